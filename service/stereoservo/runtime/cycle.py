@@ -1,0 +1,165 @@
+"""What goes into one cycle of the core and what comes out of it (DESIGN 2)."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.control.reasons import Reason
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.commands import Request
+from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
+
+
+class Lifecycle(StrEnum):
+    """What the arm may do. FAULT is latched until an explicit reset."""
+
+    UNCONFIGURED = "unconfigured"
+    INACTIVE = "inactive"
+    ACTIVE = "active"
+    FAULT = "fault"
+
+
+class ModelReadiness(StrEnum):
+    """What the core knows of the arm and the cameras."""
+
+    NONE = "none"
+    CANDIDATE = "candidate"
+    VALID = "valid"
+    SUSPECT = "suspect"
+
+
+class DriverFault(msgspec.Struct, frozen=True):
+    """A joint driver failed in this cycle."""
+
+    code: str
+    message: str
+
+
+class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
+    """A model enters the core: only at rest, with an epoch."""
+
+    model: CellModel
+
+
+class StepInputs(msgspec.Struct, frozen=True, eq=False):
+    """Everything that one step may depend on. ``stop``: the stop slot was raised since the last step.
+
+    ``driver_active``: what the servo process did with the driver (it owns enable and disable); the core's lifecycle
+    follows ``driver_active`` and asks for transitions through ``StepOutputs.driver_request``.
+    """
+
+    now_ns: int
+    period_ns: int
+    joints: JointState | None
+    observations: tuple[CameraObservation, ...] = ()
+    requests: tuple[Request, ...] = ()
+    model_update: ModelUpdate | None = None
+    stop: bool = False
+    driver_configured: bool = True
+    driver_active: bool = False
+    driver_fault: DriverFault | None = None
+    parameter_epoch: int = 0
+
+
+EventKind = Literal[
+    "reply",  # answer to a request: accepted or refused
+    "lifecycle",
+    "model",
+    "goal_started",
+    "goal_reached",
+    "goal_aborted",
+    "goal_cancelled",
+    "goal_preempted",
+    "held",
+    "resumed",
+    "stopped",
+    "fault",
+    "calibration_progress",
+    "calibration_sample",
+    "calibration_finished",
+    "calibration_aborted",
+    "taught",
+    "warning",
+]
+
+
+class Sample(msgspec.Struct, frozen=True, eq=False):
+    """Markers averaged at rest in one camera: ``ids`` (k,), ``pixels`` (k, 2), ``covariances`` (k, 2, 2) of the mean."""
+
+    camera: str
+    ids: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
+    frames: int
+
+
+class Event(msgspec.Struct, frozen=True, eq=False):
+    """Something a client may not miss. ``seq`` counts from the core's start; ``t_ns`` monotonic."""
+
+    seq: int
+    t_ns: int
+    kind: EventKind
+    message: str = ""
+    id: str = ""
+    request: int = -1
+    accepted: bool | None = None
+    reasons: tuple[Reason, ...] = ()
+    joints: FloatArray | None = None
+    samples: tuple[Sample, ...] = ()
+    trial: int = -1
+    name: str = ""
+    error_px: float | None = None
+    progress: float | None = None
+
+
+class Status(msgspec.Struct, frozen=True, eq=False):
+    """The state of the core after a step."""
+
+    t_ns: int
+    step: int
+    lifecycle: str
+    model: str
+    model_epoch: int
+    source: str
+    goal: str
+    law: str
+    level: str
+    reasons: tuple[Reason, ...]
+    positions: FloatArray
+    velocities: FloatArray
+    command_raw: FloatArray
+    command: FloatArray
+    error_px: float | None
+    task_error: FloatArray
+    """Law-specific: cartesian3 (tau, theta_r [rad], theta_p [rad]); empty otherwise."""
+    innovation_px: dict[str, float]
+    visible: dict[str, int]
+
+
+class StepOutputs(msgspec.Struct, frozen=True, eq=False):
+    """``command`` (n,) to write, or None where nothing may be written in this lifecycle state."""
+
+    command: FloatArray | None
+    status: Status
+    priors: tuple[Prior, ...] = ()
+    events: tuple[Event, ...] = ()
+    driver_request: Literal["", "activate", "deactivate", "reset"] = ""
+
+
+def encode_array(value: object) -> object:
+    """msgspec ``enc_hook``: an array as (dtype, shape, bytes), bit for bit."""
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, list(value.shape), np.ascontiguousarray(value).tobytes())
+    raise NotImplementedError(f"cannot encode {type(value).__name__}")
+
+
+def decode_array(kind: type, value: object) -> object:
+    """msgspec ``dec_hook``, inverse of :func:`encode_array`."""
+    dtype, shape, data = value  # type: ignore[misc]
+    array: npt.NDArray[np.generic] = np.frombuffer(data, dtype=np.dtype(dtype)).reshape(shape).copy()
+    return array

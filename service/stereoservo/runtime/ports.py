@@ -1,0 +1,251 @@
+"""Ports: what the service asks of a joint driver, a camera driver and a detector.
+
+All stamps are ``CLOCK_MONOTONIC`` nanoseconds of this host (in lockstep: the virtual clock), taken from
+``DriverContext.clock``. Every sample carries a stamp and a sequence number. Joint quantities are [rad], [rad/s]
+for revolute and [m], [m/s] for prismatic joints. Pixels: integer = pixel centre.
+
+Calls are non-blocking within ``call_budget_us`` of the description. ``describe()`` works before anything is
+connected. Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+ImageArray = npt.NDArray[np.uint8]
+
+JointKindName = Literal["revolute", "prismatic"]
+Mount = Literal["eye_to_hand", "eye_in_hand"]
+Pacing = Literal["clock", "driver", "lockstep"]
+
+
+class DriverError(Exception):
+    """A driver cannot do what was asked. Carries data; the text says what, the value, what would be valid.
+
+    Attributes:
+        code: short machine-readable cause, e.g. ``"not_configured"``, ``"option"``, ``"connection_lost"``.
+        data: the values the message speaks of.
+        retry: whether the same call may succeed later without a change of configuration.
+    """
+
+    def __init__(self, code: str, message: str, *, retry: bool = False, **data: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.data = data
+        self.retry = retry
+
+
+class JointSpec(msgspec.Struct, frozen=True):
+    """One joint as the driver knows it: limits of the machine, not of the cell (those can only be tighter)."""
+
+    name: str
+    kind: JointKindName
+    position_min: float
+    position_max: float
+    velocity_max: float
+    acceleration_max: float
+
+
+class JointDriverDescription(msgspec.Struct, frozen=True):
+    """What a joint driver drives, readable before it is connected."""
+
+    driver: str
+    joints: tuple[JointSpec, ...]
+    rate_hz: float
+    pacing: Pacing
+    command_timeout_s: float
+    call_budget_us: float
+
+
+class CameraDescription(msgspec.Struct, frozen=True):
+    """What a camera driver delivers: ``frames`` (a detector follows) or ``observations`` (feature level)."""
+
+    driver: str
+    name: str
+    width: int
+    height: int
+    rate_hz: float
+    delivers: Literal["frames", "observations"]
+    call_budget_us: float
+    marker_ids: tuple[int, ...] = ()
+
+
+class DetectorDescription(msgspec.Struct, frozen=True):
+    """Which marker ids a detector can report."""
+
+    detector: str
+    marker_ids: tuple[int, ...]
+
+
+class JointState(msgspec.Struct, frozen=True, eq=False):
+    """One joint sample: ``positions`` (n,), ``velocities`` (n,); ``efforts`` (n,) where the drive has them."""
+
+    seq: int
+    t_ns: int
+    positions: FloatArray
+    velocities: FloatArray
+    efforts: FloatArray | None = None
+
+
+class CommandReport(msgspec.Struct, frozen=True, eq=False):
+    """What was asked, what was sent, and why they differ (empty when they do not)."""
+
+    seq: int
+    t_ns: int
+    asked: FloatArray
+    sent: FloatArray
+    reasons: tuple[str, ...] = ()
+
+
+class Frame(msgspec.Struct, frozen=True, eq=False):
+    """One image ``(height, width)`` uint8 with its stamps."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_received_ns: int
+    image: ImageArray
+
+
+class CameraObservation(msgspec.Struct, frozen=True, eq=False):
+    """Markers seen in one frame: ``ids`` (k,), ``pixels`` (k, 2) [px], ``covariances`` (k, 2, 2) [px²]."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_received_ns: int
+    ids: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
+
+
+class Prior(msgspec.Struct, frozen=True, eq=False):
+    """Where the core expects the markers of one camera at ``t_ns``; a detector extrapolates to its frame's stamp.
+
+    ``ids`` (k,), ``pixels`` (k, 2) [px], ``velocities`` (k, 2) [px/s], ``covariances`` (k, 2, 2) [px²].
+    Never fed back as a measurement.
+    """
+
+    camera: str
+    t_ns: int
+    ids: IntArray
+    pixels: FloatArray
+    velocities: FloatArray
+    covariances: FloatArray
+
+
+@runtime_checkable
+class Clock(Protocol):
+    """The one source of time that drivers and the loop read."""
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+        ...
+
+
+@dataclass(frozen=True)
+class DriverContext:
+    """What the service gives a driver at construction, beside its own options."""
+
+    clock: Clock
+    cell: str
+    runtime_dir: Path
+    cell_dir: Path
+    camera: str = ""
+    seed: int = 0
+    services: dict[str, Any] = field(default_factory=dict)
+    """In-process objects shared between drivers of one process (lockstep: the simulated world)."""
+
+
+@runtime_checkable
+class JointDriver(Protocol):
+    """An arm. Constructed as ``Driver(options, context)``; the constructor connects to nothing."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
+
+    def describe(self) -> JointDriverDescription:
+        """Joints, limits, rate, pacing; works unconnected."""
+        ...
+
+    def configure(self) -> None:
+        """Connect and check the machine. Raises DriverError. Nothing moves."""
+        ...
+
+    def activate(self) -> None:
+        """Power circuits on, brakes released, velocity zero. Raises DriverError."""
+        ...
+
+    def read_state(self) -> JointState:
+        """Newest joint sample; valid once configured. Raises DriverError."""
+        ...
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        """Command joint velocities (n,). Raises DriverError unless active. Feeds the drive's watchdog."""
+        ...
+
+    def stop(self) -> None:
+        """Bring the arm to rest. Any state, idempotent, never raises."""
+        ...
+
+    def deactivate(self) -> None:
+        """Stop, then power off. Idempotent."""
+        ...
+
+    def close(self) -> None:
+        """Release everything. Idempotent; never raises."""
+        ...
+
+
+@runtime_checkable
+class CameraDriver(Protocol):
+    """A camera. Constructed as ``Driver(options, context)`` with ``context.camera`` its name in the cell."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
+
+    def describe(self) -> CameraDescription:
+        """Size, rate, what it delivers; works unconnected."""
+        ...
+
+    def configure(self) -> None:
+        """Open the source. Raises DriverError."""
+        ...
+
+    def activate(self) -> None:
+        """Start delivery. Raises DriverError."""
+        ...
+
+    def poll(self) -> list[Frame] | list[CameraObservation]:
+        """What arrived since the last poll, newest last; may skip old frames. Raises DriverError."""
+        ...
+
+    def deactivate(self) -> None:
+        """Stop delivery. Idempotent."""
+        ...
+
+    def close(self) -> None:
+        """Release everything. Idempotent; never raises."""
+        ...
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds markers in one camera's images. Constructed as ``Detector(options, context)``."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
+
+    def describe(self) -> DetectorDescription:
+        """The marker ids that it can report."""
+        ...
+
+    def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+        """Markers in ``frame``; without a (fresh) prior, acquisition in the whole image. Never raises on content."""
+        ...
