@@ -1,0 +1,262 @@
+"""The cell file: TOML, ``schema = 1``, decoded strictly (DESIGN 7)."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from stereoservo.runtime.commands import LAWS, LawName, Name, PointSource
+from stereoservo.runtime.ports import Mount
+
+SCHEMA = 1
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+
+
+class CellFileError(Exception):
+    """A cell file cannot be used: names the file, the key, the value and what would have been valid."""
+
+    def __init__(self, path: Path | str, key: str, message: str) -> None:
+        where = f"{path}: {key}: " if key else f"{path}: "
+        super().__init__(where + message)
+        self.path = str(path)
+        self.key = key
+
+
+class CellSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[cell]``"""
+
+    name: Name
+
+
+class JointsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[joints]``: the driver, its options, and home [rad or m] by joint name (default: the calibration's base)."""
+
+    driver: str
+    options: dict[str, Any] = {}
+    home: dict[str, float] = {}
+
+
+class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One ``[[camera]]``."""
+
+    name: Name
+    driver: str
+    detector: str = ""
+    mount: Mount = "eye_to_hand"
+    options: dict[str, Any] = {}
+    detector_options: dict[str, Any] = {}
+
+
+class ServoSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[servo]``: the loop and the defaults of goals."""
+
+    rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
+    law: LawName = "cartesian3"
+    points: PointSource = "predicted"
+    gain: Positive = 1.5
+    tolerance_px: Positive = 0.25
+    hold_frames: Annotated[int, Meta(ge=1)] = 10
+    time_limit_s: Positive = 60.0
+    filter_s: NonNegative = 0.2
+    """Time constant of the innovation filter [s]: 0 takes each frame as it is."""
+    gate_sigma: Positive = 6.0
+    jog_acceleration_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    priority: Annotated[int, Meta(ge=0, le=98)] = 50
+    """SCHED_FIFO priority of the servo process; 0 leaves the scheduler alone."""
+
+
+class JointLimit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One ``[[safety.limit]]``: position range, velocity and acceleration of one joint [rad or m, s]."""
+
+    joint: str
+    min: float
+    max: float
+    velocity: Positive
+    acceleration: Positive
+
+
+class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One ``[[safety.keep_out]]``: a box in joint space that the arm may not enter; joints left out are unbounded."""
+
+    name: str
+    ranges: dict[str, tuple[float, float]]
+
+
+class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[safety]``"""
+
+    limit: tuple[JointLimit, ...]
+    keep_out: tuple[KeepOut, ...] = ()
+    coast_s: NonNegative = 0.5
+    """How long a law may run on prediction alone when no camera delivers."""
+    joint_timeout_s: Positive = 0.1
+    """Age of the joint sample at which the arm brakes."""
+    position_margin: NonNegative = 0.01
+    """Distance kept from every position limit [rad or m]."""
+    speed_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
+
+
+class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``."""
+
+    base: dict[str, float]
+    range: dict[str, Positive]
+    stops: Annotated[int, Meta(ge=4, le=200)] = 9
+    frames: Annotated[int, Meta(ge=1, le=200)] = 5
+    settle_s: NonNegative = 0.15
+    speed_scale: Annotated[float, Meta(gt=0, le=1)] = 0.5
+    min_markers: Annotated[int, Meta(ge=3)] = 4
+    """Markers that each camera must see at a stop; fewer makes the joint back off."""
+    min_range: Positive = 0.05
+    """Smallest motion of a joint [rad or m] that can be used."""
+    wait_s: Positive = 2.0
+    """How long to wait at a stop for enough frames before backing off."""
+
+
+class TlsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[zenoh.tls]``: paths, relative to the cell file."""
+
+    root_ca_certificate: str
+    listen_private_key: str
+    listen_certificate: str
+    enable_mtls: bool = True
+
+
+class ZenohSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[zenoh]``: ``router`` (default: the daemon is its own router) or ``client`` of a site's router.
+
+    ``endpoints``: listened on as a router (default: a unix socket in the runtime directory), connected to as a client.
+    """
+
+    mode: Literal["router", "client"] = "router"
+    endpoints: tuple[str, ...] = ()
+    tls: TlsSection | None = None
+
+
+class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole cell file."""
+
+    schema: int
+    cell: CellSection
+    joints: JointsSection
+    camera: tuple[CameraSection, ...]
+    safety: SafetySection
+    calibration: CalibrationSection | None = None
+    servo: ServoSection = ServoSection()
+    zenoh: ZenohSection = ZenohSection()
+
+
+def load_cell_file(path: Path) -> CellFile:
+    """Read and check a cell file. Raises CellFileError with file, key, value and what would have been valid."""
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise CellFileError(path, "", f"cannot be read: {error.strerror}") from error
+    try:
+        tree = tomllib.loads(text.decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CellFileError(path, "", f"is not TOML: {error}") from error
+    return check_cell(tree, path)
+
+
+def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
+    """Decode a parsed cell file strictly. Raises CellFileError."""
+    if tree.get("schema") != SCHEMA:
+        raise CellFileError(path, "schema", f"is {tree.get('schema')!r}; this version reads {SCHEMA}")
+    try:
+        cell = msgspec.convert(tree, CellFile, strict=True)
+    except msgspec.ValidationError as error:
+        text, _, where = str(error).partition(" - at `")
+        key = where.rstrip("`").removeprefix("$").lstrip(".")
+        raise CellFileError(path, key, f"{text}{_allowed(tree, text, key)}") from error
+    names = [camera.name for camera in cell.camera]
+    if not names:
+        raise CellFileError(path, "camera", "no camera; at least one [[camera]] is needed")
+    for name in names:
+        if names.count(name) > 1:
+            raise CellFileError(path, "camera.name", f"{name!r} is used twice; camera names must differ")
+    _check_limits(cell, path)
+    return cell
+
+
+def _check_limits(cell: CellFile, path: Path | str) -> None:
+    seen: list[str] = []
+    for limit in cell.safety.limit:
+        if limit.joint in seen:
+            raise CellFileError(path, "safety.limit", f"joint {limit.joint!r} has two limits; one is allowed")
+        seen.append(limit.joint)
+        if not limit.min < limit.max:
+            raise CellFileError(
+                path, "safety.limit", f"joint {limit.joint!r}: min {limit.min} is not below max {limit.max}"
+            )
+        if limit.max - limit.min <= 2 * cell.safety.position_margin:
+            raise CellFileError(
+                path,
+                "safety.limit",
+                f"joint {limit.joint!r}: range {limit.max - limit.min} leaves nothing between two margins of "
+                f"{cell.safety.position_margin} (safety.position_margin)",
+            )
+    sections: list[tuple[str, dict[str, Any]]] = [("joints.home", dict(cell.joints.home))]
+    if cell.calibration is not None:
+        sections += [("calibration.base", dict(cell.calibration.base))]
+        sections += [("calibration.range", dict(cell.calibration.range))]
+    sections += [(f"safety.keep_out {k.name!r}", dict(k.ranges)) for k in cell.safety.keep_out]
+    for key, values in sections:
+        for joint in values:
+            if joint not in seen:
+                raise CellFileError(
+                    path, key, f"joint {joint!r} has no [[safety.limit]]; joints with limits: {', '.join(seen) or 'none'}"
+                )
+
+
+def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str = "<cell>") -> None:
+    """Check a cell against the joints of its driver. Raises CellFileError."""
+    limited = [limit.joint for limit in cell.safety.limit]
+    for name in joint_names:
+        if name not in limited:
+            raise CellFileError(
+                path, "safety.limit", f"joint {name!r} of driver {cell.joints.driver!r} has no limits; limits are given for: "
+                f"{', '.join(limited) or 'none'}"
+            )
+    for name in limited:
+        if name not in joint_names:
+            raise CellFileError(
+                path, "safety.limit", f"no joint {name!r} in driver {cell.joints.driver!r}; its joints: {', '.join(joint_names)}"
+            )
+    if cell.calibration is not None:
+        for key, values in (("calibration.base", cell.calibration.base), ("calibration.range", cell.calibration.range)):
+            missing = [name for name in joint_names if name not in values]
+            if missing:
+                raise CellFileError(path, key, f"missing for joint(s) {', '.join(missing)}; all of {', '.join(joint_names)} are needed")
+
+
+def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
+    """What would have been valid, where msgspec's text does not say it."""
+    if "unknown field" not in text:
+        value: Any = tree
+        for part in key.replace("[", ".[").split("."):
+            if not part:
+                continue
+            try:
+                value = value[int(part.strip("[]"))] if part.startswith("[") else value[part]
+            except (KeyError, IndexError, TypeError, ValueError):
+                return ""
+        return f", got {value!r}" if not isinstance(value, dict | list) else ""
+    sections: dict[str, type[msgspec.Struct]] = {
+        "": CellFile, "cell": CellSection, "joints": JointsSection, "camera": CameraSection, "servo": ServoSection,
+        "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
+        "calibration": CalibrationSection, "zenoh": ZenohSection, "zenoh.tls": TlsSection,
+    }  # fmt: skip
+    section = sections.get(".".join(part.split("[")[0] for part in key.split(".")))
+    if section is None:
+        return ""
+    return f"; known keys: {', '.join(field.encode_name for field in msgspec.structs.fields(section))}"
+
+
+__all__ = ["LAWS", "CellFile", "CellFileError", "check_cell", "check_joints", "load_cell_file"]
