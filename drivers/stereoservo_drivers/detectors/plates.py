@@ -1,0 +1,81 @@
+"""Self-identifying planar dot patterns: pure data, shared by the detector, the simulation and the plate printer.
+
+A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on the edge from
+corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly collinear, and the edge dot's fraction
+together with the two inner dots tells the faces apart. A detector may use the pattern of *one face* up to scale; how
+the faces are joined to a body is known to nobody but the simulation's truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+CORNERS = (0, 1, 2, 3)
+EDGE = 4
+INNER = (5, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class DotFace:
+    """One planar face.
+
+    ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen from in front.
+    Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids`` name the rows. ``radius`` [m] of a dot,
+    ``half_side`` [m] of the black square around them.
+    """
+
+    name: str
+    ids: tuple[int, ...]
+    positions: npt.NDArray[np.float64]
+    radius: float
+    half_side: float
+
+    @property
+    def edge_fraction(self) -> float:
+        """Where the edge dot divides edge 0-1, from corner 0."""
+        return float(
+            (self.positions[EDGE, 0] - self.positions[0, 0]) / (self.positions[1, 0] - self.positions[0, 0])
+        )
+
+
+def seven_dots(
+    name: str,
+    first_id: int,
+    edge_fraction: float,
+    inner: tuple[tuple[float, float], tuple[float, float]],
+    *,
+    side: float = 0.084,
+    radius: float = 0.008,
+    margin: float = 0.010,
+) -> DotFace:
+    """A face from fractions of its corner square: ``edge_fraction`` along edge 0-1, ``inner`` (x, y) from corner 0.
+
+    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots. Ids are ``first_id`` .. ``first_id + 6``.
+    """
+    fractions = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (edge_fraction, 0.0), *inner])
+    return DotFace(
+        name=name,
+        ids=tuple(range(first_id, first_id + 7)),
+        positions=(fractions - 0.5) * side,
+        radius=radius,
+        half_side=side / 2 + radius + margin,
+    )
+
+
+DEFAULT_BODY: tuple[DotFace, ...] = (
+    seven_dots("a", 0, 0.66, ((0.25, 0.40), (0.66, 0.49))),
+    seven_dots("b", 7, 0.34, ((0.76, 0.40), (0.32, 0.52))),
+)
+"""The faces of the default marker body, ids 0..6 and 7..13."""
+
+
+def face_of(marker_id: int, faces: tuple[DotFace, ...] = DEFAULT_BODY) -> DotFace:
+    """The face that carries ``marker_id``. Raises KeyError."""
+    for face in faces:
+        if marker_id in face.ids:
+            return face
+    known = ", ".join(str(i) for face in faces for i in face.ids)
+    raise KeyError(f"no marker {marker_id}; markers of these faces: {known}")
