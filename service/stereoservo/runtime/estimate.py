@@ -1,0 +1,233 @@
+"""Where the markers are now: kinematic prediction (8.35), corrected by what each camera saw at its own stamp.
+
+The innovation of a marker is observed minus predicted pixel at the frame's shutter time, with the joints interpolated
+from a short history; no trigger is needed. It is gated statistically, filtered, and carried to the present by the
+kinematics, so that between frames, and through a dropped camera, the prediction carries the loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.control.kernels import damped_least_squares
+from stereoservo.kinematics.kernels import chain_forward, image_jacobian, project_points, transform_points, triangulate
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
+from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.state import HISTORY, CameraEstimate, JointHistory
+
+MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
+TIMING_SIGMA_S = 0.003  # uncertainty of a shutter stamp against the joint stamps
+FIRST_SIGHT_SIGMA_PX = 6.0  # before a marker's innovation is known
+CORRECTION_DAMPING = 1e-4  # relative to the largest diagonal of the normal matrix
+SUSPECT_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class ModelArrays:
+    """A model as the kernels take it, in the order of the core's cameras and the model's markers."""
+
+    generators: FloatArray
+    kinds: np.ndarray[tuple[int], np.dtype[np.uint8]]
+    zero: FloatArray
+    matrices: FloatArray
+    marker_points: FloatArray
+    plane_at_infinity: FloatArray
+    marker_ids: tuple[int, ...]
+    index: dict[int, int]
+
+
+def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
+    """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
+    if model.joint_names != settings.joint_names:
+        raise ValueError(f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}")
+    if model.joint_kinds != settings.joint_kinds:
+        raise ValueError(f"model has joint kinds {model.joint_kinds}; the cell has {settings.joint_kinds}")
+    by_name = {camera.name: camera for camera in model.cameras}
+    for camera in settings.cameras:
+        known = by_name.get(camera.name)
+        if known is None:
+            raise ValueError(f"model knows cameras {', '.join(by_name)}; the cell also has {camera.name!r}")
+        if (known.width, known.height) != (camera.width, camera.height):
+            raise ValueError(
+                f"model was made with {known.width}x{known.height} images of camera {camera.name!r}; "
+                f"it now delivers {camera.width}x{camera.height}"
+            )
+    return ModelArrays(
+        generators=np.ascontiguousarray(model.generators, dtype=np.float64),
+        kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
+        zero=np.ascontiguousarray(model.zero, dtype=np.float64),
+        matrices=np.ascontiguousarray([by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64),
+        marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),
+        plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
+        marker_ids=model.marker_ids,
+        index={marker: i for i, marker in enumerate(model.marker_ids)},
+    )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Markers by kinematics alone at one configuration: operators at it (5.21), points, pixels, image Jacobian."""
+
+    operators: FloatArray
+    points: FloatArray
+    pixels: FloatArray
+    jacobian: FloatArray
+
+
+def predict(arrays: ModelArrays, q: FloatArray) -> Prediction:
+    """Bring the projective kinematics to ``q`` (5.21) and predict every marker in every camera (8.35)."""
+    H, operators = chain_forward(arrays.generators, arrays.kinds, arrays.zero, np.ascontiguousarray(q))
+    points = transform_points(H, arrays.marker_points)
+    pixels, _ = project_points(arrays.matrices, points)
+    return Prediction(operators, points, pixels, image_jacobian(operators, arrays.matrices, points))
+
+
+def remember_joints(history: JointHistory, sample: JointState) -> None:
+    """Append a joint sample to the ring."""
+    slot = history.count % HISTORY
+    history.t_ns[slot] = sample.t_ns
+    history.positions[slot] = sample.positions
+    history.count += 1
+
+
+def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
+    """Joint positions at ``t_ns`` by linear interpolation; None when the history does not reach there.
+
+    Past the newest sample it extrapolates by up to the last sample interval.
+    """
+    filled = min(history.count, HISTORY)
+    if filled < 2:
+        return None
+    newest = history.count - 1
+    for back in range(filled - 1):
+        later, earlier = (newest - back) % HISTORY, (newest - back - 1) % HISTORY
+        t1, t0 = int(history.t_ns[later]), int(history.t_ns[earlier])
+        if t_ns < t0:
+            continue
+        if t1 == t0:
+            return history.positions[later].copy()
+        fraction = min((t_ns - t0) / (t1 - t0), 2.0)
+        a, b = history.positions[earlier], history.positions[later]
+        return a + fraction * (b - a)
+    return None
+
+
+def accept_observation(
+    estimate: CameraEstimate,
+    camera: int,
+    observation: CameraObservation,
+    q: FloatArray,
+    speed: FloatArray,
+    arrays: ModelArrays,
+    settings: CoreSettings,
+) -> None:
+    """Gate one camera's observation against the prediction at its stamp and fold it into the estimate.
+
+    ``q``, ``speed`` (n,): joints at the shutter time. The gate is chi-square-like on the deviation from the filtered
+    innovation, with the sigmas of detector, model and timing.
+    """
+    prediction = predict(arrays, q)
+    accepted = rejected = 0
+    squares = 0.0
+    for k in range(observation.ids.size):
+        i = arrays.index.get(int(observation.ids[k]))
+        if i is None:
+            continue
+        innovation = observation.pixels[k] - prediction.pixels[camera, i]
+        covariance = observation.covariances[k]
+        variance = 0.5 * (covariance[0, 0] + covariance[1, 1])
+        velocity = (prediction.jacobian[camera, i] * speed).sum(axis=-1)
+        motion = TIMING_SIGMA_S * TIMING_SIGMA_S * float(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        age_s = (observation.t_shutter_ns - int(estimate.seen_ns[i])) * 1e-9
+        known = estimate.seen_ns[i] > 0 and age_s <= settings.limits.coast_s + 1.0
+        model = MODEL_SIGMA_PX if known else FIRST_SIGHT_SIGMA_PX
+        deviation = innovation - estimate.innovation[i] if known else innovation
+        gate = settings.gate_sigma * settings.gate_sigma * (variance + motion + model * model)
+        if not float(deviation[0] * deviation[0] + deviation[1] * deviation[1]) <= gate:
+            rejected += 1
+            continue
+        if known and settings.filter_s > 0.0:
+            estimate.innovation[i] += deviation * (age_s / (settings.filter_s + age_s))
+        else:
+            estimate.innovation[i] = innovation
+        estimate.sigma[i] = np.sqrt(variance)
+        estimate.seen_ns[i] = observation.t_shutter_ns
+        squares += float(innovation[0] * innovation[0] + innovation[1] * innovation[1])
+        accepted += 1
+    estimate.last_visible = accepted
+    estimate.frames += 1
+    estimate.rms_px = float(np.sqrt(squares / (2 * accepted))) if accepted else 0.0
+    estimate.rejected_frames = estimate.rejected_frames + 1 if rejected > accepted else 0
+    if accepted >= 3:
+        estimate.accepted_ns = observation.t_shutter_ns
+
+
+def marker_weights(cameras: list[CameraEstimate], now_ns: int, coast_s: float) -> FloatArray:
+    """(c, m) 1/sigma [1/px] of markers that a camera saw within ``coast_s``, 0 elsewhere."""
+    limit = int(coast_s * 1e9) + 50_000_000
+    return np.array(
+        [
+            np.where((e.seen_ns > 0) & (now_ns - e.seen_ns <= limit), 1.0 / np.maximum(e.sigma, 1e-3), 0.0)
+            for e in cameras
+        ]
+    )
+
+
+def pixels_now(prediction: Prediction, cameras: list[CameraEstimate]) -> FloatArray:
+    """(c, m, 2) where the markers are now: prediction plus held innovation [px]."""
+    return prediction.pixels + np.array([e.innovation for e in cameras])
+
+
+def joint_correction(prediction: Prediction, cameras: list[CameraEstimate], weights: FloatArray) -> FloatArray:
+    """Joint-space correction (n,) that explains the innovations best, so that corrected points stay one rigid body."""
+    n = prediction.operators.shape[0]
+    innovation = np.array([e.innovation for e in cameras])
+    row_weights = np.repeat(weights.reshape(-1), 2)
+    correction, _ = damped_least_squares(
+        prediction.jacobian.reshape(-1, n), innovation.reshape(-1), row_weights, CORRECTION_DAMPING
+    )
+    return correction
+
+
+def points_now(
+    arrays: ModelArrays, q: FloatArray, prediction: Prediction, pixels: FloatArray, weights: FloatArray,
+    correction: FloatArray, source: str,
+) -> FloatArray:  # fmt: skip
+    """Marker points (m, 4) with heights a∞ᵀM = 1: ``predicted`` (8.35) or ``triangulated`` (8.34).
+
+    Predicted points are those of the joints plus correction. A marker that fewer than two cameras see cannot be
+    triangulated: its predicted point stands in.
+    """
+    corrected = chain_forward(arrays.generators, arrays.kinds, arrays.zero, q + correction)[0]
+    points: FloatArray = transform_points(corrected, arrays.marker_points)
+    if source == "triangulated":
+        found, ok = triangulate(arrays.matrices, pixels, weights, 3)
+        points = np.where(ok[:, None], with_unit_height(found, arrays.plane_at_infinity), points)
+    return points
+
+
+def with_unit_height(points: FloatArray, plane_at_infinity: FloatArray) -> FloatArray:
+    """Points (m, 4) scaled to a∞ᵀM = 1, so that differences and middles mean something (errata, orbital height)."""
+    height = (points * plane_at_infinity).sum(axis=-1)
+    return points / np.where(height == 0.0, 1.0, height)[:, None]
+
+
+def priors(
+    arrays: ModelArrays, settings: CoreSettings, prediction: Prediction, cameras: list[CameraEstimate],
+    velocities: FloatArray, now_ns: int,
+) -> tuple[Prior, ...]:  # fmt: skip
+    """One prior a camera for the detectors' windows; covariance from model and motion, never fed back."""
+    ids: IntArray = np.array(arrays.marker_ids, dtype=np.int64)
+    found = []
+    for camera, estimate in enumerate(cameras):
+        speed = (prediction.jacobian[camera] * velocities).sum(axis=-1)
+        fresh = (now_ns - estimate.seen_ns <= 1_000_000_000) & (estimate.seen_ns > 0)
+        sigma = np.where(fresh, 1.0, FIRST_SIGHT_SIGMA_PX) + TIMING_SIGMA_S * np.abs(speed).max(axis=-1)
+        covariance = np.zeros((ids.size, 2, 2))
+        covariance[:, 0, 0] = covariance[:, 1, 1] = sigma * sigma
+        pixels = prediction.pixels[camera] + np.where(fresh[:, None], estimate.innovation, 0.0)
+        found.append(Prior(settings.cameras[camera].name, now_ns, ids, pixels, speed, covariance))
+    return tuple(found)

@@ -1,0 +1,163 @@
+"""What the core is told once: joints, limits, cameras, defaults. Serialisable, and part of every recording."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from stereoservo.runtime.cellfile import CalibrationSection, CellFile, CellFileError, check_joints
+from stereoservo.runtime.commands import LawName, PointSource
+from stereoservo.runtime.ports import CameraDescription, FloatArray, JointDriverDescription, JointKindName, Mount
+
+
+class CameraSettings(msgspec.Struct, frozen=True):
+    """A camera as the core sees it: size [px], rate [Hz], the marker ids its detector can report."""
+
+    name: str
+    width: int
+    height: int
+    rate_hz: float
+    mount: Mount
+    marker_ids: tuple[int, ...]
+
+
+class LimitSettings(msgspec.Struct, frozen=True, eq=False):
+    """Limits in joint order: the tighter of drive and cell. ``keep_outs`` (k, n, 2) joint-space boxes."""
+
+    position_min: FloatArray
+    position_max: FloatArray
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    position_margin: float
+    keep_outs: FloatArray
+    keep_out_names: tuple[str, ...]
+    coast_s: float
+    joint_timeout_s: float
+    speed_scale: float
+
+
+class TrialSettings(msgspec.Struct, frozen=True, eq=False):
+    """Trial motions in joint order; see ``cellfile.CalibrationSection``."""
+
+    base: FloatArray
+    range: FloatArray
+    stops: int
+    frames: int
+    settle_s: float
+    speed_scale: float
+    min_markers: int
+    min_range: float
+    wait_s: float
+
+
+class CoreSettings(msgspec.Struct, frozen=True, eq=False):
+    """Everything constant that a step may depend on."""
+
+    cell: str
+    joint_names: tuple[str, ...]
+    joint_kinds: tuple[JointKindName, ...]
+    cameras: tuple[CameraSettings, ...]
+    limits: LimitSettings
+    trials: TrialSettings | None
+    home: FloatArray | None
+    rate_hz: float
+    law: LawName
+    points: PointSource
+    gain: float
+    tolerance_px: float
+    hold_frames: int
+    time_limit_s: float
+    filter_s: float
+    gate_sigma: float
+
+    @property
+    def marker_ids(self) -> tuple[int, ...]:
+        """Every marker id that some camera can report, sorted."""
+        return tuple(sorted({i for camera in self.cameras for i in camera.marker_ids}))
+
+
+def core_settings(
+    cell: CellFile,
+    joints: JointDriverDescription,
+    cameras: tuple[CameraDescription, ...],
+    *,
+    speed_cap: float = 1.0,
+) -> CoreSettings:
+    """Bring cell file and driver descriptions together.
+
+    ``cameras`` in the cell file's order, each with its detector's marker ids. ``speed_cap`` (0, 1] lowers the cell's
+    speed scale (commissioning). Raises CellFileError where they do not fit.
+    """
+    names = tuple(joint.name for joint in joints.joints)
+    check_joints(cell, names)
+    limits = {limit.joint: limit for limit in cell.safety.limit}
+    for spec in joints.joints:
+        if limits[spec.name].min >= spec.position_max or limits[spec.name].max <= spec.position_min:
+            raise CellFileError(
+                cell.cell.name,
+                "safety.limit",
+                f"joint {spec.name!r}: range {limits[spec.name].min}…{limits[spec.name].max} lies outside the "
+                f"drive's {spec.position_min}…{spec.position_max} (are the limits in rad?)",
+            )
+    camera_settings = tuple(
+        CameraSettings(
+            description.name, description.width, description.height, description.rate_hz, section.mount,
+            tuple(sorted(description.marker_ids)),
+        )
+        for section, description in zip(cell.camera, cameras, strict=True)
+    )  # fmt: skip
+    trials = None if cell.calibration is None else _trial_settings(cell.calibration, names)
+    home = None
+    if cell.joints.home:
+        base = cell.calibration.base if cell.calibration is not None else {}
+        missing = [name for name in names if name not in cell.joints.home and name not in base]
+        if missing:
+            raise CellFileError(cell.cell.name, "joints.home", f"missing for joint(s) {', '.join(missing)}")
+        home = np.array([cell.joints.home.get(name, base.get(name, 0.0)) for name in names])
+    elif trials is not None:
+        home = trials.base
+    return CoreSettings(
+        cell=cell.cell.name,
+        joint_names=names,
+        joint_kinds=tuple(joint.kind for joint in joints.joints),
+        cameras=camera_settings,
+        limits=LimitSettings(
+            position_min=np.array([max(j.position_min, limits[j.name].min) for j in joints.joints]),
+            position_max=np.array([min(j.position_max, limits[j.name].max) for j in joints.joints]),
+            velocity_max=np.array([min(j.velocity_max, limits[j.name].velocity) for j in joints.joints]),
+            acceleration_max=np.array([min(j.acceleration_max, limits[j.name].acceleration) for j in joints.joints]),
+            position_margin=cell.safety.position_margin,
+            keep_outs=np.array(
+                [[k.ranges.get(name, (-np.inf, np.inf)) for name in names] for k in cell.safety.keep_out]
+            ).reshape(len(cell.safety.keep_out), len(names), 2),
+            keep_out_names=tuple(k.name for k in cell.safety.keep_out),
+            coast_s=cell.safety.coast_s,
+            joint_timeout_s=cell.safety.joint_timeout_s,
+            speed_scale=cell.safety.speed_scale * speed_cap,
+        ),
+        trials=trials,
+        home=home,
+        rate_hz=cell.servo.rate_hz,
+        law=cell.servo.law,
+        points=cell.servo.points,
+        gain=cell.servo.gain,
+        tolerance_px=cell.servo.tolerance_px,
+        hold_frames=cell.servo.hold_frames,
+        time_limit_s=cell.servo.time_limit_s,
+        filter_s=cell.servo.filter_s,
+        gate_sigma=cell.servo.gate_sigma,
+    )
+
+
+def _trial_settings(section: CalibrationSection, names: tuple[str, ...]) -> TrialSettings:
+    return TrialSettings(
+        base=np.array([section.base[name] for name in names]),
+        range=np.array([section.range[name] for name in names]),
+        stops=section.stops,
+        frames=section.frames,
+        settle_s=section.settle_s,
+        speed_scale=section.speed_scale,
+        min_markers=section.min_markers,
+        min_range=section.min_range,
+        wait_s=section.wait_s,
+    )

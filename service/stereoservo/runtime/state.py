@@ -1,0 +1,224 @@
+"""The state of the core: one versioned, serialisable value. A copy of it, and the inputs, give the same outputs."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from stereoservo.control.reasons import Reason
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.commands import Goal
+from stereoservo.runtime.cycle import Lifecycle, ModelReadiness, decode_array, encode_array
+from stereoservo.runtime.ports import FloatArray, IntArray
+from stereoservo.runtime.settings import CoreSettings
+
+STATE_VERSION = 1
+HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
+
+
+class JointHistory(msgspec.Struct, eq=False):
+    """Ring of joint samples: stamps [ns] and positions; ``count`` samples were ever written."""
+
+    t_ns: IntArray
+    positions: FloatArray
+    count: int = 0
+
+
+class CameraEstimate(msgspec.Struct, eq=False):
+    """What one camera said, per marker of the model.
+
+    ``innovation`` (m, 2) [px]: filtered difference observed - predicted; ``sigma`` (m,) [px] of one observation;
+    ``seen_ns`` (m,): shutter time of the last accepted sight, 0 = never.
+    """
+
+    innovation: FloatArray
+    sigma: FloatArray
+    seen_ns: IntArray
+    last_seq: int = -1
+    last_shutter_ns: int = 0
+    last_visible: int = 0
+    accepted_ns: int = 0
+    """Shutter time of the last frame with three or more accepted markers."""
+    frames: int = 0
+    rejected_frames: int = 0
+    """Consecutive frames of which the gate refused more than half of the markers."""
+    rms_px: float = 0.0
+
+
+class Holding(msgspec.Struct, tag="hold"):
+    """No motion."""
+
+
+class Jogging(msgspec.Struct, tag="jog", eq=False):
+    """Joint velocities until the dead man's lease runs out."""
+
+    velocity: FloatArray
+    until_ns: int
+
+
+class JointMove(msgspec.Struct, tag="joints", eq=False):
+    """A straight line in joint space to ``target`` (n,)."""
+
+    id: str
+    target: FloatArray
+    speed_scale: float
+    started_ns: int
+    time_limit_s: float
+    settled: int = 0
+
+
+class Servoing(msgspec.Struct, tag="law", eq=False):
+    """A law drives the arm to set-points.
+
+    ``set_points`` (c, m, 2) [px] with ``wanted`` (c, m) 1 or 0; ``target_points`` (m, 4) with ``target_known`` (m,);
+    ``face`` (3,) marker indices for cartesian3.
+    """
+
+    goal: Goal
+    law: str
+    points: str
+    gain: float
+    tolerance_px: float
+    hold_frames: int
+    time_limit_s: float
+    started_ns: int
+    lease_until_ns: int
+    set_points: FloatArray
+    wanted: FloatArray
+    target_points: FloatArray
+    target_known: FloatArray
+    centre_target: FloatArray
+    face: IntArray
+    moved_s: float = 0.0
+    held: int = 0
+    last_frames: int = 0
+
+
+class Trials(msgspec.Struct, tag="trials", eq=False):
+    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base."""
+
+    id: str
+    joint: int
+    side: int
+    k: int
+    phase: Literal["move", "settle", "collect", "return", "finish"]
+    target: FloatArray
+    phase_ns: int
+    start: FloatArray
+    """Measured positions when the current move began."""
+    commanded: FloatArray
+    """Integral of the commanded velocity since the current move began."""
+    counts: FloatArray
+    """Sights of each marker in each camera at this stop, (c, m)."""
+    sums: FloatArray
+    """(c, m, 2)"""
+    covariance_sums: FloatArray
+    """(c, m, 2, 2)"""
+    frames: IntArray
+    """Frames taken at this stop, by camera."""
+    joint_sum: FloatArray
+    lowest: FloatArray
+    highest: FloatArray
+    """Range really visited, by joint."""
+    stops: IntArray
+    """Stops recorded, by joint."""
+    joint_steps: int = 0
+    lost_ns: int = 0
+    base_done: bool = False
+
+
+class Teaching(msgspec.Struct, eq=False):
+    """Averaging of a goal that is being shown."""
+
+    name: str
+    request: int
+    frames_wanted: int
+    started_ns: int
+    counts: FloatArray
+    sums: FloatArray
+    covariance_sums: FloatArray
+    frames: IntArray
+
+
+Source = Holding | Jogging | JointMove | Servoing | Trials
+
+
+class CoreState(msgspec.Struct, eq=False):
+    """All state of the core."""
+
+    version: int
+    step: int
+    event_seq: int
+    lifecycle: Lifecycle
+    readiness: ModelReadiness
+    model: CellModel | None
+    pending_model: CellModel | None
+    history: JointHistory
+    last_joints_ns: int
+    last_joints_seq: int
+    velocities: FloatArray
+    command: FloatArray
+    cameras: list[CameraEstimate]
+    source: Source
+    queue: list[Goal]
+    teaching: Teaching | None
+    held: bool
+    stopped: bool
+    fault: list[Reason]
+    driver_request: str
+    correction: FloatArray
+    """Joint-space correction that explains the innovations best (n,)."""
+
+
+def initial_state(settings: CoreSettings) -> CoreState:
+    """The state before the first step: nothing known, nothing allowed."""
+    n = len(settings.joint_names)
+    return CoreState(
+        version=STATE_VERSION,
+        step=0,
+        event_seq=0,
+        lifecycle=Lifecycle.UNCONFIGURED,
+        readiness=ModelReadiness.NONE,
+        model=None,
+        pending_model=None,
+        history=JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, n))),
+        last_joints_ns=0,
+        last_joints_seq=-1,
+        velocities=np.zeros(n),
+        command=np.zeros(n),
+        cameras=[camera_estimate(0) for _ in settings.cameras],
+        source=Holding(),
+        queue=[],
+        teaching=None,
+        held=False,
+        stopped=False,
+        fault=[],
+        driver_request="",
+        correction=np.zeros(n),
+    )
+
+
+def camera_estimate(markers: int) -> CameraEstimate:
+    """An estimate that has seen nothing, for ``markers`` markers."""
+    return CameraEstimate(
+        innovation=np.zeros((markers, 2)), sigma=np.ones(markers), seen_ns=np.zeros(markers, np.int64)
+    )
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
+_decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
+
+
+def encode_state(state: CoreState) -> bytes:
+    """The state as bytes, bit for bit."""
+    return _encoder.encode(state)
+
+
+def decode_state(data: bytes) -> CoreState:
+    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, ValueError on another version."""
+    state: CoreState = _decoder.decode(data)
+    if state.version != STATE_VERSION:
+        raise ValueError(f"state version {state.version}; this program reads {STATE_VERSION}")
+    return state
