@@ -1,0 +1,154 @@
+"""Points and planes of projective space: homogeneous coordinates, joins and meets, oriented planes.
+
+Points are rows ``(n, 4)``; a plane is a 4-vector ``a`` used as ``aᵀM`` (thesis 2.5). Points that enter one
+construction keep their orbital heights: nothing here renormalises a vector whose sign or scale is an answer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.errors import GeometryError
+
+FloatArray = npt.NDArray[np.float64]
+
+RANK_TOLERANCE = 1e-12
+"""Relative singular value below which two vectors count as one: some thousand roundings."""
+
+
+def to_homogeneous(points: FloatArray) -> FloatArray:
+    """Append a coordinate of one: ``(n, d)`` -> ``(n, d + 1)``."""
+    points = np.asarray(points, dtype=np.float64)
+    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+
+
+def from_homogeneous(points: FloatArray) -> FloatArray:
+    """Divide by the last coordinate: ``(n, d + 1)`` -> ``(n, d)``; NaN for points at infinity."""
+    points = np.asarray(points, dtype=np.float64)
+    last = points[..., -1:]
+    return points[..., :-1] / np.where(last == 0.0, np.nan, last)
+
+
+def plane_of_points(A1: FloatArray, A2: FloatArray, A3: FloatArray) -> FloatArray:
+    """Oriented plane ``(..., 4)`` through three points ``(..., 4)``: ``aᵀX = det[A1 A2 A3 X]`` (2.61).
+
+    The signed 3x3 minors: the side of a point is the sign of ``aᵀX``, and swapping two points turns the
+    plane's face. Zero where the three points are collinear. As the dual, three planes give their common
+    point.
+    """
+    A1, A2, A3 = np.broadcast_arrays(A1, A2, A3)
+    a, b, c, d = A1[..., 0], A1[..., 1], A1[..., 2], A1[..., 3]
+    x, y, z, w = A2[..., 0], A2[..., 1], A2[..., 2], A2[..., 3]
+    r, s, t, u = A3[..., 0], A3[..., 1], A3[..., 2], A3[..., 3]
+    xy, xz, xw = a * y - b * x, a * z - c * x, a * w - d * x
+    yz, yw, zw = b * z - c * y, b * w - d * y, c * w - d * z
+    plane: FloatArray = np.stack(
+        [
+            -(s * zw - t * yw + u * yz),
+            r * zw - t * xw + u * xz,
+            -(r * yw - s * xw + u * xy),
+            r * yz - s * xz + t * xy,
+        ],
+        axis=-1,
+    )
+    return plane
+
+
+def planes_through_line(A1: FloatArray, A2: FloatArray) -> FloatArray:
+    """Two orthonormal planes ``(2, 4)`` that meet in the line of two points ``(4,)`` (2.59, 2.60).
+
+    Raises GeometryError where the two points are one.
+    """
+    return _complement(A1, A2, "points")
+
+
+def line_of_planes(a1: FloatArray, a2: FloatArray) -> FloatArray:
+    """Two orthonormal points ``(2, 4)`` on the line in which two planes ``(4,)`` meet (2.60).
+
+    Raises GeometryError where the two planes are one.
+    """
+    return _complement(a1, a2, "planes")
+
+
+def _complement(x: FloatArray, y: FloatArray, what: str) -> FloatArray:
+    pair = _unit_rows(np.stack([x, y]))
+    _, singular, rows = np.linalg.svd(pair)
+    if not singular[1] > RANK_TOLERANCE:
+        raise GeometryError(
+            "degenerate",
+            f"the two {what} are one ({np.asarray(x)} and {np.asarray(y)}); two different {what} span a line",
+            ratio=float(singular[1] / singular[0]),
+        )
+    return np.ascontiguousarray(rows[2:])
+
+
+def _unit_rows(rows: FloatArray) -> FloatArray:
+    rows = np.asarray(rows, dtype=np.float64)
+    if not np.isfinite(rows).all():
+        raise GeometryError("not_finite", f"homogeneous vectors must be finite, got {rows.tolist()}")
+    norms = np.linalg.norm(rows, axis=-1, keepdims=True)
+    if not (norms > 0).all():
+        raise GeometryError("degenerate", "a homogeneous vector is zero; at least one coordinate must not be")
+    unit: FloatArray = rows / norms
+    return unit
+
+
+def incidence_residual(plane: FloatArray, points: FloatArray) -> FloatArray:
+    """Signed sine ``(n,)`` between plane ``(4,)`` and points ``(n, 4)`` as unit 4-vectors: 0 where they
+    are incident.
+    """
+    residual: FloatArray = _unit_rows(points) @ _unit_rows(plane)
+    return residual
+
+
+def collinearity_residual(points: FloatArray) -> float:
+    """Third singular value of unit-norm points ``(n, 4)``, n >= 3: 0 where they lie on one line."""
+    return float(np.linalg.svd(_unit_rows(points), compute_uv=False)[2])
+
+
+def coplanarity_residual(points: FloatArray) -> float:
+    """Fourth singular value of unit-norm points ``(n, 4)``, n >= 4: 0 where they lie on one plane."""
+    return float(np.linalg.svd(_unit_rows(points), compute_uv=False)[3])
+
+
+def crossing_of_diagonals(A1: FloatArray, A2: FloatArray, A3: FloatArray, A4: FloatArray) -> FloatArray:
+    """Crossing ``(4,)`` of the diagonals A1A3 and A2A4 of a planar quadrangle of points ``(4,)``.
+
+    A centre that needs no plane at infinity. It moves with its points (H A_i gives H C), and points of one
+    height give a centre of that height. Slightly non-planar (measured) points give the middle of the closest
+    combinations. Raises GeometryError where three corners are collinear or the diagonals do not cross.
+    """
+    corners = np.stack([A1, A3, A2, A4]).astype(np.float64)
+    norms = np.linalg.norm(_unit_rows(corners) * np.linalg.norm(corners, axis=1, keepdims=True), axis=1)
+    _, singular, rows = np.linalg.svd((corners / norms[:, None] * np.array([[1.0], [1.0], [-1.0], [-1.0]])).T)
+    if not singular[2] > 1e-9 * singular[0]:
+        raise GeometryError(
+            "degenerate", "the four corners are collinear; a quadrangle is needed", singular=singular
+        )
+    weights = rows[3] / norms
+    first, second = weights[0] + weights[1], weights[2] + weights[3]
+    scale = 0.5 * (first + second)
+    if not min(abs(first), abs(second)) > 1e-9 * float(np.abs(weights).max()):
+        raise GeometryError(
+            "degenerate", "the diagonals are parallel in these heights; give convex corners in cyclic order"
+        )
+    centre: FloatArray = 0.5 * (weights @ corners) / scale
+    return centre
+
+
+def affine_middle(points: FloatArray, plane_at_infinity: FloatArray) -> FloatArray:
+    """Affine middle ``(4,)`` of points ``(n, 4)``, scaled to ``a∞ᵀM = 1``. Raises GeometryError for one at
+    infinity.
+    """
+    points = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    heights = points @ plane_at_infinity
+    far = np.abs(incidence_residual(plane_at_infinity, points)) < RANK_TOLERANCE
+    if far.any():
+        raise GeometryError(
+            "degenerate",
+            f"point(s) {np.flatnonzero(far).tolist()} lie at infinity; a middle needs finite points",
+            points=np.flatnonzero(far).tolist(),
+        )
+    middle: FloatArray = (points / heights[:, None]).mean(axis=0)
+    return middle

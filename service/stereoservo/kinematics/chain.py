@@ -1,0 +1,124 @@
+"""The arm as the cameras see it: a product of exponentials of projective generators (thesis 5). Readable
+reference.
+
+The loop itself runs on :mod:`stereoservo.kinematics.kernels`, which are tested against this module.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.cameras import projection_jacobian_many
+from stereoservo.geometry.displacements import exp_generator
+from stereoservo.geometry.homogeneous import FloatArray
+
+KIND_CODES = {"revolute": 0, "prismatic": 1}
+
+
+class ChainError(ValueError):
+    """A chain or a configuration is malformed; ``data`` holds the values that the message speaks of."""
+
+    def __init__(self, message: str, **data: Any) -> None:
+        super().__init__(message)
+        self.data = data
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectiveChain:
+    """``H(q) = exp((q₁−z₁)Ĥ₁)…exp((qₙ−zₙ)Ĥₙ)``, base first (5.18).
+
+    ``kinds``: ``"revolute"`` [rad] or ``"prismatic"`` [m] for each joint. ``generators`` (n, 4, 4) at the
+    zero. ``zero`` (n,): the configuration at which H is the identity. Raises ChainError on shapes or kinds
+    that do not fit.
+    """
+
+    kinds: tuple[str, ...]
+    generators: FloatArray
+    zero: FloatArray
+
+    def __post_init__(self) -> None:
+        generators = np.ascontiguousarray(self.generators, dtype=np.float64)
+        zero = np.ascontiguousarray(self.zero, dtype=np.float64)
+        n = len(self.kinds)
+        if generators.shape != (n, 4, 4) or zero.shape != (n,):
+            raise ChainError(
+                f"{n} kinds, generators {generators.shape}, zero {zero.shape}; ({n}, 4, 4), ({n},) would fit",
+                generators=generators.shape,
+                zero=zero.shape,
+            )
+        for j, kind in enumerate(self.kinds):
+            if kind not in KIND_CODES:
+                raise ChainError(
+                    f"joint {j} is of kind {kind!r}; known: {', '.join(KIND_CODES)}", joint=j, kind=kind
+                )
+        if not (np.isfinite(generators).all() and np.isfinite(zero).all()):
+            raise ChainError("generators and zero must be finite")
+        object.__setattr__(self, "kinds", tuple(self.kinds))
+        object.__setattr__(self, "generators", generators)
+        object.__setattr__(self, "zero", zero)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.kinds)
+
+    @property
+    def kind_codes(self) -> npt.NDArray[np.uint8]:
+        """``(n,)`` as the kernels take them: 0 revolute, 1 prismatic."""
+        return np.array([KIND_CODES[kind] for kind in self.kinds], dtype=np.uint8)
+
+    def partial_displacements(self, q: FloatArray) -> FloatArray:
+        """``H̄_j = exp(·Ĥ₁)…exp(·Ĥ_j)`` for j = 0…n, ``(n + 1, 4, 4)`` (5.20); the first is the identity."""
+        steps = self._steps(q)
+        partial = np.empty((self.joints + 1, 4, 4))
+        partial[0] = np.eye(4)
+        for j in range(self.joints):
+            partial[j + 1] = partial[j] @ exp_generator(self.kinds[j], self.generators[j], steps[j])
+        return partial
+
+    def displacement(self, q: FloatArray) -> FloatArray:
+        """``H(q)`` (4, 4): points at the zero to points at ``q`` (n,) (5.18)."""
+        return np.array(self.partial_displacements(q)[-1])
+
+    def operators_at(self, q: FloatArray) -> FloatArray:
+        """``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4): the joints' generators where the arm is now
+        (5.21).
+        """
+        partial = self.partial_displacements(q)[:-1]
+        operators: FloatArray = partial @ self.generators @ np.linalg.inv(partial)
+        return operators
+
+    def point_jacobian(self, q: FloatArray, M_now: FloatArray) -> FloatArray:
+        """``∂M/∂q_j = Ĥ_j|_Q M`` (m, 4, n) of points ``(m, 4)`` as they are at ``q`` (5.47)."""
+        jacobian: FloatArray = np.einsum("jik,mk->mij", self.operators_at(q), M_now)
+        return jacobian
+
+    def point_jacobian_zero_reference(self, q: FloatArray, M0: FloatArray) -> FloatArray:
+        """``∂M/∂q_j = Ĥ_j|_Q H(q) M(0)`` (m, 4, n) of points ``(m, 4)`` given at the zero (5.38)."""
+        return self.point_jacobian(q, M0 @ self.displacement(q).T)
+
+    def rezeroed(self, Q: FloatArray) -> ProjectiveChain:
+        """The same arm with its zero at ``Q`` (n,): generators become ``Ĥ_j|_Q`` (5.22). Points must move
+        with ``H(Q)``.
+        """
+        return ProjectiveChain(self.kinds, self.operators_at(Q), np.array(Q, dtype=np.float64))
+
+    def image_jacobian(self, Ps: FloatArray, q: FloatArray, M_now: FloatArray) -> FloatArray:
+        """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3,
+        4)`` (8.33).
+        """
+        J_H = self.point_jacobian(q, M_now)
+        jacobian: FloatArray = np.einsum("cmik,mkj->cmij", projection_jacobian_many(Ps, M_now), J_H)
+        return jacobian
+
+    def _steps(self, q: FloatArray) -> FloatArray:
+        q = np.asarray(q, dtype=np.float64)
+        if q.shape != self.zero.shape:
+            raise ChainError(f"configuration has shape {q.shape}; {self.zero.shape} is needed", shape=q.shape)
+        if not np.isfinite(q).all():
+            raise ChainError(f"configuration {q.tolist()} is not finite")
+        return q - self.zero

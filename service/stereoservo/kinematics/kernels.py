@@ -1,0 +1,383 @@
+"""The loop's kinematics in numba: the same as `chain` and `geometry.cameras`, without BLAS, LAPACK or
+fastmath.
+
+Explicit loops in a fixed order: the same input gives the same bits on one machine. All arrays are float64 and
+C-contiguous; joint kinds are uint8, 0 revolute, 1 prismatic. The ``*_into`` forms write into arrays of the
+caller.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.homogeneous import FloatArray
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+KindArray = npt.NDArray[np.uint8]
+BoolArray = npt.NDArray[np.bool_]
+
+PIVOT_TOLERANCE = 1e-14
+"""Relative Cholesky pivot below which a point's rays count as one."""
+
+
+def kernel(function: _F) -> _F:
+    """Compile for the loop: cached on disk, exact arithmetic, no Python objects."""
+    return cast(_F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+@kernel
+def multiply4_into(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """``out = A B`` for (4, 4); ``out`` must be neither of them."""
+    for i in range(4):
+        for j in range(4):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j] + A[i, 3] * B[3, j]
+
+
+@kernel
+def chain_forward_into(
+    generators: FloatArray,
+    kinds: KindArray,
+    zero: FloatArray,
+    q: FloatArray,
+    H: FloatArray,
+    operators: FloatArray,
+) -> None:
+    """``H(q)`` into (4, 4) and ``Ĥ_j|_Q`` into (n, 4, 4) (5.18, 5.21)."""
+    n = q.shape[0]
+    inverse = np.empty((4, 4))
+    first = np.empty((4, 4))
+    second = np.empty((4, 4))
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = 1.0 if i == k else 0.0
+            inverse[i, k] = H[i, k]
+    for j in range(n):
+        G = generators[j]
+        # With O = H̄ Ĥ H̄⁻¹ at hand, exp(sĤ) moves through: H̄ exp(sĤ) = exp(sO) H̄ = H̄ + sin s H̄Ĥ + (1 −
+        # cos s) H̄Ĥ².
+        multiply4_into(H, G, first)
+        multiply4_into(first, inverse, operators[j])
+        step = q[j] - zero[j]
+        if kinds[j] == 1:
+            for i in range(4):
+                for k in range(4):
+                    H[i, k] += step * first[i, k]
+            multiply4_into(G, inverse, first)
+            for i in range(4):
+                for k in range(4):
+                    inverse[i, k] -= step * first[i, k]
+        else:
+            sine = math.sin(step)
+            half = math.sin(0.5 * step)
+            versine = 2.0 * half * half
+            multiply4_into(first, G, second)
+            for i in range(4):
+                for k in range(4):
+                    H[i, k] += sine * first[i, k] + versine * second[i, k]
+            multiply4_into(G, inverse, first)
+            multiply4_into(G, first, second)
+            for i in range(4):
+                for k in range(4):
+                    inverse[i, k] += -sine * first[i, k] + versine * second[i, k]
+
+
+@kernel
+def chain_forward(
+    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``H(q)`` (4, 4) and the operators ``Ĥ_j|_Q`` (n, 4, 4) of a chain at ``q`` (n,) (5.18, 5.21)."""
+    H = np.empty((4, 4))
+    operators = np.empty((q.shape[0], 4, 4))
+    chain_forward_into(generators, kinds, zero, q, H, operators)
+    return H, operators
+
+
+@kernel
+def transform_points_into(H: FloatArray, M: FloatArray, out: FloatArray) -> None:
+    """``H M`` of points (m, 4) into (m, 4), which must not be ``M``."""
+    for p in range(M.shape[0]):
+        for i in range(4):
+            out[p, i] = H[i, 0] * M[p, 0] + H[i, 1] * M[p, 1] + H[i, 2] * M[p, 2] + H[i, 3] * M[p, 3]
+
+
+@kernel
+def transform_points(H: FloatArray, M: FloatArray) -> FloatArray:
+    """Points (m, 4) moved by ``H`` (4, 4)."""
+    out = np.empty((M.shape[0], 4))
+    transform_points_into(H, M, out)
+    return out
+
+
+@kernel
+def invert4(H: FloatArray) -> FloatArray:
+    """Inverse (4, 4) by 2x2 minors; all NaN where the determinant is zero or not finite."""
+    s0 = H[0, 0] * H[1, 1] - H[1, 0] * H[0, 1]
+    s1 = H[0, 0] * H[1, 2] - H[1, 0] * H[0, 2]
+    s2 = H[0, 0] * H[1, 3] - H[1, 0] * H[0, 3]
+    s3 = H[0, 1] * H[1, 2] - H[1, 1] * H[0, 2]
+    s4 = H[0, 1] * H[1, 3] - H[1, 1] * H[0, 3]
+    s5 = H[0, 2] * H[1, 3] - H[1, 2] * H[0, 3]
+    c5 = H[2, 2] * H[3, 3] - H[3, 2] * H[2, 3]
+    c4 = H[2, 1] * H[3, 3] - H[3, 1] * H[2, 3]
+    c3 = H[2, 1] * H[3, 2] - H[3, 1] * H[2, 2]
+    c2 = H[2, 0] * H[3, 3] - H[3, 0] * H[2, 3]
+    c1 = H[2, 0] * H[3, 2] - H[3, 0] * H[2, 2]
+    c0 = H[2, 0] * H[3, 1] - H[3, 0] * H[2, 1]
+    determinant = s0 * c5 - s1 * c4 + s2 * c3 + s3 * c2 - s4 * c1 + s5 * c0
+    out = np.empty((4, 4))
+    if determinant == 0.0 or not math.isfinite(determinant):
+        for i in range(4):
+            for j in range(4):
+                out[i, j] = math.nan
+        return out
+    d = 1.0 / determinant
+    out[0, 0] = (H[1, 1] * c5 - H[1, 2] * c4 + H[1, 3] * c3) * d
+    out[0, 1] = (-H[0, 1] * c5 + H[0, 2] * c4 - H[0, 3] * c3) * d
+    out[0, 2] = (H[3, 1] * s5 - H[3, 2] * s4 + H[3, 3] * s3) * d
+    out[0, 3] = (-H[2, 1] * s5 + H[2, 2] * s4 - H[2, 3] * s3) * d
+    out[1, 0] = (-H[1, 0] * c5 + H[1, 2] * c2 - H[1, 3] * c1) * d
+    out[1, 1] = (H[0, 0] * c5 - H[0, 2] * c2 + H[0, 3] * c1) * d
+    out[1, 2] = (-H[3, 0] * s5 + H[3, 2] * s2 - H[3, 3] * s1) * d
+    out[1, 3] = (H[2, 0] * s5 - H[2, 2] * s2 + H[2, 3] * s1) * d
+    out[2, 0] = (H[1, 0] * c4 - H[1, 1] * c2 + H[1, 3] * c0) * d
+    out[2, 1] = (-H[0, 0] * c4 + H[0, 1] * c2 - H[0, 3] * c0) * d
+    out[2, 2] = (H[3, 0] * s4 - H[3, 1] * s2 + H[3, 3] * s0) * d
+    out[2, 3] = (-H[2, 0] * s4 + H[2, 1] * s2 - H[2, 3] * s0) * d
+    out[3, 0] = (-H[1, 0] * c3 + H[1, 1] * c1 - H[1, 2] * c0) * d
+    out[3, 1] = (H[0, 0] * c3 - H[0, 1] * c1 + H[0, 2] * c0) * d
+    out[3, 2] = (-H[3, 0] * s3 + H[3, 1] * s1 - H[3, 2] * s0) * d
+    out[3, 3] = (H[2, 0] * s3 - H[2, 1] * s1 + H[2, 2] * s0) * d
+    return out
+
+
+@kernel
+def project_points(Ps: FloatArray, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (c, m, 2) and depths (c, m) of points (m, 4) in cameras (c, 3, 4); NaN pixels where the depth
+    is 0.
+    """
+    cameras, points = Ps.shape[0], M.shape[0]
+    pixels = np.empty((cameras, points, 2))
+    depths = np.empty((cameras, points))
+    for c in range(cameras):
+        P = Ps[c]
+        for p in range(points):
+            u = P[0, 0] * M[p, 0] + P[0, 1] * M[p, 1] + P[0, 2] * M[p, 2] + P[0, 3] * M[p, 3]
+            v = P[1, 0] * M[p, 0] + P[1, 1] * M[p, 1] + P[1, 2] * M[p, 2] + P[1, 3] * M[p, 3]
+            d = P[2, 0] * M[p, 0] + P[2, 1] * M[p, 1] + P[2, 2] * M[p, 2] + P[2, 3] * M[p, 3]
+            depths[c, p] = d
+            pixels[c, p, 0] = u / d if d != 0.0 else math.nan
+            pixels[c, p, 1] = v / d if d != 0.0 else math.nan
+    return pixels, depths
+
+
+@kernel
+def image_jacobian(operators: FloatArray, Ps: FloatArray, M: FloatArray) -> FloatArray:
+    """``J_G P Ĥ_j|_Q M`` (c, m, 2, n) [px/rad or px/m] for operators (n, 4, 4), cameras (c, 3, 4), points (m,
+    4) (8.33).
+
+    NaN where a point lies in a camera's focal plane.
+    """
+    n, cameras, points = operators.shape[0], Ps.shape[0], M.shape[0]
+    out = np.empty((cameras, points, 2, n))
+    velocity = np.empty((n, 4))
+    for p in range(points):
+        for j in range(n):
+            G = operators[j]
+            for i in range(4):
+                velocity[j, i] = G[i, 0] * M[p, 0] + G[i, 1] * M[p, 1] + G[i, 2] * M[p, 2] + G[i, 3] * M[p, 3]
+        for c in range(cameras):
+            P = Ps[c]
+            d = P[2, 0] * M[p, 0] + P[2, 1] * M[p, 1] + P[2, 2] * M[p, 2] + P[2, 3] * M[p, 3]
+            scale = 1.0 / d if d != 0.0 else math.nan
+            for r in range(2):
+                x = P[r, 0] * M[p, 0] + P[r, 1] * M[p, 1] + P[r, 2] * M[p, 2] + P[r, 3] * M[p, 3]
+                pixel = x * scale
+                g0 = (P[r, 0] - pixel * P[2, 0]) * scale
+                g1 = (P[r, 1] - pixel * P[2, 1]) * scale
+                g2 = (P[r, 2] - pixel * P[2, 2]) * scale
+                g3 = (P[r, 3] - pixel * P[2, 3]) * scale
+                for j in range(n):
+                    out[c, p, r, j] = (
+                        g0 * velocity[j, 0] + g1 * velocity[j, 1] + g2 * velocity[j, 2] + g3 * velocity[j, 3]
+                    )
+    return out
+
+
+@kernel
+def symmetric_eigen4(A: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (4,), ascending, and eigenvectors as columns (4, 4) of a symmetric (4, 4), by cyclic
+    Jacobi rotations.
+    """
+    D = np.empty((4, 4))
+    V = np.empty((4, 4))
+    for i in range(4):
+        for j in range(4):
+            D[i, j] = A[i, j]
+            V[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off = 0.0
+        on = 0.0
+        for i in range(4):
+            on += D[i, i] * D[i, i]
+            for j in range(i + 1, 4):
+                off += D[i, j] * D[i, j]
+        if not off > 1e-36 * on:
+            break
+        for p in range(3):
+            for r in range(p + 1, 4):
+                if D[p, r] == 0.0:
+                    continue
+                ratio = (D[r, r] - D[p, p]) / (2.0 * D[p, r])
+                t = 1.0 / (abs(ratio) + math.sqrt(1.0 + ratio * ratio))
+                if ratio < 0.0:
+                    t = -t
+                c = 1.0 / math.sqrt(1.0 + t * t)
+                s = t * c
+                for k in range(4):
+                    x, y = D[k, p], D[k, r]
+                    D[k, p], D[k, r] = c * x - s * y, s * x + c * y
+                for k in range(4):
+                    x, y = D[p, k], D[r, k]
+                    D[p, k], D[r, k] = c * x - s * y, s * x + c * y
+                for k in range(4):
+                    x, y = V[k, p], V[k, r]
+                    V[k, p], V[k, r] = c * x - s * y, s * x + c * y
+    values = np.empty(4)
+    vectors = np.empty((4, 4))
+    used = np.zeros(4, dtype=np.uint8)
+    for i in range(4):
+        best = -1
+        for j in range(4):
+            if used[j] == 0 and (best < 0 or D[j, j] < D[best, best]):
+                best = j
+        used[best] = 1
+        values[i] = D[best, best]
+        for k in range(4):
+            vectors[k, i] = V[k, best]
+    return values, vectors
+
+
+@kernel
+def _triangulate_point(
+    Ps: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    p: int,
+    iterations: int,
+    M: FloatArray,
+    work: FloatArray,
+) -> bool:
+    """One point into ``M[p]``; ``work`` (3,) scratch. False where its rays do not determine it."""
+    cameras = Ps.shape[0]
+    views = 0
+    for c in range(cameras):
+        if weights[c, p] > 0.0:
+            views += 1
+    if views < 2:
+        return False
+    # Depth 1 in camera 0 is kept by eliminating the coordinate k that its third row weighs most.
+    k = 0
+    for i in range(1, 4):
+        if abs(Ps[0, 2, i]) > abs(Ps[0, 2, k]):
+            k = i
+    pivot = Ps[0, 2, k]
+    i0 = 1 if k == 0 else 0
+    i1 = 2 if k <= 1 else 1
+    i2 = 3 if k <= 2 else 2
+    f0, f1, f2 = -Ps[0, 2, i0] / pivot, -Ps[0, 2, i1] / pivot, -Ps[0, 2, i2] / pivot
+    for i in range(4):
+        M[p, i] = 0.0
+    M[p, k] = 1.0 / pivot
+    for round_ in range(iterations + 1):
+        n00 = n01 = n02 = n11 = n12 = n22 = b0 = b1 = b2 = 0.0
+        for c in range(cameras):
+            w = weights[c, p]
+            if not w > 0.0:
+                continue
+            P = Ps[c]
+            d = P[2, 0] * M[p, 0] + P[2, 1] * M[p, 1] + P[2, 2] * M[p, 2] + P[2, 3] * M[p, 3]
+            for r in range(2):
+                x = P[r, 0] * M[p, 0] + P[r, 1] * M[p, 1] + P[r, 2] * M[p, 2] + P[r, 3] * M[p, 3]
+                if round_ == 0:  # linear (2.71): measured pixel in the constraint
+                    pixel = pixels[c, p, r]
+                    scale = w
+                    residual = (pixel * d - x) * w
+                else:  # renormalised (2.73): predicted pixel, divided by the depth
+                    if d == 0.0:
+                        return False
+                    pixel = x / d
+                    scale = w / d
+                    residual = (pixels[c, p, r] - pixel) * w
+                gk = P[r, k] - pixel * P[2, k]
+                a0 = (P[r, i0] - pixel * P[2, i0] + f0 * gk) * scale
+                a1 = (P[r, i1] - pixel * P[2, i1] + f1 * gk) * scale
+                a2 = (P[r, i2] - pixel * P[2, i2] + f2 * gk) * scale
+                n00 += a0 * a0
+                n01 += a0 * a1
+                n02 += a0 * a2
+                n11 += a1 * a1
+                n12 += a1 * a2
+                n22 += a2 * a2
+                b0 += a0 * residual
+                b1 += a1 * residual
+                b2 += a2 * residual
+        floor = PIVOT_TOLERANCE * (n00 + n11 + n22)
+        if not n00 > floor:
+            return False
+        l10, l20 = n01 / n00, n02 / n00
+        d1 = n11 - l10 * n01
+        if not d1 > floor:
+            return False
+        e12 = n12 - l10 * n02
+        l21 = e12 / d1
+        d2 = n22 - l20 * n02 - l21 * e12
+        if not d2 > floor:
+            return False
+        y1 = b1 - l10 * b0
+        y2 = b2 - l20 * b0 - l21 * y1
+        work[2] = y2 / d2
+        work[1] = y1 / d1 - l21 * work[2]
+        work[0] = b0 / n00 - l10 * work[1] - l20 * work[2]
+        M[p, i0] += work[0]
+        M[p, i1] += work[1]
+        M[p, i2] += work[2]
+        M[p, k] += f0 * work[0] + f1 * work[1] + f2 * work[2]
+    # One sum tells whether all are finite: NaN and infinities survive it.
+    return math.isfinite(abs(M[p, 0]) + abs(M[p, 1]) + abs(M[p, 2]) + abs(M[p, 3]))
+
+
+@kernel
+def triangulate_into(
+    Ps: FloatArray, pixels: FloatArray, weights: FloatArray, iterations: int, M: FloatArray, ok: BoolArray
+) -> None:
+    """Points into (m, 4) and validity into (m,) bool; see `triangulate`."""
+    work = np.empty(3)
+    for p in range(pixels.shape[1]):
+        good = _triangulate_point(Ps, pixels, weights, p, iterations, M, work)
+        ok[p] = good
+        if not good:
+            for i in range(4):
+                M[p, i] = math.nan
+
+
+@kernel
+def triangulate(
+    Ps: FloatArray, pixels: FloatArray, weights: FloatArray, iterations: int
+) -> tuple[FloatArray, BoolArray]:
+    """Points (m, 4) of least reprojection error at depth 1 in camera 0, and validity (m,) bool (2.71, 2.73).
+
+    ``pixels`` (c, m, 2) [px], ``weights`` (c, m) = 1/sigma [1/px], 0 where missing (the pixel is then not
+    read). A linear solution, then ``iterations`` renormalised ones. NaN rows where fewer than two cameras see
+    a point or its rays do not determine it.
+    """
+    M = np.empty((pixels.shape[1], 4))
+    ok = np.empty(pixels.shape[1], dtype=np.bool_)
+    triangulate_into(Ps, pixels, weights, iterations, M, ok)
+    return M, ok
