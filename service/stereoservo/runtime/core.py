@@ -1,0 +1,353 @@
+"""ServoCore: one step from inputs to a joint velocity. Pure given its state: no clock, no I/O, no random number (DESIGN 2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stereoservo.control.reasons import Level, Reason
+from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime import intake
+from stereoservo.runtime.averaging import add_observation, averages
+from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
+from stereoservo.runtime.estimate import (
+    SUSPECT_FRAMES,
+    ModelArrays,
+    accept_observation,
+    joint_correction,
+    joints_at,
+    marker_weights,
+    model_arrays,
+    pixels_now,
+    predict,
+    priors,
+    remember_joints,
+)
+from stereoservo.runtime.motion import Motion, Present, joint_move
+from stereoservo.runtime.ports import CameraObservation, FloatArray
+from stereoservo.runtime.servoing import servo_step
+from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.state import (
+    CoreState,
+    Holding,
+    Jogging,
+    JointMove,
+    Servoing,
+    Trials,
+    camera_estimate,
+    initial_state,
+)
+from stereoservo.runtime.trials import trials_step
+
+PRIOR_RATE_HZ = 125.0
+VELOCITY_FILTER_S = 0.01
+AT_REST = 1e-3  # [rad/s or m/s]
+TEACH_TIMEOUT_S = 20.0
+
+
+class ServoCore:
+    """The servo loop's algorithm. ``state`` is all that it remembers."""
+
+    def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
+        self.settings = settings
+        self.state = initial_state(settings) if state is None else state
+        self._arrays: ModelArrays | None = None
+        if self.state.model is not None:
+            self._arrays = model_arrays(self.state.model, settings)
+        limits = settings.limits
+        self._limits = SafetyLimits(
+            joint_names=settings.joint_names,
+            position_min=limits.position_min,
+            position_max=limits.position_max,
+            velocity_max=limits.velocity_max,
+            acceleration_max=limits.acceleration_max,
+            position_margin=limits.position_margin,
+            keep_outs=limits.keep_outs,
+            keep_out_names=limits.keep_out_names,
+            joint_timeout_s=limits.joint_timeout_s,
+            coast_s=limits.coast_s,
+        )
+        self._prior_every = max(1, round(settings.rate_hz / PRIOR_RATE_HZ))
+
+    def step(self, inputs: StepInputs) -> StepOutputs:
+        """One cycle: age-gate, estimate, motion source, safety stage, status and priors."""
+        state = self.state
+        events: list[Event] = []
+        state.driver_request = ""
+
+        def emit(kind: str, **fields: Any) -> None:
+            state.event_seq += 1
+            events.append(Event(state.event_seq, inputs.now_ns, kind, **fields))  # type: ignore[arg-type]
+
+        q = self._take_joints(inputs)
+        self._follow_driver(inputs, emit)
+        self._take_model(inputs, emit)
+        present = self._present(inputs, q, emit)
+        if inputs.stop:
+            self._stop(present)
+        for request in inputs.requests:
+            intake.answer(request, present)
+        self._teach(present)
+        self._watch_model(present)
+        intake.next_goal(present)
+        motion = self._move(present)
+        safety = self._safety(inputs, present, motion)
+        active = state.lifecycle == Lifecycle.ACTIVE
+        state.command = safety.limited.copy() if active else np.zeros_like(q)
+        if motion.finished:
+            state.source = Holding()
+        state.step += 1
+        return StepOutputs(
+            command=state.command.copy() if active else None,
+            status=self._status(inputs, present, motion, safety),
+            priors=self._priors(present),
+            events=tuple(events),
+            driver_request=state.driver_request,  # type: ignore[arg-type]
+        )
+
+    # -- inputs ---------------------------------------------------------------------------------------------
+
+    def _take_joints(self, inputs: StepInputs) -> FloatArray:
+        """Append a new joint sample to the history; return the newest positions (zero before the first)."""
+        state = self.state
+        sample = inputs.joints
+        if sample is not None and sample.seq != state.last_joints_seq and sample.t_ns > state.last_joints_ns:
+            if state.history.count > 0:
+                elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
+                previous = state.history.positions[(state.history.count - 1) % len(state.history.t_ns)]
+                share = elapsed_s / (elapsed_s + VELOCITY_FILTER_S)
+                state.velocities = state.velocities + share * ((sample.positions - previous) / elapsed_s - state.velocities)
+            remember_joints(state.history, sample)
+            state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
+        if state.history.count == 0:
+            return np.zeros_like(state.command)
+        return state.history.positions[(state.history.count - 1) % len(state.history.t_ns)].copy()
+
+    def _follow_driver(self, inputs: StepInputs, emit: Any) -> None:
+        """The lifecycle follows what the servo process did with the driver; a fault is latched."""
+        state = self.state
+        before = state.lifecycle
+        if inputs.driver_fault is not None and (before != Lifecycle.FAULT or not state.fault):
+            reason = Reason("DRIVER_FAULT", "fault", hint=f"{inputs.driver_fault.code}: {inputs.driver_fault.message}; clear the cause, then reset")
+            state.fault = [reason]
+            state.lifecycle = Lifecycle.FAULT
+            state.driver_request = "deactivate"
+            emit("fault", message=reason.hint, reasons=(reason,))
+        elif before == Lifecycle.FAULT:
+            if inputs.driver_fault is None and not state.fault:
+                state.lifecycle = Lifecycle.INACTIVE
+        elif not inputs.driver_configured:
+            state.lifecycle = Lifecycle.UNCONFIGURED
+        else:
+            state.lifecycle = Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE
+        if state.lifecycle != before:
+            emit("lifecycle", message=f"{before} -> {state.lifecycle}", name=str(state.lifecycle))
+
+    def _take_model(self, inputs: StepInputs, emit: Any) -> None:
+        """A new model waits until the arm rests and no law runs; then every estimate starts anew."""
+        state = self.state
+        if inputs.model_update is not None:
+            try:
+                model_arrays(inputs.model_update.model, self.settings)
+            except ValueError as error:
+                emit("warning", message=f"model refused: {error}")
+            else:
+                state.pending_model = inputs.model_update.model
+        if state.pending_model is None or isinstance(state.source, Servoing):
+            return
+        if bool((np.abs(state.command) > AT_REST).any()):
+            return
+        self._use_model(state.pending_model)
+        state.pending_model = None
+        emit("model", message=f"model epoch {self._epoch()} is {state.readiness}", name=str(state.readiness))
+
+    def _use_model(self, model: CellModel) -> None:
+        state = self.state
+        self._arrays = model_arrays(model, self.settings)
+        state.model = model
+        good = model.statistics is not None and model.statistics.chi2_ok
+        state.readiness = ModelReadiness.VALID if good else ModelReadiness.CANDIDATE
+        state.cameras = [camera_estimate(len(model.marker_ids)) for _ in self.settings.cameras]
+
+    def _present(self, inputs: StepInputs, q: FloatArray, emit: Any) -> Present:
+        """Fold the observations in, each at its own stamp, and predict the present."""
+        state = self.state
+        fresh: list[CameraObservation] = []
+        for observation in inputs.observations:
+            camera = next((i for i, c in enumerate(self.settings.cameras) if c.name == observation.camera), None)
+            if camera is None or observation.seq <= state.cameras[camera].last_seq:
+                continue
+            estimate = state.cameras[camera]
+            estimate.last_seq, estimate.last_shutter_ns = observation.seq, observation.t_shutter_ns
+            estimate.last_visible = int(observation.ids.size)
+            fresh.append(observation)
+            at_shutter = joints_at(state.history, observation.t_shutter_ns)
+            if self._arrays is not None and at_shutter is not None:
+                accept_observation(estimate, camera, observation, at_shutter, state.velocities, self._arrays, self.settings)
+        common: dict[str, Any] = {
+            "now_ns": inputs.now_ns, "dt_s": inputs.period_ns * 1e-9, "q": q, "state": state,
+            "settings": self.settings, "observations": tuple(fresh), "emit": emit,
+        }  # fmt: skip
+        if self._arrays is None or state.history.count == 0:
+            return Present(**common)
+        prediction = predict(self._arrays, q)
+        weights = marker_weights(state.cameras, inputs.now_ns, self.settings.limits.coast_s)
+        state.correction = joint_correction(prediction, state.cameras, weights)
+        return Present(
+            **common, arrays=self._arrays, prediction=prediction, weights=weights,
+            pixels=pixels_now(prediction, state.cameras),
+        )  # fmt: skip
+
+    # -- what happens ---------------------------------------------------------------------------------------
+
+    def _stop(self, present: Present) -> None:
+        reason = Reason("STOPPED", "hold", hint="resume, then send the goal again")
+        intake.end_source(present, "goal_aborted", (reason,), "stopped")
+        intake.end_queue(present, (reason,), "stopped")
+        present.state.stopped = True
+        present.emit("stopped", message="stop: the arm brakes and holds", reasons=(reason,))
+
+    def _teach(self, present: Present) -> None:
+        teaching = self.state.teaching
+        if teaching is None:
+            return
+        if bool((np.abs(self.state.command) > AT_REST).any()):
+            self.state.teaching = None
+            present.emit("warning", request=teaching.request, accepted=False, name=teaching.name, message=f"teaching {teaching.name!r} failed: the arm moved")
+            return
+        for observation in present.observations:
+            add_observation(teaching, self.settings, observation, teaching.frames_wanted, teaching.started_ns)
+        if bool((teaching.frames >= teaching.frames_wanted).all()):
+            self.state.teaching = None
+            present.emit(
+                "taught", request=teaching.request, name=teaching.name, joints=present.q,
+                samples=averages(teaching, self.settings), message=f"goal {teaching.name!r} taught",
+            )  # fmt: skip
+        elif (present.now_ns - teaching.started_ns) * 1e-9 > TEACH_TIMEOUT_S:
+            self.state.teaching = None
+            slow = self.settings.cameras[int(teaching.frames.argmin())].name
+            present.emit(
+                "warning", request=teaching.request, accepted=False, name=teaching.name,
+                message=f"teaching {teaching.name!r} failed: camera {slow} gave {int(teaching.frames.min())} of {teaching.frames_wanted} frames in {TEACH_TIMEOUT_S:.0f} s",
+            )  # fmt: skip
+
+    def _watch_model(self, present: Present) -> None:
+        """Images that contradict the model for many frames make it SUSPECT."""
+        state = self.state
+        if state.readiness not in (ModelReadiness.VALID, ModelReadiness.CANDIDATE):
+            return
+        for camera, estimate in zip(self.settings.cameras, state.cameras, strict=True):
+            if estimate.rejected_frames < SUSPECT_FRAMES:
+                continue
+            state.readiness = ModelReadiness.SUSPECT
+            reason = Reason(
+                "MODEL_SUSPECT", "hold", camera.name, float(estimate.rejected_frames), float(SUSPECT_FRAMES), "frames",
+                f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
+            )  # fmt: skip
+            present.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
+            if isinstance(state.source, Servoing):
+                intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+            return
+
+    def _move(self, present: Present) -> Motion:
+        """The active source's joint velocity; nothing in hold, stop or outside ACTIVE."""
+        state = self.state
+        rest = Motion(np.zeros_like(present.q))
+        if state.lifecycle != Lifecycle.ACTIVE:
+            if not isinstance(state.source, Holding):
+                reason = Reason("NOT_ACTIVE", "hold", hint=f"the cell became {state.lifecycle}")
+                intake.end_source(present, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}")
+                intake.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
+            return rest
+        source = state.source
+        if isinstance(source, Servoing) and source.goal.lease_s is not None and present.now_ns > source.lease_until_ns:
+            reason = Reason("LEASE_EXPIRED", "hold", "", source.goal.lease_s, source.goal.lease_s, "s", "the client did not renew its lease: is it alive?")
+            intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+            return rest
+        if state.held or state.stopped:
+            return rest
+        if isinstance(source, Jogging):
+            if present.now_ns >= source.until_ns:
+                state.source = Holding()
+                return rest
+            return Motion(source.velocity)
+        if isinstance(source, JointMove):
+            return joint_move(source, present)
+        if isinstance(source, Trials):
+            return trials_step(source, present)
+        if isinstance(source, Servoing):
+            return servo_step(source, present)
+        return rest
+
+    def _safety(self, inputs: StepInputs, present: Present, motion: Motion) -> SafetyResult:
+        state = self.state
+        newest = max((e.accepted_ns for e in state.cameras), default=0)
+        return safety_stage(
+            SafetyInputs(
+                raw=motion.velocity,
+                positions=present.q,
+                previous=state.command,
+                dt_s=present.dt_s,
+                joint_age_s=(inputs.now_ns - state.last_joints_ns) * 1e-9,
+                feature_age_s=(inputs.now_ns - newest) * 1e-9,
+                needs_features=motion.needs_features,
+                speed_scale=motion.speed_scale * self.settings.limits.speed_scale,
+                brake=state.held or state.stopped,
+            ),
+            self._limits,
+        )
+
+    # -- outputs --------------------------------------------------------------------------------------------
+
+    def _priors(self, present: Present) -> tuple[Any, ...]:
+        if present.prediction is None or self._arrays is None or self.state.step % self._prior_every:
+            return ()
+        return priors(self._arrays, self.settings, present.prediction, self.state.cameras, self.state.velocities, present.now_ns)
+
+    def _epoch(self) -> int:
+        return 0 if self.state.model is None else self.state.model.epoch
+
+    def _reasons(self, motion: Motion, safety: SafetyResult) -> tuple[Reason, ...]:
+        state = self.state
+        found = [*state.fault, *safety.reasons, *motion.reasons]
+        if state.stopped:
+            found.append(Reason("STOPPED", "hold", hint="resume to go on"))
+        elif state.held:
+            found.append(Reason("HELD", "hold", hint="resume to go on"))
+        if state.readiness == ModelReadiness.SUSPECT:
+            found.append(Reason("MODEL_SUSPECT", "hold", hint="calibrate again"))
+        return tuple(found)
+
+    def _status(self, inputs: StepInputs, present: Present, motion: Motion, safety: SafetyResult) -> Status:
+        state = self.state
+        reasons = self._reasons(motion, safety)
+        source = state.source
+        names = {Holding: "hold", Jogging: "jog", JointMove: "joints", Servoing: "law", Trials: "calibrate"}
+        return Status(
+            t_ns=inputs.now_ns,
+            step=state.step,
+            lifecycle=str(state.lifecycle),
+            model=str(state.readiness),
+            model_epoch=self._epoch(),
+            source=names[type(source)],
+            goal=intake.goal_of(source),
+            law=source.law if isinstance(source, Servoing) else "",
+            level=_level(reasons),
+            reasons=reasons,
+            positions=present.q,
+            velocities=state.velocities.copy(),
+            command_raw=motion.velocity,
+            command=state.command.copy(),
+            error_px=motion.error_px,
+            task_error=motion.task_error,
+            innovation_px={c.name: e.rms_px for c, e in zip(self.settings.cameras, state.cameras, strict=True)},
+            visible={c.name: e.last_visible for c, e in zip(self.settings.cameras, state.cameras, strict=True)},
+        )
+
+
+def _level(reasons: tuple[Reason, ...]) -> str:
+    order: tuple[Level, ...] = ("info", "slow", "hold", "fault")
+    worst = max((order.index(reason.level) for reason in reasons), default=0)
+    return "ok" if worst == 0 else order[worst]

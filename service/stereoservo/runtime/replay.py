@@ -1,0 +1,126 @@
+"""Replay: the recorded inputs through the same core, compared bit for bit."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Channel, Header, Message
+from mcap.stream_reader import StreamReader
+
+from stereoservo.runtime.core import ServoCore
+from stereoservo.runtime.cycle import decode_array
+from stereoservo.runtime.record import Fingerprint, StepRecord, decode_step, encode_step, fingerprint
+from stereoservo.runtime.recorder import FORMAT
+from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.state import decode_state, encode_state
+
+
+class RecordingError(Exception):
+    """A recording cannot be read: names the file, how far it is good, and the cause."""
+
+    def __init__(self, path: Path, steps: int, cause: str) -> None:
+        good = f"; {steps} steps before that are good" if steps else ""
+        super().__init__(f"{path}: {cause}{good}")
+        self.path = str(path)
+        self.steps = steps
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """``identical`` is None where the fingerprints differ; ``max_relative_error`` of the joint velocities then counts."""
+
+    identical: bool | None
+    steps: int
+    max_relative_error: float
+    first_difference: int | None
+    checkpoints: int
+    gaps: int
+    fingerprint: Fingerprint
+
+
+def replay(path: Path, progress: Callable[[int], None] | None = None) -> ReplayResult:
+    """Run a recording through a fresh core. Raises RecordingError on a damaged or foreign file."""
+    core: ServoCore | None = None
+    settings: CoreSettings | None = None
+    recorded: Fingerprint | None = None
+    steps = checkpoints = gaps = 0
+    worst = 0.0
+    differs: int | None = None
+    for topic, data in _messages(path):
+        try:
+            if topic == "header":
+                header = msgspec.msgpack.decode(data)
+                recorded = msgspec.convert(header["fingerprint"], Fingerprint)
+                settings = msgspec.msgpack.decode(header["settings"], type=CoreSettings, dec_hook=decode_array)
+            elif topic == "gap":
+                core = None
+                gaps += 1
+            elif topic == "checkpoint" and settings is not None:
+                step, state = msgspec.msgpack.decode(data)
+                checkpoints += 1
+                if core is None:
+                    core = ServoCore(settings, decode_state(state))
+                elif differs is None and encode_state(core.state) != state:
+                    differs = step
+            elif topic == "step" and core is not None:
+                record = decode_step(data)
+                same, error = _compare(core, record)
+                worst = max(worst, error)
+                if not same and differs is None:
+                    differs = record.step
+                steps += 1
+                if progress is not None and steps % 1000 == 0:
+                    progress(steps)
+        except (msgspec.MsgspecError, ValueError, KeyError, TypeError) as error:
+            raise RecordingError(path, steps, f"step record is damaged ({error})") from error
+    if settings is None or recorded is None:
+        raise RecordingError(path, steps, "holds no header; is it a flight recording?")
+    if steps == 0:
+        raise RecordingError(path, steps, "holds no step after a checkpoint")
+    same_machine = recorded == fingerprint()
+    return ReplayResult(
+        identical=(differs is None) if same_machine else None,
+        steps=steps,
+        max_relative_error=worst,
+        first_difference=differs,
+        checkpoints=checkpoints,
+        gaps=gaps,
+        fingerprint=recorded,
+    )
+
+
+def _compare(core: ServoCore, record: StepRecord) -> tuple[bool, float]:
+    """Whether all outputs agree bit for bit, and the largest relative difference of the raw joint velocity."""
+    outputs = core.step(record.inputs)
+    again = decode_step(encode_step(record.inputs, outputs))
+    difference = float(np.abs(again.raw - record.raw).max(initial=0.0))
+    scale = float(np.abs(record.raw).max(initial=0.0))
+    error = difference / scale if scale > 0.0 else difference
+    return again.outputs_crc == record.outputs_crc and again.step == record.step, error
+
+
+def _messages(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Topic and payload in file order. Raises RecordingError naming how far the file is good."""
+    steps = 0
+    topics: dict[int, str] = {}
+    try:
+        with path.open("rb") as stream:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, Header) and record.profile != FORMAT:
+                    raise RecordingError(path, 0, f"is of profile {record.profile!r}; this program reads {FORMAT!r}")
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, Message):
+                    topic = topics[record.channel_id]
+                    steps += topic == "step"
+                    yield topic, record.data
+    except OSError as error:
+        raise RecordingError(path, steps, f"cannot be read: {error.strerror}") from error
+    except (McapError, EOFError, ValueError, KeyError, struct.error) as error:
+        raise RecordingError(path, steps, f"is truncated or damaged ({type(error).__name__}: {error})") from error

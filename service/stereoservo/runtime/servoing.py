@@ -1,0 +1,136 @@
+"""A law as a motion source: from a goal's set-points to a joint velocity, until the error holds below its tolerance."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from stereoservo.control.cartesian3 import cartesian3_reasons
+from stereoservo.control.kernels import cartesian3_step, stereo_step
+from stereoservo.control.reasons import Reason
+from stereoservo.kinematics.kernels import triangulate
+from stereoservo.runtime.commands import FeatureTarget, Goal
+from stereoservo.runtime.estimate import ModelArrays, points_now, with_unit_height
+from stereoservo.runtime.motion import Motion, Present
+from stereoservo.runtime.ports import FloatArray, IntArray
+from stereoservo.runtime.state import Servoing
+
+MIN_MARKERS = 3
+MIN_FACE_AREA_PX2 = 100.0
+
+
+def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servoing:
+    """The state of a law before its first step. Raises ValueError naming what makes the goal unusable."""
+    arrays = present.arrays
+    if arrays is None:
+        raise ValueError("no model")
+    settings = present.settings
+    set_points, wanted = _set_points(target, present, arrays)
+    law = goal.law or settings.law
+    seen_by_all = wanted.sum(axis=0) >= 2
+    target_points, ok = triangulate(arrays.matrices, set_points, wanted, 5)
+    known = np.asarray(ok, dtype=bool) & seen_by_all
+    target_points = np.where(known[:, None], with_unit_height(target_points, arrays.plane_at_infinity), 0.0)
+    if int((wanted.sum(axis=0) > 0).sum()) < MIN_MARKERS:
+        raise ValueError(
+            f"the goal shows {int((wanted.sum(axis=0) > 0).sum())} markers; at least {MIN_MARKERS} are needed to fix a pose"
+        )
+    face: IntArray = np.zeros(3, np.int64)
+    centre = np.zeros(4)
+    if law == "cartesian3":
+        face = _face(set_points, known, arrays)
+        centre = target_points[known].sum(axis=0) / float(known.sum())
+    lease_s = goal.lease_s if goal.lease_s is not None else 0.0
+    return Servoing(
+        goal=goal,
+        law=law,
+        points=goal.points or settings.points,
+        gain=goal.gain or settings.gain,
+        tolerance_px=goal.tolerance_px or settings.tolerance_px,
+        hold_frames=goal.hold_frames or settings.hold_frames,
+        time_limit_s=goal.time_limit_s or settings.time_limit_s,
+        started_ns=present.now_ns,
+        lease_until_ns=present.now_ns + int(lease_s * 1e9),
+        set_points=set_points,
+        wanted=wanted,
+        target_points=target_points,
+        target_known=known.astype(np.float64),
+        centre_target=centre,
+        face=face,
+        last_frames=sum(e.frames for e in present.state.cameras),
+    )
+
+
+def _set_points(target: FeatureTarget, present: Present, arrays: ModelArrays) -> tuple[FloatArray, FloatArray]:
+    """(c, m, 2) set-points and (c, m) wanted. Raises ValueError on a camera, marker or pixel that cannot be."""
+    settings = present.settings
+    c, m = len(settings.cameras), len(arrays.marker_ids)
+    names = [camera.name for camera in settings.cameras]
+    set_points, wanted = np.zeros((c, m, 2)), np.zeros((c, m))
+    for name, markers in target.set_points.items():
+        if name not in names:
+            raise ValueError(f"no camera {name!r}; cameras: {', '.join(names)}")
+        camera = names.index(name)
+        size = settings.cameras[camera]
+        for marker, (u, v) in markers.items():
+            i = arrays.index.get(marker)
+            if i is None:
+                known = ", ".join(str(k) for k in arrays.marker_ids)
+                raise ValueError(f"marker {marker} is not in the model; its markers: {known}")
+            if not (-0.5 <= u <= size.width - 0.5 and -0.5 <= v <= size.height - 0.5):
+                raise ValueError(
+                    f"camera {name!r}, marker {marker}: ({u}, {v}) lies outside its {size.width}x{size.height} image"
+                )
+            set_points[camera, i] = (u, v)
+            wanted[camera, i] = 1.0
+    return set_points, wanted
+
+
+def _face(set_points: FloatArray, known: FloatArray, arrays: ModelArrays) -> IntArray:
+    """Three markers known at the goal that span the largest triangle in the images."""
+    candidates = np.flatnonzero(known)
+    if candidates.size < 3:
+        raise ValueError(
+            f"cartesian3 needs {MIN_MARKERS} markers that two cameras show at the goal; {candidates.size} are"
+        )
+    triples = np.array(list(combinations(candidates.tolist(), 3)), dtype=np.int64)
+    a, b, c = (set_points[:, triples[:, k]] for k in range(3))
+    areas = np.abs((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0]).min(axis=0)
+    best = int(areas.argmax())
+    if float(areas[best]) < MIN_FACE_AREA_PX2:
+        ids = [arrays.marker_ids[int(i)] for i in candidates]
+        raise ValueError(f"the markers {ids} of the goal lie on one line; cartesian3 needs three that span a face")
+    return triples[best]
+
+
+def servo_step(source: Servoing, present: Present) -> Motion:
+    """One step of a law: error, joint velocity, and whether the goal is reached or out of time."""
+    arrays, prediction, weights, pixels = present.arrays, present.prediction, present.weights, present.pixels
+    if arrays is None or prediction is None or weights is None or pixels is None:
+        raise AssertionError("a law runs only with a model")
+    zero = np.zeros_like(present.q)
+    source.moved_s += present.dt_s
+    active = weights * source.wanted
+    visible = int((active > 0.0).sum())
+    distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
+    error_px = float(np.where(active > 0.0, distance, 0.0).max()) if visible else None
+    if source.moved_s > source.time_limit_s:
+        reason = Reason(
+            "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
+            "no error was measured" if error_px is None else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
+        )  # fmt: skip
+        present.emit("goal_aborted", id=source.goal.id, message="not reached in time", reasons=(reason,), error_px=error_px)
+        return Motion(zero, finished=True, error_px=error_px)
+    if int((active.max(axis=0) > 0.0).sum()) < MIN_MARKERS:
+        reason = Reason(
+            "TOO_FEW_MARKERS", "hold", "", float((active.max(axis=0) > 0.0).sum()), float(MIN_MARKERS), "markers",
+            "bring the goal's markers back into view",
+        )  # fmt: skip
+        return Motion(zero, needs_features=True, error_px=error_px, reasons=(reason,))
+    if _reached(source, present, error_px):
+        present.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
+        return Motion(zero, finished=True, error_px=error_px)
+    if source.law == "stereo":
+        return _stereo(source, present, arrays, active, error_px)
+    return _cartesian3(source, present, arrays, error_px)
