@@ -263,7 +263,15 @@ def canonical_pair(
             best = (count, block, heights)
     assert best is not None
     _, block, heights = best
-    middle = float(np.median(heights[np.isfinite(heights)])) if np.isfinite(heights).any() else 0.0
+    heights = heights[np.isfinite(heights)]
+    middle = float(np.median(heights)) if len(heights) else 0.0
+    # A nominal focal length far off may put the frame's infinity among the points: move it, by a, behind them.
+    side = float(np.copysign(1.0, middle))
+    lowest = float((side * heights).min()) if len(heights) else 0.0
+    if lowest < 0.25 * abs(middle):
+        shift = side * (lowest - 0.25 * abs(middle)) / 0.75
+        block = block + shift * np.outer(epipole, [0.0, 0.0, 1.0])
+        middle -= shift
     baseline = np.copysign(np.clip(abs(middle), 1e-3, 1e3), middle) * epipole
     P_left = np.hstack([np.linalg.inv(N_left), np.zeros((3, 1))])
     P_right = np.linalg.inv(N_right) @ K @ np.hstack([block @ np.linalg.inv(K), baseline[:, None]])
