@@ -17,7 +17,9 @@ def cross_matrix(t):
 
 @dataclass(frozen=True)
 class Rig:
-    """Two cameras that look at a point ``distance`` [m] ahead; F from K, R, t, not from projection matrices."""
+    """Two cameras that look at a point ``distance`` [m] ahead; F from K, R, t, not from projection
+    matrices.
+    """
 
     focal: float = 800.0
     baseline: float = 0.2

@@ -55,8 +55,8 @@ def project_many(Ps: FloatArray, M: FloatArray) -> FloatArray:
 
 
 def projection_jacobian(P: FloatArray, M: FloatArray) -> FloatArray:
-    """``J_G P`` ``(n, 2, 4)`` [px per unit of M] (8.4, 8.8): derivative of pixels in homogeneous points ``(n,
-    4)``.
+    """``J_G P`` ``(n, 2, 4)`` [px per unit of M] (8.4, 8.8): derivative of pixels in homogeneous points
+    ``(n, 4)``.
 
     ``J_G = 1/m₃ [[1, 0, −u], [0, 1, −v]]``.
     """
@@ -103,8 +103,8 @@ def _check_views(
 
 
 def triangulate_linear(Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Points ``(n, 4)`` from pixels ``(c, n, 2)`` by the linear constraints (2.71), depth in the first camera
-    1.
+    """Points ``(n, 4)`` from pixels ``(c, n, 2)`` by the linear constraints (2.71), depth in the first
+    camera 1.
 
     ``weights`` (c, n) [1/px] multiply the constraints. NaN rows where fewer than two cameras see a point or
     its rays are one. Raises GeometryError on shapes that do not fit.
@@ -127,10 +127,10 @@ def triangulate(
     """Points ``(n, 4)`` of least reprojection error, scaled to depth 1 in the first camera (third row of
     ``Ps[0]``).
 
-    A linear solution, then ``iterations`` renormalised ones (2.73): constraints of each camera divided by its
-    own depth. The constraints take the *predicted* pixel, so that the fixed point is the exact minimum of the
-    reprojection error. ``sigmas`` (c, n) or a number [px]; default 1. NaN rows where fewer than two cameras
-    see a point or its rays do not determine it. Raises GeometryError on shapes that do not fit.
+    A linear solution, then ``iterations`` renormalised ones (2.73): constraints of each camera divided by
+    its own depth. The constraints take the *predicted* pixel, so that the fixed point is the exact minimum
+    of the reprojection error. ``sigmas`` (c, n) or a number [px]; default 1. NaN rows where fewer than two
+    cameras see a point or its rays do not determine it. Raises GeometryError on shapes that do not fit.
     """
     weights = (
         None
@@ -219,10 +219,10 @@ def canonical_pair(
     2.12).
 
     With ``e'`` the right epipole, ``P_right ~ [[e']ₓF + e'aᵀ | λe']``. The free ``a`` is taken so that the
-    left 3x3 block is a rotation for cameras of ``nominal_focal`` [half image widths]: the frame is then close
-    to an affine one and well conditioned. The signs and ``λ`` put the matches ``left``, ``right`` (n, 2)
-    [px], or without them the crossing of the optical axes, in front of both cameras at a fourth coordinate of
-    about one.
+    left 3x3 block is a rotation for cameras of ``nominal_focal`` [half image widths]: the frame is then
+    close to an affine one and well conditioned. The signs and ``λ`` put the matches ``left``, ``right`` (n,
+    2) [px], or without them the crossing of the optical axes, in front of both cameras at a fourth
+    coordinate of about one.
 
     ``width``, ``height`` of the left image; ``right_size`` of the right one where it differs. Raises
     GeometryError when F is not of rank two.
@@ -233,7 +233,8 @@ def canonical_pair(
     N_left = pixel_normaliser(width, height)
     N_right = pixel_normaliser(*(right_size or (width, height)))
     K = np.diag([nominal_focal, nominal_focal, 1.0])
-    # Fundamental matrix of the nominally calibrated rays: an essential matrix where the nominal focal length
+    # Fundamental matrix of the nominally calibrated rays: an essential matrix where the nominal focal
+    # length
     # is right.
     E = K @ np.linalg.inv(N_right).T @ F @ np.linalg.inv(N_left) @ K
     U, s, Vt = np.linalg.svd(E)
@@ -265,7 +266,8 @@ def canonical_pair(
     _, block, heights = best
     heights = heights[np.isfinite(heights)]
     middle = float(np.median(heights)) if len(heights) else 0.0
-    # A nominal focal length far off may put the frame's infinity among the points: move it, by a, behind them.
+    # A nominal focal length far off may put the frame's infinity among the points: move it, by a, behind
+    # them.
     side = float(np.copysign(1.0, middle))
     lowest = float((side * heights).min()) if len(heights) else 0.0
     if lowest < 0.25 * abs(middle):
@@ -318,7 +320,8 @@ def _heights_and_depths(
 
 
 def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatArray:
-    """Camera ``P`` (3, 4), of unit Frobenius norm, from points ``(n, 4)`` and pixels ``(n, 2)`` [px], n >= 6.
+    """Camera ``P`` (3, 4), of unit Frobenius norm, from points ``(n, 4)`` and pixels ``(n, 2)`` [px], n >=
+    6.
 
     Linear in whitened coordinates, then (``refine``) of least reprojection error. Rows with NaN pixels are
     left out. The sign gives the points of positive height a positive depth. Raises GeometryError for fewer

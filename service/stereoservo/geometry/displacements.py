@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import brentq
 
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
@@ -117,7 +118,8 @@ def rotation_axis(H: FloatArray) -> FloatArray:
 
 
 def log_rotation(H: FloatArray) -> tuple[FloatArray, float]:
-    """``(Ĥ, θ)`` with ``H = exp(θĤ)``, θ in (0, π), of a projective rotation ``H`` (4, 4), normalised (4.28).
+    """``(Ĥ, θ)`` with ``H = exp(θĤ)``, θ in (0, π), of a projective rotation ``H`` (4, 4), normalised
+    (4.28).
 
     The odd part of H gives the generator; near θ = π, where it is small, it is read between the eigenspaces
     of the even part ``I + (1 − cos θ)Ĥ²``, which are accurate there. ``Ĥ³ = −Ĥ`` holds to rounding. Raises
@@ -185,7 +187,8 @@ def translation_generator(H: FloatArray, tau: float = 1.0) -> FloatArray:
 
 
 def nearest_rotation_generator(A: FloatArray) -> FloatArray:
-    """An exact revolute generator (``Ĥ³ = −Ĥ``) near ``A`` (4, 4): its complex eigenvectors, ``−2 Im(v wᴴ)``.
+    """An exact revolute generator (``Ĥ³ = −Ĥ``) near ``A`` (4, 4): its complex eigenvectors, ``−2 Im(v
+    wᴴ)``.
 
     Raises GeometryError where A has no complex pair of eigenvalues.
     """
@@ -217,28 +220,32 @@ def nearest_rotation_generator(A: FloatArray) -> FloatArray:
 
 
 def nearest_translation_generator(A: FloatArray) -> FloatArray:
-    """The nilpotent of rank one (``Ĥ² = 0``) nearest to ``A`` (4, 4) (3.32-3.34, with hᵀk = 0 kept exactly).
+    """The nilpotent of rank one (``Ĥ² = 0``) nearest to ``A`` (4, 4) (3.32-3.34, with hᵀk = 0 kept
+    exactly).
 
     Raises GeometryError for A = 0.
     """
     A = _square(A, "generator")
-    U, s, Vt = np.linalg.svd(A)
-    if not s[0] > 0:
+    size = float(np.linalg.norm(A, 2))
+    if not size > 0:
         raise GeometryError("degenerate", "the generator is zero; a translation is needed")
-    h = Vt[0]
-    k = U[:, 0]
-    for _ in range(50):  # alternating projections; each step solves exactly for one factor
-        k_new = A @ h - h * (h @ A @ h)
-        k_new = k_new / np.linalg.norm(k_new)
-        h_new = A.T @ k_new - k_new * (k_new @ A.T @ k_new)
-        length = np.linalg.norm(h_new)
-        h_new = h_new / length
-        moved = np.linalg.norm(h_new - h)
-        h, k = h_new, k_new
-        if moved < 1e-15:
-            break
+    A = A / size
+
+    def pair(shift: float) -> tuple[FloatArray, FloatArray]:
+        U, _, Vt = np.linalg.svd(A - shift * np.eye(4))
+        return U[:, 0], Vt[0]
+
+    def overlap(shift: float) -> float:
+        k, h = pair(shift)
+        return float(-(k @ h))
+
+    # The best k hᵀ under hᵀk = 0 is a leading singular pair of A − λI, λ the constraint's multiplier; there
+    # the
+    # norm of A − λI is least. That norm is convex in λ, and its slope is −kᵀh.
+    shift = brentq(overlap, -2.0, 2.0, xtol=1e-16, rtol=1e-15)
+    k, h = pair(float(shift))
     k = k - h * (h @ k)
-    G: FloatArray = np.outer(k, h) * float(k @ A @ h) / float(k @ k)
+    G: FloatArray = size * np.outer(k, h) * float(k @ A @ h) / float(k @ k)
     return G
 
 

@@ -39,7 +39,7 @@ def fundamental_linear(left: FloatArray, right: FloatArray) -> FloatArray:
     if not singular[7] > 1e-7 * singular[0]:
         raise GeometryError(
             "degenerate",
-            "the matches do not determine F: they lie on one plane, line or point, or the cameras share a centre",
+            "the matches do not determine F: they lie on one plane, or the cameras share a centre",
             singular=singular,
         )
     return _unit(T_right.T @ _rank_two(v[8].reshape(3, 3)) @ T_left)
@@ -51,9 +51,9 @@ def fundamental_robust(
     """``F`` (3, 3) and inliers ``(n,)`` of matches ``(n, 2)`` [px] with outliers; noise ``sigma_px`` [px] a
     coordinate.
 
-    MAGSAC with a fixed seed, then refinement on the matches within 3.29 sigmas, until they stay the same: the
-    same input gives the same output. Raises GeometryError where no F has eight inliers, or where a homography
-    explains the inliers as well (points of one plane leave F undetermined).
+    MAGSAC with a fixed seed, then refinement on the matches within 3.29 sigmas, until they stay the same:
+    the same input gives the same output. Raises GeometryError where no F has eight inliers, or where a
+    homography explains the inliers as well (points of one plane leave F undetermined).
     """
     if not sigma_px > 0:
         raise GeometryError("shape", f"sigma_px is {sigma_px}; it must be positive", sigma_px=sigma_px)
@@ -139,7 +139,8 @@ def fundamental_refine(
             D[5 + i] = 0.0
             D[5 + i, :, 2] = p @ B[:, i]
         value, on_right, on_left, length = _sampson_parts(p @ B @ q, u, v, lines)
-        # d(value/length): value is linear in the matrix, length² a sum of squares of line normals in pixels.
+        # d(value/length): value is linear in the matrix, length² a sum of squares of line normals in
+        # pixels.
         d_value = np.einsum("ni,kij,nj->nk", v, D, u)
         d_right = np.einsum("ai,kij,nj->nka", lines[1], D, u)
         d_left = np.einsum("aj,kij,ni->nka", lines[0], D, v)

@@ -1,7 +1,8 @@
 """Points and planes of projective space: homogeneous coordinates, joins and meets, oriented planes.
 
 Points are rows ``(n, 4)``; a plane is a 4-vector ``a`` used as ``aᵀM`` (thesis 2.5). Points that enter one
-construction keep their orbital heights: nothing here renormalises a vector whose sign or scale is an answer.
+construction keep their orbital heights: nothing here renormalises a vector whose sign or scale is an
+answer.
 """
 
 from __future__ import annotations
@@ -116,8 +117,9 @@ def crossing_of_diagonals(A1: FloatArray, A2: FloatArray, A3: FloatArray, A4: Fl
     """Crossing ``(4,)`` of the diagonals A1A3 and A2A4 of a planar quadrangle of points ``(4,)``.
 
     A centre that needs no plane at infinity. It moves with its points (H A_i gives H C), and points of one
-    height give a centre of that height. Slightly non-planar (measured) points give the middle of the closest
-    combinations. Raises GeometryError where three corners are collinear or the diagonals do not cross.
+    height give a centre of that height. Slightly non-planar (measured) points give the middle of the
+    closest combinations. Raises GeometryError where three corners are collinear or the diagonals do not
+    cross.
     """
     corners = np.stack([A1, A3, A2, A4]).astype(np.float64)
     norms = np.linalg.norm(_unit_rows(corners) * np.linalg.norm(corners, axis=1, keepdims=True), axis=1)

@@ -80,8 +80,8 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
 def homography_refine(
     H: FloatArray, Ps: FloatArray, M_from: FloatArray, pixels_to: FloatArray, sigma: FloatArray | float = 1.0
 ) -> FloatArray:
-    """``H`` (4, 4) of least reprojection error of ``P_c H M``, 15 parameters; ``det H`` of its sign and size
-    1.
+    """``H`` (4, 4) of least reprojection error of ``P_c H M``, 15 parameters; ``det H`` of its sign and
+    size 1.
 
     Cameras ``(c, 3, 4)``, points ``(n, 4)``, target pixels ``(c, n, 2)`` [px], NaN where missing; ``sigma``
     (c, n) or a number [px]. Raises GeometryError for shapes that do not fit or fewer than 15 coordinates.
