@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -294,6 +295,8 @@ def _jog(command: Jog, present: Present) -> str:
         raise Refusal("BUSY", f"a goal is active ({goal_of(state.source)}): cancel it before jogging", subject=goal_of(state.source))
     velocity = np.zeros_like(present.q)
     for name, speed in command.velocities.items():
+        if not math.isfinite(speed):
+            raise Refusal("NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name)
         velocity[_joint(name, present)] = speed
     state.source = Jogging(velocity, present.now_ns + int(command.lease_s * 1e9))
     return f"jogging for {command.lease_s} s"

@@ -1,0 +1,94 @@
+"""What an operator does, on a cell in lockstep: enable, calibrate, teach, send goals, wait for their ends."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+
+from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.calibration_job import CalibrationJob
+from stereoservo.runtime.commands import Calibrate, Command, Enable, FeatureTarget, Goal, Home, JointTarget, RunGoal, Teach
+from stereoservo.runtime.cycle import Event, Lifecycle, ModelUpdate
+from stereoservo.runtime.lockstep import LockstepCell
+from stereoservo.runtime.taught import feature_target
+
+TERMINAL = frozenset({"goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted"})
+CALIBRATION_TIMEOUT_S = 1800.0
+
+
+class LockstepRefusal(Exception):
+    """The cell refused, or a goal did not end as hoped; carries the event."""
+
+    def __init__(self, event: Event) -> None:
+        super().__init__(event.message)
+        self.event = event
+
+
+class LockstepOperator:
+    """Drives a ``LockstepCell`` the way a client drives a daemon; every call runs virtual time until its end."""
+
+    def __init__(self, cell: LockstepCell, *, seed: int = 0) -> None:
+        self.cell = cell
+        self.taught: dict[str, FeatureTarget] = {}
+        self.trials: TrialData | None = None
+        self._epoch = 0
+        self._ids = (uuid.UUID(int=(seed << 32) + k) for k in range(1, 1 << 32))
+
+    def _submit(self, command: Command) -> Event:
+        reply = self.cell.submit(command)
+        if not reply.accepted:
+            raise LockstepRefusal(reply)
+        return reply
+
+    def enable(self) -> None:
+        """Enable, and wait until the arm may move. Raises LockstepRefusal, LockstepTimeout."""
+        since = self.cell.events[-1].seq if self.cell.events else 0
+        self._submit(Enable())
+        self.cell.wait_for(lambda e: e.kind == "lifecycle" and e.name == Lifecycle.ACTIVE, 5.0, since - 1)
+
+    def calibrate(self, progress: Callable[[float, str], None] | None = None) -> CellModel:
+        """Trial motions, fit in this process, model into the core. Raises LockstepRefusal, CalibrationError."""
+        first = len(self.cell.events)
+        goal_id = str(next(self._ids))
+        self._submit(Calibrate(goal_id))
+        end = self.cell.wait_for(
+            lambda e: e.id == goal_id and e.kind in ("calibration_finished", "calibration_aborted"),
+            CALIBRATION_TIMEOUT_S, self.cell.events[first].seq - 1,
+        )  # fmt: skip
+        if end.kind == "calibration_aborted":
+            raise LockstepRefusal(end)
+        job = CalibrationJob(self.cell.settings)
+        for event in self.cell.events[first:]:
+            job.add(event)
+        self._epoch += 1
+        self.trials = job.trials()
+        model = fit_model(self.trials, epoch=self._epoch, progress=progress)
+        self.cell.update_model(ModelUpdate(model))
+        self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
+        return model
+
+    def teach(self, name: str, frames: int = 20) -> Event:
+        """Store what the cameras see now as goal ``name``. Raises LockstepRefusal."""
+        reply = self._submit(Teach(name, frames))
+        event = self.cell.wait_for(
+            lambda e: e.name == name and e.kind in ("taught", "warning"), 30.0, reply.seq
+        )
+        if event.kind != "taught":
+            raise LockstepRefusal(event)
+        self.taught[name] = feature_target(event, self._epoch)
+        return event
+
+    def goal(self, target: FeatureTarget | JointTarget | str, *, timeout_s: float = 120.0, **options: object) -> Event:
+        """Run a goal (a taught one by its name) to its terminal event. Raises LockstepRefusal when it is refused."""
+        resolved = self.taught[target] if isinstance(target, str) else target
+        goal = Goal(str(next(self._ids)), resolved, **options)  # type: ignore[arg-type]
+        reply = self._submit(RunGoal(goal))
+        return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, reply.seq)
+
+    def home(self) -> Event:
+        """Move home. Raises LockstepRefusal."""
+        goal_id = str(next(self._ids))
+        reply = self._submit(Home(goal_id))
+        return self.cell.wait_for(lambda e: e.id == goal_id and e.kind in TERMINAL, 120.0, reply.seq)

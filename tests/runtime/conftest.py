@@ -1,0 +1,234 @@
+"""A Euclidean arm and stereo pair, conjugated into a random projective frame: the core's independent truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics
+from stereoservo.runtime.commands import Command, Request
+from stereoservo.runtime.core import ServoCore
+from stereoservo.runtime.cycle import Event, ModelUpdate, StepInputs, StepOutputs
+from stereoservo.runtime.ports import CameraObservation, JointState
+from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings, TrialSettings
+
+NAMES = ("j1", "j2", "j3", "j4", "j5", "j6")
+ROWS = ((0, -90, 0.42), (0.40, 0, 0), (0, 90, 0), (0, -90, 0.80), (0, 90, 0), (0, 0, 0.085))
+BASE = np.array([0.1, -1.0, 1.9, 0.3, 0.8, 0.2])
+
+
+def twist(axis: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Euclidean generator (4, 4) of a rotation about a line."""
+    x, y, z = axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.block([[skew, (-skew @ point)[:, None]], [np.zeros((1, 4))]])
+
+
+def link(a: float, alpha_deg: float, d: float, theta: float) -> np.ndarray:
+    """Classic Denavit-Hartenberg transform."""
+    ca, sa, ct, st = np.cos(np.radians(alpha_deg)), np.sin(np.radians(alpha_deg)), np.cos(theta), np.sin(theta)
+    return np.array(
+        [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0, sa, ca, d], [0, 0, 0, 1.0]]
+    )
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera pose (4, 4), z towards the target, y downwards."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack([x, np.cross(z, x), z, eye])
+    return pose
+
+
+@dataclass
+class Truth:
+    """Arm, cameras and markers in metres, and the same in the projective frame."""
+
+    model: CellModel
+    cameras: np.ndarray
+    generators: np.ndarray
+    markers: np.ndarray
+
+    def points(self, q: np.ndarray) -> np.ndarray:
+        """Markers (m, 3) [m] at ``q``."""
+        from scipy.linalg import expm
+
+        H = np.eye(4)
+        for j in range(6):
+            H = H @ expm((q[j] - BASE[j]) * self.generators[j])
+        return (H @ self.markers.T).T[:, :3]
+
+    def pixels(self, q: np.ndarray) -> np.ndarray:
+        """(2, m, 2) exact pixels at ``q``."""
+        homogeneous = np.column_stack([self.points(q), np.ones(len(self.markers))])
+        image = np.einsum("cij,mj->cmi", self.cameras, homogeneous)
+        return image[..., :2] / image[..., 2:]
+
+
+def make_truth(seed: int) -> Truth:
+    rng = np.random.default_rng(seed)
+    frames = [np.eye(4)]
+    for (a, alpha, d), theta in zip(ROWS, BASE, strict=True):
+        frames.append(frames[-1] @ link(a, alpha, d, theta))
+    generators = np.array([twist(frame[:3, 2], frame[:3, 3]) for frame in frames[:6]])
+    flange = frames[6]
+    body = np.array([[x, y, z] for x, y, z in
+                     [(-.06, -.06, .05), (.06, -.06, .05), (.06, .06, .05), (-.06, .06, .05), (.02, -.01, .08),
+                      (-.03, .02, .08), (.01, .04, .07), (0, -.05, .08)]])  # fmt: skip
+    markers = (flange @ np.column_stack([body, np.ones(len(body))]).T).T
+    middle = markers[:, :3].mean(axis=0)
+    outward = flange[:3, 2]
+    side = np.cross(outward, [0, 0, 1.0])
+    side /= np.linalg.norm(side)
+    K = np.array([[800, 0, 320], [0, 800, 240], [0, 0, 1.0]])
+    cameras = np.array(
+        [(K @ np.linalg.inv(look_at(middle + 1.2 * outward + s * 0.15 * side + [0, 0, 0.1], middle))[:3]) for s in (-1, 1)]
+    )
+    H = np.eye(4) + 0.3 * rng.standard_normal((4, 4))  # projective -> Euclidean
+    inverse = np.linalg.inv(H)
+    plane = np.array([0, 0, 0, 1.0]) @ H
+    points = (inverse @ markers.T).T
+    points /= (points @ plane)[:, None]
+    statistics = FitStatistics(0.02, 1.0, 1, True, 1, 0, 0, (), 1)
+    model = CellModel(
+        schema=MODEL_SCHEMA, epoch=7, joint_names=NAMES, joint_kinds=("revolute",) * 6, zero=BASE.copy(),
+        generators=np.array([inverse @ G @ H for G in generators]),
+        cameras=tuple(CameraModel(n, P @ H, 640, 480) for n, P in zip(("left", "right"), cameras, strict=True)),
+        marker_ids=tuple(range(len(body))), marker_points=points, plane_at_infinity=plane, stratum="metric",
+        projective_to_euclidean=H, statistics=statistics,
+    )  # fmt: skip
+    return Truth(model, cameras, generators, markers)
+
+
+def make_settings() -> CoreSettings:
+    return CoreSettings(
+        cell="test", joint_names=NAMES, joint_kinds=("revolute",) * 6,
+        cameras=tuple(CameraSettings(n, 640, 480, 25.0, "eye_to_hand", tuple(range(8))) for n in ("left", "right")),
+        limits=LimitSettings(
+            np.full(6, -3.0), np.full(6, 3.0), np.full(6, 1.0), np.full(6, 4.0), 0.01, np.zeros((0, 6, 2)), (),
+            0.5, 0.1, 1.0,
+        ),
+        trials=TrialSettings(BASE.copy(), np.full(6, 0.1), 5, 2, 0.05, 1.0, 4, 0.05, 1.0), home=BASE.copy(),
+        rate_hz=100.0, law="cartesian3", points="predicted", gain=1.5, tolerance_px=0.1, hold_frames=5,
+        time_limit_s=30.0, filter_s=0.2, gate_sigma=6.0,
+    )  # fmt: skip
+
+
+@dataclass
+class Bench:
+    """Drives a core in virtual time against the truth: perfect joints, cameras at 25 Hz with 20 ms latency."""
+
+    truth: Truth
+    settings: CoreSettings
+    core: ServoCore
+    rng: np.random.Generator
+    q: np.ndarray
+    noise_px: float = 0.0
+    active: bool = False
+    now_ns: int = 1_000_000_000
+    seq: int = 0
+    cameras_on: list[bool] = field(default_factory=lambda: [True, True])
+    joints_on: bool = True
+    frozen_joint: int = -1
+    marker_mask: np.ndarray = field(default_factory=lambda: np.ones(8, bool))
+    bias_px: float = 0.0
+    events: list[Event] = field(default_factory=list)
+    commands: list[np.ndarray] = field(default_factory=list)
+    log: list[tuple[StepInputs, StepOutputs]] = field(default_factory=list)
+    pending: list[CameraObservation] = field(default_factory=list)
+    encoder: np.ndarray | None = None
+
+    def step(self, *commands: Command, **inputs: object) -> StepOutputs:
+        period_ns = round(1e9 / self.settings.rate_hz)
+        self.now_ns += period_ns
+        self.seq += 1
+        q_encoder = self.q.copy()
+        if self.frozen_joint >= 0:
+            self.encoder = self.q.copy() if self.encoder is None else self.encoder
+            q_encoder[self.frozen_joint] = self.encoder[self.frozen_joint]
+        joints = JointState(self.seq, self.now_ns, q_encoder, np.zeros(6)) if self.joints_on else None
+        due = [o for o in self.pending if o.t_received_ns <= self.now_ns]
+        self.pending = [o for o in self.pending if o.t_received_ns > self.now_ns]
+        requests = tuple(Request(self.seq * 10 + k, "tester", c) for k, c in enumerate(commands))
+        step = StepInputs(
+            self.now_ns, period_ns, joints, tuple(due), requests, driver_active=self.active, **inputs
+        )
+        outputs = self.core.step(step)
+        self.log.append((step, outputs))
+        self.events.extend(outputs.events)
+        if outputs.driver_request:
+            self.active = outputs.driver_request == "activate"
+        if self.seq % 4 == 0:
+            self._shutter()
+        if outputs.command is not None:
+            self.commands.append(outputs.command)
+            self.q = self.q + outputs.command * period_ns * 1e-9
+        return outputs
+
+    def _shutter(self) -> None:
+        exact = self.truth.pixels(self.q)
+        for c, name in enumerate(("left", "right")):
+            if not self.cameras_on[c]:
+                continue
+            inside = self.marker_mask & np.all((exact[c] >= 0) & (exact[c] < (640, 480)), axis=1)
+            pixels = exact[c, inside] + self.noise_px * self.rng.standard_normal((inside.sum(), 2)) + self.bias_px
+            covariance = np.tile(np.eye(2) * max(self.noise_px, 0.01) ** 2, (inside.sum(), 1, 1))
+            self.pending.append(
+                CameraObservation(name, self.seq, self.now_ns, self.now_ns + 20_000_000, np.flatnonzero(inside), pixels, covariance)
+            )
+
+    def run(self, seconds: float) -> StepOutputs:
+        for _ in range(max(1, round(seconds * self.settings.rate_hz))):
+            outputs = self.step()
+        return outputs
+
+    def until(self, wanted: Callable[[Event], bool], seconds: float) -> Event:
+        start = len(self.events)
+        for _ in range(round(seconds * self.settings.rate_hz)):
+            self.step()
+            for event in self.events[start:]:
+                if wanted(event):
+                    return event
+        raise AssertionError(f"not seen in {seconds} s; events: {[(e.kind, e.message) for e in self.events[start:]]}")
+
+    def reply(self, command: Command) -> Event:
+        return next(e for e in self.step(command).events if e.kind == "reply")
+
+    def ready(self) -> Bench:
+        """Model in, arm enabled, first frames seen."""
+        from stereoservo.runtime.commands import Enable
+
+        self.run(0.1)
+        self.step(model_update=ModelUpdate(self.truth.model))
+        self.step(Enable())
+        self.run(0.3)
+        return self
+
+    def features(self, q: np.ndarray) -> dict[str, dict[int, tuple[float, float]]]:
+        exact = self.truth.pixels(q)
+        return {
+            name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])} for c, name in enumerate(("left", "right"))
+        }
+
+    def error_px(self, q: np.ndarray) -> float:
+        return float(np.abs(self.truth.pixels(self.q) - self.truth.pixels(q)).max())
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return make_bench(0)
+
+
+@pytest.fixture
+def benches() -> Callable[..., Bench]:
+    return make_bench
+
+
+def make_bench(seed: int, noise_px: float = 0.0) -> Bench:
+    settings = make_settings()
+    return Bench(make_truth(seed), settings, ServoCore(settings), np.random.default_rng(seed), BASE.copy(), noise_px)
