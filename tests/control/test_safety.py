@@ -1,0 +1,274 @@
+"""The safety stage: what it promises, for any input."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereoservo.control import safety
+from stereoservo.control.safety import SafetyConfigurationError, SafetyInputs, SafetyLimits, safety_stage
+
+DT = 0.004
+
+
+def make_limits(n=3, keep_outs=(), **changes):
+    values = {
+        "joint_names": tuple(f"j{j + 1}" for j in range(n)),
+        "position_min": np.full(n, -1.0),
+        "position_max": np.full(n, 1.5),
+        "velocity_max": np.linspace(0.5, 1.5, n),
+        "acceleration_max": np.linspace(6.0, 2.0, n),
+        "position_margin": 0.01,
+        "keep_outs": np.array(keep_outs).reshape(-1, n, 2),
+        "keep_out_names": tuple(f"box{k}" for k in range(len(keep_outs))),
+        "joint_timeout_s": 0.1,
+        "coast_s": 0.5,
+    }
+    return SafetyLimits(**(values | changes))
+
+
+def codes(result):
+    return {reason.code for reason in result.reasons}
+
+
+anything = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    raw=st.lists(anything, min_size=3, max_size=3),
+    positions=st.lists(anything, min_size=3, max_size=3),
+    previous=st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3),
+    joint_age=anything,
+    feature_age=anything,
+    needs=st.booleans(),
+    scale=anything,
+    brake=st.booleans(),
+)
+def test_any_input_gives_a_finite_command_within_velocity_and_acceleration(
+    raw, positions, previous, joint_age, feature_age, needs, scale, brake
+):
+    limits = make_limits(keep_outs=[[[0.2, 0.4], [-0.3, 0.3], [-np.inf, np.inf]]])
+    previous = np.clip(previous, -limits.velocity_max, limits.velocity_max)
+    result = safety_stage(
+        SafetyInputs(
+            np.array(raw), np.array(positions), previous, DT, joint_age, feature_age, needs, scale, brake
+        ),
+        limits,
+    )
+    assert np.isfinite(result.limited).all()
+    assert (np.abs(result.limited) <= limits.velocity_max * (1 + 1e-12)).all()
+    assert (np.abs(result.limited - previous) <= limits.acceleration_max * DT * (1 + 1e-9) + 1e-15).all()
+    if not np.isfinite(raw).all():
+        assert safety.NON_FINITE_COMMAND in codes(result)
+        assert result.braking
+    for reason in result.reasons:
+        assert reason.hint
+        assert reason.value is None or math.isfinite(reason.value)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    raw=st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3),
+    previous=st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3),
+    scale=st.floats(0.0, 1.0),
+)
+def test_the_direction_is_kept_unless_positions_or_acceleration_act(raw, previous, scale):
+    raw, previous = np.array(raw), np.array(previous)
+    result = safety_stage(SafetyInputs(raw, np.zeros(3), previous, DT, speed_scale=scale), make_limits())
+    if codes(result) & {safety.ACCELERATION_LIMITED, safety.JOINT_LIMIT}:
+        change = result.limited - previous
+        if safety.JOINT_LIMIT not in codes(result):  # a share of the way to a multiple of raw
+            factor = 1.0 if not raw.any() else None
+            assert (
+                factor == 1.0
+                or np.linalg.matrix_rank(np.stack([raw, previous, previous + change]), tol=1e-9) <= 2
+            )
+        return
+    size = np.abs(raw).max()
+    multiple = 0.0 if size == 0.0 else result.limited[np.abs(raw).argmax()] / raw[np.abs(raw).argmax()]
+    assert multiple >= 0.0
+    np.testing.assert_allclose(result.limited, multiple * raw, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    start=st.lists(st.floats(-0.98, 1.48), min_size=3, max_size=3),
+    seed=st.integers(0, 10**6),
+    dt=st.sampled_from([0.001, 0.004, 0.02, 0.04]),
+    persistence=st.integers(1, 60),
+    age=st.sampled_from([0.0, 0.003]),
+)
+def test_positions_never_leave_their_range(start, seed, dt, persistence, age):
+    rng = np.random.default_rng(seed)
+    limits = make_limits()
+    q, command = np.array(start), np.zeros(3)
+    for step in range(250):
+        if step % persistence == 0:
+            raw = rng.choice([-20.0, -1.0, -0.1, 0.0, 0.1, 1.0, 20.0], 3) * rng.random(3)
+        period = dt * rng.uniform(0.5, 1.0)  # the loop may jitter, as long as the stage is told
+        before = command
+        command = safety_stage(
+            SafetyInputs(raw, q, before, period, joint_age_s=age, brake=bool(rng.random() < 0.02)), limits
+        ).limited
+        q = q + command * period
+        assert (np.abs(command - before) <= limits.acceleration_max * period + 1e-12).all()
+        assert (q >= limits.position_min + limits.position_margin - 1e-9).all()
+        assert (q <= limits.position_max - limits.position_margin + 1e-9).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    start=st.lists(st.floats(-0.98, 1.48), min_size=3, max_size=3),
+    seed=st.integers(0, 10**6),
+    dt=st.sampled_from([0.001, 0.004, 0.02]),
+    persistence=st.integers(5, 120),
+)
+def test_keep_outs_are_never_entered(start, seed, dt, persistence):
+    boxes = np.array(
+        [
+            [[0.0, 0.5], [-0.4, 0.4], [-np.inf, np.inf]],
+            [[-0.6, -0.3], [0.2, np.inf], [0.0, 0.3]],
+            [[-np.inf, np.inf], [-np.inf, -0.6], [-np.inf, np.inf]],
+        ]
+    )
+    limits = make_limits(keep_outs=boxes)
+
+    def inside(q):
+        return ((q > boxes[:, :, 0] - 0.01 + 1e-9) & (q < boxes[:, :, 1] + 0.01 - 1e-9)).all(axis=1)
+
+    rng = np.random.default_rng(seed)
+    q, command = np.array(start), np.zeros(3)
+    if inside(q).any():
+        return
+    for step in range(250):
+        if step % persistence == 0:
+            raw = rng.uniform(-3.0, 3.0, 3)
+        command = safety_stage(SafetyInputs(raw, q, command, dt), limits).limited
+        q = q + command * dt
+        assert not inside(q).any()
+
+
+@pytest.mark.parametrize("outside", [1.6, -1.3, 1.495])
+def test_a_joint_outside_may_only_move_inward(outside):
+    inward = -np.sign(outside)
+    q = np.array([outside, 0.0, 0.0])
+    limits = make_limits()
+    out = safety_stage(SafetyInputs(np.array([-inward, 0.2, 0.0]), q, np.zeros(3), DT), limits)
+    assert out.limited[0] == 0.0
+    assert out.limited[1] > 0.0
+    (reason,) = [r for r in out.reasons if r.code == safety.JOINT_LIMIT]
+    assert reason.subject == "j1"
+    assert reason.value == outside
+    assert reason.hint.startswith("jog j1 down" if outside > 0 else "jog j1 up")
+    command = np.zeros(3)
+    for _ in range(2000):
+        command = safety_stage(SafetyInputs(np.array([inward, 0.0, 0.0]), q, command, DT), limits).limited
+        assert command[0] * inward >= 0.0
+        q = q + command * DT
+    assert -1.0 < q[0] < 1.5
+
+
+def test_a_braking_joint_has_its_full_deceleration_while_another_one_is_slow():
+    # j3 turns round at full swing: alone, the uniform share would leave j1 too fast for its limit
+    limits = make_limits(acceleration_max=np.array([4.0, 4.0, 0.5]))
+    q, command = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+    weakest = 1.0
+    for step in range(1200):
+        flip = 1.0 if (step // 60) % 2 else -1.0
+        result = safety_stage(SafetyInputs(np.array([0.5, 0.0, 1.5 * flip]), q, command, DT), limits)
+        command = result.limited
+        q = q + command * DT
+        weakest = min(weakest, 1.49 - q[0])
+    assert -1e-9 <= weakest < 0.02
+    assert safety.JOINT_LIMIT in codes(result)
+
+
+def test_braking_is_uniform_and_ends_at_rest():
+    limits = make_limits()
+    command = np.array([0.4, -0.2, 0.1])
+    direction = command / np.linalg.norm(command)
+    steps = 0
+    while np.abs(command).max() > 0:
+        result = safety_stage(SafetyInputs(np.full(3, 0.3), np.zeros(3), command, DT, brake=True), limits)
+        assert codes(result) == {safety.BRAKING}
+        assert np.linalg.norm(command) > np.linalg.norm(result.limited)
+        command = result.limited
+        np.testing.assert_allclose(command, direction * np.linalg.norm(command), atol=1e-12)
+        steps += 1
+    # j1 (0.4 at 6) needs 0.067 s, j2 0.05 s, j3 0.05 s: the slowest sets the pace
+    assert steps == math.ceil(0.4 / 6.0 / DT)
+
+
+def test_stale_joints_brake():
+    moving = np.array([0.3, 0.0, 0.0])
+    fresh = safety_stage(SafetyInputs(moving, np.zeros(3), moving, DT, joint_age_s=0.1), make_limits())
+    assert not fresh.braking
+    for age in (0.11, math.nan, math.inf):
+        result = safety_stage(SafetyInputs(moving, np.zeros(3), moving, DT, joint_age_s=age), make_limits())
+        assert codes(result) == {safety.JOINTS_STALE, safety.BRAKING}
+        assert result.limited[0] < moving[0]
+
+
+@pytest.mark.parametrize(
+    ("age", "needs", "expected", "braking"),
+    [
+        (0.05, True, set(), False),
+        (0.3, True, {safety.COASTING}, False),
+        (0.51, True, {safety.FEATURES_STALE, safety.BRAKING}, True),
+        (math.nan, True, {safety.FEATURES_STALE, safety.BRAKING}, True),
+        (5.0, False, set(), False),
+    ],
+)
+def test_features_coast_then_brake(age, needs, expected, braking):
+    moving = np.array([0.3, 0.0, 0.0])
+    inputs = SafetyInputs(moving, np.zeros(3), moving, DT, feature_age_s=age, needs_features=needs)
+    result = safety_stage(inputs, make_limits())
+    assert codes(result) == expected
+    assert result.braking == braking
+
+
+def test_speed_scale_keeps_direction_and_says_so():
+    raw = np.array([0.25, 0.5, -1.0])
+    limits = make_limits(velocity_max=np.ones(3))
+    result = safety_stage(SafetyInputs(raw, np.zeros(3), 0.1 * raw, DT, speed_scale=0.1), limits)
+    np.testing.assert_allclose(result.limited, 0.1 * raw)
+    (reason,) = result.reasons
+    assert (reason.code, reason.subject, reason.value) == (safety.VELOCITY_SCALED, "j3", 1.0)
+    assert reason.threshold == pytest.approx(0.1)
+
+
+def test_a_command_within_every_limit_passes_bit_for_bit():
+    raw = np.array([0.1, -0.123456789, 0.3])
+    result = safety_stage(SafetyInputs(raw, np.zeros(3), raw, DT), make_limits())
+    np.testing.assert_array_equal(result.limited, raw)
+    assert result.reasons == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"velocity_max": np.array([1.0, 0.0, 1.0])}, "'j2': velocity_max is 0.0"),
+        ({"acceleration_max": np.array([1.0, 1.0, np.inf])}, "'j3': acceleration_max is inf"),
+        ({"position_margin": 2.0}, "nothing inside the margin 2.0"),
+        ({"position_min": np.zeros(2)}, "position_min"),
+        ({"coast_s": -1.0}, "coast_s is -1.0"),
+        (
+            {"keep_outs": np.zeros((1, 3, 2)), "keep_out_names": ("a",)},
+            "'a': every low must be below its high",
+        ),
+        ({"keep_outs": [[[-np.inf, np.inf]] * 3], "keep_out_names": ("a",)}, "bounds no joint"),
+        ({"keep_outs": [[[-0.1, 0.1]] * 3], "keep_out_names": ()}, "1 keep-outs have 0 names"),
+    ],
+)
+def test_limits_that_cannot_work_are_refused_by_name(changes, text):
+    with pytest.raises(SafetyConfigurationError, match=text):
+        make_limits(**changes)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf])
+def test_a_period_that_is_none_is_refused(dt):
+    with pytest.raises(SafetyConfigurationError, match="dt_s"):
+        safety_stage(SafetyInputs(np.zeros(3), np.zeros(3), np.zeros(3), dt), make_limits())
