@@ -1,0 +1,1 @@
+"""Self-calibration from joint-wise trial motions (thesis 5.4)."""

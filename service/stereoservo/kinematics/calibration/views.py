@@ -1,0 +1,107 @@
+"""Cameras and points before any kinematics: F over all stops, the canonical pair, further cameras, triangulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.cameras import canonical_pair, resection, triangulate
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.fundamental import fundamental_robust
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+MIN_MATCHES = 16
+"""Matches between two cameras below which the epipolar geometry is not worth a robust search."""
+MIN_AGREEMENT = 0.6
+"""Share of matches that must fit one epipolar geometry; below it the stated sigmas are widened once or twice."""
+
+
+def first_views(trials: TrialData) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Cameras (c, 3, 4) in the canonical frame, points (s, m, 4) of each stop, and usable pixels (c, s, m).
+
+    Points have depth 1 in the left camera, NaN where they are not usable in two cameras. Raises CalibrationError
+    (``too_few_markers``, ``views_degenerate``).
+    """
+    c, s, m = trials.sigmas.shape
+    flat = trials.pixels.reshape(c, s * m, 2)
+    sigmas = np.where(trials.visible, trials.sigmas, 1.0).reshape(c, s * m)
+    usable = np.zeros((c, s * m), dtype=bool)
+    left, right = trials.cameras[:2]
+    F, fits, seen = _epipolar(trials, flat, sigmas, 1)
+    usable[:2, np.flatnonzero(seen)[fits]] = True
+    try:
+        P_left, P_right = canonical_pair(
+            F,
+            left.width,
+            left.height,
+            right_size=(right.width, right.height),
+            left=flat[0, usable[0]],
+            right=flat[1, usable[1]],
+        )
+        cameras = [P_left, P_right]
+        points = triangulate(np.array(cameras), np.where(usable[:2, :, None], flat[:2], np.nan), sigmas[:2])
+        for k in range(2, c):
+            _, fits, seen = _epipolar(trials, flat, sigmas, k)
+            usable[k, np.flatnonzero(seen)[fits]] = True
+            both = usable[k] & np.isfinite(points).all(axis=1)
+            cameras.append(resection(points[both], flat[k, both]))
+        matrices = np.array(cameras)
+        points = triangulate(matrices, np.where(usable[:, :, None], flat, np.nan), sigmas)
+    except GeometryError as error:
+        raise _degenerate(trials, 1, error) from error
+    # Points behind a camera, or at its focal plane, come from wrong matches.
+    depths = np.einsum("cj,pj->cp", matrices[:, 2], np.nan_to_num(points))
+    common = np.sign(np.median(depths[:, np.isfinite(points).all(axis=1)], axis=1))
+    matrices *= common[:, None, None]
+    behind = (depths * common[:, None] <= 0) & usable
+    usable &= ~behind
+    points[behind.any(axis=0)] = np.nan
+    return matrices, points.reshape(s, m, 4), usable.reshape(c, s, m)
+
+
+def _epipolar(
+    trials: TrialData, flat: FloatArray, sigmas: FloatArray, k: int
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """F of cameras 0 and k, inliers among the common matches, and which (s m,) are common."""
+    seen = np.isfinite(flat[0]).all(axis=1) & np.isfinite(flat[k]).all(axis=1)
+    names = f"{trials.cameras[0].name!r} and {trials.cameras[k].name!r}"
+    if int(seen.sum()) < MIN_MATCHES:
+        raise CalibrationError(
+            "too_few_markers",
+            f"cameras {names} see {int(seen.sum())} markers in common over all stops; at least {MIN_MATCHES} are needed",
+            matches=int(seen.sum()),
+            minimum=MIN_MATCHES,
+        )
+    sigma = float(np.sqrt(np.median(sigmas[0, seen] ** 2 + sigmas[k, seen] ** 2) / 2))
+    failure: GeometryError | None = None
+    for wider in (1.0, 4.0, 16.0):
+        try:
+            F, fits = fundamental_robust(flat[0, seen], flat[k, seen], wider * sigma)
+        except GeometryError as error:
+            failure = error
+            continue
+        if fits.mean() >= MIN_AGREEMENT:
+            return F, fits, seen
+    if failure is not None:
+        raise _degenerate(trials, k, failure) from failure
+    raise CalibrationError(
+        "views_degenerate",
+        f"only {fits.mean():.0%} of the matches of cameras {names} fit one epipolar geometry at 16 sigmas "
+        f"({16 * sigma:.3g} px); at least {MIN_AGREEMENT:.0%} must. Did a camera move, or are markers mixed up?",
+        agreement=float(fits.mean()),
+        minimum=MIN_AGREEMENT,
+    )
+
+
+def _degenerate(trials: TrialData, k: int, error: GeometryError) -> CalibrationError:
+    names = f"{trials.cameras[0].name!r} and {trials.cameras[k].name!r}"
+    return CalibrationError(
+        "views_degenerate",
+        f"the views of cameras {names} do not determine their geometry: {error}. The cameras must stand apart, and "
+        "the markers must not stay in one plane over all trials",
+        cause=error.code,
+        cameras=[trials.cameras[0].name, trials.cameras[k].name],
+    )
