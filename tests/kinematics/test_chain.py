@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -159,3 +162,12 @@ def test_malformed_chains_and_configurations_are_refused():
         chain.displacement(np.zeros(3))
     with pytest.raises(ChainError, match="not finite"):
         chain.operators_at(np.array([0.0, np.inf]))
+
+
+def test_the_loops_kinematics_load_no_scipy_and_no_opencv():
+    code = (
+        "import sys, stereoservo.kinematics.chain, stereoservo.kinematics.kernels;"
+        "print([m for m in ('scipy.optimize', 'scipy.linalg', 'cv2') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

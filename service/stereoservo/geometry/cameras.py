@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, plane_of_points, to_homogeneous
+from stereoservo.geometry.homogeneous import FloatArray, plane_of_points, to_homogeneous, whitener
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -80,10 +79,13 @@ def reprojection_residuals(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
     return residuals
 
 
-def _check_views(
+def check_views(
     Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels with 0 for missing ones, and weights ``(c, n)`` with 0 for missing ones."""
+    """Pixels ``(c, n, 2)`` with 0 for missing ones, and weights ``(c, n)`` with 0 for missing ones.
+
+    Raises GeometryError on shapes that do not fit and on weights that are not finite or negative.
+    """
     if Ps.ndim != 3 or Ps.shape[1:] != (3, 4) or pixels.ndim != 3 or pixels.shape[::2] != (Ps.shape[0], 2):
         raise GeometryError(
             "shape",
@@ -109,7 +111,7 @@ def triangulate_linear(Ps: FloatArray, pixels: FloatArray, weights: FloatArray |
     ``weights`` (c, n) [1/px] multiply the constraints. NaN rows where fewer than two cameras see a point or
     its rays are one. Raises GeometryError on shapes that do not fit.
     """
-    values, w = _check_views(Ps, pixels, weights)
+    values, w = check_views(Ps, pixels, weights)
     rows = (values[..., None] * Ps[:, None, 2:, :] - Ps[:, None, :2, :]) * w[..., None, None]
     stacked = rows.transpose(1, 0, 2, 3).reshape(values.shape[1], -1, 4)
     scale = np.abs(Ps).max()
@@ -137,7 +139,7 @@ def triangulate(
         if sigmas is None
         else 1.0 / np.broadcast_to(np.asarray(sigmas, dtype=np.float64), pixels.shape[:2])
     )
-    values, w = _check_views(Ps, pixels, weights)
+    values, w = check_views(Ps, pixels, weights)
     # The depth is fixed by eliminating one coordinate k through the first camera's third row.
     third = Ps[0, 2]
     k = int(np.argmax(np.abs(third)))
@@ -336,7 +338,7 @@ def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatAr
         )
     T = isotropic_normaliser(pixels)
     x = to_homogeneous(pixels) @ T.T
-    root = _whitener(M)
+    root = whitener(M)
     X = M @ root.T
     X = X / np.linalg.norm(X, axis=1, keepdims=True)
     zero = np.zeros_like(X)
@@ -357,8 +359,12 @@ def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatAr
 
 
 def _refine_camera(P: FloatArray, M: FloatArray, pixels: FloatArray) -> FloatArray:
+    from scipy.optimize import (
+        least_squares,
+    )  # here, so that the servo process can import cameras without scipy
+
     T = isotropic_normaliser(pixels)
-    root = _whitener(M)
+    root = whitener(M)
     X, x = M @ root.T, from_pixels(T, pixels)
     start = (T @ P @ np.linalg.inv(root)).ravel()
     start = start / np.linalg.norm(start)
@@ -401,12 +407,3 @@ def from_pixels(T: FloatArray, pixels: FloatArray) -> FloatArray:
     """Apply a pixel map ``T`` (3, 3) without perspective to pixels ``(n, 2)``."""
     mapped: FloatArray = pixels @ T[:2, :2].T + T[:2, 2]
     return mapped
-
-
-def _whitener(M: FloatArray) -> FloatArray:
-    """``W`` (4, 4) with unit second moments of ``W M / |M|``; damped, so that flat points stay finite."""
-    unit = M / np.linalg.norm(M, axis=1, keepdims=True)
-    moment = unit.T @ unit / M.shape[0]
-    moment = moment + 1e-12 * np.trace(moment) * np.eye(4)
-    whitener: FloatArray = np.linalg.inv(np.linalg.cholesky(moment))
-    return whitener

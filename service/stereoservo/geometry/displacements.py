@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
 
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
@@ -225,6 +224,10 @@ def nearest_translation_generator(A: FloatArray) -> FloatArray:
 
     Raises GeometryError for A = 0.
     """
+    from scipy.optimize import (
+        brentq,
+    )  # here, so that the servo process can import displacements without scipy
+
     A = _square(A, "generator")
     size = float(np.linalg.norm(A, 2))
     if not size > 0:

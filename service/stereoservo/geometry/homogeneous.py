@@ -154,3 +154,19 @@ def affine_middle(points: FloatArray, plane_at_infinity: FloatArray) -> FloatArr
         )
     middle: FloatArray = (points / heights[:, None]).mean(axis=0)
     return middle
+
+
+def whitener(points: FloatArray) -> FloatArray:
+    """``W`` (4, 4) that gives ``W M / |M|`` of points ``(n, 4)`` unit second moments: the conditioning of
+    linear fits.
+
+    Raises GeometryError where the points are coplanar.
+    """
+    unit = _unit_rows(points)
+    values, vectors = np.linalg.eigh(unit.T @ unit / len(unit))
+    if not values[0] > 1e-14 * values[3]:
+        raise GeometryError(
+            "degenerate", f"the {len(unit)} points are coplanar; spatial ones are needed", moments=values
+        )
+    W: FloatArray = (vectors / np.sqrt(values)).T
+    return W

@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from stereoservo.geometry.cameras import _check_views
+from stereoservo.geometry.cameras import check_views
 from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import FloatArray, whitener
 
 
 def homography_from_basis(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -54,7 +54,7 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
     A, B = A[seen], B[seen]
     if len(A) < 5:
         raise GeometryError("too_few", f"{len(A)} points; a 4x4 homography needs at least 5", points=len(A))
-    W_A, W_B = _whitener(A, "first"), _whitener(B, "second")
+    W_A, W_B = whitener(A), whitener(B)
     a, b = A @ W_A.T, B @ W_B.T
     a = a / np.linalg.norm(a, axis=1, keepdims=True)
     b = b / np.linalg.norm(b, axis=1, keepdims=True)
@@ -86,7 +86,7 @@ def homography_refine(
     Cameras ``(c, 3, 4)``, points ``(n, 4)``, target pixels ``(c, n, 2)`` [px], NaN where missing; ``sigma``
     (c, n) or a number [px]. Raises GeometryError for shapes that do not fit or fewer than 15 coordinates.
     """
-    pixels, weights = _check_views(
+    pixels, weights = check_views(
         Ps, pixels_to, np.broadcast_to(1.0 / np.asarray(sigma), pixels_to.shape[:2])
     )
     measured = 2 * int((weights > 0).sum())
@@ -95,7 +95,7 @@ def homography_refine(
             "too_few", f"{measured} pixel coordinates; 15 parameters need as many", measured=measured
         )
     start = np.asarray(H, dtype=np.float64) / np.linalg.norm(H)
-    W = _whitener(M_from, "first")
+    W = whitener(M_from)
     X = M_from @ W.T
     base = (start @ np.linalg.inv(W)).ravel()
     size = float(np.linalg.norm(base))
@@ -129,13 +129,3 @@ def homography_refine(
         raise GeometryError("degenerate", "the refined homography is singular", determinant=determinant)
     result: FloatArray = refined / (np.linalg.norm(refined) * determinant**0.25)
     return result
-
-
-def _whitener(X: FloatArray, name: str) -> FloatArray:
-    unit = X / np.linalg.norm(X, axis=1, keepdims=True)
-    moment = unit.T @ unit / len(X)
-    values, vectors = np.linalg.eigh(moment)
-    if not values[0] > 1e-14 * values[3]:
-        raise GeometryError("degenerate", f"the points of the {name} set are coplanar", eigenvalues=values)
-    whitener: FloatArray = (vectors / np.sqrt(values)).T
-    return whitener
