@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -173,3 +175,41 @@ def test_kernels_repeat_themselves_to_the_bit():
 
     first = run()
     assert all(run() == first for _ in range(20))
+
+
+def test_pixels_that_are_not_numbers_spoil_their_own_point_only():
+    _, Ps, X = random_scene(4)
+    pixels = cameras.project_many(Ps, X)
+    truth, _ = kernels.triangulate(Ps, pixels, np.ones((2, 6)), 3)
+    pixels[0, 2, 1] = np.nan
+    pixels[1, 4, 0] = np.inf
+    M, ok = kernels.triangulate(Ps, pixels, np.ones((2, 6)), 3)
+    assert ok.tolist() == [True, True, False, True, False, True]
+    assert np.isnan(M[~ok]).all()
+    assert np.array_equal(M[ok], truth[ok])
+
+
+def test_kernels_compile_where_no_cache_directory_is_writable(monkeypatch):
+    njit = kernels.numba.njit
+
+    def without_cache(**options):
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(**options)
+
+    monkeypatch.setattr(kernels.numba, "njit", without_cache)
+
+    def double(x):
+        return 2.0 * x
+
+    with pytest.warns(RuntimeWarning, match="no locator available; compiling at every start"):
+        compiled = kernels.kernel(double)
+    assert compiled(3.0) == 6.0
+    assert compiled.signatures
+
+
+def test_kernels_are_cached_on_disk():
+    rng, _, chain = random_chain(5, ("revolute", "prismatic"))
+    kernels.chain_forward(chain.generators, chain.kind_codes, chain.zero, rng.uniform(-1, 1, 2))
+    assert Path(kernels.chain_forward.stats.cache_path).is_dir()
+    assert list(Path(kernels.chain_forward.stats.cache_path).glob("kernels.chain_forward-*.nbi"))

@@ -200,21 +200,17 @@ def nearest_rotation_generator(A: FloatArray) -> FloatArray:
             f"eigenvalues {values.tolist()} hold no complex pair; a rotation has ±i",
             eigenvalues=values,
         )
-    v = right[:, k]
-    # The row of the inverse eigenvector matrix is the left eigenvector, scaled to wᴴv = 1 and orthogonal to
-    # v̄. With a
-    # kernel that is nearly defective, the inverse is bad but this row is not: take it from the adjoint
-    # problem.
+    # The left eigenvector from the transpose: inverting the eigenvectors fails where the kernel is nearly defective.
     adjoint_values, left = np.linalg.eig(A.T)
-    w = left[:, int(np.argmin(np.abs(adjoint_values - values[k])))]
+    v, w = right[:, k], left[:, int(np.argmin(np.abs(adjoint_values - values[k])))]
     product = w @ v
     if abs(product) < 1e-12:
         raise GeometryError("degenerate", "left and right eigenvectors are orthogonal; the pair is defective")
-    outer = np.outer(v, w) / product
-    # wᵀv̄ vanishes in exact arithmetic; two Newton steps of the projector equation make it so to rounding.
+    G: FloatArray = -2.0 * (np.outer(v, w) / product).imag
+    # x ↦ −x³(5 + 3x²)/2 has ±i and 0 as fixed points of slope zero: rounding is squared away.
     for _ in range(2):
-        outer = outer @ (3.0 * outer - 2.0 * outer @ outer)
-    G: FloatArray = -2.0 * outer.imag
+        square = G @ G
+        G = -0.5 * G @ square @ (5.0 * np.eye(4) + 3.0 * square)
     return G
 
 

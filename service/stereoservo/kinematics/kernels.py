@@ -9,6 +9,7 @@ caller.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -28,8 +29,19 @@ PIVOT_TOLERANCE = 1e-14
 
 
 def kernel(function: _F) -> _F:
-    """Compile for the loop: cached on disk, exact arithmetic, no Python objects."""
-    return cast(_F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    """Compile for the loop: cached on disk, exact arithmetic, no Python objects.
+
+    Numba renews a cached kernel when its own file changes, not when a kernel that it calls changes in another
+    file: after an edit here, touch the callers' files. Where no cache directory is writable the kernel is
+    compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
+    """
+    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
+    try:
+        compiled = numba.njit(cache=True, **options)(function)
+    except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
+        warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=2)
+        compiled = numba.njit(**options)(function)
+    return cast(_F, compiled)
 
 
 @kernel
