@@ -1,0 +1,543 @@
+"""A client of a cell: ten lines to servo an arm. Every call either succeeds or raises; "no reply" means refused."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import re
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from types import TracebackType
+from typing import Any, Literal, Self, TypeVar
+
+import msgspec
+import zenoh
+from zenoh.handlers import RingChannel
+
+from stereoservo.gateway.keys import KeySpace
+from stereoservo.gateway.messages import (
+    ENCODING,
+    CalibrationResult,
+    CellInfo,
+    EventList,
+    EventMessage,
+    FeaturesMessage,
+    Reply,
+    StateMessage,
+    encode,
+)
+from stereoservo.gateway.session import client_config, close_session, open_session
+from stereoservo.runtime.commands import (
+    Calibrate,
+    CancelGoal,
+    Command,
+    Disable,
+    Enable,
+    FeatureTarget,
+    Goal,
+    Hold,
+    Home,
+    Jog,
+    JointTarget,
+    LawName,
+    PointSource,
+    RenewGoal,
+    Reset,
+    Resume,
+    Target,
+    TaughtTarget,
+    Teach,
+)
+from stereoservo.runtime.daemon import find_daemon
+
+POLL_S = 0.01
+ALIVE_EVERY_S = 1.0
+TERMINAL = {
+    "goal_reached": "reached",
+    "goal_aborted": "aborted",
+    "goal_cancelled": "cancelled",
+    "goal_preempted": "preempted",
+}
+
+_T = TypeVar("_T")
+
+
+class ClientError(Exception):
+    """Something that a client asked for did not happen."""
+
+
+class NoReplyError(ClientError):
+    """Nobody answered: the daemon is gone, hangs, or does not let this client ask. Means refused."""
+
+    def __init__(self, key: str, timeout_s: float) -> None:
+        super().__init__(
+            f"no reply on {key} within {timeout_s:g} s: the daemon is gone, hangs, or refuses this client"
+        )
+        self.key = key
+        self.timeout_s = timeout_s
+
+
+class RefusedError(ClientError):
+    """The daemon refused; ``reply`` says why."""
+
+    def __init__(self, what: str, reply: Reply) -> None:
+        why = "; ".join(
+            reply.problems or tuple(reason.hint for reason in reply.reasons if reason.hint != reply.message)
+        )
+        super().__init__(f"{what} refused: {reply.message}" + (f": {why}" if why else ""))
+        self.reply = reply
+
+
+class FailedError(ClientError):
+    """What was accepted ended badly; ``event`` says how."""
+
+    def __init__(self, what: str, event: EventMessage) -> None:
+        super().__init__(f"{what}: {event.kind.replace('_', ' ')}: {event.message}")
+        self.event = event
+
+
+class TimedOutError(ClientError):
+    """What was waited for did not happen in time."""
+
+
+class DaemonLostError(ClientError):
+    """The daemon went away, or another one took its place, while this client waited."""
+
+
+class GoalResult(msgspec.Struct, frozen=True):
+    """How a goal ended."""
+
+    id: str
+    outcome: Literal["reached", "aborted", "cancelled", "preempted"]
+    message: str
+    error_px: float | None
+    reasons: tuple[Any, ...]
+    seconds: float
+
+
+class Client:
+    """A session with the daemon of one cell.
+
+    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this host.
+    Raises NotRunningError, SessionError.
+    """
+
+    def __init__(
+        self, cell: str, *, endpoint: str | None = None, operator: str | None = None, timeout_s: float = 2.0
+    ) -> None:
+        if endpoint is None:
+            info = find_daemon(cell)
+            cell, endpoint = info.cell, info.endpoint
+        self.cell = cell
+        self.operator = _default_operator() if operator is None else operator
+        self.keys = KeySpace(cell)
+        self._goal_key = self.keys.goal(self.operator)
+        self._timeout_s = timeout_s
+        self._session = open_session(client_config(endpoint))
+        self._declared: list[Any] = []
+        self._closed = False
+
+    # -- asking ---------------------------------------------------------------------------------------------
+
+    def _get(self, key: str, payload: bytes = b"", timeout_s: float | None = None) -> bytes:
+        timeout = self._timeout_s if timeout_s is None else timeout_s
+        for reply in self._session.get(key, payload=payload, encoding=ENCODING, timeout=timeout):
+            if reply.ok is not None:
+                return bytes(reply.ok.payload.to_bytes())
+        raise NoReplyError(key, timeout)
+
+    def _ask(self, what: str, key: str, payload: bytes) -> Reply:
+        reply = msgspec.json.decode(self._get(key, payload), type=Reply)
+        if not reply.accepted:
+            raise RefusedError(what, reply)
+        return reply
+
+    def _read(self, key: str, kind: type[_T]) -> _T:
+        data = self._get(key)
+        try:
+            return msgspec.json.decode(data, type=kind)
+        except msgspec.ValidationError as error:
+            reply = msgspec.json.decode(data, type=Reply)
+            raise RefusedError(key.rpartition("/")[2], reply) from error
+
+    def command(self, verb: str, command: Command) -> Reply:
+        """Give a command. Raises RefusedError, NoReplyError."""
+        return self._ask(verb, self.keys.command(verb, self.operator), encode(command))
+
+    def status(self) -> StateMessage:
+        """The newest state."""
+        return self._read(self.keys.state, StateMessage)
+
+    def info(self) -> CellInfo:
+        """Joints, cameras, laws, model and taught goals."""
+        return self._read(self.keys.info, CellInfo)
+
+    def events(self, first: int = 1) -> EventList:
+        """Events from number ``first`` on (a page of them)."""
+        return self._read(f"{self.keys.event}?from={first}", EventList)
+
+    def schema(self, name: str) -> bytes:
+        """The JSON Schema of a message."""
+        return self._get(self.keys.schema(name))
+
+    def stop(self) -> Reply:
+        """Stop the arm. Raises RefusedError where the servo process did not acknowledge it, NoReplyError."""
+        return self._ask("stop", self.keys.stop, b"{}")
+
+    def enable(self, timeout_s: float = 10.0) -> None:
+        """Let the arm move; returns once it is ACTIVE. Raises RefusedError, TimedOutError."""
+        self.command("enable", Enable())
+        self.wait_state(lambda state: state.lifecycle in ("active", "fault"), "active", timeout_s)
+        if self.status().lifecycle == "fault":
+            raise ClientError(
+                "the joint driver failed while it was enabled: "
+                + "; ".join(r.hint for r in self.status().reasons)
+            )
+
+    def disable(self) -> Reply:
+        """Stop the arm and switch its drives off."""
+        return self.command("disable", Disable())
+
+    def hold(self) -> Reply:
+        """Decelerate and hold; the goal is kept."""
+        return self.command("hold", Hold())
+
+    def resume(self) -> Reply:
+        """Go on after hold or stop."""
+        return self.command("resume", Resume())
+
+    def reset(self) -> Reply:
+        """Leave FAULT."""
+        return self.command("reset", Reset())
+
+    def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
+        """Joint velocities for ``lease_s``; call again within it to go on (a dead man's switch)."""
+        return self.command("jog", Jog(dict(velocities), lease_s))
+
+    def cancel(self, goal_id: str) -> Reply:
+        """Cancel a goal."""
+        return self.command("cancel", CancelGoal(goal_id))
+
+    def wait_state(self, wanted: Callable[[StateMessage], bool], what: str, timeout_s: float) -> StateMessage:
+        """Ask for the state until it is as ``wanted``. Raises TimedOutError."""
+        until = time.monotonic() + timeout_s
+        while True:
+            state = self.status()
+            if wanted(state):
+                return state
+            if time.monotonic() > until:
+                raise TimedOutError(f"the cell is {state.lifecycle} and not {what} after {timeout_s:g} s")
+            time.sleep(0.02)
+
+    # -- goals ----------------------------------------------------------------------------------------------
+
+    def goal(
+        self,
+        target: Target | str | Mapping[str, Any],
+        *,
+        law: LawName | None = None,
+        points: PointSource | None = None,
+        gain: float | None = None,
+        tolerance_px: float | None = None,
+        hold_frames: int | None = None,
+        speed_scale: float = 1.0,
+        lease_s: float | None = None,
+        time_limit_s: float | None = None,
+        mode: Literal["preempt", "queue"] = "preempt",
+    ) -> GoalHandle:
+        """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
+
+        A lease is renewed by a thread of this client until the goal has ended or the client is closed.
+        Raises RefusedError with every problem, NoReplyError.
+        """
+        goal = Goal(
+            id=str(uuid.uuid4()), target=as_target(target), law=law, points=points, gain=gain, tolerance_px=tolerance_px,
+            hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease_s, time_limit_s=time_limit_s, mode=mode,
+        )  # fmt: skip
+        return self.send(goal)
+
+    def check(self, goal: Goal) -> Reply:
+        """Whether a goal would be accepted. Raises RefusedError."""
+        return self._ask("goal", self._goal_key, encode(msgspec.structs.replace(goal, check=True)))
+
+    def send(self, goal: Goal) -> GoalHandle:
+        """Send a goal made by the caller."""
+        watch = EventWatch(self)
+        try:
+            self._ask("goal", self._goal_key, encode(goal))
+        except BaseException:
+            watch.close()
+            raise
+        return GoalHandle(self, goal, watch)
+
+    def home(self, speed_scale: float = 1.0) -> GoalHandle:
+        """Move every joint to the cell's home position."""
+        command = Home(str(uuid.uuid4()), speed_scale)
+        watch = EventWatch(self)
+        try:
+            self.command("home", command)
+        except BaseException:
+            watch.close()
+            raise
+        return GoalHandle(self, Goal(command.id, JointTarget({})), watch)
+
+    def teach(self, name: str, frames: int = 20, timeout_s: float = 30.0) -> EventMessage:
+        """Store what the cameras see now as goal ``name``. Raises RefusedError, FailedError."""
+        with EventWatch(self) as watch:
+            reply = self.command("teach", Teach(name, frames))
+            event = watch.wait(
+                lambda e: e.request == reply.request and e.kind in ("taught", "warning"),
+                f"teaching {name!r}",
+                timeout_s,
+            )
+        if event.kind != "taught":
+            raise FailedError(f"teaching {name!r}", event)
+        return event
+
+    def calibrate(
+        self, progress: Callable[[EventMessage], None] | None = None, timeout_s: float = 1800.0
+    ) -> CalibrationResult:
+        """Trial motions, fit, model. ``progress`` hears every event of it. Raises RefusedError, FailedError."""
+        command = Calibrate(str(uuid.uuid4()))
+        ends = ("calibrated", "calibration_failed", "calibration_aborted")
+
+        def wanted(event: EventMessage) -> bool:
+            if event.id != command.id:
+                return False
+            if progress is not None:
+                progress(event)
+            return event.kind in ends
+
+        with EventWatch(self) as watch:
+            self.command("calibrate", command)
+            event = watch.wait(wanted, "calibration", timeout_s)
+        if event.calibration is None:
+            raise FailedError("calibration", event)
+        return event.calibration
+
+    # -- watching -------------------------------------------------------------------------------------------
+
+    def watch(self, *, features: bool = False) -> Iterator[StateMessage | EventMessage | FeaturesMessage]:
+        """Everything the cell publishes, without end; raises DaemonLostError when it goes away."""
+        kinds: list[tuple[str, type[Any], int]] = [
+            (self.keys.event, EventMessage, 1024),
+            (self.keys.state, StateMessage, 16),
+        ]
+        if features:
+            kinds.append((f"{self.keys.prefix}/features/*", FeaturesMessage, 256))
+        subscribers = [
+            (self._session.declare_subscriber(key, RingChannel(size)), kind) for key, kind, size in kinds
+        ]
+        heard = time.monotonic()
+        try:
+            while True:
+                idle = True
+                for subscriber, kind in subscribers:
+                    while (sample := subscriber.try_recv()) is not None:
+                        idle = False
+                        heard = time.monotonic()
+                        yield msgspec.json.decode(sample.payload.to_bytes(), type=kind)
+                if idle:
+                    if time.monotonic() - heard > 2.0:
+                        raise DaemonLostError(f"cell {self.cell!r} has been silent for 2 s")
+                    time.sleep(POLL_S)
+        finally:
+            for subscriber, _ in subscribers:
+                subscriber.undeclare()
+
+    @property
+    def session(self) -> Any:
+        """The zenoh session, for what this class does not do."""
+        return self._session
+
+    def renew(self, goal_id: str) -> None:
+        """Renew the lease of a goal (a put: no reply)."""
+        self._session.put(self._goal_key, encode(RenewGoal(goal_id)), encoding=ENCODING)
+
+    def close(self) -> None:
+        """Close the session. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            close_session(self._session, self._declared)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class EventWatch:
+    """Events from now on, in order and without gaps: what a subscription lost is asked for."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._subscriber = client.session.declare_subscriber(client.keys.event, RingChannel(1024))
+        state = client.status()
+        self._boot = state.boot
+        self._next = client.events(1 << 60).next
+        self._alive = time.monotonic()
+
+    def poll(self) -> list[EventMessage]:
+        """What happened since the last poll. Raises DaemonLostError."""
+        found: list[EventMessage] = []
+        while (sample := self._subscriber.try_recv()) is not None:
+            event = msgspec.json.decode(sample.payload.to_bytes(), type=EventMessage)
+            if event.boot != self._boot:
+                raise DaemonLostError(
+                    f"the gateway of cell {self._client.cell!r} was started anew; ask for the state"
+                )
+            if event.seq > self._next:
+                self._fill(found, event.seq)
+            if event.seq == self._next:
+                found.append(event)
+                self._next += 1
+        if found:
+            self._alive = time.monotonic()
+        elif time.monotonic() - self._alive > ALIVE_EVERY_S:
+            self._check()
+            self._fill(found, 1 << 60)
+        return found
+
+    def _fill(self, found: list[EventMessage], before: int) -> None:
+        while self._next < before:
+            page = self._client.events(self._next)
+            if page.first > self._next:
+                raise DaemonLostError(f"events {self._next} to {page.first - 1} are no longer kept")
+            some = [event for event in page.events if event.seq < before]
+            if not some:
+                return
+            found.extend(some)
+            self._next = some[-1].seq + 1
+
+    def _check(self) -> None:
+        try:
+            boot = self._client.status().boot
+        except NoReplyError as error:
+            raise DaemonLostError(f"the daemon of cell {self._client.cell!r} no longer answers") from error
+        if boot != self._boot:
+            raise DaemonLostError(
+                f"the gateway of cell {self._client.cell!r} was started anew; ask for the state"
+            )
+        self._alive = time.monotonic()
+
+    def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:
+        """Wait for an event. Raises TimedOutError, DaemonLostError."""
+        until = time.monotonic() + timeout_s
+        while True:
+            for event in self.poll():
+                if wanted(event):
+                    return event
+            if time.monotonic() > until:
+                raise TimedOutError(f"{what}: nothing within {timeout_s:g} s")
+            time.sleep(POLL_S)
+
+    def close(self) -> None:
+        """End the subscription. Idempotent."""
+        if self._subscriber is not None:
+            self._subscriber.undeclare()
+            self._subscriber = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class GoalHandle:
+    """A goal that was accepted. As a context manager it cancels the goal when left before its end."""
+
+    def __init__(self, client: Client, goal: Goal, watch: EventWatch) -> None:
+        self.id = goal.id
+        self._client = client
+        self._watch = watch
+        self._started = time.monotonic()
+        self._result: GoalResult | None = None
+        self._ended = threading.Event()
+        if goal.lease_s is not None:
+            self._renewal = threading.Thread(
+                target=self._renew, args=(goal.lease_s / 3.0,), name=f"lease {goal.id}", daemon=True
+            )
+            self._renewal.start()
+
+    def _renew(self, every_s: float) -> None:
+        while not self._ended.wait(every_s):
+            try:
+                self._client.renew(self.id)
+            except zenoh.ZError:  # the session is closed: the lease runs out, as it should
+                return
+
+    def wait(self, timeout_s: float = 600.0) -> GoalResult:
+        """Wait for its terminal event. Raises TimedOutError (the goal goes on), DaemonLostError."""
+        if self._result is None:
+            event = self._watch.wait(
+                lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
+            )
+            self._end()
+            outcome: Any = TERMINAL[event.kind]
+            self._result = GoalResult(
+                self.id,
+                outcome,
+                event.message,
+                event.error_px,
+                event.reasons,
+                time.monotonic() - self._started,
+            )
+        return self._result
+
+    def reached(self, timeout_s: float = 600.0) -> GoalResult:
+        """Like :meth:`wait`, and raises ClientError unless the goal was reached."""
+        result = self.wait(timeout_s)
+        if result.outcome != "reached":
+            raise ClientError(f"goal {self.id} was {result.outcome}: {result.message}")
+        return result
+
+    def cancel(self) -> None:
+        """Cancel it."""
+        self._client.cancel(self.id)
+
+    def abandon(self) -> None:
+        """Stop renewing and watching; the goal goes on until its lease or time limit ends."""
+        self._end()
+
+    def _end(self) -> None:
+        self._ended.set()
+        self._watch.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._result is None and not self._ended.is_set():
+            self._end()
+            self.cancel()
+
+
+def as_target(target: Target | str | Mapping[str, Any]) -> Target:
+    """What a target may be short for: a taught goal's name, positions by joint, set-points by camera."""
+    if isinstance(target, str):
+        return TaughtTarget(target)
+    if isinstance(target, Mapping):
+        if all(isinstance(value, Mapping) for value in target.values()) and target:
+            return FeatureTarget(
+                {
+                    camera: {int(marker): (float(u), float(v)) for marker, (u, v) in points.items()}
+                    for camera, points in target.items()
+                }
+            )
+        return JointTarget({str(name): float(value) for name, value in target.items()})
+    return target
+
+
+def _default_operator() -> str:
+    name = re.sub(r"[^A-Za-z0-9_-]", "", getpass.getuser())[:40] or "user"
+    return f"{name}-{os.getpid()}"

@@ -1,0 +1,295 @@
+"""Messages on the wire: JSON by msgspec structs; strict at the daemon's intake, tolerant at readers (DESIGN 5)."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, TypeVar
+
+import msgspec
+
+from stereoservo.control.reasons import Reason
+from stereoservo.runtime.commands import (
+    Calibrate,
+    CancelGoal,
+    Command,
+    Disable,
+    Enable,
+    Goal,
+    Hold,
+    Home,
+    Jog,
+    RenewGoal,
+    Reset,
+    Resume,
+    Teach,
+)
+
+ENCODING = "application/json"
+MAX_PAYLOAD_BYTES = 65_536
+
+_T = TypeVar("_T")
+_NOT_FINITE = re.compile(rb"(?<![\w\"])(-?NaN|[+-]?Infinity|-?inf|nan)(?![\w\"])")
+
+COMMANDS: dict[str, type[Command]] = {
+    "enable": Enable,
+    "disable": Disable,
+    "hold": Hold,
+    "resume": Resume,
+    "reset": Reset,
+    "jog": Jog,
+    "home": Home,
+    "calibrate": Calibrate,
+    "teach": Teach,
+    "cancel": CancelGoal,
+    "renew": RenewGoal,
+}
+"""What the payload of ``command/<verb>/<operator>`` decodes into; the ``command`` tag may be left out."""
+
+
+class MessageError(ValueError):
+    """A message cannot be sent or taken: names the place in it, the value and what would have been valid."""
+
+
+class JointInfo(msgspec.Struct, frozen=True):
+    """A joint of the cell; limits [rad or m, s]."""
+
+    name: str
+    kind: str
+    position_min: float
+    position_max: float
+    velocity_max: float
+
+
+class CameraInfo(msgspec.Struct, frozen=True):
+    """A camera of the cell; size [px]."""
+
+    name: str
+    width: int
+    height: int
+    rate_hz: float
+    mount: str
+    marker_ids: tuple[int, ...]
+
+
+class ModelInfo(msgspec.Struct, frozen=True):
+    """The model in use."""
+
+    epoch: int
+    stratum: str
+    marker_ids: tuple[int, ...]
+    created: str
+    rms_px: float | None = None
+    path: str = ""
+
+
+class TaughtInfo(msgspec.Struct, frozen=True):
+    """A taught goal and the model it was taught with."""
+
+    name: str
+    model_epoch: int
+    created: str
+
+
+class CellInfo(msgspec.Struct, frozen=True):
+    """What does not change from step to step; ``get …/info``."""
+
+    cell: str
+    version: str
+    boot: str
+    joints: tuple[JointInfo, ...]
+    cameras: tuple[CameraInfo, ...]
+    laws: tuple[str, ...]
+    law: str
+    tolerance_px: float
+    model: ModelInfo | None = None
+    taught: tuple[TaughtInfo, ...] = ()
+    can_calibrate: bool = False
+    can_home: bool = False
+    dry_run: bool = False
+    commissioning: bool = False
+    recording: str = ""
+
+
+class LoopInfo(msgspec.Struct, frozen=True):
+    """Statistics of the servo loop since its start; lateness and work [us]."""
+
+    rate_hz: float
+    cycles: int
+    overruns: int
+    skipped: int
+    lateness_us: dict[str, float]
+    work_us: dict[str, float]
+    records_dropped: int = 0
+
+
+class StateMessage(msgspec.Struct, frozen=True):
+    """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970]."""
+
+    cell: str
+    boot: str
+    t_ns: int
+    t_wall: float
+    lifecycle: str
+    model: str
+    model_epoch: int
+    source: str
+    goal: str
+    law: str
+    level: str
+    reasons: tuple[Reason, ...]
+    joints: dict[str, float]
+    velocities: dict[str, float]
+    command: dict[str, float]
+    error_px: float | None
+    task_error: tuple[float, ...]
+    innovation_px: dict[str, float]
+    visible: dict[str, int]
+    loop: LoopInfo
+    driver_active: bool = False
+    servo_alive: bool = True
+    dry_run: bool = False
+    differences: tuple[str, ...] = ()
+    last_event: int = 0
+
+
+class FeaturesMessage(msgspec.Struct, frozen=True):
+    """Markers of one frame: pixels (u, v) [px], integer = pixel centre; ``sigmas`` [px] of one axis."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_received_ns: int
+    t_wall: float
+    ids: tuple[int, ...]
+    pixels: tuple[tuple[float, float], ...]
+    sigmas: tuple[float, ...]
+
+
+class CalibrationResult(msgspec.Struct, frozen=True):
+    """What a calibration gave. ``covariance_ok``: the residuals are what the measurement noise explains (chi-square)."""
+
+    rms_px: float
+    per_joint_px: dict[str, float]
+    covariance_ok: bool
+    model: str
+    epoch: int
+    stratum: str
+    chi2: float
+    degrees_of_freedom: int
+    measurements: int
+    parameters: int
+    outliers: int
+    joints: int
+    images: int
+    seconds: float
+
+
+class EventMessage(msgspec.Struct, frozen=True):
+    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal it speaks of."""
+
+    seq: int
+    boot: str
+    t_ns: int
+    t_wall: float
+    kind: str
+    message: str = ""
+    id: str = ""
+    request: int = -1
+    operator: str = ""
+    accepted: bool | None = None
+    reasons: tuple[Reason, ...] = ()
+    name: str = ""
+    error_px: float | None = None
+    progress: float | None = None
+    origin: str = "core"
+    calibration: CalibrationResult | None = None
+
+
+class EventList(msgspec.Struct, frozen=True):
+    """Answer to ``get …/event?from=N``: at most a few hundred; ``next`` is where to go on, ``first`` the oldest kept."""
+
+    boot: str
+    first: int
+    next: int
+    events: tuple[EventMessage, ...]
+
+
+class Reply(msgspec.Struct, frozen=True):
+    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message itself."""
+
+    accepted: bool
+    message: str = ""
+    id: str = ""
+    request: int = -1
+    reasons: tuple[Reason, ...] = ()
+    problems: tuple[str, ...] = ()
+    boot: str = ""
+
+
+SCHEMAS: dict[str, Any] = {
+    "goal": Goal,
+    "state": StateMessage,
+    "event": EventMessage,
+    "events": EventList,
+    "features": FeaturesMessage,
+    "info": CellInfo,
+    "reply": Reply,
+    **{f"command-{verb}": kind for verb, kind in COMMANDS.items()},
+}
+
+
+def schema(name: str) -> bytes:
+    """The JSON Schema of a message as JSON. Raises MessageError with the names there are."""
+    kind = SCHEMAS.get(name)
+    if kind is None:
+        raise MessageError(f"no schema {name!r}; there are: {', '.join(SCHEMAS)}")
+    return msgspec.json.encode(msgspec.json.schema(kind))
+
+
+def encode(message: Any) -> bytes:
+    """A message as JSON. Raises MessageError for a number that is not finite (JSON would turn it into null)."""
+    tree = msgspec.to_builtins(message)
+    require_finite(tree)
+    return msgspec.json.encode(tree)
+
+
+def require_finite(tree: Any, where: str = "") -> None:
+    """Raises MessageError naming the place of the first number that is not finite."""
+    if isinstance(tree, float):
+        if not math.isfinite(tree):
+            raise MessageError(f"{where or 'value'} is {tree}; finite numbers are valid")
+    elif isinstance(tree, dict):
+        for key, value in tree.items():
+            require_finite(value, f"{where}.{key}" if where else str(key))
+    elif isinstance(tree, list | tuple):
+        for index, value in enumerate(tree):
+            require_finite(value, f"{where}[{index}]")
+
+
+def decode(data: bytes, kind: type[_T]) -> _T:
+    """Take a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do not.
+
+    Raises MessageError: too large, not JSON, a number that is not finite, a field that does not fit.
+    """
+    if len(data) > MAX_PAYLOAD_BYTES:
+        raise MessageError(f"payload of {len(data)} bytes; at most {MAX_PAYLOAD_BYTES} are taken")
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.ValidationError as error:
+        text, _, where = str(error).partition(" - at `")
+        place = where.rstrip("`").removeprefix("$").lstrip(".")
+        raise MessageError(f"{place}: {text}" if place else text) from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        if match := _NOT_FINITE.search(data):
+            raise MessageError(
+                f"{match[0].decode()} is not a JSON number; finite numbers are valid"
+            ) from error
+        raise MessageError(f"payload is not JSON: {error}") from error
+
+
+def decode_command(verb: str, data: bytes) -> Command:
+    """The payload of ``command/<verb>``; an empty one stands for ``{}``. Raises MessageError."""
+    kind: Any = COMMANDS[verb]
+    command: Command = decode(data or b"{}", kind)
+    return command

@@ -1,0 +1,549 @@
+"""The gateway process: zenoh on one side, the servo process on the other; recorder, journal, taught goals, models, fits.
+
+Nothing that the arm waits for runs here; its silence means hold.
+``python -m stereoservo.gateway.process RUNTIME_DIRECTORY PARENT_PID``.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zenoh
+from zenoh.handlers import RingChannel
+
+import stereoservo
+from stereoservo.gateway.fitting import Fit, FitFailedError, calibration_result
+from stereoservo.gateway.intake import Intake
+from stereoservo.gateway.keys import VERBS, InvalidKeyError, KeySpace
+from stereoservo.gateway.messages import (
+    CalibrationResult,
+    CameraInfo,
+    CellInfo,
+    JointInfo,
+    MessageError,
+    ModelInfo,
+    Reply,
+    StateMessage,
+    TaughtInfo,
+    encode,
+    schema,
+)
+from stereoservo.gateway.publisher import (
+    SILENT,
+    EventLog,
+    Publishers,
+    ReplyThread,
+    features_message,
+    state_message,
+)
+from stereoservo.gateway.servolink import ServoLink
+from stereoservo.gateway.session import (
+    SessionError,
+    client_config,
+    close_session,
+    endpoint_of,
+    open_session,
+    router_config,
+)
+from stereoservo.gateway.stores import Journal, ModelStore, StoreError, TaughtStore
+from stereoservo.gateway.validation import GoalContext
+from stereoservo.kinematics.calibration.trials import CalibrationError
+from stereoservo.kinematics.model import CellModel, ModelFileError
+from stereoservo.runtime.calibration_job import CalibrationJob
+from stereoservo.runtime.channel import ChannelServer
+from stereoservo.runtime.commands import LAWS
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.daemon import DaemonInfo
+from stereoservo.runtime.directories import DirectoryError
+from stereoservo.runtime.handover import SlotError, SlotReader, StopSlot
+from stereoservo.runtime.interprocess import (
+    OBSERVATION_LAYOUT,
+    PlanError,
+    RecordedCheckpoint,
+    RecordedStep,
+    RecordingStart,
+    RunPlan,
+    load_plan,
+    observation_decoder,
+    report_decoder,
+)
+from stereoservo.runtime.lifeline import Termination, die_with_parent, say
+from stereoservo.runtime.recorder import FlightRecorder
+
+STATE_EVERY_S = 0.05
+IDLE_S = 0.003
+STOP_POLL_S = 0.002
+ACKNOWLEDGE_S = 0.1
+SERVO_STALE_S = 0.5
+DRAIN = 32
+EXIT_SETUP = 3
+
+
+class StopThread:
+    """Takes stops and enables on a session of its own, so that no flood on other keys delays them."""
+
+    def __init__(self, endpoint: str, keys: KeySpace, plan: RunPlan, boot: str) -> None:
+        self._session = open_session(client_config(endpoint))
+        self._slot = StopSlot(plan.directories.stop_slot)
+        self._boot = boot
+        self._stops = self._session.declare_queryable(keys.stop, RingChannel(16), complete=True)
+        self._puts = self._session.declare_subscriber(keys.stop, RingChannel(16))
+        self._enables = self._session.declare_queryable(
+            keys.any_command("enable"), RingChannel(16), complete=True
+        )
+        self._replies = ReplyThread()
+        self.enables: deque[Any] = deque(maxlen=16)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="stop", daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            try:
+                while self._puts.try_recv() is not None:
+                    self._slot.raise_stop()
+                while (query := self._stops.try_recv()) is not None:
+                    self._stop(query)
+                while (query := self._enables.try_recv()) is not None:
+                    self.enables.append(query)
+            except zenoh.ZError:  # closed under our hands at the end
+                return
+            self._ending.wait(STOP_POLL_S)
+
+    def _stop(self, query: Any) -> None:
+        word = self._slot.raise_stop()
+        until = time.monotonic() + ACKNOWLEDGE_S
+        while not self._slot.acknowledged(word) and time.monotonic() < until:
+            time.sleep(0.001)
+        seen = self._slot.acknowledged(word)
+        text = (
+            "the servo process has taken the stop"
+            if seen
+            else "the stop is raised; the servo process has not taken it yet"
+        )
+        self._replies.reply(query, encode(Reply(accepted=seen, message=text, boot=self._boot)))
+
+    def close(self) -> None:
+        """End the thread, close the session."""
+        self._ending.set()
+        self._thread.join(1.0)
+        self._replies.close()
+        close_session(self._session, [self._stops, self._puts, self._enables])
+        self._slot.close()
+
+
+class Gateway:
+    """All that the gateway process holds; ``turn`` is one pass of its loop."""
+
+    def __init__(self, plan: RunPlan) -> None:
+        self.plan = plan
+        self.settings = plan.settings()
+        directories = plan.directories
+        self.boot = f"{plan.boot}-{os.getpid()}"
+        cell_dir = Path(plan.cell_path).parent
+        self._taught = TaughtStore(directories.taught)
+        self._models = ModelStore(directories.models)
+        self._model: CellModel | None = None
+        self._journal = Journal(directories.journal)
+        self.keys = KeySpace(plan.cell.cell.name)
+        cameras = tuple(camera.name for camera in plan.cameras)
+        self._session = open_session(router_config(plan.cell, cell_dir, directories.zenoh_socket))
+        self.endpoint = endpoint_of(plan.cell, directories.zenoh_socket)
+        self._publishers = Publishers(self._session, self.keys, cameras)
+        self.log = EventLog(self.boot, self._publish_event)
+        self._link = ServoLink(directories, records=bool(plan.record))
+        self._replies = ReplyThread()
+        self._intake = Intake(
+            self.keys, self._link, self._replies, self.log, self._context, self._taught, self.boot
+        )
+        self._reports = ChannelServer(directories.reports_socket)
+        self._observations = [
+            SlotReader(directories.observation_slot(name), OBSERVATION_LAYOUT) for name in cameras
+        ]
+        self._declare()
+        self._stop = StopThread(self.endpoint, self.keys, plan, self.boot)
+        self._state: StateMessage | None = None
+        self._state_heard = 0.0
+        self._state_sent = 0.0
+        self._job = CalibrationJob(self.settings)
+        self._fit: Fit | None = None
+        self._result: CalibrationResult | None = None
+        self._recorder: FlightRecorder | None = None
+        self._recording = ""
+        self._handled_path = directories.runtime / "handled"
+        self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
+        self._greeted = False
+
+    def _declare(self) -> None:
+        session, keys = self._session, self.keys
+        self._goal_puts = session.declare_subscriber(keys.any_goal, RingChannel(64))
+        self._goal_queries = session.declare_queryable(keys.any_goal, RingChannel(64))
+        self._command_queries = [
+            session.declare_queryable(keys.any_command(verb), RingChannel(32))
+            for verb in VERBS
+            if verb != "enable"
+        ]
+        self._event_queries = session.declare_queryable(keys.event, RingChannel(32))
+        self._state_queries = session.declare_queryable(keys.state, RingChannel(32))
+        self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
+        self._schema_queries = session.declare_queryable(keys.any_schema, RingChannel(32))
+        self._alive = session.liveliness().declare_token(keys.alive)
+
+    def _publish_event(self, payload: bytes) -> None:
+        self._journal.add(payload)
+        self._publishers.event.put(payload)
+
+    def _context(self) -> GoalContext:
+        markers = None if self._model is None else self._model.marker_ids
+        return GoalContext(self.settings, self._taught.names, markers)
+
+    # -- the loop -------------------------------------------------------------------------------------------
+
+    def turn(self) -> bool:
+        """One pass; whether there was anything to do."""
+        self._link.keep()
+        if self._link.connected and not self._greeted:
+            self._greeted = True
+            self._load_model()
+        busy = False
+        for event in self._link.events():
+            busy = True
+            self._core_event(event)
+        busy |= self._queries()
+        self._intake.expire()
+        self._tell_features()
+        self._tell_state()
+        self._take_reports()
+        self._record()
+        self._follow_fit()
+        return busy
+
+    def _queries(self) -> bool:
+        busy = False
+        for source, take in (
+            (self._goal_puts, self._intake.goal_sample),
+            (self._goal_queries, self._intake.goal_query),
+            *((queryable, self._intake.command_query) for queryable in self._command_queries),
+            (self._event_queries, self._answer_events),
+            (self._state_queries, self._answer_state),
+            (self._info_queries, self._answer_info),
+            (self._schema_queries, self._answer_schema),
+        ):
+            for _ in range(DRAIN):
+                item = source.try_recv()
+                if item is None:
+                    break
+                busy = True
+                take(item)
+        while self._stop.enables:
+            self._intake.command_query(self._stop.enables.popleft())
+        return busy
+
+    def _answer_events(self, query: Any) -> None:
+        given = str(query.parameters)
+        number = dict(part.split("=", 1) for part in given.split(";") if "=" in part).get("from", "1")
+        if not number.isdigit():
+            problem = f"from={number}: a number is valid, 1 to {self.log.last + 1}"
+            self._replies.reply(
+                query, encode(Reply(False, "the query is not valid", problems=(problem,), boot=self.boot))
+            )
+            return
+        self._replies.reply(query, encode(self.log.since(int(number))))
+
+    def _answer_state(self, query: Any) -> None:
+        if self._state is None:
+            self._replies.reply(
+                query, encode(Reply(False, "the servo process has shown no state yet", boot=self.boot))
+            )
+        else:
+            self._replies.reply(query, encode(self._state))
+
+    def _answer_info(self, query: Any) -> None:
+        self._replies.reply(query, encode(self.info()))
+
+    def _answer_schema(self, query: Any) -> None:
+        try:
+            payload = schema(self.keys.schema_of(str(query.key_expr)))
+        except (MessageError, InvalidKeyError) as error:
+            payload = encode(Reply(False, "there is no such schema", problems=(str(error),), boot=self.boot))
+        self._replies.reply(query, payload)
+
+    def info(self) -> CellInfo:
+        """What the cell is."""
+        settings, plan = self.settings, self.plan
+        limits = settings.limits
+        model = self._model
+        return CellInfo(
+            cell=settings.cell,
+            version=stereoservo.__version__,
+            boot=self.boot,
+            joints=tuple(
+                JointInfo(
+                    name, kind, float(limits.position_min[i]), float(limits.position_max[i]), float(limits.velocity_max[i])
+                )
+                for i, (name, kind) in enumerate(zip(settings.joint_names, settings.joint_kinds, strict=True))
+            ),
+            cameras=tuple(
+                CameraInfo(camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids)
+                for camera in settings.cameras
+            ),
+            laws=LAWS,
+            law=settings.law,
+            tolerance_px=settings.tolerance_px,
+            model=None
+            if model is None
+            else ModelInfo(
+                model.epoch, model.stratum, model.marker_ids, model.created,
+                None if model.statistics is None else model.statistics.rms_px, str(self._models.path(model.epoch)),
+            ),
+            taught=tuple(TaughtInfo(g.name, g.model_epoch, g.created) for _, g in sorted(self._taught.goals.items())),
+            can_calibrate=settings.trials is not None,
+            can_home=settings.home is not None,
+            dry_run=plan.dry_run,
+            commissioning=plan.commissioning,
+            recording=self._recording,
+        )  # fmt: skip
+
+    # -- what the core says ---------------------------------------------------------------------------------
+
+    def _core_event(self, event: Event) -> None:
+        self._job.add(event)
+        if event.kind == "reply":
+            self._intake.core_reply(event)
+        if event.kind in SILENT:
+            return
+        fresh = event.seq > self._handled
+        if event.kind == "taught" and fresh:
+            self._store_taught(event)
+        self.log.add_core(event)
+        if event.kind == "calibration_finished" and fresh:
+            self._start_fit()
+        elif event.kind == "model" and self._result is not None:
+            result, self._result = self._result, None
+            self.log.add(
+                "calibrated", message=f"model epoch {result.epoch}: {result.rms_px:.3f} px rms", id=self._job.id,
+                calibration=result, origin="gateway",
+            )  # fmt: skip
+        elif (
+            event.kind == "warning" and event.message.startswith("model refused") and self._result is not None
+        ):
+            self._result = None
+            self._calibration_failed(event.message)
+        if event.kind in ("taught", "calibration_finished"):
+            # A restarted gateway is sent the servo process's events again and must not do these twice.
+            self._handled = max(self._handled, event.seq)
+            self._handled_path.write_text(str(self._handled))
+
+    def _store_taught(self, event: Event) -> None:
+        epoch = 0 if self._model is None else self._model.epoch
+        try:
+            self._taught.add(event, self.settings, epoch, _now())
+        except OSError as error:
+            self.log.add(
+                "warning",
+                message=f"taught goal {event.name!r} is not saved: {error}",
+                name=event.name,
+                origin="gateway",
+            )
+
+    # -- models ---------------------------------------------------------------------------------------------
+
+    def _load_model(self) -> None:
+        model, passed = self._models.newest_fitting(self.settings)
+        for text in passed:
+            self.log.add("warning", message=f"model passed over: {text}", origin="gateway")
+        if model is not None and self._link.give_model(model):
+            self._model = model
+
+    def _start_fit(self) -> None:
+        if self._fit is not None:
+            self._fit.cancel()
+        try:
+            epoch = self._models.next_epoch()
+            self._fit = Fit(self._job.trials(), self._models.path(epoch), epoch, self.plan.directories.models)
+        except (CalibrationError, OSError) as error:
+            self._calibration_failed(str(error))
+            return
+        self.log.add(
+            "fit_started", message=f"{self._job.stops} stops", id=self._job.id, progress=0.0, origin="gateway"
+        )
+
+    def _follow_fit(self) -> None:
+        if self._fit is None:
+            return
+        for step in self._fit.poll():
+            self.log.add(
+                "fit_progress",
+                message=step.message,
+                id=self._job.id,
+                progress=step.progress,
+                origin="gateway",
+            )
+        if not self._fit.ended:
+            return
+        fit, self._fit = self._fit, None
+        try:
+            model, seconds = fit.result()
+            result = calibration_result(model, fit.model_path, seconds)
+        except (FitFailedError, ModelFileError) as error:
+            self._calibration_failed(str(error))
+            return
+        if not self._link.give_model(model):
+            self._calibration_failed(
+                f"the servo process does not take the model; it is saved as {fit.model_path}"
+            )
+            return
+        self._model, self._result = model, result
+
+    def _calibration_failed(self, message: str) -> None:
+        self.log.add("calibration_failed", message=message, id=self._job.id, origin="gateway")
+
+    # -- telling --------------------------------------------------------------------------------------------
+
+    def _tell_features(self) -> None:
+        for reader in self._observations:
+            data = reader.poll()
+            if data is None:
+                continue
+            observation = observation_decoder.decode(data)
+            try:
+                payload = encode(features_message(observation))
+            except MessageError as error:
+                say("gateway", str(error))
+                continue
+            self._publishers.features[observation.camera].put(payload)
+
+    def _tell_state(self) -> None:
+        now = time.monotonic()
+        state = self._link.state()
+        if state is not None:
+            self._state_heard = now
+            self._state = state_message(
+                self.plan, self.boot, state, servo_alive=True, last_event=self.log.last
+            )
+        if self._state is None or now - self._state_sent < STATE_EVERY_S:
+            return
+        if self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
+            self._state = msgspec.structs.replace(self._state, servo_alive=False)
+        self._state_sent = now
+        self._publishers.state.put(encode(self._state))
+
+    def _take_reports(self) -> None:
+        self._reports.accept()
+        for peer in self._reports.peers:
+            for data in peer.receive():
+                report = report_decoder.decode(data)
+                self.log.add(
+                    report.kind,
+                    t_ns=report.t_ns,
+                    message=report.message,
+                    name=report.origin,
+                    origin=report.origin,
+                )
+
+    def _record(self) -> None:
+        for item in self._link.steps():
+            if isinstance(item, RecordingStart):
+                if self._recorder is not None:
+                    self._recorder.close()
+                path = self._recording_path()
+                self._recorder = FlightRecorder(path, item.settings, item.fingerprint)
+                self._recording = str(path)
+                self.log.add("recording", message=str(path), origin="gateway")
+            elif self._recorder is None:
+                continue
+            elif isinstance(item, RecordedCheckpoint):
+                if item.lost:
+                    self._recorder.gap(item.lost, item.t_ns)
+                self._recorder.checkpoint(item.step, item.state, item.t_ns)
+            else:
+                assert isinstance(item, RecordedStep)
+                self._recorder.step(item.data, item.t_ns)
+
+    def _recording_path(self) -> Path:
+        if self.plan.record != "auto":
+            wanted = Path(self.plan.record)
+            return wanted if not self._recording else wanted.with_stem(f"{wanted.stem}-{os.getpid()}")
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        return self.plan.directories.recordings / f"{self.settings.cell}-{stamp}.mcap"
+
+    # -- life -----------------------------------------------------------------------------------------------
+
+    def announce(self) -> None:
+        """Say that the daemon is up: ``daemon.json``."""
+        plan = self.plan
+        info = DaemonInfo(
+            cell=plan.cell.cell.name, endpoint=self.endpoint, boot=self.boot, pid=os.getppid(), cell_path=plan.cell_path,
+            dry_run=plan.dry_run, commissioning=plan.commissioning,
+        )  # fmt: skip
+        path = plan.directories.daemon
+        temporary = path.with_suffix(".new")
+        temporary.write_bytes(encode(info))
+        temporary.replace(path)
+
+    def close(self) -> None:
+        """Finish the recording, end the fit, close the sessions within a time limit."""
+        if self._fit is not None:
+            self._fit.cancel()
+        if self._recorder is not None:
+            for _ in range(20):
+                self._record()
+            self._recorder.close()
+        with suppress(zenoh.ZError):  # telling is good manners, not needed
+            self.log.add("daemon_ends", message="the daemon ends", origin="gateway")
+        self._replies.close()
+        self._stop.close()
+        declared = [
+            self._alive, self._goal_puts, self._goal_queries, *self._command_queries, self._event_queries,
+            self._state_queries, self._info_queries, self._schema_queries, *self._publishers.all,
+        ]  # fmt: skip
+        close_session(self._session, declared)
+        self._link.close()
+        self._reports.close()
+        self._journal.close()
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def run(plan: RunPlan, termination: Termination) -> None:
+    """Run until asked to end."""
+    gateway = Gateway(plan)
+    try:
+        gateway.announce()
+        while not termination.asked:
+            if not gateway.turn():
+                time.sleep(IDLE_S)
+    finally:
+        gateway.close()
+
+
+def main() -> int:
+    """Entry of the process."""
+    runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
+    die_with_parent(parent, signal.SIGTERM)
+    termination = Termination(grace_s=8.0)
+    try:
+        run(load_plan(runtime), termination)
+    except (DirectoryError, OSError, PlanError, SessionError, SlotError, StoreError) as error:
+        say("gateway", str(error))
+        return EXIT_SETUP
+    return 0
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # a hung client may still hold a zenoh thread

@@ -1,0 +1,198 @@
+"""What the gateway publishes: state, features and numbered events, and the replies, each from where it may block."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from stereoservo.gateway.keys import KeySpace
+from stereoservo.gateway.messages import (
+    ENCODING,
+    EventList,
+    EventMessage,
+    FeaturesMessage,
+    LoopInfo,
+    MessageError,
+    StateMessage,
+    encode,
+)
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.interprocess import RunPlan, ServoState
+from stereoservo.runtime.lifeline import say
+from stereoservo.runtime.ports import CameraObservation
+
+KEPT_EVENTS = 10_000
+EVENTS_A_REPLY = 300
+SILENT = frozenset({"reply"})
+"""Core events that are answers, not news."""
+
+
+class ReplyThread:
+    """Replies leave from here: a client that hangs may block a reply, and must not block the gateway."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[tuple[Any, str, bytes] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="replies", daemon=True)
+        self._thread.start()
+
+    def reply(self, query: Any, payload: bytes) -> None:
+        """Answer ``query`` and let it go."""
+        self._queue.put((query, str(query.key_expr), payload))
+
+    def _work(self) -> None:
+        while (item := self._queue.get()) is not None:
+            query, key, payload = item
+            try:
+                with query:
+                    query.reply(key, payload, encoding=ENCODING)
+            except zenoh.ZError as error:
+                say("gateway", f"a reply on {key} could not be sent: {error}")
+
+    def close(self) -> None:
+        """Send what waits, within a second, and end."""
+        self._queue.put(None)
+        self._thread.join(1.0)
+
+
+class EventLog:
+    """Numbers events per boot, keeps the last ones, publishes each."""
+
+    def __init__(self, boot: str, publish: Callable[[bytes], None]) -> None:
+        self._boot = boot
+        self._publish = publish
+        self._kept: deque[EventMessage] = deque(maxlen=KEPT_EVENTS)
+        self.last = 0
+
+    def add(self, kind: str, *, t_ns: int | None = None, **fields: Any) -> EventMessage:
+        """Publish an event of the gateway's own, or of another process."""
+        self.last += 1
+        now_ns = time.monotonic_ns()
+        stamp = now_ns if t_ns is None else t_ns
+        message = EventMessage(
+            seq=self.last,
+            boot=self._boot,
+            t_ns=stamp,
+            t_wall=time.time() - (now_ns - stamp) * 1e-9,
+            kind=kind,
+            **fields,
+        )
+        self._kept.append(message)
+        self._publish(encode(message))
+        return message
+
+    def add_core(self, event: Event, kind: str = "", operator: str = "") -> EventMessage:
+        """Publish an event of the core."""
+        return self.add(
+            kind or event.kind,
+            t_ns=event.t_ns,
+            message=event.message,
+            id=event.id,
+            request=event.request,
+            operator=operator,
+            accepted=event.accepted,
+            reasons=event.reasons,
+            name=event.name,
+            error_px=event.error_px,
+            progress=event.progress,
+        )
+
+    def since(self, number: int) -> EventList:
+        """Events from ``number`` on, as many as fit into one reply."""
+        first = self._kept[0].seq if self._kept else self.last + 1
+        begin = max(number, first)
+        offset = begin - first
+        some = tuple(self._kept[i] for i in range(offset, min(offset + EVENTS_A_REPLY, len(self._kept))))
+        return EventList(self._boot, first, begin + len(some), some)
+
+
+def state_message(
+    plan: RunPlan, boot: str, state: ServoState, *, servo_alive: bool, last_event: int
+) -> StateMessage:
+    """The state as clients see it; numbers that are not finite are left out."""
+    status, loop = state.status, state.loop
+    names = tuple(joint.name for joint in plan.joints.joints)
+    now_ns = time.monotonic_ns()
+    return StateMessage(
+        cell=plan.cell.cell.name,
+        boot=boot,
+        t_ns=status.t_ns,
+        t_wall=time.time() - (now_ns - status.t_ns) * 1e-9,
+        lifecycle=status.lifecycle,
+        model=status.model,
+        model_epoch=status.model_epoch,
+        source=status.source,
+        goal=status.goal,
+        law=status.law,
+        level=status.level,
+        reasons=tuple(status.reasons),
+        joints=_finite(names, status.positions),
+        velocities=_finite(names, status.velocities),
+        command=_finite(names, status.command),
+        error_px=status.error_px if status.error_px is not None and np.isfinite(status.error_px) else None,
+        task_error=tuple(float(x) for x in status.task_error if np.isfinite(x)),
+        innovation_px={name: value for name, value in status.innovation_px.items() if np.isfinite(value)},
+        visible=status.visible,
+        loop=LoopInfo(
+            rate_hz=loop.rate_hz,
+            cycles=loop.cycles,
+            overruns=loop.overruns,
+            skipped=loop.skipped,
+            lateness_us={"p50": loop.p50_us, "p99": loop.p99_us, "max": loop.max_us},
+            work_us={"p50": loop.work_p50_us, "p99": loop.work_p99_us, "max": loop.work_max_us},
+            records_dropped=state.records_dropped,
+        ),
+        driver_active=state.driver_active,
+        servo_alive=servo_alive,
+        dry_run=plan.dry_run,
+        differences=state.differences,
+        last_event=last_event,
+    )
+
+
+def _finite(names: tuple[str, ...], values: Any) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)}
+
+
+def features_message(observation: CameraObservation) -> FeaturesMessage:
+    """An observation as clients see it. Raises MessageError for numbers that are not finite."""
+    if not (np.isfinite(observation.pixels).all() and np.isfinite(observation.covariances).all()):
+        raise MessageError(
+            f"camera {observation.camera}: frame {observation.seq} holds numbers that are not finite"
+        )
+    now_ns = time.monotonic_ns()
+    sigmas = np.sqrt(0.5 * np.trace(observation.covariances, axis1=1, axis2=2))
+    return FeaturesMessage(
+        camera=observation.camera,
+        seq=observation.seq,
+        t_shutter_ns=observation.t_shutter_ns,
+        t_received_ns=observation.t_received_ns,
+        t_wall=time.time() - (now_ns - observation.t_shutter_ns) * 1e-9,
+        ids=tuple(observation.ids.tolist()),
+        pixels=tuple((u, v) for u, v in observation.pixels.tolist()),
+        sigmas=tuple(sigmas.tolist()),
+    )
+
+
+class Publishers:
+    """One zenoh publisher a key."""
+
+    def __init__(self, session: Any, keys: KeySpace, cameras: tuple[str, ...]) -> None:
+        drop = zenoh.CongestionControl.DROP
+        self.state = session.declare_publisher(keys.state, encoding=ENCODING, congestion_control=drop)
+        self.event = session.declare_publisher(keys.event, encoding=ENCODING, congestion_control=drop)
+        self.features = {
+            name: session.declare_publisher(keys.features(name), encoding=ENCODING, congestion_control=drop)
+            for name in cameras
+        }
+
+    @property
+    def all(self) -> list[Any]:
+        """All of them, to undeclare."""
+        return [self.state, self.event, *self.features.values()]

@@ -1,0 +1,110 @@
+"""The gateway's side of the servo process: requests and heartbeats there, events, state and step records back."""
+
+from __future__ import annotations
+
+import time
+
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.channel import Channel, ChannelError
+from stereoservo.runtime.commands import Command, Request
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.directories import CellDirectories
+from stereoservo.runtime.handover import SlotReader
+from stereoservo.runtime.interprocess import (
+    STATE_LAYOUT,
+    Ask,
+    FromServoSteps,
+    Heartbeat,
+    Hello,
+    NewModel,
+    ServoState,
+    encode,
+    event_decoder,
+    state_decoder,
+    steps_decoder,
+)
+
+HEARTBEAT_EVERY_S = 0.05
+RECONNECT_EVERY_S = 0.1
+
+
+class ServoLink:
+    """Connection to the servo process; reconnects by itself, blocks never."""
+
+    def __init__(self, directories: CellDirectories, *, records: bool) -> None:
+        self._directories = directories
+        self._records = records
+        self._control: Channel | None = None
+        self._steps: Channel | None = None
+        self._state = SlotReader(directories.state_slot, STATE_LAYOUT)
+        self._last_beat = 0.0
+        self._last_try = 0.0
+        self._last_event = 0
+        # A restarted gateway is sent old replies again: numbers must not meet those of its predecessor.
+        self._next_request = time.monotonic_ns() // 1000
+
+    @property
+    def connected(self) -> bool:
+        """Whether the servo process takes requests."""
+        return self._control is not None and self._control.is_open
+
+    def keep(self) -> None:
+        """Connect where needed; beat."""
+        now = time.monotonic()
+        if now - self._last_try >= RECONNECT_EVERY_S:
+            self._last_try = now
+            if not self.connected:
+                self._control = _try(self._directories, "control_socket")
+                if self._control is not None:
+                    self._control.send(encode(Hello(self._last_event)))
+            if self._records and (self._steps is None or not self._steps.is_open):
+                self._steps = _try(self._directories, "steps_socket")
+        if self._control is not None and now - self._last_beat >= HEARTBEAT_EVERY_S:
+            self._last_beat = now
+            self._control.send(encode(Heartbeat()))
+
+    def ask(self, command: Command, operator: str) -> int | None:
+        """Forward a command; gives its request number, None where the servo process does not take it."""
+        number = self._next_request
+        self._next_request += 1
+        if self._control is None or not self._control.send(encode(Ask(Request(number, operator, command)))):
+            return None
+        return number
+
+    def give_model(self, model: CellModel) -> bool:
+        """Hand a model to the core."""
+        return self._control is not None and self._control.send(encode(NewModel(model)))
+
+    def events(self) -> list[Event]:
+        """Core events since the last call, in order."""
+        if self._control is None:
+            return []
+        found = [event_decoder.decode(data) for data in self._control.receive(256)]
+        if found:
+            self._last_event = max(self._last_event, found[-1].seq)
+        return found
+
+    def steps(self) -> list[FromServoSteps]:
+        """Step records since the last call."""
+        if self._steps is None:
+            return []
+        return [steps_decoder.decode(data) for data in self._steps.receive(512)]
+
+    def state(self) -> ServoState | None:
+        """The servo process's newest state, if it is new."""
+        data = self._state.poll()
+        return None if data is None else state_decoder.decode(data)
+
+    def close(self) -> None:
+        """Release all; idempotent."""
+        for channel in (self._control, self._steps):
+            if channel is not None:
+                channel.close()
+        self._state.close()
+
+
+def _try(directories: CellDirectories, name: str) -> Channel | None:
+    try:
+        return Channel.connect(getattr(directories, name))
+    except ChannelError:  # not up (yet); tried again
+        return None

@@ -1,0 +1,147 @@
+"""zenoh sessions with the habits that were measured to matter: bounded, local, no discovery, never blocking."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from stereoservo.runtime.cellfile import CellFile
+from stereoservo.runtime.directories import check_socket_path
+
+MAX_MESSAGE_BYTES = 1 << 18
+MAX_SESSIONS = 64
+CLOSE_TIMEOUT_S = 2.0
+
+
+class SessionError(Exception):
+    """A zenoh session cannot be opened; names the endpoint and the cause."""
+
+
+def endpoint_of(cell: CellFile, socket: Path) -> str:
+    """Where clients of this host reach the cell."""
+    if cell.zenoh.endpoints:
+        return cell.zenoh.endpoints[0]
+    return f"unixsock-stream/{socket}"
+
+
+def _common() -> dict[str, Any]:
+    return {
+        # Discovery would announce the arm to every host of the network and bring in peers that no access rule sees.
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "shared_memory": {"enabled": False},  # leaves segments behind and has watchdog drops
+            "unicast": {"max_sessions": MAX_SESSIONS, "accept_timeout": 1000},
+            "link": {
+                "tx": {
+                    "lease": 2000,
+                    # A subscriber that hangs must cost its messages, not this process's time.
+                    "queue": {
+                        "congestion_control": {
+                            "drop": {"wait_before_drop": 0},
+                            "block": {"wait_before_close": 20000},
+                        }
+                    },
+                },
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+            },
+        },
+    }
+
+
+def router_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
+    """The gateway's main session: the router itself, or a client of a site's router.
+
+    Raises SessionError: more than this host may connect, and no TLS is configured.
+    """
+    zenoh_section = cell.zenoh
+    config = _common()
+    tls = zenoh_section.tls
+    if tls is not None:
+        config["transport"]["link"]["tls"] = {
+            "root_ca_certificate": str(cell_dir / tls.root_ca_certificate),
+            "listen_private_key": str(cell_dir / tls.listen_private_key),
+            "listen_certificate": str(cell_dir / tls.listen_certificate),
+            "enable_mtls": tls.enable_mtls,
+        }
+    if zenoh_section.mode == "client":
+        if not zenoh_section.endpoints:
+            raise SessionError(
+                'zenoh.mode = "client" needs zenoh.endpoints: the router to connect to, e.g. ["tls/router:7447"]'
+            )
+        return config | _client(list(zenoh_section.endpoints))
+    endpoints = list(zenoh_section.endpoints) or [endpoint_of(cell, socket)]
+    if not zenoh_section.endpoints:
+        check_socket_path(socket)
+    for endpoint in endpoints:
+        check_listen_endpoint(endpoint, secured=tls is not None)
+    return config | {"mode": "router", "listen": {"endpoints": endpoints}, "connect": {"endpoints": []}}
+
+
+def check_listen_endpoint(endpoint: str, *, secured: bool) -> None:
+    """Refuse to listen where the whole network could command the arm. Raises SessionError."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream":
+        return
+    host = address.rpartition(":")[0].strip("[]")
+    local = host in ("127.0.0.1", "::1", "localhost")
+    if protocol not in ("tcp", "tls") or not address.rpartition(":")[2].isdigit():
+        raise SessionError(
+            f"zenoh.endpoints: {endpoint!r}; valid are unixsock-stream/PATH, tcp/127.0.0.1:PORT, or tls/HOST:PORT with [zenoh.tls]"
+        )
+    if protocol == "tcp" and not local:
+        raise SessionError(
+            f"zenoh.endpoints: {endpoint!r} would let every host that reaches it command the arm; "
+            "listen on 127.0.0.1, or use tls/HOST:PORT with [zenoh.tls]"
+        )
+    if protocol == "tls" and not secured:
+        raise SessionError(f"zenoh.endpoints: {endpoint!r} needs [zenoh.tls]")
+
+
+def _client(endpoints: list[str]) -> dict[str, Any]:
+    return {
+        "mode": "client",
+        "listen": {"endpoints": []},
+        "connect": {
+            "endpoints": endpoints,
+            "timeout_ms": 2000,
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 100, "period_max_ms": 500},
+        },
+    }
+
+
+def client_config(endpoint: str) -> dict[str, Any]:
+    """A client of the daemon at ``endpoint``."""
+    return _common() | _client([endpoint])
+
+
+def open_session(config: dict[str, Any]) -> Any:
+    """Open a session. Raises SessionError."""
+    zenoh.init_log_from_env_or("error")
+    where = ", ".join(config["listen"]["endpoints"] or config["connect"]["endpoints"])
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError as error:
+        verb = "listen on" if config["mode"] == "router" else "connect to"
+        raise SessionError(f"cannot {verb} {where}: {error}") from error
+
+
+def close_session(session: Any, declared: list[Any]) -> bool:
+    """Undeclare, then close, in a side thread with a time limit (a hung client would hold ``close`` for 10 s).
+
+    False where the limit passed; the process may then end without it.
+    """
+
+    def work() -> None:
+        for entity in declared:
+            entity.undeclare()
+        session.close()
+
+    thread = threading.Thread(target=work, name="zenoh-close", daemon=True)
+    thread.start()
+    thread.join(CLOSE_TIMEOUT_S)
+    return not thread.is_alive()

@@ -1,0 +1,163 @@
+"""What outlives a run: taught goals, models, the journal. All in the cell's state directory, written whole or not at all."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+
+from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, write_atomically
+from stereoservo.runtime.commands import FeatureTarget
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.settings import CoreSettings
+
+TAUGHT_SCHEMA = 1
+JOURNAL_BYTES = 10_000_000
+
+
+class StoreError(Exception):
+    """A file of the state directory cannot be used; names the file, the cause and the way out."""
+
+
+class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A goal that was shown: mean pixels per camera and marker, the joints then, and the model's epoch."""
+
+    name: str
+    model_epoch: int
+    set_points: dict[str, dict[int, tuple[float, float]]]
+    joints: dict[str, float]
+    created: str
+
+
+class _TaughtFile(msgspec.Struct, forbid_unknown_fields=True):
+    schema: int
+    goals: dict[str, TaughtGoal]
+
+
+class TaughtStore:
+    """Taught goals by name. Raises StoreError for a damaged file (which stays as it is)."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.goals: dict[str, TaughtGoal] = {}
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise StoreError(f"{path}: {error.strerror}") from error
+        try:
+            file = msgspec.json.decode(data, type=_TaughtFile)
+        except msgspec.MsgspecError as error:
+            raise StoreError(
+                f"{path}: {error}; repair the file, or move it away and teach the goals again"
+            ) from error
+        if file.schema != TAUGHT_SCHEMA:
+            raise StoreError(f"{path}: schema is {file.schema}; this version reads {TAUGHT_SCHEMA}")
+        self.goals = file.goals
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the goals, sorted."""
+        return tuple(sorted(self.goals))
+
+    def add(self, event: Event, settings: CoreSettings, model_epoch: int, created: str) -> TaughtGoal:
+        """Store what a ``taught`` event carries, in place of an older goal of that name."""
+        set_points = {
+            sample.camera: {
+                int(marker): (float(u), float(v))
+                for marker, (u, v) in zip(sample.ids, sample.pixels, strict=True)
+            }
+            for sample in event.samples
+            if sample.ids.size
+        }
+        joints = (
+            {}
+            if event.joints is None
+            else dict(zip(settings.joint_names, event.joints.tolist(), strict=True))
+        )
+        goal = TaughtGoal(event.name, model_epoch, set_points, joints, created)
+        self.goals[event.name] = goal
+        data = msgspec.json.encode(_TaughtFile(TAUGHT_SCHEMA, self.goals), order="sorted")
+        write_atomically(self._path, msgspec.json.format(data, indent=1) + b"\n")
+        return goal
+
+    def target(self, name: str) -> FeatureTarget:
+        """The set-points of a taught goal, bound to its model's epoch. Raises KeyError."""
+        goal = self.goals[name]
+        return FeatureTarget(goal.set_points, goal.model_epoch)
+
+
+class ModelStore:
+    """Model files ``model-<epoch>.json``; an epoch is never used twice."""
+
+    _FILE = re.compile(r"model-(\d{6,})\.json")
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+
+    def path(self, epoch: int) -> Path:
+        """The file of a model."""
+        return self._directory / f"model-{epoch:06d}.json"
+
+    def epochs(self) -> list[int]:
+        """Epochs of all model files, ascending."""
+        return sorted(
+            int(match[1]) for path in self._directory.iterdir() if (match := self._FILE.fullmatch(path.name))
+        )
+
+    def next_epoch(self) -> int:
+        """One more than the last."""
+        return max(self.epochs(), default=0) + 1
+
+    def newest_fitting(self, settings: CoreSettings) -> tuple[CellModel | None, list[str]]:
+        """The newest model that fits the cell's joints and cameras, and why newer ones were passed over."""
+        passed = []
+        for epoch in reversed(self.epochs()):
+            path = self.path(epoch)
+            try:
+                model = load_model(path)
+            except ModelFileError as error:
+                passed.append(str(error))
+                continue
+            misfit = _misfit(model, settings)
+            if not misfit:
+                return model, passed
+            passed.append(f"{path}: {misfit}")
+        return None, passed
+
+
+def _misfit(model: CellModel, settings: CoreSettings) -> str:
+    """Why ``model`` is not one of this cell; empty when it is."""
+    if model.joint_names != settings.joint_names or model.joint_kinds != settings.joint_kinds:
+        return f"is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
+    of_model = [(camera.name, camera.width, camera.height) for camera in model.cameras]
+    of_cell = [(camera.name, camera.width, camera.height) for camera in settings.cameras]
+    if of_model != of_cell:
+        return f"is of cameras {of_model}; the cell has {of_cell}"
+    unknown = [marker for marker in model.marker_ids if marker not in settings.marker_ids]
+    if unknown:
+        return f"has markers {unknown} that no detector of the cell reports"
+    return ""
+
+
+class Journal:
+    """Events, one JSON object a line, for people; the older half gives way when the file has grown large."""
+
+    def __init__(self, path: Path, limit: int = JOURNAL_BYTES) -> None:
+        self._path = path
+        self._limit = limit
+        self._stream = path.open("ab", buffering=0)
+
+    def add(self, line: bytes) -> None:
+        """Append a line."""
+        self._stream.write(line + b"\n")
+        if self._stream.tell() > self._limit:
+            self._stream.close()
+            self._path.replace(self._path.with_suffix(".1.jsonl"))
+            self._stream = self._path.open("ab", buffering=0)
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        self._stream.close()

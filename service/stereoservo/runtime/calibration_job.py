@@ -1,0 +1,79 @@
+"""Gathers what the trial motions showed until it can be fitted: ``calibration_sample`` events in, trial data out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialCamera, TrialData
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.settings import CoreSettings
+
+
+class CalibrationJob:
+    """The stops of one calibration. A sample with another goal's id starts it anew."""
+
+    def __init__(self, settings: CoreSettings) -> None:
+        self._settings = settings
+        self.id = ""
+        self._stops: list[Event] = []
+
+    @property
+    def stops(self) -> int:
+        """Stops gathered so far."""
+        return len(self._stops)
+
+    def add(self, event: Event) -> None:
+        """Take an event; only ``calibration_sample`` counts."""
+        if event.kind != "calibration_sample":
+            return
+        if event.id != self.id:
+            self.id = event.id
+            self._stops.clear()
+        self._stops.append(event)
+
+    def trials(self) -> TrialData:
+        """All stops as trial data, markers that no camera ever saw left out.
+
+        Raises CalibrationError (``too_few_stops``) where there is no stop.
+        """
+        if not self._stops:
+            raise CalibrationError(
+                "too_few_stops", "the trial motions gave no stop; at least 4 a joint are needed", stops=0
+            )
+        settings = self._settings
+        seen = {int(i) for event in self._stops for sample in event.samples for i in sample.ids}
+        markers = tuple(marker for marker in settings.marker_ids if marker in seen)
+        column = {marker: k for k, marker in enumerate(markers)}
+        row = {camera.name: c for c, camera in enumerate(settings.cameras)}
+        shape = (len(settings.cameras), len(self._stops), len(markers))
+        pixels = np.full((*shape, 2), np.nan)
+        sigmas = np.full(shape, np.nan)
+        images = 0
+        for s, event in enumerate(self._stops):
+            for sample in event.samples:
+                images += sample.frames
+                for marker, pixel, covariance in zip(
+                    sample.ids, sample.pixels, sample.covariances, strict=True
+                ):
+                    where = row[sample.camera], s, column[int(marker)]
+                    pixels[where] = pixel
+                    sigmas[where] = np.sqrt(0.5 * np.trace(covariance))
+        return TrialData(
+            joint_names=settings.joint_names,
+            joint_kinds=settings.joint_kinds,
+            cameras=tuple(
+                TrialCamera(camera.name, camera.width, camera.height) for camera in settings.cameras
+            ),
+            marker_ids=markers,
+            positions=np.array([_joints(event) for event in self._stops]),
+            trials=np.array([event.trial for event in self._stops], dtype=np.int64),
+            pixels=pixels,
+            sigmas=sigmas,
+            images=images,
+        )
+
+
+def _joints(event: Event) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    if event.joints is None:
+        raise CalibrationError("bad_data", f"calibration sample {event.seq} carries no joint positions")
+    return event.joints

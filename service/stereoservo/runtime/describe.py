@@ -1,0 +1,133 @@
+"""What a cell's drivers say of themselves, asked in a process of its own: a driver that crashes takes nothing with it.
+
+``python -m stereoservo.runtime.describe CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID JSON_OPTIONS`` writes the
+run plan and compiles the kernels, so that the other processes find them compiled.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import msgspec
+
+from stereoservo.runtime import plugins
+from stereoservo.runtime.cellfile import CellFile, CellFileError, load_cell_file
+from stereoservo.runtime.clock import MonotonicClock
+from stereoservo.runtime.interprocess import RunPlan, save_plan
+from stereoservo.runtime.lifeline import die_with_parent
+from stereoservo.runtime.ports import (
+    CameraDescription,
+    Clock,
+    DriverContext,
+    DriverError,
+    JointDriverDescription,
+)
+from stereoservo.runtime.vision import make_camera
+from stereoservo.runtime.warmup import warm_up
+
+EXIT_INVALID = 2
+
+
+class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a run that are not the cell file's."""
+
+    boot: str
+    seed: int = 0
+    dry_run: bool = False
+    commissioning: bool = False
+    record: str = ""
+
+
+def describe_cell(
+    cell: CellFile, cell_path: Path, runtime: Path, clock: Clock, *, seed: int = 0
+) -> tuple[JointDriverDescription, tuple[CameraDescription, ...]]:
+    """Descriptions of joint driver and cameras, each camera with its detector's marker ids.
+
+    Raises PluginError, DriverError, CellFileError (a camera that can show no marker, a camera without detector).
+    """
+    common = {
+        "clock": clock,
+        "cell": cell.cell.name,
+        "runtime_dir": runtime,
+        "cell_dir": cell_path.parent,
+        "seed": seed,
+    }
+    joint_context = DriverContext(**common)  # type: ignore[arg-type]
+    joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
+        cell.joints.options, joint_context
+    ).describe()
+    if joints.pacing != "clock":
+        raise CellFileError(
+            cell_path,
+            "joints.driver",
+            f"driver {cell.joints.driver!r} asks for pacing {joints.pacing!r}; the daemon paces by 'clock'",
+        )
+    cameras = []
+    for section in cell.camera:
+        driver, detector = make_camera(section, DriverContext(**common, camera=section.name))  # type: ignore[arg-type]
+        description = driver.describe()
+        ids = description.marker_ids
+        if detector is not None:
+            if description.delivers == "observations":
+                raise CellFileError(
+                    cell_path,
+                    "camera.detector",
+                    f"camera {section.name!r} delivers observations; leave the detector out",
+                )
+            ids = detector.describe().marker_ids
+        elif description.delivers == "frames":
+            known = ", ".join(plugins.names(plugins.DETECTORS)) or "none installed"
+            raise CellFileError(
+                cell_path,
+                "camera.detector",
+                f"camera {section.name!r} delivers frames and needs a detector; there are: {known}",
+            )
+        if not ids:
+            raise CellFileError(
+                cell_path,
+                "camera",
+                f"camera {section.name!r} can report no marker; check its detector's options",
+            )
+        cameras.append(msgspec.structs.replace(description, name=section.name, marker_ids=ids))
+    return joints, tuple(cameras)
+
+
+def make_plan(cell_path: Path, runtime: Path, state: Path, options: PlanOptions) -> RunPlan:
+    """Read and check a cell whole. Raises CellFileError, PluginError, DriverError."""
+    cell = load_cell_file(cell_path)
+    joints, cameras = describe_cell(cell, cell_path, runtime, MonotonicClock(), seed=options.seed)
+    plan = RunPlan(
+        cell=cell, cell_path=str(cell_path), runtime=str(runtime), state=str(state), boot=options.boot,
+        joints=joints, cameras=cameras, seed=options.seed, dry_run=options.dry_run,
+        commissioning=options.commissioning, record=options.record,
+    )  # fmt: skip
+    try:
+        plan.settings()
+    except CellFileError as error:  # settings know the cell, not its file
+        if error.path == str(cell_path):
+            raise
+        raise CellFileError(
+            cell_path, error.key, str(error).partition(f"{error.key}: ")[2] or str(error)
+        ) from error
+    return plan
+
+
+def main() -> int:
+    """Entry of the process: one line on stderr where the cell cannot be run."""
+    cell_path, runtime, state = (Path(argument) for argument in sys.argv[1:4])
+    die_with_parent(int(sys.argv[4]), signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        plan = make_plan(cell_path, runtime, state, msgspec.json.decode(sys.argv[5], type=PlanOptions))
+    except (CellFileError, DriverError, plugins.PluginError) as error:
+        print(error, file=sys.stderr)
+        return EXIT_INVALID
+    save_plan(plan)
+    warm_up(plan.settings())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,52 @@
+"""What ties a process to its parent and to signals: no orphan survives a killed supervisor, no signal is lost."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from types import FrameType
+
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent(parent: int, how: signal.Signals) -> None:
+    """Have the kernel send ``how`` when the parent dies; exits at once where ``parent`` has died already.
+
+    The kernel watches the parent's *thread*, so processes must be spawned from a thread that lives as long as it should.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0) != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, f"prctl(PR_SET_PDEATHSIG): {os.strerror(code)}")
+    if os.getppid() != parent:
+        sys.exit(1)
+
+
+class Termination:
+    """SIGTERM and SIGINT as a flag. After the first one the process has ``grace_s`` to end; then SIGALRM kills it."""
+
+    def __init__(self, grace_s: float = 5.0) -> None:
+        self.signals = 0
+        self.first: int = 0
+        self._grace_s = grace_s
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.signals += 1
+        if self.signals == 1:
+            self.first = number
+            if self._grace_s > 0:
+                signal.setitimer(signal.ITIMER_REAL, self._grace_s)
+
+    @property
+    def asked(self) -> bool:
+        """Whether the process has been asked to end."""
+        return self.signals > 0
+
+
+def say(process: str, message: str) -> None:
+    """One line of log on stderr; the journal or the terminal adds the time."""
+    print(f"stereoservo {process}: {message}", file=sys.stderr, flush=True)
