@@ -200,7 +200,7 @@ def nearest_rotation_generator(A: FloatArray) -> FloatArray:
             f"eigenvalues {values.tolist()} hold no complex pair; a rotation has ±i",
             eigenvalues=values,
         )
-    # The left eigenvector from the transpose: inverting the eigenvectors fails where the kernel is nearly defective.
+    # The left eigenvector from the transpose: inverting all eigenvectors fails near a defective kernel.
     adjoint_values, left = np.linalg.eig(A.T)
     v, w = right[:, k], left[:, int(np.argmin(np.abs(adjoint_values - values[k])))]
     product = w @ v
