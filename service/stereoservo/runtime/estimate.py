@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoservo.control.kernels import damped_least_squares
+from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import chain_forward, image_jacobian, project_points, transform_points, triangulate
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
@@ -35,6 +36,7 @@ class ModelArrays:
     matrices: FloatArray
     marker_points: FloatArray
     plane_at_infinity: FloatArray
+    camera_centres: FloatArray
     marker_ids: tuple[int, ...]
     index: dict[int, int]
 
@@ -55,13 +57,16 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
                 f"model was made with {known.width}x{known.height} images of camera {camera.name!r}; "
                 f"it now delivers {camera.width}x{camera.height}"
             )
+    matrices = np.ascontiguousarray([by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64)
+    centres = np.array([camera_centre(P) for P in matrices])
     return ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
         zero=np.ascontiguousarray(model.zero, dtype=np.float64),
-        matrices=np.ascontiguousarray([by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64),
+        matrices=matrices,
         marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),
         plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
+        camera_centres=with_unit_height(centres, model.plane_at_infinity),
         marker_ids=model.marker_ids,
         index={marker: i for i, marker in enumerate(model.marker_ids)},
     )

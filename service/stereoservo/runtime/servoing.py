@@ -6,10 +6,11 @@ from itertools import combinations
 
 import numpy as np
 
+from stereoservo.control.cartesian3_kernel import cartesian3_step
 from stereoservo.control.cartesian3 import cartesian3_reasons
-from stereoservo.control.kernels import cartesian3_step, stereo_step
+from stereoservo.control.kernels import stereo_step
 from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.kernels import triangulate
+from stereoservo.kinematics.kernels import image_jacobian, triangulate
 from stereoservo.runtime.commands import FeatureTarget, Goal
 from stereoservo.runtime.estimate import ModelArrays, points_now, with_unit_height
 from stereoservo.runtime.motion import Motion, Present
@@ -18,6 +19,8 @@ from stereoservo.runtime.state import Servoing
 
 MIN_MARKERS = 3
 MIN_FACE_AREA_PX2 = 100.0
+STEREO_DAMPING = 1e-6  # relative to the largest diagonal of the normal matrix
+ILL_CONDITIONED = 1e-5
 
 
 def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servoing:
@@ -134,3 +137,54 @@ def servo_step(source: Servoing, present: Present) -> Motion:
     if source.law == "stereo":
         return _stereo(source, present, arrays, active, error_px)
     return _cartesian3(source, present, arrays, error_px)
+
+
+def _reached(source: Servoing, present: Present, error_px: float | None) -> bool:
+    """Whether the error stayed below the tolerance for ``hold_frames`` frames of every camera on average."""
+    frames = sum(e.frames for e in present.state.cameras)
+    new, cameras = frames - source.last_frames, len(present.state.cameras)
+    if new >= cameras:
+        source.last_frames = frames
+        inside = error_px is not None and error_px <= source.tolerance_px
+        source.held = source.held + new // cameras if inside else 0
+    return source.held >= source.hold_frames
+
+
+def _stereo(source: Servoing, present: Present, arrays: ModelArrays, active: FloatArray, error_px: float | None) -> Motion:
+    """(8.36) with the Jacobian developed around triangulated (8.34) or predicted points (8.35)."""
+    prediction, pixels = present.prediction, present.pixels
+    assert prediction is not None and pixels is not None
+    points = _points(source, present, arrays)
+    jacobian = image_jacobian(prediction.operators, arrays.matrices, points)
+    velocity, _, conditioning = stereo_step(jacobian, pixels, source.set_points, active, source.gain, STEREO_DAMPING)
+    reasons: tuple[Reason, ...] = ()
+    if conditioning < ILL_CONDITIONED:
+        reasons = (
+            Reason(
+                "JACOBIAN_ILL_CONDITIONED", "slow", "", conditioning, ILL_CONDITIONED, "",
+                "the arm is near a singularity, or the markers do not fix its pose: jog away, or use cartesian3",
+            ),
+        )  # fmt: skip
+    return Motion(velocity, True, source.goal.speed_scale, error_px=error_px, reasons=reasons)
+
+
+def _points(source: Servoing, present: Present, arrays: ModelArrays) -> FloatArray:
+    assert present.prediction is not None and present.pixels is not None and present.weights is not None
+    return points_now(
+        arrays, present.q, present.prediction, present.pixels, present.weights, present.state.correction, source.points
+    )
+
+
+def _cartesian3(source: Servoing, present: Present, arrays: ModelArrays, error_px: float | None) -> Motion:
+    """(8.42) from three points that span the goal's face, about the affine middle of the goal's markers."""
+    prediction = present.prediction
+    assert prediction is not None
+    points = _points(source, present, arrays)
+    known = source.target_known > 0.0
+    centre = points[known].sum(axis=0) / float(known.sum())
+    velocity, task_error, allowed, status = cartesian3_step(
+        prediction.operators, points[source.face], source.target_points[source.face], centre, source.centre_target,
+        arrays.camera_centres, np.full(3, source.gain),
+    )  # fmt: skip
+    reasons = cartesian3_reasons(task_error, allowed, status)
+    return Motion(velocity, True, source.goal.speed_scale, error_px=error_px, task_error=task_error, reasons=reasons)

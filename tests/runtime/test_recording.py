@@ -1,0 +1,106 @@
+"""A recording replays bit for bit; a damaged one says how far it is good."""
+
+from __future__ import annotations
+
+import uuid
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.runtime.commands import FeatureTarget, Goal, RunGoal
+from stereoservo.runtime.record import encode_step, fingerprint
+from stereoservo.runtime.recorder import FlightRecorder
+from stereoservo.runtime.replay import RecordingError, replay
+from stereoservo.runtime.state import encode_state
+
+
+def record(bench: Any, path: Path, *, seconds: float = 6.0, gap_at: int = -1, tamper_at: int = -1, foreign: bool = False) -> int:
+    """Fly a goal and record it; returns the number of steps."""
+    bench.ready()
+    print_of = fingerprint()
+    if foreign:
+        print_of = msgspec.structs.replace(print_of, processor="another")
+    target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
+    goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(target)))
+    with FlightRecorder(path, bench.settings, print_of) as recorder:
+        for k in range(round(seconds * bench.settings.rate_hz)):
+            if k % 100 == 0:
+                recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
+            outputs = bench.step(*([RunGoal(goal)] if k == 5 else []))
+            inputs = bench.log[-1][0]
+            if k == gap_at:
+                recorder.gap(50, inputs.now_ns)
+            if gap_at <= k < gap_at + 50 and gap_at >= 0:
+                continue
+            if k == tamper_at:
+                inputs = msgspec.structs.replace(
+                    inputs, joints=msgspec.structs.replace(inputs.joints, positions=inputs.joints.positions * (1 + 1e-12))
+                )
+            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
+        return recorder.steps
+
+
+def test_replay_is_identical(benches: Any, tmp_path: Path) -> None:
+    bench = benches(3, noise_px=0.1)
+    steps = record(bench, tmp_path / "flight.mcap")
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is True
+    assert (result.steps, result.gaps, result.max_relative_error) == (steps, 0, 0.0)
+    assert result.checkpoints == 6
+
+
+def test_replay_notices_one_changed_bit_of_an_input(benches: Any, tmp_path: Path) -> None:
+    record(benches(3, noise_px=0.1), tmp_path / "flight.mcap", tamper_at=250)
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is False
+    assert result.first_difference is not None
+    assert result.first_difference > 250
+
+
+def test_replay_goes_on_after_a_gap_from_the_next_checkpoint(benches: Any, tmp_path: Path) -> None:
+    steps = record(benches(4), tmp_path / "flight.mcap", gap_at=220)
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is True
+    assert result.gaps == 1
+    assert steps - 100 <= result.steps < steps
+
+
+def test_replay_on_another_machine_reports_the_largest_error(benches: Any, tmp_path: Path) -> None:
+    record(benches(3), tmp_path / "flight.mcap", seconds=2.0, foreign=True)
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is None
+    assert result.max_relative_error == 0.0
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.999])
+def test_truncated_recording_says_how_far_it_is_good(benches: Any, tmp_path: Path, share: float) -> None:
+    path = tmp_path / "flight.mcap"
+    record(benches(3), path, seconds=4.0)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    with pytest.raises(RecordingError, match=r"truncated|header") as caught:
+        replay(path)
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == whole[: int(len(whole) * share)]
+
+
+def test_flipped_bytes_are_noticed(benches: Any, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record(benches(3), path, seconds=4.0)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(bytes(data))
+    with pytest.raises(RecordingError):
+        replay(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89MCAP0\r\n"])
+def test_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.mcap").write_bytes(content)
+    with pytest.raises(RecordingError):
+        replay(tmp_path / "x.mcap")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        replay(tmp_path / "missing.mcap")
