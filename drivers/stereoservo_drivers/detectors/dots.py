@@ -1,0 +1,351 @@
+"""The dot detector: faces of seven dots, found anywhere, then tracked in windows placed by the core's priors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from stereoservo.runtime.ports import (
+    CameraObservation,
+    DetectorDescription,
+    DriverContext,
+    DriverError,
+    FloatArray,
+    Frame,
+    ImageArray,
+    Prior,
+)
+from stereoservo_drivers.detectors.blobs import find_spots
+from stereoservo_drivers.detectors.centroids import AREA, CXX, CXY, CYY, FIELDS, NOISE, scratch
+from stereoservo_drivers.detectors.patterns import find_face
+from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY, DotFace
+from stereoservo_drivers.detectors.tracking import agree_with_prior, settle_face, track_face
+
+QUANTISATION = 1.0 / 12.0
+"""Least noise variance [grey levels squared]: rounding to whole levels."""
+SMALLEST_IMAGE = 32
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class FaceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A face of one's own: ids and positions of its dots [any unit], four corners clockwise first; radius in that unit."""
+
+    name: str
+    ids: tuple[int, ...]
+    positions: tuple[tuple[float, float], ...]
+    radius: Positive
+
+
+class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[camera.detector_options]`` of the detector ``dots``."""
+
+    polarity: Literal["light", "dark"] = "light"
+    """Dots lighter or darker than their plate."""
+    faces: tuple[FaceOptions, ...] | None = None
+    """Default: the two faces of the default marker body."""
+    image_size: tuple[int, int] | None = None
+    """(width, height) [px] that frames must have; default: that of the first frame."""
+    max_prior_age_s: Positive = 0.25
+    min_contrast: Annotated[int, Meta(ge=5, le=250)] = 30
+    """Least difference of a dot from its background [grey levels]."""
+    min_dots: Annotated[int, Meta(ge=1)] = 4
+    """Tracking that finds fewer dots gives way to acquisition."""
+    acquire_dots: Annotated[int, Meta(ge=6, le=7)] = 6
+    """Dots of a face that acquisition must find."""
+    consistency_px: Positive = 0.3
+    """How far a dot may lie from its face's homography [px]: print and lens errors, not noise."""
+    gate_sigma: Annotated[float, Meta(ge=0)] = 0.0
+    """Refuse dots so many standard deviations off their prior; 0: leave it to the core."""
+    lopsided: Positive = 0.02
+    """Largest odd harmonic of a whole dot's edge; a cut of 0.5 px makes 0.02, of 1 px 0.04."""
+    floor_px: Annotated[float, Meta(ge=0)] = 0.002
+    """Systematic standard deviation [px] added to every covariance: sampling of sharp edges (measured 0.0005-0.003)."""
+    max_spots: Annotated[int, Meta(ge=7, le=100)] = 48
+    """Dot-like spots that acquisition looks at, the roundest first."""
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """A face as the kernels want it, in units of half the distance of its corners."""
+
+    ids: npt.NDArray[np.int64]
+    positions: FloatArray
+    radius: float
+    bases: npt.NDArray[np.int64]
+    spare_bases: npt.NDArray[np.int64]
+
+
+class DotDetector:
+    """Dots of self-identifying faces with ids, centres and calibrated covariances. One thread at a time.
+
+    With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are found, the whole
+    image is searched and every face identified on its own. A face with fewer than four accepted dots is not reported: fewer
+    cannot be checked. Ids are reported in ascending order. The same frame and prior give the same observation.
+
+    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for frames that are
+    not what was announced. Content never raises.
+    """
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        try:
+            self.options = msgspec.convert(dict(options), DotOptions, strict=True)
+        except msgspec.ValidationError as error:
+            known = ", ".join(DotOptions.__struct_fields__)
+            raise DriverError(
+                "option",
+                f"detector options of camera {context.camera!r}: {error}; known options: {known}",
+                options=dict(options),
+            ) from error
+        self.camera = context.camera
+        self._patterns = _patterns(self.options)
+        self._dark = self.options.polarity == "dark"
+        self._labels, self._stack = scratch()
+        self._size = self.options.image_size
+        every = np.concatenate([pattern.ids for pattern in self._patterns])
+        self._ids = tuple(int(i) for i in np.sort(every))
+        self._place = {int(i): (f, r) for f, p in enumerate(self._patterns) for r, i in enumerate(p.ids)}
+
+    def describe(self) -> DetectorDescription:
+        """The marker ids of all faces."""
+        return DetectorDescription(detector="dots", marker_ids=self._ids)
+
+    def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+        """Dots of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
+        image = self._checked(frame)
+        found: list[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]] = []
+        if prior is not None and self._fresh(frame, prior):
+            found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9)
+        if sum(int(used.sum()) for _, _, used in found) < self.options.min_dots:
+            found = self._acquire(image)
+        return self._observation(frame, found)
+
+    def _fresh(self, frame: Frame, prior: Prior) -> bool:
+        age_s = abs(frame.t_shutter_ns - prior.t_ns) * 1e-9
+        return len(prior.ids) > 0 and age_s <= self.options.max_prior_age_s
+
+    def _checked(self, frame: Frame) -> ImageArray:
+        image = frame.image
+        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
+            shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
+            raise DriverError(
+                "image_format",
+                f"camera {self.camera!r}: image of shape {shape}, {kind}; expected (height, width) of uint8",
+                shape=shape,
+                dtype=str(kind),
+            )
+        height, width = image.shape
+        if self._size is None and min(width, height) >= SMALLEST_IMAGE:
+            self._size = (width, height)
+        if (width, height) != self._size:
+            expected = (
+                f"{self._size[0]}x{self._size[1]}" if self._size else f"at least {SMALLEST_IMAGE} a side"
+            )
+            raise DriverError(
+                "image_size",
+                f"camera {self.camera!r}: image of {width}x{height} px; expected {expected}",
+                size=(width, height),
+                expected=self._size,
+            )
+        return np.ascontiguousarray(image)
+
+    def _track(
+        self, image: ImageArray, prior: Prior, dt_s: float
+    ) -> list[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]]:
+        options = self.options
+        motion = prior.velocities * dt_s
+        predicted = prior.pixels + motion
+        covariances = prior.covariances
+        middle = 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
+        half = 0.5 * (covariances[:, 0, 0] - covariances[:, 1, 1])
+        largest = middle + np.hypot(half, covariances[:, 0, 1])
+        spread = 3.0 * np.sqrt(np.maximum(largest, 0.0)) + 0.25 * np.hypot(motion[:, 0], motion[:, 1])
+        usable = np.isfinite(predicted).all(axis=1) & np.isfinite(spread)
+        n_faces = len(self._patterns)
+        places = np.zeros((n_faces, 7, 2))
+        spreads = np.zeros((n_faces, 7))
+        present = np.zeros((n_faces, 7), np.bool_)
+        rows = np.zeros((n_faces, 7), np.int64)
+        for k, marker in enumerate(prior.ids.tolist()):
+            where = self._place.get(marker)
+            if where is not None and usable[k]:
+                places[where] = predicted[k]
+                spreads[where] = spread[k]
+                present[where] = True
+                rows[where] = k
+        others = places[present]
+        found = []
+        for f, pattern in enumerate(self._patterns):
+            dots = np.zeros((7, FIELDS))
+            used = np.zeros(7, np.bool_)
+            count = track_face(
+                image, self._dark, pattern.positions, pattern.radius, places[f], spreads[f], present[f], others,
+                options.min_contrast, options.lopsided, self._labels, self._stack, dots, used,
+            )  # fmt: skip
+            if options.gate_sigma and count:
+                used &= _within(dots[:, :2] - places[f], covariances[rows[f]], options.gate_sigma)
+                count = int(used.sum())
+            if count == 4 and not agree_with_prior(places[f], dots, used, 1.0):
+                continue
+            if count >= 4 and settle_face(
+                pattern.positions, pattern.radius, dots, used, options.consistency_px
+            ):
+                found.append((pattern, dots, used))
+        return found
+
+    def _acquire(self, image: ImageArray) -> list[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]]:
+        options = self.options
+        spots = find_spots(
+            image,
+            self._dark,
+            options.min_contrast,
+            options.lopsided,
+            options.max_spots,
+            self._labels,
+            self._stack,
+        )
+        owners = []
+        for pattern in self._patterns:
+            owner = np.full(7, -1, np.int64)
+            count = 0
+            for bases in (pattern.bases, pattern.spare_bases):
+                # the spare bases stand in for a hidden corner
+                if count == 0 and len(spots) >= options.acquire_dots and len(bases):
+                    count = find_face(
+                        pattern.positions, pattern.radius, np.ascontiguousarray(spots[:, :2]), spots[:, AREA].copy(),
+                        bases, options.acquire_dots, 1.5, options.consistency_px, owner,
+                    )  # fmt: skip
+            owners.append(owner)
+        owners = _without_conflicts(owners)
+        found = []
+        for pattern, owner in zip(self._patterns, owners, strict=True):
+            used = owner >= 0
+            dots = np.zeros((7, FIELDS))
+            dots[used] = spots[owner[used]]
+            if used.any() and settle_face(
+                pattern.positions, pattern.radius, dots, used, options.consistency_px
+            ):
+                found.append((pattern, dots, used))
+        return found
+
+    def _observation(
+        self, frame: Frame, found: Sequence[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]]
+    ) -> CameraObservation:
+        if found:
+            ids = np.concatenate([pattern.ids[used] for pattern, _, used in found])
+            dots = np.concatenate([dots[used] for _, dots, used in found])
+        else:
+            ids, dots = np.zeros(0, np.int64), np.zeros((0, FIELDS))
+        order = np.argsort(ids)
+        ids, dots = ids[order], dots[order]
+        covariances = np.empty((len(ids), 2, 2))
+        variance = noise_variances(dots[:, NOISE])
+        covariances[:, 0, 0] = variance * dots[:, CXX] + self.options.floor_px**2
+        covariances[:, 1, 1] = variance * dots[:, CYY] + self.options.floor_px**2
+        covariances[:, 0, 1] = covariances[:, 1, 0] = variance * dots[:, CXY]
+        return CameraObservation(
+            camera=frame.camera,
+            seq=frame.seq,
+            t_shutter_ns=frame.t_shutter_ns,
+            t_received_ns=frame.t_received_ns,
+            ids=ids,
+            pixels=np.ascontiguousarray(dots[:, :2]),
+            covariances=covariances,
+        )
+
+
+def noise_variances(measured: FloatArray) -> FloatArray:
+    """Noise variance of each dot's surroundings (k,) from the measured ones (k,), -1 where there is none [levels²].
+
+    One picture has one noise: each gets the median over all dots, which is steadier (a dot's own: 15 % standard deviation),
+    unless its own surroundings are more than twice as restless.
+    """
+    known = measured[measured >= 0.0]
+    if not len(known):
+        return np.full(len(measured), 1.0 + QUANTISATION)
+    common = max(float(np.median(known)), QUANTISATION)
+    return np.where(measured > 2.0 * common, measured, common)
+
+
+def _within(offsets: FloatArray, covariances: FloatArray, sigma: float) -> npt.NDArray[np.bool_]:
+    """Which offsets (k, 2) [px] lie within ``sigma`` standard deviations of covariances (k, 2, 2)."""
+    solved = np.linalg.solve(covariances + 1e-9 * np.eye(2), offsets[:, :, None])[:, :, 0]
+    inside: npt.NDArray[np.bool_] = (offsets * solved).sum(axis=1) <= sigma**2
+    return inside
+
+
+def _without_conflicts(owners: list[npt.NDArray[np.int64]]) -> list[npt.NDArray[np.int64]]:
+    """Faces that share a spot: the one with more dots stays; of equals, none."""
+    kept = []
+    for f, owner in enumerate(owners):
+        mine = set(owner[owner >= 0].tolist())
+        beaten = any(
+            g != f and mine & set(other[other >= 0].tolist()) and (other >= 0).sum() >= len(mine)
+            for g, other in enumerate(owners)
+        )
+        kept.append(np.full(len(owner), -1, np.int64) if beaten else owner)
+    return kept
+
+
+def _patterns(options: DotOptions) -> tuple[_Pattern, ...]:
+    if options.faces is None:
+        return tuple(_pattern(face.name, face.ids, face.positions, face.radius) for face in DEFAULT_BODY)
+    if not options.faces:
+        raise DriverError("option", "faces: is empty; give at least one face, or leave it out", faces=[])
+    patterns = tuple(
+        _pattern(face.name, face.ids, np.array(face.positions, dtype=float), face.radius)
+        for face in options.faces
+    )
+    ids = [int(i) for pattern in patterns for i in pattern.ids]
+    twice = sorted({i for i in ids if ids.count(i) > 1})
+    if twice:
+        raise DriverError("option", f"faces: marker ids {twice} are used twice; ids must differ", ids=twice)
+    return patterns
+
+
+def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float) -> _Pattern:
+    if len(ids) != 7 or positions.shape != (7, 2) or not np.isfinite(positions).all():
+        raise DriverError(
+            "option",
+            f"face {name!r}: {len(ids)} ids and positions {positions.shape}; a face has 7 ids and 7 finite (x, y)",
+            face=name,
+        )
+    corners = positions[list(CORNERS)]
+    edges = np.roll(corners, -1, axis=0) - corners
+    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
+    if not (turns > 0).all():
+        raise DriverError(
+            "option",
+            f"face {name!r}: its first four dots are not convex and clockwise (x right, y down)",
+            face=name,
+        )
+    unit = 0.5 * float(np.linalg.norm(edges, axis=1).mean())
+    scaled = np.ascontiguousarray((positions - corners.mean(axis=0)) / unit)
+    return _Pattern(
+        ids=np.array(ids, np.int64),
+        positions=scaled,
+        radius=radius / unit,
+        bases=np.array([CORNERS], np.int64),
+        spare_bases=np.array([_spare_basis(scaled, corner) for corner in CORNERS], np.int64),
+    )
+
+
+def _spare_basis(positions: FloatArray, missing: int) -> tuple[int, int, int, int]:
+    """Four dots without ``missing``, convex and clockwise where possible, whose smallest triangle is largest."""
+    from itertools import permutations
+
+    def quality(rows: tuple[int, ...]) -> float:
+        p = positions[list(rows)]
+        triangles = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
+        return min(
+            float(np.cross(np.append(p[b] - p[a], 0), np.append(p[c] - p[a], 0))[2]) for a, b, c in triangles
+        )
+
+    others = [i for i in range(len(positions)) if i != missing]
+    best = max(permutations(others, 4), key=quality)
+    return best[0], best[1], best[2], best[3]

@@ -1,0 +1,359 @@
+"""Planar dot patterns under homographies: fit, check, search. Numba kernels; no state.
+
+Pattern coordinates are those of :class:`~stereoservo_drivers.detectors.plates.DotFace` in units of half its corner distance.
+A face seen from in front has a homography of positive determinant and positive depths; a mirrored pattern has not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+CLEAR = 1.6
+"""Least ratio of misfits between the second-best and the best explanation of the same dots."""
+
+
+@njit(cache=True)
+def _solve(A, b):  # type: ignore[no-untyped-def]
+    """Gaussian elimination with partial pivoting, in place; the solution is in ``b``. False if singular."""
+    n = b.size
+    for i in range(n):
+        pivot = i
+        for k in range(i + 1, n):
+            if abs(A[k, i]) > abs(A[pivot, i]):
+                pivot = k
+        if abs(A[pivot, i]) < 1e-11:
+            return False
+        if pivot != i:
+            for j in range(n):
+                A[i, j], A[pivot, j] = A[pivot, j], A[i, j]
+            b[i], b[pivot] = b[pivot], b[i]
+        for k in range(i + 1, n):
+            f = A[k, i] / A[i, i]
+            if f != 0.0:
+                for j in range(i, n):
+                    A[k, j] -= f * A[i, j]
+                b[k] -= f * b[i]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            b[i] -= A[i, j] * b[j]
+        b[i] /= A[i, i]
+    return True
+
+
+@njit(cache=True)
+def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
+    """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,), into ``H``.
+
+    Scaled to H[2, 2] = 1. Algebraic residuals reweighted by depth, so that the minimum is that of the pixel residuals to
+    first order. False where fewer than four rows are used, they are degenerate or depths are not positive.
+    """
+    n = 0
+    mu = mv = 0.0
+    for i in range(used.size):
+        if used[i]:
+            n += 1
+            mu += pixels[i, 0]
+            mv += pixels[i, 1]
+    if n < 4:
+        return False
+    mu /= n
+    mv /= n
+    spread = 0.0
+    for i in range(used.size):
+        if used[i]:
+            spread += (pixels[i, 0] - mu) ** 2 + (pixels[i, 1] - mv) ** 2
+    s = np.sqrt(spread / n)
+    if s < 1e-6:
+        return False
+    A = np.zeros((8, 8))
+    b = np.zeros(8)
+    row = np.zeros(8)
+    h = np.zeros(8)
+    for step in range(3):
+        A[:] = 0.0
+        b[:] = 0.0
+        for i in range(used.size):
+            if not used[i]:
+                continue
+            x, y = pattern[i, 0], pattern[i, 1]
+            depth = 1.0 if step == 0 else h[6] * x + h[7] * y + 1.0
+            if depth < 1e-3:
+                return False
+            for axis in range(2):
+                target = ((pixels[i, 0] - mu) if axis == 0 else (pixels[i, 1] - mv)) / s
+                row[:] = 0.0
+                row[3 * axis] = x
+                row[3 * axis + 1] = y
+                row[3 * axis + 2] = 1.0
+                row[6] = -target * x
+                row[7] = -target * y
+                w = 1.0 / (depth * depth)
+                for j in range(8):
+                    if row[j] == 0.0:
+                        continue
+                    for k in range(8):
+                        A[j, k] += w * row[j] * row[k]
+                    b[j] += w * row[j] * target
+        if not _solve(A, b):
+            return False
+        h[:] = b
+        if n == 4:
+            break
+    for i in range(used.size):
+        if h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0 < 1e-3:
+            return False
+    for j in range(2):
+        m = mu if j == 0 else mv
+        H[j, 0] = s * h[3 * j] + m * h[6]
+        H[j, 1] = s * h[3 * j + 1] + m * h[7]
+        H[j, 2] = s * h[3 * j + 2] + m
+    H[2, 0] = h[6]
+    H[2, 1] = h[7]
+    H[2, 2] = 1.0
+    return True
+
+
+@njit(cache=True)
+def image_of_circle(H, x, y, radius, out):  # type: ignore[no-untyped-def]
+    """The picture of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's centre, ellipse
+    area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen from in front.
+    """
+    w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+    if w <= 0.0:
+        return False
+    u = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w
+    v = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w
+    # dual conic of the picture, D = H (r² diag(1, 1, 0) - p pᵀ) Hᵀ
+    r2 = radius * radius
+    d33 = r2 * (H[2, 0] ** 2 + H[2, 1] ** 2) - w * w
+    if d33 >= 0.0:
+        return False
+    d13 = r2 * (H[0, 0] * H[2, 0] + H[0, 1] * H[2, 1]) - u * w * w
+    d23 = r2 * (H[1, 0] * H[2, 0] + H[1, 1] * H[2, 1]) - v * w * w
+    j11 = (H[0, 0] - u * H[2, 0]) / w
+    j12 = (H[0, 1] - u * H[2, 1]) / w
+    j21 = (H[1, 0] - v * H[2, 0]) / w
+    j22 = (H[1, 1] - v * H[2, 1]) / w
+    det = j11 * j22 - j12 * j21
+    if det <= 0.0:
+        return False
+    out[0] = u
+    out[1] = v
+    out[2] = d13 / d33 - u
+    out[3] = d23 / d33 - v
+    out[4] = np.pi * r2 * det
+    total = j11 * j11 + j12 * j12 + j21 * j21 + j22 * j22
+    root = np.sqrt(max(total * total - 4.0 * det * det, 0.0))
+    out[5] = radius * np.sqrt(0.5 * (total + root))
+    out[6] = radius * det / np.sqrt(0.5 * (total + root))
+    return True
+
+
+@njit(cache=True)
+def misfits(pattern, pixels, used, H, out):  # type: ignore[no-untyped-def]
+    """Distances (n,) [px] between pixels and projected pattern; 0 where not used. Returns the largest."""
+    worst = 0.0
+    for i in range(used.size):
+        out[i] = 0.0
+        if used[i]:
+            x, y = pattern[i, 0], pattern[i, 1]
+            w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+            du = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w - pixels[i, 0]
+            dv = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w - pixels[i, 1]
+            out[i] = np.sqrt(du * du + dv * dv)
+            worst = max(worst, out[i])
+    return worst
+
+
+@njit(cache=True)
+def drop_outliers(pattern, pixels, used, tolerance, least, H):  # type: ignore[no-untyped-def]
+    """Clear rows of ``used`` until the rest fits a homography within ``tolerance`` [px]. False if ``least`` rows cannot.
+
+    The row whose removal leaves the smallest misfit goes; with five rows left nothing tells which one is wrong, so that
+    ``least`` must be at least 5 for a removal to be meaningful.
+    """
+    distances = np.zeros(used.size)
+    count = 0
+    for i in range(used.size):
+        count += 1 if used[i] else 0
+    if count < least or not fit_homography(pattern, pixels, used, H):
+        return False
+    worst = misfits(pattern, pixels, used, H, distances)
+    while worst > tolerance:
+        if count - 1 < least:
+            return False
+        best = -1
+        best_worst = 1e30
+        for i in range(used.size):
+            if not used[i]:
+                continue
+            used[i] = False
+            if fit_homography(pattern, pixels, used, H):
+                rest = misfits(pattern, pixels, used, H, distances)
+                if rest < best_worst:
+                    best_worst = rest
+                    best = i
+            used[i] = True
+        if best < 0:
+            return False
+        used[best] = False
+        count -= 1
+        if not fit_homography(pattern, pixels, used, H):
+            return False
+        worst = misfits(pattern, pixels, used, H, distances)
+    return True
+
+
+@njit(cache=True)
+def _turn(a, b, c):  # type: ignore[no-untyped-def]
+    """Twice the signed area of a triangle; positive when clockwise as seen (v down)."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+@njit(cache=True)
+def _basis_inverse(pattern, basis, inverse):  # type: ignore[no-untyped-def]
+    """Inverse (3, 3) of the matrix that maps the standard projective basis to four pattern points."""
+    p, q, r, s = pattern[basis[0]], pattern[basis[1]], pattern[basis[2]], pattern[basis[3]]
+    whole = _turn(p, q, r)
+    a, b, c = _turn(s, q, r) / whole, _turn(p, s, r) / whole, _turn(p, q, s) / whole
+    M = np.array([[a * p[0], b * q[0], c * r[0]], [a * p[1], b * q[1], c * r[1]], [a, b, c]])
+    inverse[:] = np.linalg.inv(M)
+
+
+@njit(cache=True)
+def _hypothesis(p, q, r, s, inverse, H):  # type: ignore[no-untyped-def]
+    """Homography of four pattern points (by ``inverse``) to four pixels, H[2, 2] > 0."""
+    whole = _turn(p, q, r)
+    a, b, c = _turn(s, q, r) / whole, _turn(p, s, r) / whole, _turn(p, q, s) / whole
+    for j in range(3):
+        H[0, j] = a * p[0] * inverse[0, j] + b * q[0] * inverse[1, j] + c * r[0] * inverse[2, j]
+        H[1, j] = a * p[1] * inverse[0, j] + b * q[1] * inverse[1, j] + c * r[1] * inverse[2, j]
+        H[2, j] = a * inverse[0, j] + b * inverse[1, j] + c * inverse[2, j]
+    scale = H[2, 2]
+    if abs(scale) < 1e-12:
+        return False
+    for i in range(3):
+        for j in range(3):
+            H[i, j] /= scale
+    return True
+
+
+@njit(cache=True)
+def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: ignore[no-untyped-def]
+    """Dots nearest to the projected pattern into ``owner`` (n,), -1 where none has the right place and size.
+
+    Returns their number; 0 where the homography does not show the pattern from in front.
+    """
+    n = pattern.shape[0]
+    count = 0
+    for i in range(n):
+        owner[i] = -1
+        if not image_of_circle(H, pattern[i, 0], pattern[i, 1], radius, circle):
+            return 0
+        u, v = circle[0] + circle[2], circle[1] + circle[3]
+        # blur inflates the area of thin dots
+        most = np.pi * (circle[5] + 0.7) * (circle[6] + 0.7) * 1.25
+        least = 0.75 * circle[4]
+        nearest = reach * reach
+        for k in range(pixels.shape[0]):
+            du = pixels[k, 0] - u
+            dv = pixels[k, 1] - v
+            if du * du + dv * dv < nearest and least < areas[k] < most:
+                nearest = du * du + dv * dv
+                owner[i] = k
+        if owner[i] >= 0:
+            count += 1
+            for j in range(i):
+                if owner[j] == owner[i]:
+                    return 0
+    return count
+
+
+@njit(cache=True)
+def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, owner):  # type: ignore[no-untyped-def]
+    """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas`` (m,) [px²].
+
+    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4), pruned by the signs and sizes of its
+    triangles, which the dots' areas foretell. A hypothesis counts when ``least`` dots or more lie within ``tolerance`` [px]
+    of the homography fitted to all of them and are of the right size. ``owner`` (n,) gets the dots' rows, -1 for missing ones.
+    Returns the number found; 0 if none, or if another assignment explains as many dots nearly as well.
+    """
+    n = pattern.shape[0]
+    m = pixels.shape[0]
+    unit = np.pi * radius * radius
+    H = np.zeros((3, 3))
+    inverse = np.zeros((3, 3))
+    circle = np.zeros(7)
+    trial = np.zeros(n, np.int64)
+    used = np.zeros(n, np.bool_)
+    matched = np.zeros((n, 2))
+    distances = np.zeros(n)
+    best_count = 0
+    best_misfit = 1e30
+    rival = 1e30
+    owner[:] = -1
+    for row in range(bases.shape[0]):
+        basis = bases[row]
+        t012 = _turn(pattern[basis[0]], pattern[basis[1]], pattern[basis[2]])
+        t013 = _turn(pattern[basis[0]], pattern[basis[1]], pattern[basis[3]])
+        t023 = _turn(pattern[basis[0]], pattern[basis[2]], pattern[basis[3]])
+        t123 = _turn(pattern[basis[1]], pattern[basis[2]], pattern[basis[3]])
+        _basis_inverse(pattern, basis, inverse)
+        for i in range(m):
+            for j in range(m):
+                if j == i or areas[j] > 3.0 * areas[i] or areas[i] > 3.0 * areas[j]:
+                    continue
+                for k in range(m):
+                    if k == i or k == j:
+                        continue
+                    ratio = _turn(pixels[i], pixels[j], pixels[k]) / t012
+                    foretold = (areas[i] + areas[j] + areas[k]) / (3.0 * unit)
+                    if ratio < 0.4 * foretold or ratio > 2.0 * foretold:
+                        continue
+                    for l in range(m):  # noqa: E741
+                        if l == i or l == j or l == k:
+                            continue
+                        if _turn(pixels[i], pixels[j], pixels[l]) / t013 < 0.3 * foretold:
+                            continue
+                        if _turn(pixels[i], pixels[k], pixels[l]) / t023 < 0.3 * foretold:
+                            continue
+                        if _turn(pixels[j], pixels[k], pixels[l]) / t123 < 0.3 * foretold:
+                            continue
+                        if not _hypothesis(pixels[i], pixels[j], pixels[k], pixels[l], inverse, H):
+                            continue
+                        count = _assign(pattern, radius, pixels, areas, reach, H, trial, circle)
+                        if count < least or count < best_count:
+                            continue
+                        same = count == best_count
+                        for d in range(n):
+                            used[d] = trial[d] >= 0
+                            if trial[d] != owner[d]:
+                                same = False
+                            if used[d]:
+                                matched[d, 0] = pixels[trial[d], 0]
+                                matched[d, 1] = pixels[trial[d], 1]
+                        if same:
+                            continue
+                        if not fit_homography(pattern, matched, used, H):
+                            continue
+                        misfit = misfits(pattern, matched, used, H, distances)
+                        if misfit > tolerance:
+                            continue
+                        # sizes once more, under the better homography
+                        if _assign(pattern, radius, pixels, areas, reach, H, trial, circle) < count:
+                            continue
+                        if count > best_count:
+                            rival = 1e30
+                        elif misfit >= best_misfit:
+                            rival = min(rival, misfit)
+                            continue
+                        else:
+                            rival = best_misfit
+                        best_count = count
+                        best_misfit = misfit
+                        owner[:] = trial
+    if best_count == 0 or rival < CLEAR * best_misfit or rival < 0.5 * tolerance:
+        owner[:] = -1
+        return 0
+    return best_count
