@@ -1,10 +1,10 @@
-"""Damped least squares and null directions: the readable reference of `control.kernels`."""
+"""Damped least squares and null directions: the readable reference of `control.linear_kernels`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.kernels import PIVOT_TOLERANCE
+from stereoservo.control.linear_kernels import PIVOT_TOLERANCE
 from stereoservo.geometry.homogeneous import FloatArray
 
 
