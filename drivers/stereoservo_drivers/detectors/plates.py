@@ -1,9 +1,11 @@
-"""Self-identifying planar dot patterns: pure data, shared by the detector, the simulation and the plate printer.
+"""Self-identifying planar dot patterns: pure data, shared by the detector, the simulation and the plate
+printer.
 
-A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on the edge from
-corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly collinear, and the edge dot's fraction
-together with the two inner dots tells the faces apart. A detector may use the pattern of *one face* up to scale; how
-the faces are joined to a body is known to nobody but the simulation's truth.
+A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on
+the edge from corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly
+collinear, and the edge dot's fraction together with the two inner dots tells the faces apart. A detector
+may use the pattern of *one face* up to scale; how the faces are joined to a body is known to nobody but
+the simulation's truth.
 """
 
 from __future__ import annotations
@@ -22,9 +24,9 @@ INNER = (5, 6)
 class DotFace:
     """One planar face.
 
-    ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen from in front.
-    Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids`` name the rows. ``radius`` [m] of a dot,
-    ``half_side`` [m] of the black square around them.
+    ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen
+    from in front. Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids`` name the
+    rows. ``radius`` [m] of a dot, ``half_side`` [m] of the black square around them.
     """
 
     name: str
@@ -51,9 +53,11 @@ def seven_dots(
     radius: float = 0.008,
     margin: float = 0.010,
 ) -> DotFace:
-    """A face from fractions of its corner square: ``edge_fraction`` along edge 0-1, ``inner`` (x, y) from corner 0.
+    """A face from fractions of its corner square: ``edge_fraction`` along edge 0-1, ``inner`` (x, y) from
+    corner 0.
 
-    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots. Ids are ``first_id`` .. ``first_id + 6``.
+    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots. Ids are ``first_id`` ..
+    ``first_id + 6``.
     """
     fractions = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (edge_fraction, 0.0), *inner])
     return DotFace(

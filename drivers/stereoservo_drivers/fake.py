@@ -1,0 +1,201 @@
+"""Fakes: an arm of pure arithmetic and cameras that deliver marker positions; with faults to order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from stereoservo.runtime.ports import (
+    CameraDescription,
+    CameraObservation,
+    CommandReport,
+    DriverContext,
+    DriverError,
+    JointSpec,
+    JointState,
+)
+from stereoservo_drivers.options import decode_options
+from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
+from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
+from stereoservo_sim.drives import DriveBank, IdealPlant, Plant
+from stereoservo_sim.rig import project
+from stereoservo_sim.world import demo_cell
+
+FloatArray = npt.NDArray[np.float64]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=1)]
+
+
+class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Faults of a fake arm; may be changed while it runs (``driver.faults``).
+
+    Each call counts from 1 over the driver's life. ``fail_write``, ``fail_read``: that call and later
+    ones raise DriverError (``connection_lost``). ``fail_activate``: activate() raises.
+    ``freeze_encoder_after``: from that read on positions, velocities and stamp stand still (no feedback).
+    ``stuck_encoder_after``: positions stand still, the stamp goes on. ``drop_writes_after``: later
+    commands do not reach the drives, though reported as sent. ``delay_s``: states are that old. ``gain``:
+    the drives run at this multiple of the command.
+    """
+
+    fail_write: Count | None = None
+    fail_read: Count | None = None
+    fail_activate: bool = False
+    freeze_encoder_after: Count | None = None
+    stuck_encoder_after: Count | None = None
+    drop_writes_after: Count | None = None
+    delay_s: NonNegative = 0.0
+    gain: float = 1.0
+
+
+class FakeJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One joint of a fake arm [rad or m, s]."""
+
+    name: str
+    kind: Literal["revolute", "prismatic"] = "revolute"
+    min: float = -3.0
+    max: float = 3.0
+    velocity: Positive = 1.0
+    acceleration: Positive = 4.0
+
+
+class FakeJointOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of the fake arm. ``joints``: its joints (default: those of the simulated cell's arm)."""
+
+    joints: tuple[FakeJoint, ...] = ()
+    faults: Faults = msgspec.field(default_factory=Faults)
+
+
+class FakeJointDriver(SimulatedArm):
+    """An arm whose joints follow ideal drives; see :class:`Faults` for what can go wrong on demand."""
+
+    driver = "fake"
+    call_budget_us = 500.0
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        decoded = decode_options(FakeJointOptions, options, self.driver)
+        cell = demo_cell()
+        joints, base = cell.robot.joints, cell.base
+        if decoded.joints:
+            joints = tuple(
+                JointSpec(j.name, j.kind, j.min, j.max, j.velocity, j.acceleration) for j in decoded.joints
+            )
+            base = np.clip(
+                np.zeros(len(joints)), [j.min for j in decoded.joints], [j.max for j in decoded.joints]
+            )
+        super().__init__(decoded, context, joints, base)
+        self.faults = decoded.faults
+        self._reads = 0
+        self._writes = 0
+        self._frozen: JointState | None = None
+        self._past: list[JointState] = []
+
+    def make_plant(self, positions: FloatArray) -> Plant:
+        """Ideal joints."""
+        return IdealPlant(positions)
+
+    def activate(self) -> None:
+        """Brakes off, at rest. Raises DriverError."""
+        if self.faults.fail_activate:
+            raise DriverError("fault", "fake arm: activate() fails as ordered (faults.fail_activate)")
+        super().activate()
+
+    def read_state(self) -> JointState:
+        """The encoders now, or what the faults leave of them. Raises DriverError."""
+        state = super().read_state()
+        self._reads += 1
+        faults = self.faults
+        if _due(faults.fail_read, self._reads):
+            raise DriverError("connection_lost", f"fake arm: read {self._reads} fails as ordered", retry=True)
+        if faults.delay_s > 0:
+            state = self._delayed(state)
+        frozen = _due(faults.freeze_encoder_after, self._reads)
+        stuck = _due(faults.stuck_encoder_after, self._reads)
+        if not frozen and not stuck:
+            self._frozen = state
+            return state
+        held = self._frozen if self._frozen is not None else state
+        if frozen:
+            return held
+        return JointState(state.seq, state.t_ns, held.positions, np.zeros_like(held.velocities))
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        """Command (n,) velocities. Raises DriverError."""
+        self._writes += 1
+        if _due(self.faults.fail_write, self._writes):
+            raise DriverError(
+                "connection_lost", f"fake arm: write {self._writes} fails as ordered", retry=True
+            )
+        return super().write_velocity(qd)
+
+    def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+        """Hand a command to the drives, unless a fault swallows it."""
+        if _due(self.faults.drop_writes_after, self._writes):
+            return asked.copy(), ()
+        if self.faults.gain != 1.0:
+            bank.command(now_ns, asked * self.faults.gain)
+            return asked.copy(), ()
+        return super().send(bank, now_ns, asked)
+
+    def _delayed(self, state: JointState) -> JointState:
+        self._past.append(state)
+        limit = state.t_ns - round(self.faults.delay_s * 1e9)
+        while len(self._past) > 1 and self._past[1].t_ns <= limit:
+            self._past.pop(0)
+        return self._past[0]
+
+
+class FakeCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of a fake camera. ``noise_px``: sigma of each coordinate; ``marker_drop_rate``: chance to
+    miss a marker.
+    """
+
+    noise_px: NonNegative = 0.05
+    marker_drop_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
+
+
+class FakeCameraDriver(SimulatedCamera):
+    """A camera that delivers the markers of the simulated cell as observations: projection plus Gaussian
+    noise.
+    """
+
+    driver = "fake"
+    call_budget_us = 2000.0
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self._fake = decode_options(FakeCameraOptions, options, self.driver)
+        super().__init__(self._fake, context)
+
+    def describe(self) -> CameraDescription:
+        """Size, rate, marker ids; delivers observations."""
+        return self.describe_as("observations", tuple(int(i) for i in self.cell.body.ids))
+
+    def deliver(
+        self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
+    ) -> CameraObservation:
+        """The markers that this camera sees with the arm at ``q`` (n,)."""
+        pixels, _ = project(self.camera.P, self.cell.marker_positions(q))
+        seen = self.cell.visible(q, self.camera)
+        # The same numbers are drawn whatever is seen: one marker's fate does not change another's noise.
+        noise = rng.standard_normal(pixels.shape) * self._fake.noise_px
+        seen &= rng.random(len(seen)) >= self._fake.marker_drop_rate
+        k = int(np.count_nonzero(seen))
+        sigma = max(self._fake.noise_px, 1e-3)
+        return CameraObservation(
+            camera=self.name,
+            seq=seq,
+            t_shutter_ns=t_shutter_ns,
+            t_received_ns=t_received_ns,
+            ids=self.cell.body.ids[seen],
+            pixels=(pixels + noise)[seen],
+            covariances=np.broadcast_to(np.eye(2) * sigma**2, (k, 2, 2)).copy(),
+        )
+
+
+def _due(limit: int | None, count: int) -> bool:
+    return limit is not None and count >= limit

@@ -1,0 +1,40 @@
+"""The lifecycle of a driver: what is allowed in which state."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from stereoservo.runtime.ports import DriverError
+
+
+class State(StrEnum):
+    """Where a driver stands. CLOSED is final."""
+
+    CREATED = "created"
+    CONFIGURED = "configured"
+    ACTIVE = "active"
+    CLOSED = "closed"
+
+
+_CODES = {State.CREATED: "not_configured", State.CONFIGURED: "not_active", State.CLOSED: "closed"}
+
+
+class DriverLifecycle:
+    """State of one driver. ``what`` names the driver in messages."""
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+        self.state = State.CREATED
+
+    def require(self, call: str, *allowed: State) -> None:
+        """Raise DriverError (``not_configured``, ``not_active``, ``closed``, ``state``) unless in an
+        allowed state.
+        """
+        if self.state not in allowed:
+            names = " or ".join(state.value for state in allowed)
+            raise DriverError(
+                _CODES.get(self.state, "state"),
+                f"{self.what}: {call} while {self.state.value}; allowed while {names}",
+                state=self.state.value,
+                call=call,
+            )

@@ -1,0 +1,105 @@
+"""The simulated cell: an arm whose joints pybullet moves, and cameras that render what they would see.
+
+pybullet itself is imported by the arm only, when it is configured: the servo process loads no image code,
+the camera process no physics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from stereoservo.runtime.ports import CameraDescription, DriverContext, DriverError, Frame
+from stereoservo_drivers.options import decode_options
+from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
+from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
+from stereoservo_sim.drives import Plant
+from stereoservo_sim.world import demo_cell
+
+if TYPE_CHECKING:
+    from stereoservo_sim.rendering import Renderer
+
+FloatArray = npt.NDArray[np.float64]
+NonNegative = Annotated[float, Meta(ge=0)]
+
+
+class PybulletJointOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of the pybullet arm: those of every simulated arm."""
+
+
+class PybulletJointDriver(SimulatedArm):
+    """The simulated cell's arm in pybullet: rigid bodies, drives with limited acceleration, encoders."""
+
+    driver = "pybullet"
+    call_budget_us = 2000.0
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        decoded = decode_options(PybulletJointOptions, options, self.driver)
+        cell = demo_cell()
+        super().__init__(decoded, context, cell.robot.joints, cell.base)
+        self._robot = cell.robot
+
+    def make_plant(self, positions: FloatArray) -> Plant:
+        """The arm in a physics engine of its own. Raises DriverError."""
+        from stereoservo_sim.physics import PhysicsError, PybulletPlant
+
+        try:
+            return PybulletPlant(self._robot, positions, self.step_ns * 1e-9)
+        except PhysicsError as error:
+            raise DriverError("physics", str(error)) from error
+
+
+class PybulletCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of a rendering camera. ``noise``: sigma [grey levels]; ``blur``: sigma of the lens [px]."""
+
+    noise: NonNegative = 2.0
+    blur: NonNegative = 0.7
+    background: Literal["arm", "plain"] = "arm"
+
+
+class PybulletCameraDriver(SimulatedCamera):
+    """A camera of the simulated cell that delivers rendered grey images."""
+
+    driver = "pybullet"
+    call_budget_us = 10_000.0
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self._render = decode_options(PybulletCameraOptions, options, self.driver)
+        super().__init__(self._render, context)
+        self._renderer: Renderer | None = None
+
+    def describe(self) -> CameraDescription:
+        """Size and rate; delivers frames."""
+        return self.describe_as("frames")
+
+    def configure(self) -> None:
+        """Load the renderer and draw once, so that no later frame waits for a compiler. Raises
+        DriverError.
+        """
+        super().configure()
+        if self._renderer is None:
+            from stereoservo_sim.rendering import Renderer, RenderSettings
+
+            options = self._render
+            settings = RenderSettings(
+                blur_px=options.blur, noise_grey=options.noise, background=options.background
+            )
+            self._renderer = Renderer(self.cell, self.camera, settings)
+            self._renderer.render(self.cell.base, np.random.default_rng(0))
+
+    def deliver(
+        self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
+    ) -> Frame:
+        """The image with the arm at ``q`` (n,)."""
+        assert self._renderer is not None  # active: the lifecycle was checked
+        return Frame(
+            camera=self.name,
+            seq=seq,
+            t_shutter_ns=t_shutter_ns,
+            t_received_ns=t_received_ns,
+            image=self._renderer.render(q, rng),
+        )

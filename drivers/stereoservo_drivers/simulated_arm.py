@@ -1,0 +1,223 @@
+"""What the simulated joint drivers share: lifecycle, time, encoder, and the record of the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from stereoservo.runtime.ports import (
+    CommandReport,
+    DriverContext,
+    DriverError,
+    JointDriverDescription,
+    JointSpec,
+    JointState,
+)
+from stereoservo_drivers.lifecycle import DriverLifecycle, State
+from stereoservo_sim.drives import DriveBank, Plant
+from stereoservo_sim.history import CAPACITY, FILE_NAME, HistoryError, JointHistory
+
+FloatArray = npt.NDArray[np.float64]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+
+
+class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of every simulated arm.
+
+    ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the
+    simulated cell's base. ``resume``: an arm whose history exists stands where that ends. ``encoder``:
+    resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept.
+    """
+
+    rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
+    start: dict[str, float] = {}
+    resume: bool = True
+    command_timeout_s: Positive = 0.1
+    encoder: NonNegative = 1e-5
+    history: Annotated[int, Meta(ge=64, le=10_000_000)] = CAPACITY
+
+
+class SimulatedArm:
+    """A joint driver over a simulated plant. Time is the context's clock: nothing moves between calls.
+
+    ``read_state`` and ``write_velocity`` bring the simulation up to now, so the truth that cameras see is
+    as fine as these calls are frequent. ``context.services["world"]`` may hold a JointHistory to write
+    to; otherwise it is a file in the runtime directory.
+    """
+
+    driver = "simulated"
+    call_budget_us = 2000.0
+    step_ns = 1_000_000
+
+    def __init__(
+        self,
+        options: ArmOptions,
+        context: DriverContext,
+        joints: tuple[JointSpec, ...],
+        base: FloatArray,
+    ) -> None:
+        self._options = options
+        self._context = context
+        self._joints = joints
+        self._start = _start(self.driver, joints, base, options.start)
+        self._life = DriverLifecycle(f"joint driver {self.driver!r}")
+        self._bank: DriveBank | None = None
+        self._history: JointHistory | None = None
+        self._seq = 0
+        self._write_seq = 0
+        self._last_ns = 0
+
+    def make_plant(self, positions: FloatArray) -> Plant:
+        """The joints, standing at ``positions`` (n,). Raises DriverError."""
+        raise NotImplementedError
+
+    def describe(self) -> JointDriverDescription:
+        """Joints, limits, rate; the clock paces."""
+        return JointDriverDescription(
+            driver=self.driver,
+            joints=self._joints,
+            rate_hz=self._options.rate_hz,
+            pacing="clock",
+            command_timeout_s=self._options.command_timeout_s,
+            call_budget_us=self.call_budget_us,
+        )
+
+    def configure(self) -> None:
+        """Set the arm up where it was left. Raises DriverError."""
+        self._life.require("configure()", State.CREATED, State.CONFIGURED)
+        if self._life.state is State.CONFIGURED:
+            return
+        now_ns = self._context.clock.now_ns()
+        self._history = self._open_history(now_ns)
+        newest = self._history.newest() if self._options.resume else None
+        positions = newest[1] if newest is not None else self._start
+        self._bank = DriveBank(
+            self._joints,
+            self.make_plant(positions),
+            now_ns=now_ns,
+            step_ns=self.step_ns,
+            timeout_ns=round(self._options.command_timeout_s * 1e9),
+        )
+        self._record(self._bank)
+        self._life.state = State.CONFIGURED
+
+    def activate(self) -> None:
+        """Brakes off, at rest. Raises DriverError."""
+        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
+        self._life.state = State.ACTIVE
+
+    def read_state(self) -> JointState:
+        """The encoders now. Raises DriverError."""
+        self._life.require("read_state()", State.CONFIGURED, State.ACTIVE)
+        bank = self._advance()
+        self._seq += 1
+        return JointState(
+            seq=self._seq, t_ns=self._stamp(bank), positions=self.encode(bank.plant.positions),
+            velocities=bank.plant.velocities.copy(),
+        )  # fmt: skip
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        """Command (n,) velocities. Raises DriverError: not active, wrong shape, not finite."""
+        self._life.require("write_velocity()", State.ACTIVE)
+        asked = np.array(qd, dtype=np.float64)
+        if asked.shape != (len(self._joints),):
+            raise DriverError(
+                "shape", f"write_velocity() got shape {asked.shape}; this arm takes ({len(self._joints)},)"
+            )
+        if not np.all(np.isfinite(asked)):
+            raise DriverError(
+                "not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite"
+            )
+        bank = self._advance()
+        now_ns = self._context.clock.now_ns()
+        sent, reasons = self.send(bank, now_ns, asked)
+        self._write_seq += 1
+        return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
+
+    def stop(self) -> None:
+        """Brake to rest. Any state; never raises."""
+        if self._bank is not None and self._life.state in (State.CONFIGURED, State.ACTIVE):
+            self._bank.brake(self._context.clock.now_ns())
+            self._record(self._bank)
+
+    def deactivate(self) -> None:
+        """Brake; commands are refused from now on. Idempotent."""
+        if self._life.state is State.ACTIVE:
+            self.stop()
+            self._life.state = State.CONFIGURED
+
+    def close(self) -> None:
+        """Brake, release. Idempotent; never raises."""
+        self.deactivate()
+        if self._bank is not None:
+            self._bank.plant.close()
+        if self._history is not None and self._history.path is not None:
+            self._history.close()
+        self._bank = None
+        self._history = None
+        self._life.state = State.CLOSED
+
+    def encode(self, positions: FloatArray) -> FloatArray:
+        """What encoders of the given resolution say, (n,)."""
+        step = self._options.encoder
+        return np.round(positions / step) * step if step > 0 else positions.copy()
+
+    def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+        """Hand a command to the drives: what was sent (n,), and why it differs from what was asked."""
+        return bank.command(now_ns, asked)
+
+    def _advance(self) -> DriveBank:
+        assert self._bank is not None  # configured: the lifecycle was checked
+        self._bank.advance(self._context.clock.now_ns())
+        self._record(self._bank)
+        return self._bank
+
+    def _stamp(self, bank: DriveBank) -> int:
+        # Several reads inside one simulation step still carry growing stamps.
+        self._last_ns = max(bank.t_ns, self._last_ns + 1)
+        return self._last_ns
+
+    def _record(self, bank: DriveBank) -> None:
+        if self._history is not None:
+            self._history.append(bank.t_ns, bank.plant.positions, bank.plant.velocities)
+
+    def _open_history(self, now_ns: int) -> JointHistory:
+        shared = self._context.services.get("world")
+        if shared is not None:
+            if not isinstance(shared, JointHistory) or shared.joints != len(self._joints):
+                raise DriverError(
+                    "world", f"services['world'] must be a JointHistory of {len(self._joints)} joints"
+                )
+            return shared
+        path = self._context.runtime_dir / FILE_NAME
+        try:
+            return JointHistory.create(path, len(self._joints), now_ns=now_ns, capacity=self._options.history)
+        except HistoryError as error:
+            raise DriverError("history", str(error), path=str(path)) from error
+
+
+def _start(
+    driver: str, joints: tuple[JointSpec, ...], base: FloatArray, start: Mapping[str, Any]
+) -> FloatArray:
+    names = [joint.name for joint in joints]
+    positions = base.copy()
+    for name, value in start.items():
+        if name not in names:
+            raise DriverError(
+                "option", f"driver {driver!r}: start: no joint {name!r}; joints: {', '.join(names)}"
+            )
+        positions[names.index(name)] = value
+    for joint, value in zip(joints, positions, strict=True):
+        if not joint.position_min <= value <= joint.position_max:
+            raise DriverError(
+                "option",
+                f"driver {driver!r}: start of joint {joint.name!r} is {value:g}; its range is "
+                f"{joint.position_min:g} to {joint.position_max:g}",
+            )
+    return positions

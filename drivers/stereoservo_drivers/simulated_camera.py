@@ -1,0 +1,198 @@
+"""What the simulated camera drivers share: the shutter grid, latency, drop-outs, and where the arm was at
+the shutter.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from stereoservo.runtime.ports import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
+from stereoservo_drivers.lifecycle import DriverLifecycle, State
+from stereoservo_sim.history import FILE_NAME, HistoryError, JointHistory
+from stereoservo_sim.world import demo_cell
+
+FloatArray = npt.NDArray[np.float64]
+NonNegative = Annotated[float, Meta(ge=0)]
+HOLD_NS = 100_000_000
+
+
+class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of every simulated camera.
+
+    ``view``: which camera of the simulated rig it is (default: the one with the driver's own name).
+    Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later. ``drop_rate``: chance
+    that a frame is lost; ``dropouts``: spans [s, s] after activation without frames; ``freeze_after_s``:
+    from then on the picture stands still though frames keep coming. ``seed``: of noise and losses
+    (default: the context's).
+    """
+
+    view: str = ""
+    rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 30.0
+    latency_s: NonNegative = 0.012
+    phase_s: NonNegative = 0.0
+    drop_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    dropouts: tuple[tuple[float, float], ...] = ()
+    freeze_after_s: float | None = None
+    seed: int | None = None
+
+
+class SimulatedCamera:
+    """A camera of the simulated cell. Shows the arm as it truly stood at the shutter time.
+
+    ``blackout`` may be set while it runs: no frame arrives until it is cleared. Before the simulated arm
+    has ever moved the camera shows it at the cell's base; when the arm's process is silent, where it was
+    last.
+    """
+
+    driver = "simulated"
+    call_budget_us = 5000.0
+
+    def __init__(self, options: CameraOptions, context: DriverContext) -> None:
+        self.name = context.camera
+        self.cell = demo_cell()
+        self._options = options
+        self._context = context
+        view = options.view or context.camera
+        try:
+            self.camera = self.cell.rig.camera(view)
+        except KeyError as error:
+            raise DriverError(
+                "option", f"driver {self.driver!r}: view: {error.args[0]}", view=view
+            ) from error
+        self._life = DriverLifecycle(f"camera driver {self.driver!r} ({self.name})")
+        self._history: JointHistory | None = None
+        self._seed = context.seed if options.seed is None else options.seed
+        self._period_ns = 1e9 / options.rate_hz
+        self._next = 0
+        self._activated_ns = 0
+        self._frozen: FloatArray | None = None
+        self.blackout = False
+
+    def deliver(
+        self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
+    ) -> Frame | CameraObservation:
+        """What this camera gives for the arm at ``q`` (n,)."""
+        raise NotImplementedError
+
+    def describe_as(
+        self, delivers: Literal["frames", "observations"], marker_ids: tuple[int, ...] = ()
+    ) -> CameraDescription:
+        """The description, given what is delivered."""
+        return CameraDescription(
+            driver=self.driver,
+            name=self.name,
+            width=self.camera.width,
+            height=self.camera.height,
+            rate_hz=self._options.rate_hz,
+            delivers=delivers,
+            call_budget_us=self.call_budget_us,
+            marker_ids=marker_ids,
+        )
+
+    def configure(self) -> None:
+        """Nothing to connect to: the arm may start later. Raises DriverError."""
+        self._life.require("configure()", State.CREATED, State.CONFIGURED)
+        self._life.state = State.CONFIGURED
+
+    def activate(self) -> None:
+        """Frames from the next shutter on. Raises DriverError."""
+        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
+        if self._life.state is State.CONFIGURED:
+            self._activated_ns = self._context.clock.now_ns()
+            self._next = self._grid(self._activated_ns) + 1
+        self._life.state = State.ACTIVE
+
+    def poll(self) -> list[Frame] | list[CameraObservation]:
+        """The newest frame that has arrived since the last poll, or nothing. Raises DriverError."""
+        self._life.require("poll()", State.ACTIVE)
+        now_ns = self._context.clock.now_ns()
+        k = self._grid(now_ns - round(self._options.latency_s * 1e9))
+        if k < self._next:
+            return []
+        t_shutter_ns = self._shutter(k)
+        q = self._arm_at(t_shutter_ns, now_ns)
+        if q is None:
+            return []
+        self._next = k + 1
+        rng = np.random.default_rng((self._seed & 0xFFFFFFFF, zlib.crc32(self.name.encode()), k))
+        if self._lost(t_shutter_ns, rng):
+            return []
+        return [self.deliver(k, t_shutter_ns, now_ns, q, rng)]  # type: ignore[return-value]
+
+    def deactivate(self) -> None:
+        """No more frames. Idempotent."""
+        if self._life.state is State.ACTIVE:
+            self._life.state = State.CONFIGURED
+
+    def close(self) -> None:
+        """Release. Idempotent; never raises."""
+        self.deactivate()
+        if self._history is not None and self._history.path is not None:
+            self._history.close()
+        self._history = None
+        self._life.state = State.CLOSED
+
+    def _grid(self, t_ns: int) -> int:
+        k = int((t_ns - self._options.phase_s * 1e9) // self._period_ns)
+        return k if self._shutter(k) <= t_ns else k - 1
+
+    def _shutter(self, k: int) -> int:
+        return round(k * self._period_ns + self._options.phase_s * 1e9)
+
+    def _lost(self, t_shutter_ns: int, rng: np.random.Generator) -> bool:
+        since = (t_shutter_ns - self._activated_ns) * 1e-9
+        unlucky = bool(rng.random() < self._options.drop_rate)
+        return unlucky or self.blackout or any(start <= since < end for start, end in self._options.dropouts)
+
+    def _arm_at(self, t_ns: int, now_ns: int) -> FloatArray | None:
+        """Joint positions at the shutter, or None while the arm's process has not got there yet."""
+        after = self._options.freeze_after_s
+        if after is not None and self._frozen is not None and (t_ns - self._activated_ns) * 1e-9 >= after:
+            return self._frozen
+        history = self._open_history(now_ns)
+        if history is None:
+            q: FloatArray | None = self.cell.base
+        else:
+            q = history.at(t_ns)
+            if q is None:
+                newest = history.newest()
+                if newest is None:
+                    q = self.cell.base
+                elif now_ns - t_ns > HOLD_NS:
+                    q = newest[1]
+        self._frozen = q
+        return q
+
+    def _open_history(self, now_ns: int) -> JointHistory | None:
+        shared = self._context.services.get("world")
+        if isinstance(shared, JointHistory):
+            return self._checked(shared)
+        if self._history is not None:
+            newest = self._history.newest()
+            silent = newest is None or abs(now_ns - newest[0]) > HOLD_NS
+            if not (silent and self._history.replaced()):
+                return self._history
+            self._history.close()
+            self._history = None
+        path = self._context.runtime_dir / FILE_NAME
+        if path.exists():
+            try:
+                self._history = self._checked(JointHistory.open(path))
+            except HistoryError as error:
+                raise DriverError("history", str(error), path=str(path)) from error
+        return self._history
+
+    def _checked(self, history: JointHistory) -> JointHistory:
+        joints = len(self.cell.robot.joints)
+        if history.joints != joints:
+            raise DriverError(
+                "history",
+                f"the simulated arm has {history.joints} joints; this camera's cell has {joints}",
+            )
+        return history
