@@ -64,7 +64,7 @@ class LockstepOperator:
             job.add(event)
         self._epoch += 1
         self.trials = job.trials()
-        model = fit_model(self.trials, epoch=self._epoch, progress=progress)
+        model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
         self.cell.update_model(ModelUpdate(model))
         self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
         return model

@@ -14,7 +14,7 @@ from stereoservo.runtime.ports import CameraObservation, FloatArray
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import CoreState, JointMove
 
-APPROACH_GAIN = 8.0  # [1/s] end of a joint move
+APPROACH_GAIN = 15.0  # [1/s] end of a joint move
 BRAKE_SHARE = 0.6  # of the acceleration limit that a joint move plans with
 ARRIVED = 5e-4  # [rad or m]
 ARRIVED_STEPS = 5
