@@ -55,7 +55,7 @@ from stereoservo.gateway.session import (
     open_session,
     router_config,
 )
-from stereoservo.gateway.stores import Journal, ModelStore, StoreError, TaughtStore
+from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo.kinematics.model import CellModel, ModelFileError
@@ -79,6 +79,7 @@ from stereoservo.runtime.interprocess import (
 )
 from stereoservo.runtime.lifeline import Termination, die_with_parent, say
 from stereoservo.runtime.recorder import FlightRecorder
+from stereoservo.runtime.taught import TaughtFileError
 
 STATE_EVERY_S = 0.05
 IDLE_S = 0.003
@@ -306,7 +307,8 @@ class Gateway:
                 model.epoch, model.stratum, model.marker_ids, model.created,
                 None if model.statistics is None else model.statistics.rms_px, str(self._models.path(model.epoch)),
             ),
-            taught=tuple(TaughtInfo(g.name, g.model_epoch, g.created) for _, g in sorted(self._taught.goals.items())),
+            taught=tuple(TaughtInfo(name, goal.target.model_epoch or 0, goal.created)
+                for name, goal in sorted(self._taught.goals.items())),
             can_calibrate=settings.trials is not None,
             can_home=settings.home is not None,
             dry_run=plan.dry_run,
@@ -347,7 +349,7 @@ class Gateway:
     def _store_taught(self, event: Event) -> None:
         epoch = 0 if self._model is None else self._model.epoch
         try:
-            self._taught.add(event, self.settings, epoch, _now())
+            self._taught.add(event, epoch, _now())
         except OSError as error:
             self.log.add(
                 "warning",
@@ -536,7 +538,7 @@ def main() -> int:
     termination = Termination(grace_s=8.0)
     try:
         run(load_plan(runtime), termination)
-    except (DirectoryError, OSError, PlanError, SessionError, SlotError, StoreError) as error:
+    except (DirectoryError, OSError, PlanError, SessionError, SlotError, TaughtFileError) as error:
         say("gateway", str(error))
         return EXIT_SETUP
     return 0

@@ -5,88 +5,35 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import msgspec
-
-from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, write_atomically
+from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
 from stereoservo.runtime.commands import FeatureTarget
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.taught import TaughtGoal, load_taught, save_taught, taught_goal
 
-TAUGHT_SCHEMA = 1
 JOURNAL_BYTES = 10_000_000
 
 
-class StoreError(Exception):
-    """A file of the state directory cannot be used; names the file, the cause and the way out."""
-
-
-class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A goal that was shown: mean pixels per camera and marker, the joints then, and the model's epoch."""
-
-    name: str
-    model_epoch: int
-    set_points: dict[str, dict[int, tuple[float, float]]]
-    joints: dict[str, float]
-    created: str
-
-
-class _TaughtFile(msgspec.Struct, forbid_unknown_fields=True):
-    schema: int
-    goals: dict[str, TaughtGoal]
-
-
 class TaughtStore:
-    """Taught goals by name. Raises StoreError for a damaged file (which stays as it is)."""
+    """Taught goals by name. Raises TaughtFileError for a damaged file (which stays as it is)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.goals: dict[str, TaughtGoal] = {}
-        try:
-            data = path.read_bytes()
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise StoreError(f"{path}: {error.strerror}") from error
-        try:
-            file = msgspec.json.decode(data, type=_TaughtFile)
-        except msgspec.MsgspecError as error:
-            raise StoreError(
-                f"{path}: {error}; repair the file, or move it away and teach the goals again"
-            ) from error
-        if file.schema != TAUGHT_SCHEMA:
-            raise StoreError(f"{path}: schema is {file.schema}; this version reads {TAUGHT_SCHEMA}")
-        self.goals = file.goals
+        self.goals: dict[str, TaughtGoal] = load_taught(path)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the goals, sorted."""
         return tuple(sorted(self.goals))
 
-    def add(self, event: Event, settings: CoreSettings, model_epoch: int, created: str) -> TaughtGoal:
-        """Store what a ``taught`` event carries, in place of an older goal of that name."""
-        set_points = {
-            sample.camera: {
-                int(marker): (float(u), float(v))
-                for marker, (u, v) in zip(sample.ids, sample.pixels, strict=True)
-            }
-            for sample in event.samples
-            if sample.ids.size
-        }
-        joints = (
-            {}
-            if event.joints is None
-            else dict(zip(settings.joint_names, event.joints.tolist(), strict=True))
-        )
-        goal = TaughtGoal(event.name, model_epoch, set_points, joints, created)
-        self.goals[event.name] = goal
-        data = msgspec.json.encode(_TaughtFile(TAUGHT_SCHEMA, self.goals), order="sorted")
-        write_atomically(self._path, msgspec.json.format(data, indent=1) + b"\n")
-        return goal
+    def add(self, event: Event, model_epoch: int, created: str) -> None:
+        """Store what a ``taught`` event carries, in place of an older goal of that name. Raises OSError."""
+        self.goals[event.name] = taught_goal(event, model_epoch, created)
+        save_taught(self._path, self.goals)
 
     def target(self, name: str) -> FeatureTarget:
         """The set-points of a taught goal, bound to its model's epoch. Raises KeyError."""
-        goal = self.goals[name]
-        return FeatureTarget(goal.set_points, goal.model_epoch)
+        return self.goals[name].target
 
 
 class ModelStore:

@@ -25,16 +25,11 @@ def check_goal(goal: Goal, context: GoalContext) -> list[str]:
     target = goal.target
     if isinstance(target, JointTarget):
         return _check_joints(goal, target, context)
-    problems = []
-    if goal.points is not None and goal.law == "cartesian3":
-        problems.append(
-            f"points: {goal.points!r} goes with law 'stereo'; law 'cartesian3' has no choice of points"
-        )
     if isinstance(target, TaughtTarget):
         if target.name not in context.taught:
-            problems.append(f"target.name: no taught goal {target.name!r}; taught: {_list(context.taught)}")
-        return problems
-    return problems + _check_features(target, context)
+            return [f"target.name: no taught goal {target.name!r}; taught: {_list(context.taught)}"]
+        return []
+    return _check_features(target, context)
 
 
 def _check_features(target: FeatureTarget, context: GoalContext) -> list[str]:

@@ -125,7 +125,7 @@ def main() -> int:
         print(error, file=sys.stderr)
         return EXIT_INVALID
     save_plan(plan)
-    warm_up(plan.settings())
+    warm_up()
     return 0
 
 

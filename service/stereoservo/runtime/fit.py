@@ -19,7 +19,7 @@ import numpy as np
 
 from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.trials import CalibrationError, load_trials
-from stereoservo.kinematics.model import ModelFileError, save_model
+from stereoservo.kinematics.model import ModelFileError, save_model, write_atomically
 from stereoservo.runtime.lifeline import die_with_parent
 
 NICENESS = 10
@@ -36,8 +36,8 @@ def _plain(value: object) -> object:
     return str(value)
 
 
-def _progress(fraction: float, message: str) -> None:
-    _print({"progress": fraction, "message": message})
+def _progress(stage: str, fraction: float) -> None:
+    _print({"progress": fraction, "message": stage})
 
 
 def main() -> int:
@@ -54,24 +54,19 @@ def main() -> int:
     os.nice(NICENESS)
     try:
         created = datetime.now(UTC).isoformat(timespec="seconds")
-        model = fit_model(
+        result = fit_model(
             load_trials(arguments.trials), epoch=arguments.epoch, created=created, progress=_progress
         )
-        save_model(model, arguments.model)
+        save_model(result.model, arguments.model)
+        report = arguments.model.with_name(arguments.model.stem + "-report.json")
+        write_atomically(report, msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n")
     except CalibrationError as error:
         _print({"error": {"code": error.code, "message": str(error), "data": error.data}})
         return 1
     except (ModelFileError, OSError) as error:
         _print({"error": {"code": type(error).__name__, "message": str(error), "data": {}}})
         return 1
-    _print(
-        {
-            "model": str(arguments.model),
-            "epoch": model.epoch,
-            "stratum": model.stratum,
-            "statistics": model.statistics,
-        }
-    )
+    _print({"model": str(arguments.model), "epoch": result.model.epoch, "report": str(report)})
     return 0
 
 

@@ -91,7 +91,7 @@ class ServoState(msgspec.Struct, frozen=True, eq=False):
     """Why the drive was sent something else than the core asked; empty when it was not."""
 
 
-class RecordingStart(msgspec.Struct, frozen=True, tag="start", eq=False):
+class RecordingStart(msgspec.Struct, frozen=True, tag="start", array_like=True, eq=False):
     """First message on the step socket."""
 
     settings: CoreSettings

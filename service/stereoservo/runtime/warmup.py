@@ -1,21 +1,134 @@
-"""Compiles the kernels of the loop into numba's cache, so that a process that starts later finds them compiled."""
+"""Compiles the kernels of the loop into numba's cache, so that a process that starts later finds them compiled.
+
+A made-up arm with two cameras runs some steps of each law; kernels are compiled by types, not by sizes.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
+from stereoservo.runtime.commands import Command, FeatureTarget, Goal, LawName, PointSource, Request, RunGoal
 from stereoservo.runtime.core import ServoCore
-from stereoservo.runtime.cycle import StepInputs
-from stereoservo.runtime.ports import JointState
-from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.cycle import ModelUpdate, StepInputs
+from stereoservo.runtime.ports import CameraObservation, FloatArray, JointState
+from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 600.0
+JOINTS = tuple(f"j{k}" for k in range(1, 7))
+CAMERAS = ("left", "right")
+MARKERS = tuple(range(6))
+PERIOD_NS = 4_000_000
 
 
-def warm_up(settings: CoreSettings) -> None:
-    """Run some steps of a core that drives nothing."""
-    core = ServoCore(settings)
-    period_ns = round(1e9 / settings.rate_hz)
-    rest = np.zeros(len(settings.joint_names))
-    middle = 0.5 * (settings.limits.position_min + settings.limits.position_max)
-    for k in range(1, 4):
-        now_ns = 1_000_000_000 + k * period_ns
-        core.step(StepInputs(now_ns, period_ns, JointState(k, now_ns, middle, rest), driver_active=True))
+def warm_up() -> None:
+    """Run each law on the made-up cell."""
+    model = _model()
+    pixels = np.stack([_project(camera.matrix, model.marker_points) for camera in model.cameras])
+    law: LawName
+    points: PointSource
+    for law, points in (("stereo", "triangulated"), ("stereo", "predicted"), ("cartesian3", "predicted")):
+        core = ServoCore(_settings())
+        target = FeatureTarget(
+            {
+                name: {
+                    marker: (float(u) + 3.0, float(v) - 2.0)
+                    for marker, (u, v) in zip(MARKERS, pixels[c], strict=True)
+                }
+                for c, name in enumerate(CAMERAS)
+            }
+        )
+        for step in range(1, 9):
+            now_ns = 1_000_000_000 + step * PERIOD_NS
+            command: Command | None = None
+            if step == 5:
+                command = RunGoal(Goal("00000000-0000", target, law=law, points=points))
+            core.step(
+                StepInputs(
+                    now_ns=now_ns,
+                    period_ns=PERIOD_NS,
+                    joints=JointState(step, now_ns, np.zeros(6), np.zeros(6)),
+                    observations=tuple(
+                        _sight(name, pixels[c], step, now_ns) for c, name in enumerate(CAMERAS)
+                    ),
+                    requests=() if command is None else (Request(1, "warmup", command),),
+                    model_update=ModelUpdate(model) if step == 2 else None,
+                    driver_active=True,
+                )
+            )
+
+
+def _sight(camera: str, pixels: FloatArray, step: int, now_ns: int) -> CameraObservation:
+    covariances = np.tile(0.01 * np.eye(2), (len(MARKERS), 1, 1))
+    shutter_ns = now_ns - PERIOD_NS // 2
+    return CameraObservation(camera, step, shutter_ns, now_ns, np.array(MARKERS), pixels.copy(), covariances)
+
+
+def _project(matrix: FloatArray, points: FloatArray) -> FloatArray:
+    m = points @ matrix.T
+    pixels: FloatArray = m[:, :2] / m[:, 2:]
+    return pixels
+
+
+def _model() -> CellModel:
+    axes = np.array([(0, 0, 1), (0, 1, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0)], dtype=float)
+    feet = np.array(
+        [(-0.8, 0, 1.6), (-0.7, 0, 1.5), (-0.4, 0, 1.5), (-0.2, 0, 1.4), (-0.1, 0, 1.3), (0, 0.05, 1.25)]
+    )
+    generators = np.zeros((6, 4, 4))
+    for generator, (x, y, z), foot in zip(generators, axes, feet, strict=True):
+        generator[:3, :3] = [(0, -z, y), (z, 0, -x), (-y, x, 0)]
+        generator[:3, 3] = -generator[:3, :3] @ foot
+    K = np.array([(FOCAL, 0, 0.5 * WIDTH), (0, FOCAL, 0.5 * HEIGHT), (0, 0, 1)])
+    left = K @ np.eye(3, 4)
+    right = left.copy()
+    right[:, 3] = K @ (-0.2, 0.0, 0.0)
+    markers = np.array(
+        [
+            (0, 0, 1.2, 1),
+            (0.1, 0, 1.2, 1),
+            (0.1, 0.1, 1.2, 1),
+            (0, 0.1, 1.22, 1),
+            (0.05, 0.03, 1.25, 1),
+            (0.02, 0.08, 1.3, 1),
+        ]
+    )
+    return CellModel(
+        schema=MODEL_SCHEMA,
+        epoch=1,
+        joint_names=JOINTS,
+        joint_kinds=("revolute",) * 6,
+        zero=np.zeros(6),
+        generators=generators,
+        cameras=(CameraModel("left", left, WIDTH, HEIGHT), CameraModel("right", right, WIDTH, HEIGHT)),
+        marker_ids=MARKERS,
+        marker_points=markers,
+        plane_at_infinity=np.array([0.0, 0.0, 0.0, 1.0]),
+        stratum="metric",
+        projective_to_euclidean=np.eye(4),
+        statistics=None,
+    )
+
+
+def _settings() -> CoreSettings:
+    ones = np.ones(6)
+    return CoreSettings(
+        cell="warmup",
+        joint_names=JOINTS,
+        joint_kinds=("revolute",) * 6,
+        cameras=tuple(CameraSettings(name, WIDTH, HEIGHT, 30.0, "eye_to_hand", MARKERS) for name in CAMERAS),
+        limits=LimitSettings(
+            -2 * ones, 2 * ones, ones, 4 * ones, 0.01, np.zeros((0, 6, 2)), (), 0.5, 0.1, 1.0
+        ),
+        trials=None,
+        home=None,
+        rate_hz=250.0,
+        law="stereo",
+        points="predicted",
+        gain=1.0,
+        tolerance_px=0.1,
+        hold_frames=10,
+        time_limit_s=10.0,
+        filter_s=0.2,
+        gate_sigma=6.0,
+    )

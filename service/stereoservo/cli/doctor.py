@@ -1,0 +1,131 @@
+"""``stereoservo doctor``: checks a cell before it moves."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.gateway.session import SessionError, router_config
+from stereoservo.gateway.stores import ModelStore
+from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.runtime.describe import PlanOptions, make_plan
+from stereoservo.runtime.directories import CellDirectories, cell_directories, create_directories
+from stereoservo.runtime.interprocess import RunPlan
+from stereoservo.runtime.locks import holder
+from stereoservo.runtime.taught import load_taught
+
+LOW_DISK_BYTES = 500_000_000
+
+
+class Check(msgspec.Struct, frozen=True):
+    """One check. ``ok`` None: a warning."""
+
+    name: str
+    ok: bool | None
+    message: str
+
+
+def doctor(
+    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Path of a cell file.")],
+    json: JsonOption = False,
+) -> None:
+    """Check cell file, drivers, cameras, directories, wire, model and scheduling, without moving anything."""
+    loaded = load_cell_file(cell)
+    checks = [Check("cell file", True, f"{cell} is valid")]
+    directories = cell_directories(loaded.cell.name)
+    create_directories(directories)
+    plan = make_plan(cell.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
+    checks.append(Check("drivers", True, _drivers(plan)))
+    checks += [check(plan, directories) for check in CHECKS]
+    failed = [check for check in checks if check.ok is False]
+    marks = {True: "ok", False: "FAILED", None: "note"}
+    if failed:
+        tree = msgspec.to_builtins(checks)
+        raise CommandError(
+            "checks_failed", "; ".join(f"{check.name}: {check.message}" for check in failed), checks=tree
+        )
+    emit({"checks": checks}, "\n".join(f"{marks[c.ok]:6} {c.name:12} {c.message}" for c in checks), json)
+
+
+def _drivers(plan: RunPlan) -> str:
+    cameras = ", ".join(
+        f"{c.name} {c.width}x{c.height} at {c.rate_hz:g} Hz, {len(c.marker_ids)} markers"
+        for c in plan.cameras
+    )
+    return f"{plan.joints.driver}: {len(plan.joints.joints)} joints; {cameras}"
+
+
+def _daemon(plan: RunPlan, directories: CellDirectories) -> Check:
+    pid = holder(directories.daemon_lock)
+    if pid is None:
+        return Check("daemon", True, "none runs for this cell")
+    return Check("daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`")
+
+
+def _wire(plan: RunPlan, directories: CellDirectories) -> Check:
+    try:
+        config = router_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
+    except SessionError as error:
+        return Check("zenoh", False, str(error))
+    return Check(
+        "zenoh",
+        True,
+        f"{config['mode']}: {', '.join(config['listen']['endpoints'] or config['connect']['endpoints'])}",
+    )
+
+
+def _model(plan: RunPlan, directories: CellDirectories) -> Check:
+    model, passed = ModelStore(directories.models).newest_fitting(plan.settings())
+    if model is not None:
+        return Check("model", True, f"epoch {model.epoch}, {model.stratum}, of {model.created}")
+    return Check("model", None, "; ".join(passed) or "none yet: calibrate")
+
+
+def _taught(plan: RunPlan, directories: CellDirectories) -> Check:
+    goals = load_taught(directories.taught)
+    return Check("taught", True, ", ".join(sorted(goals)) or "none yet")
+
+
+def _scheduling(plan: RunPlan, directories: CellDirectories) -> Check:
+    wanted = plan.cell.servo.priority
+    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if wanted == 0 or soft >= wanted or soft == resource.RLIM_INFINITY or _is_root():
+        return Check(
+            "scheduling",
+            True,
+            f"SCHED_FIFO priority {wanted}" if wanted else "ordinary scheduling was asked for",
+        )
+    return Check(
+        "scheduling",
+        None,
+        f"SCHED_FIFO priority {wanted} is not allowed here (limit {soft}): `ulimit -r {wanted}`",
+    )
+
+
+def _is_root() -> bool:
+    with open("/proc/self/status", encoding="ascii", errors="replace") as file:
+        capabilities = next(int(line.split()[1], 16) for line in file if line.startswith("CapEff"))
+    return bool(capabilities >> 23 & 1)  # CAP_SYS_NICE
+
+
+def _disk(plan: RunPlan, directories: CellDirectories) -> Check:
+    free = shutil.disk_usage(directories.state).free
+    ok = True if free > LOW_DISK_BYTES else None
+    return Check("disk", ok, f"{free / 1e9:.1f} GB free for recordings in {directories.state}")
+
+
+CHECKS: tuple[Callable[[RunPlan, CellDirectories], Check], ...] = (
+    _daemon,
+    _wire,
+    _model,
+    _taught,
+    _scheduling,
+    _disk,
+)

@@ -1,0 +1,23 @@
+"""``stereoservo drivers``."""
+
+from __future__ import annotations
+
+from stereoservo.cli.output import JsonOption, emit
+from stereoservo.runtime import plugins
+
+
+def drivers(json: JsonOption = False) -> None:
+    """List drivers, detectors and commands that are installed; broken ones with their error."""
+    groups = {group.rpartition(".")[2]: plugins.list_plugins(group, check=True) for group in plugins.GROUPS}
+    tree = {
+        kind: [
+            {"name": p.name, "value": p.value, "distribution": p.distribution, "error": p.error or None}
+            for p in found
+        ]
+        for kind, found in groups.items()
+    }
+    lines = []
+    for kind, found in groups.items():
+        lines.append(kind.replace("_", " "))
+        lines += [f"  {p.name:12} {p.value}" + (f"  BROKEN: {p.error}" if p.error else "") for p in found]
+    emit(tree, "\n".join(lines), json)

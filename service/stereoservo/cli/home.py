@@ -1,0 +1,23 @@
+"""``stereoservo home``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from stereoservo.cli.goal import follow
+from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption
+from stereoservo.gateway.client import Client
+
+
+def home(
+    cell: CellArgument,
+    speed_scale: Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")] = 1.0,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Move every joint to the cell's home position. Ctrl-C cancels."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        follow(client.home(speed_scale), json)

@@ -1,0 +1,124 @@
+"""``stereoservo init``: a commented cell file, its limits taken from what the driver says of itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.runtime import plugins
+from stereoservo.runtime.cellfile import check_joints, load_cell_file
+from stereoservo.runtime.clock import MonotonicClock
+from stereoservo.runtime.directories import CELL_NAME
+from stereoservo.runtime.ports import CameraDescription, DriverContext, JointDriverDescription
+
+
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The cell file to write, e.g. cell.toml.")],
+    name: Annotated[str, typer.Option(help="Name of the cell (default: the file's).")] = "",
+    joint_driver: Annotated[str, typer.Option(help="See `stereoservo drivers`.")] = "fake",
+    camera_driver: Annotated[str, typer.Option(help="See `stereoservo drivers`.")] = "fake",
+    detector: Annotated[str, typer.Option(help="For camera drivers that deliver images.")] = "dots",
+    camera: Annotated[list[str] | None, typer.Option(help="Camera names (default: left, right).")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Write a cell file with every joint's limits and comments on what to set."""
+    cell = name or file.stem
+    if not CELL_NAME.fullmatch(cell):
+        raise CommandError(
+            "argument", f"cell name {cell!r}: letters, digits, '_' and '-' are valid, up to 64 (--name)"
+        )
+    if file.exists() and not force:
+        raise CommandError("exists", f"{file} exists already; --force writes over it")
+    cameras = camera or ["left", "right"]
+    context = DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent)
+    joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, joint_driver)({}, context).describe()
+    described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
+        {},
+        DriverContext(
+            MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0]
+        ),
+    ).describe()
+    wanted = detector if described.delivers == "frames" else ""
+    try:
+        file.write_text(_text(cell, joint_driver, joints, camera_driver, wanted, cameras))
+    except OSError as error:
+        raise CommandError("file", f"{file}: {error.strerror}") from error
+    check_joints(load_cell_file(file), tuple(joint.name for joint in joints.joints), file)
+    emit({"cell": cell, "file": str(file)}, f"wrote {file}; next: stereoservo doctor {file}", json)
+
+
+def _text(
+    cell: str,
+    driver: str,
+    joints: JointDriverDescription,
+    camera_driver: str,
+    detector: str,
+    cameras: list[str],
+) -> str:
+    lines = [
+        "schema = 1",
+        "",
+        "[cell]",
+        f'name = "{cell}"',
+        "",
+        "[joints]",
+        f'driver = "{driver}"',
+        "# [joints.options]              # what the driver wants to know",
+        "# [joints.home]                 # home position by joint [rad or m]; default: calibration.base",
+        "",
+    ]
+    for name in cameras:
+        lines += ["[[camera]]", f'name = "{name}"', f'driver = "{camera_driver}"']
+        if detector:
+            lines.append(f'detector = "{detector}"')
+        lines += ['mount = "eye_to_hand"         # or "eye_in_hand"', ""]
+    lines += [
+        "[servo]",
+        f"rate_hz = {min(joints.rate_hz, 250.0):g}                 # cycles of the loop a second",
+        'law = "cartesian3"             # default law of goals: "cartesian3" or "stereo"',
+        "gain = 1.5                     # [1/s]",
+        "tolerance_px = 0.25            # a goal is reached when every marker is this close ...",
+        "hold_frames = 10               # ... for so many frames",
+        "",
+        "[safety]",
+        "coast_s = 0.5                  # how long a law may run on prediction when no camera delivers",
+        "position_margin = 0.01         # distance kept from every limit [rad or m]",
+        "speed_scale = 1.0              # lowers every speed",
+        "",
+        "# Limits of the cell: at most those of the machine (given here). Say why where you lower one.",
+    ]
+    for joint in joints.joints:
+        lines += [
+            "[[safety.limit]]",
+            f'joint = "{joint.name}"',
+            f"min = {joint.position_min!r}",
+            f"max = {joint.position_max!r}",
+            f"velocity = {joint.velocity_max!r}",
+            f"acceleration = {joint.acceleration_max!r}",
+            "",
+        ]
+    lines += [
+        "# Trial motions: each joint moves alone from base over base ± range. Choose base such that every camera",
+        "# sees the markers there, and ranges as large as the markers stay in view.",
+        "[calibration]",
+        "stops = 9",
+        "frames = 5",
+        "",
+        "[calibration.base]",
+    ]
+    lines += [f"{joint.name} = {_base(joint.position_min, joint.position_max)!r}" for joint in joints.joints]
+    lines += ["", "[calibration.range]"]
+    lines += [f"{joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints]
+    return "\n".join(lines) + "\n"
+
+
+def _base(low: float, high: float) -> float:
+    return round(min(max(0.0, low + 0.25 * (high - low)), high - 0.25 * (high - low)), 3)
+
+
+def _range(low: float, high: float) -> float:
+    return round(min(0.3, 0.2 * (high - low)), 3)

@@ -1,0 +1,144 @@
+"""``stereoservo``: one module a command, imported when it is called; further commands by entry point."""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import sys
+import traceback
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+from typer.main import get_command
+from typer.models import CommandInfo
+
+import stereoservo
+from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
+from stereoservo.runtime import plugins
+
+COMMANDS: dict[str, str] = {
+    "run": "run:run",
+    "status": "status:status",
+    "stop": "stop:stop",
+    "goal": "goal:goal",
+    "teach": "teach:teach",
+    "jog": "jog:jog",
+    "home": "home:home",
+    "calibrate": "calibrate:calibrate",
+    "watch": "watch:watch",
+    "enable": "verbs:enable",
+    "disable": "verbs:disable",
+    "hold": "verbs:hold",
+    "resume": "verbs:resume",
+    "reset": "verbs:reset",
+    "replay": "replay:replay",
+    "drivers": "drivers:drivers",
+    "doctor": "doctor:doctor",
+    "init": "init:init",
+    "ls": "ls:ls",
+    "warmup": "warmup:warmup",
+}
+"""Commands of the service: name -> module:function below ``stereoservo.cli``."""
+
+_USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
+"""click's UsageError, wherever this version of typer keeps its click."""
+
+
+class LazyGroup(TyperGroup):
+    """Imports a command when it is asked for. A broken plug-in is listed with its error and takes no other with it."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
+        return [*COMMANDS, *extra]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        try:
+            function = _load(cmd_name)
+        except plugins.PluginError as error:
+            function = _broken(error)
+        return _command(cmd_name, function)
+
+
+def _load(name: str) -> Any:
+    where = COMMANDS.get(name)
+    if where is None:
+        return plugins.load(plugins.COMMANDS, name)
+    module, _, function = where.partition(":")
+    return getattr(importlib.import_module(f"stereoservo.cli.{module}"), function)
+
+
+def _broken(error: plugins.PluginError) -> Any:
+    def broken(json: bool = typer.Option(False, "--json")) -> None:
+        raise CommandError("plugin", str(error))
+
+    broken.__doc__ = f"(broken) {error}"
+    return broken
+
+
+def _command(name: str, function: Any) -> Any:
+    """A typer command of one function."""
+    single = typer.Typer(add_completion=False, rich_markup_mode=None)
+    single.registered_commands.append(CommandInfo(name=name, callback=function))
+    command = get_command(single)
+    command.name = name
+    return command
+
+
+app = typer.Typer(cls=LazyGroup, add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"stereoservo {stereoservo.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    """Closes the loop between two uncalibrated cameras and a robot arm."""
+
+
+def invoke(arguments: list[str]) -> int:
+    """Run one command line; gives the exit code. Prints failures as the contract says."""
+    as_json = "--json" in arguments
+    try:
+        code = get_command(app).main(args=arguments, prog_name="stereoservo", standalone_mode=False)
+    except KeyboardInterrupt:
+        fail(CommandError("interrupted", "interrupted"), as_json)
+        return EXIT_INTERRUPTED
+    except typer.Abort:
+        fail(CommandError("interrupted", "interrupted"), as_json)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read us has gone
+        return EXIT_FAILED
+    except _USAGE_ERROR as error:
+        context = getattr(error, "ctx", None)
+        message = error.format_message() if hasattr(error, "format_message") else str(error)
+        if context is not None and not as_json:
+            note(context.get_usage())
+        fail(CommandError("usage", message), as_json)
+        return EXIT_USAGE
+    except Exception as error:
+        if not known(error):
+            traceback.print_exc()
+        fail(error, as_json)
+        return EXIT_FAILED
+    return code if isinstance(code, int) else 0
+
+
+def main() -> None:
+    """Entry point of the command line."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    sys.exit(invoke(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""What every command does alike: exactly one JSON object on stdout with ``--json``, messages on stderr, exit codes."""
+
+from __future__ import annotations
+
+import re
+import sys
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
+CellArgument = Annotated[
+    str, typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml).")
+]
+EndpointOption = Annotated[
+    str | None,
+    typer.Option("--endpoint", help="zenoh endpoint of a daemon on another host (CELL is then its name)."),
+]
+OperatorOption = Annotated[
+    str | None,
+    typer.Option("--operator", help="Name under which commands are given (default: user and process)."),
+]
+
+
+class CommandError(Exception):
+    """A command failed. ``code`` is stable; ``data`` goes into the JSON beside the message."""
+
+    def __init__(self, code: str, message: str, **data: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.data = data
+
+
+def emit(result: Any, text: str, as_json: bool) -> None:
+    """Print a result: as JSON, or as text for people."""
+    if as_json:
+        sys.stdout.write(msgspec.json.encode(result, enc_hook=str).decode() + "\n")
+    elif text:
+        sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def note(message: str) -> None:
+    """Progress and remarks, on stderr."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def fail(error: BaseException, as_json: bool) -> None:
+    """Print a failure: the message on stderr, and ``{"error": …}`` on stdout with ``--json``."""
+    message = str(error) or type(error).__name__
+    note(f"error: {message}")
+    if as_json:
+        given = getattr(error, "code", None)
+        code = given if isinstance(given, str) and given else _snake(type(error).__name__)
+        body: dict[str, Any] = {"code": code, "message": message}
+        reply = getattr(error, "reply", None)
+        if reply is not None:
+            body["problems"] = list(reply.problems)
+            body["reasons"] = msgspec.to_builtins(reply.reasons)
+        if isinstance(error, CommandError):
+            body |= error.data
+        emit({"error": body}, "", True)
+
+
+def known(error: BaseException) -> bool:
+    """Whether an exception is one that this project raises on purpose: its text is the message, no traceback needed."""
+    return type(error).__module__.split(".")[0].startswith("stereoservo") or isinstance(error, OSError)
+
+
+def pairs(items: list[str], what: str) -> dict[str, float]:
+    """``["a=0.1", "b=-2"]`` as a mapping. Raises CommandError for anything else."""
+    found: dict[str, float] = {}
+    for item in items:
+        name, equals, value = item.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = float("nan")
+        if not equals or not name or number != number or abs(number) == float("inf"):
+            raise CommandError("argument", f"{what} {item!r}: NAME=NUMBER with a finite number is valid")
+        found[name] = number
+    return found
+
+
+def _snake(name: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name.removesuffix("Error")).lower()

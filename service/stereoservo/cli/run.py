@@ -1,0 +1,42 @@
+"""``stereoservo run``: the daemon of a cell."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoservo.cli.output import JsonOption, emit, note
+from stereoservo.runtime.interprocess import COMMISSIONING_SPEED, RunPlan
+from stereoservo.runtime.supervisor import run_cell
+
+
+def run(
+    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Path of a cell file.")],
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Compute everything, write nothing to the drives.")
+    ] = False,
+    commissioning: Annotated[
+        bool, typer.Option("--commissioning", help=f"Cap speed at {COMMISSIONING_SPEED:.0%} of the cell's.")
+    ] = False,
+    record: Annotated[
+        str, typer.Option("--record", metavar="FILE", help="Record the flight; 'auto' names the file itself.")
+    ] = "",
+    seed: Annotated[int, typer.Option("--seed", help="Seed for simulated drivers.")] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Run a cell until SIGTERM or Ctrl-C; either ends it with the arm stopped."""
+
+    def ready(plan: RunPlan) -> None:
+        mode = " (dry run: nothing is written to the drives)" if dry_run else ""
+        note(f"cell {plan.cell.cell.name!r} is up{mode}")
+
+    file = record if record in ("", "auto") else str(Path(record).absolute())
+    ended_by = run_cell(
+        cell, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready
+    )
+    if ended_by == signal.SIGINT:
+        raise KeyboardInterrupt
+    emit({"cell": str(cell), "ended_by": signal.Signals(ended_by).name if ended_by else ""}, "", json)

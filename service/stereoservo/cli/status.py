@@ -1,0 +1,37 @@
+"""``stereoservo status``."""
+
+from __future__ import annotations
+
+import math
+
+from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, emit
+from stereoservo.gateway.client import Client
+from stereoservo.gateway.messages import StateMessage
+
+
+def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
+    """What the cell does now, and why it does not do more."""
+    with Client(cell, endpoint=endpoint) as client:
+        state = client.status()
+    emit(state, describe(state), json)
+
+
+def describe(state: StateMessage) -> str:
+    """A state in some lines of text."""
+    joints = "  ".join(
+        f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items()
+    )
+    lines = [
+        f"{state.cell}: {state.lifecycle}, model {state.model} (epoch {state.model_epoch}), {state.source}",
+        f"  joints  {joints}",
+        f"  loop    {state.loop.rate_hz:g} Hz, {state.loop.cycles} cycles, {state.loop.overruns} overruns, lateness p99 "
+        f"{state.loop.lateness_us['p99']:.0f} us, max {state.loop.lateness_us['max']:.0f} us",
+        "  markers " + "  ".join(f"{camera} {count}" for camera, count in state.visible.items()),
+    ]
+    if state.goal:
+        error = "" if state.error_px is None else f", error {state.error_px:.3f} px"
+        lines.append(f"  goal    {state.goal} ({state.law or 'joints'}){error}")
+    lines += [f"  {reason.level:7} {reason.code} {reason.subject}: {reason.hint}" for reason in state.reasons]
+    if not state.servo_alive:
+        lines.append("  the servo process is silent")
+    return "\n".join(lines)

@@ -1,0 +1,67 @@
+"""``stereoservo enable · disable · hold · resume · reset``."""
+
+from __future__ import annotations
+
+from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit
+from stereoservo.gateway.client import Client
+
+
+def enable(
+    cell: CellArgument,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Let the arm move: power on, brakes released, at rest."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        client.enable()
+        state = client.status()
+    emit(state, state.lifecycle, json)
+
+
+def disable(
+    cell: CellArgument,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Stop the arm and switch its drives off."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        reply = client.disable()
+    emit(reply, reply.message, json)
+
+
+def hold(
+    cell: CellArgument,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Decelerate and hold; the goal is kept for `resume`."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        reply = client.hold()
+    emit(reply, reply.message, json)
+
+
+def resume(
+    cell: CellArgument,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Go on after `hold` or `stop`, from the measured state."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        reply = client.resume()
+    emit(reply, reply.message, json)
+
+
+def reset(
+    cell: CellArgument,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Leave a fault whose cause is gone; the arm stays off until `enable`."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        reply = client.reset()
+    emit(reply, reply.message, json)
