@@ -393,3 +393,34 @@ def triangulate(
     ok = np.empty(pixels.shape[1], dtype=np.bool_)
     triangulate_into(Ps, pixels, weights, iterations, M, ok)
     return M, ok
+
+
+EXP_HALVINGS = 8
+EXP_TERMS = 10
+
+
+@kernel
+def exp_twist(G: FloatArray) -> FloatArray:
+    """Exponential (4, 4) of any generator (4, 4), a general screw included: Taylor series with scaling and squaring."""
+    term = np.zeros((4, 4))
+    H = np.zeros((4, 4))
+    product = np.empty((4, 4))
+    scaled = np.empty((4, 4))
+    scale = 1.0 / 2.0**EXP_HALVINGS
+    for i in range(4):
+        term[i, i] = 1.0
+        H[i, i] = 1.0
+        for k in range(4):
+            scaled[i, k] = G[i, k] * scale
+    for n in range(1, EXP_TERMS + 1):
+        multiply4_into(term, scaled, product)
+        for i in range(4):
+            for k in range(4):
+                term[i, k] = product[i, k] / n
+                H[i, k] += term[i, k]
+    for _ in range(EXP_HALVINGS):
+        multiply4_into(H, H, product)
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = product[i, k]
+    return H

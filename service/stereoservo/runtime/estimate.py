@@ -13,7 +13,15 @@ import numpy as np
 
 from stereoservo.control.kernels import damped_least_squares
 from stereoservo.geometry.cameras import camera_centre
-from stereoservo.kinematics.kernels import chain_forward, image_jacobian, project_points, transform_points, triangulate
+from stereoservo.kinematics.kernels import (
+    chain_forward,
+    image_jacobian,
+    invert4,
+    multiply4_into,
+    project_points,
+    transform_points,
+    triangulate,
+)
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
 from stereoservo.runtime.settings import CoreSettings
@@ -37,6 +45,8 @@ class ModelArrays:
     marker_points: FloatArray
     plane_at_infinity: FloatArray
     camera_centres: FloatArray
+    metric_basis: FloatArray | None
+    """Six twists (6, 4, 4) that span all displacements, where the model is metric."""
     marker_ids: tuple[int, ...]
     index: dict[int, int]
 
@@ -67,9 +77,36 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),
         plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
         camera_centres=with_unit_height(centres, model.plane_at_infinity),
+        metric_basis=_metric_basis(model),
         marker_ids=model.marker_ids,
         index={marker: i for i, marker in enumerate(model.marker_ids)},
     )
+
+
+def _metric_basis(model: CellModel) -> FloatArray | None:
+    """Translations along, and rotations about, three axes through the markers' middle, in the projective frame."""
+    H = model.projective_to_euclidean
+    if H is None:
+        return None
+    inverse = invert4(np.ascontiguousarray(H, dtype=np.float64))
+    euclidean = transform_points(np.ascontiguousarray(H), np.ascontiguousarray(model.marker_points))
+    middle = (euclidean[:, :3] / euclidean[:, 3:]).sum(axis=0) / float(len(euclidean))
+    size = float(np.sqrt(((euclidean[:, :3] / euclidean[:, 3:] - middle) ** 2).sum(axis=-1).max()))
+    basis = np.zeros((6, 4, 4))
+    for k in range(3):
+        basis[k, k, 3] = size
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[3 + k, j, i], basis[3 + k, i, j] = 1.0, -1.0
+        basis[3 + k, j, 3], basis[3 + k, i, 3] = -middle[i], middle[j]
+    for k in range(6):  # H⁻¹ T̂ H, by explicit loops
+        basis[k] = _product(inverse, _product(basis[k], H))
+    return basis
+
+
+def _product(A: FloatArray, B: FloatArray) -> FloatArray:
+    product = np.empty((4, 4))
+    multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
+    return product
 
 
 @dataclass(frozen=True)

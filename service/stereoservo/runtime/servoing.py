@@ -6,19 +6,20 @@ from itertools import combinations
 
 import numpy as np
 
-from stereoservo.control.cartesian3_kernel import cartesian3_step
 from stereoservo.control.cartesian3 import cartesian3_reasons
-from stereoservo.control.kernels import stereo_step
+from stereoservo.control.kernels import cartesian3_step, stereo_step
 from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.kernels import image_jacobian, triangulate
+from stereoservo.kinematics.kernels import chain_forward, image_jacobian, transform_points, triangulate
 from stereoservo.runtime.commands import FeatureTarget, Goal
 from stereoservo.runtime.estimate import ModelArrays, points_now, with_unit_height
+from stereoservo.runtime.goal_pose import goal_pose
 from stereoservo.runtime.motion import Motion, Present
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.state import Servoing
 
 MIN_MARKERS = 3
 MIN_FACE_AREA_PX2 = 100.0
+MAX_GOAL_RESIDUAL_PX = 5.0
 STEREO_DAMPING = 1e-6  # relative to the largest diagonal of the normal matrix
 ILL_CONDITIONED = 1e-5
 
@@ -41,8 +42,9 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         )
     face: IntArray = np.zeros(3, np.int64)
     centre = np.zeros(4)
-    if law == "cartesian3":
+    if law == "cartesian3" or int(known.sum()) >= MIN_MARKERS:
         face = _face(set_points, known, arrays)
+        target_points = _goal_points(present, arrays, target_points, known, face, set_points, wanted)
         centre = target_points[known].sum(axis=0) / float(known.sum())
     lease_s = goal.lease_s if goal.lease_s is not None else 0.0
     return Servoing(
@@ -95,7 +97,7 @@ def _face(set_points: FloatArray, known: FloatArray, arrays: ModelArrays) -> Int
     candidates = np.flatnonzero(known)
     if candidates.size < 3:
         raise ValueError(
-            f"cartesian3 needs {MIN_MARKERS} markers that two cameras show at the goal; {candidates.size} are"
+            f"{MIN_MARKERS} markers that two cameras show at the goal are needed; {candidates.size} are"
         )
     triples = np.array(list(combinations(candidates.tolist(), 3)), dtype=np.int64)
     a, b, c = (set_points[:, triples[:, k]] for k in range(3))
@@ -103,8 +105,28 @@ def _face(set_points: FloatArray, known: FloatArray, arrays: ModelArrays) -> Int
     best = int(areas.argmax())
     if float(areas[best]) < MIN_FACE_AREA_PX2:
         ids = [arrays.marker_ids[int(i)] for i in candidates]
-        raise ValueError(f"the markers {ids} of the goal lie on one line; cartesian3 needs three that span a face")
+        raise ValueError(f"the markers {ids} of the goal lie on one line; three that span a face are needed")
     return triples[best]
+
+
+def _goal_points(
+    present: Present, arrays: ModelArrays, targets: FloatArray, known: FloatArray, face: IntArray,
+    set_points: FloatArray, wanted: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """The goal's pose as marker points. Raises ValueError where no displacement of the body explains the set-points."""
+    prediction = present.prediction
+    assert prediction is not None
+    points = transform_points(
+        chain_forward(arrays.generators, arrays.kinds, arrays.zero, present.q)[0], arrays.marker_points
+    )
+    pose = goal_pose(arrays, prediction.operators, points, targets, known, face, set_points, wanted)
+    if not pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
+        raise ValueError(
+            f"no displacement of the marker body explains the set-points: marker {pose.worst_marker} is off by "
+            f"{pose.worst_px:.2f} px (rms {pose.rms_px:.2f} px; up to {MAX_GOAL_RESIDUAL_PX} px is accepted): are ids "
+            "swapped, is it another body, or is it mirrored?"
+        )
+    return pose.points
 
 
 def servo_step(source: Servoing, present: Present) -> Motion:
