@@ -1,0 +1,180 @@
+"""``stereoservo reproduce EXPERIMENT``: an experiment run again, with the value to compare with beside
+ours."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from stereoservo_sim.experiments.errors import ExperimentError
+
+ProgressCall = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the command line; an experiment takes those that its ``takes`` lists, the others must be
+    unset."""
+
+    seed: int
+    plot: Path | None
+    data: Path | None
+    hand_tag: int | None
+    table_tags: str | None
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """``run`` gives the JSON object; ``show`` prints it for people."""
+
+    summary: str
+    takes: frozenset[str]
+    run: Callable[[Options, ProgressCall], dict[str, Any]]
+    show: Callable[[dict[str, Any], Console], None]
+
+
+def run_real_franka_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """The real-arm experiment from its options. Raises ExperimentError."""
+    from stereoservo_sim.experiments.real_franka import TABLE_TAGS, run_real_franka
+    from stereoservo_sim.experiments.real_franka_report import draw, report
+
+    if options.data is None:
+        raise ExperimentError("option", "real-franka needs --data DIR, a folder with ee_poses.csv and images")
+    table = TABLE_TAGS if options.table_tags is None else _tag_list(options.table_tags)
+    hand_tag = 9 if options.hand_tag is None else options.hand_tag
+    result = run_real_franka(
+        options.data, hand_tag=hand_tag, table_tags=table, seed=options.seed, progress=progress
+    )
+    answer = report(result)
+    if options.plot is not None:
+        answer["plots"] = [str(path) for path in draw(result, options.plot)]
+    return answer
+
+
+def show_real_franka(answer: dict[str, Any], console: Console) -> None:
+    """Tables of the held-out errors and of the figures beside the reference."""
+    reference = answer["reference"]
+    table = Table(title="real-franka: held-out poses predicted from the arm's poses", title_justify="left")
+    for column in ("", "ours", "reference"):
+        table.add_column(column, justify="left" if not column else "right")
+    table.add_row("median [px]", f"{answer['median_px']:.3f}", f"{reference['median_px']}")
+    table.add_row("rms [px]", f"{answer['rms_px']:.3f}", f"{reference['rms_px']}")
+    sides = ", ".join(f"{side:.2f}" for side in answer["tag_sides_mm"])
+    table.add_row("tag sides [mm]", sides, "–".join(f"{side:.2f}" for side in reference["tag_sides_mm"]))
+    flat = answer["table_flatness_mm"]
+    table.add_row(
+        "table flatness [mm]",
+        answer["table_flatness_reason"] if flat is None else f"{flat:.3f}",
+        f"{reference['table_flatness_mm']}",
+    )
+    console.print(table)
+    variants = Table(title="variants", title_justify="left")
+    for column in ("", "median [px]", "rms [px]", "largest [px]"):
+        variants.add_column(column, justify="left" if not column else "right")
+    for name, figures in answer["variants"].items():
+        variants.add_row(name, *(f"{figures[key]:.3f}" for key in ("median_px", "rms_px", "max_px")))
+    console.print(variants)
+    images = answer["images"]
+    console.print(f"{images['with_hand_tag']} of {images['read']} images show tag {answer['hand_tag']}")
+    for path in answer.get("plots", []):
+        console.print(f"wrote {path}")
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "real-franka": Experiment(
+        "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
+        frozenset({"data", "hand_tag", "table_tags"}),
+        run_real_franka_command,
+        show_real_franka,
+    ),
+}
+"""By the name given on the command line."""
+
+
+def reproduce(
+    experiment: Annotated[str, typer.Argument(help="Which one: " + ", ".join(EXPERIMENTS) + ".")],
+    data: Annotated[
+        Path | None, typer.Option(help="real-franka: folder with ee_poses.csv and images.")
+    ] = None,
+    hand_tag: Annotated[
+        int | None, typer.Option(help="real-franka: id of the tag on the hand [default: 9].")
+    ] = None,
+    table_tags: Annotated[
+        str | None,
+        typer.Option(help="real-franka: ids of tags lying on the table, by commas [default: 0,2,3]."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    plot: Annotated[Path | None, typer.Option(help="Write pictures into this folder.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """Run an experiment again and print our figures beside those to compare with."""
+    try:
+        chosen = _find(experiment)
+        options = Options(seed, plot, data, hand_tag, table_tags)
+        for name in ("data", "hand_tag", "table_tags"):
+            if getattr(options, name) is not None and name not in chosen.takes:
+                raise ExperimentError("option", f"{experiment} does not take --{name.replace('_', '-')}")
+        with _progress_bar() as progress:
+            answer = chosen.run(options, progress)
+    except (ExperimentError, OSError) as error:
+        _fail(error, as_json)
+    if as_json:
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        chosen.show(answer, Console(markup=False))
+
+
+def _find(name: str) -> Experiment:
+    if name not in EXPERIMENTS:
+        known = ", ".join(sorted(EXPERIMENTS))
+        raise ExperimentError(
+            "experiment", f"no experiment {name!r}; known: {known}", known=sorted(EXPERIMENTS)
+        )
+    return EXPERIMENTS[name]
+
+
+def _fail(error: ExperimentError | OSError, as_json: bool) -> None:
+    """Say what went wrong, as JSON on stdout or as text on stderr, and leave with code 1."""
+    if as_json:
+        code, data = (error.code, error.data) if isinstance(error, ExperimentError) else ("file", {})
+        print(json.dumps({"error": {"code": code, "message": str(error), "data": data}}))
+    else:
+        print(f"error: {error}", file=sys.stderr)
+    raise typer.Exit(1)
+
+
+def _tag_list(text: str) -> tuple[int, ...]:
+    """Tag ids from ``0,2,3``; an empty text is no tag."""
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise ExperimentError("option", f"--table-tags {text!r}; needed: ids by commas, like 0,2,3") from None
+
+
+@contextmanager
+def _progress_bar() -> Iterator[ProgressCall]:
+    """A bar on stderr where that is a terminal, else nothing."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda stage, done, total: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def tell(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield tell
