@@ -1,8 +1,9 @@
-"""Virtual cells as independent truth: Euclidean arms and a stereo rig, seen only through a random projective frame."""
+"""Virtual cells as independent truth: Euclidean arms and a stereo rig, hidden by a random frame."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def dh_screws(rows):
     T, generators = np.eye(4), []
     for a, alpha, d in rows:
         generators.append(screw(T[:3, 2], T[:3, 3]))
-        T = T @ pose(Rotation.identity(), [0, 0, d]) @ pose(Rotation.from_euler("x", alpha, degrees=True), [a, 0, 0])
+        T = T @ pose(Rotation.from_euler("x", alpha, degrees=True), [a, 0, d])
     return np.array(generators), T
 
 
@@ -116,7 +117,7 @@ def random_frame(rng):
 
 
 def free_arm(rng, T0):
-    """Three prismatic and three revolute joints, these through the middle of the plate at its start ``T0``."""
+    """Three prismatic and three revolute joints, through the middle of the plate at its start ``T0``."""
     generators = np.array(
         [screw(axis) for axis in np.eye(3)] + [screw(axis, T0[:3, 3]) for axis in np.eye(3)]
     )
@@ -139,7 +140,10 @@ def rx90(rng, q=RX90_MIDDLE, T0=None, rows=RX90):
     return World(rig_from_base @ generators @ inverse, rig_from_base @ flange @ mount, random_frame(rng), q)
 
 
-def random_task(rng, angle_deg, distance, front=np.cos(np.radians(75))):
+GRAZING = np.cos(np.radians(75))
+
+
+def random_task(rng, angle_deg, distance, front=GRAZING):
     """Poses of start and target that both cameras see, ``angle_deg`` and ``distance`` [m] apart."""
     probe = World(np.zeros((0, 4, 4)), np.eye(4), np.eye(4), np.zeros(0))
 
@@ -167,20 +171,16 @@ def random_task(rng, angle_deg, distance, front=np.cos(np.radians(75))):
 
 @pytest.fixture(scope="session")
 def virtual():
-    """Builders of virtual cells: ``free_arm``, ``rx90``, ``random_task``, ``random_frame``, ``World``, ``pose``, ``screw``."""
-    return type(
-        "Virtual",
-        (),
-        {
-            "free_arm": staticmethod(free_arm),
-            "rx90": staticmethod(rx90),
-            "random_task": staticmethod(random_task),
-            "random_frame": staticmethod(random_frame),
-            "pose": staticmethod(pose),
-            "screw": staticmethod(screw),
-            "World": World,
-            "PLATE": PLATE,
-            "RX90": RX90,
-            "RX90_MIDDLE": RX90_MIDDLE,
-        },
+    """Builders of virtual cells, by name."""
+    return SimpleNamespace(
+        free_arm=free_arm,
+        rx90=rx90,
+        random_task=random_task,
+        random_frame=random_frame,
+        pose=pose,
+        screw=screw,
+        World=World,
+        PLATE=PLATE,
+        RX90=RX90,
+        RX90_MIDDLE=RX90_MIDDLE,
     )

@@ -79,7 +79,9 @@ def cartesian3_reasons(task_error: FloatArray, allowed: FloatArray, status: IntA
         left, may = float(task_error[i]), float(allowed[i])
         if status[i] == ComponentStatus.NOT_REACHABLE:
             hint = "the arm lacks this freedom here: leave the singularity by joints, or give another goal"
-            reasons.append(Reason("NOT_REACHABLE", "slow", component, left, None, unit, hint))
+            # an angle can only be measured by the operator that the arm lacks
+            value = left if component == TRANSLATION else None
+            reasons.append(Reason("NOT_REACHABLE", "slow", component, value, None, unit, hint))
         elif status[i] == ComponentStatus.WAITS:
             hint = "waits for the other components, so that the cameras keep seeing the face"
             reasons.append(Reason("VISIBILITY_WAIT", "info", component, left, may, unit, hint))

@@ -15,7 +15,13 @@ from stereoservo.control.cartesian3 import IntArray
 from stereoservo.control.linear_kernels import null_direction, right_singular
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
-from stereoservo.trajectory.primitives import DEGENERATE_RATIO, RANK_RATIO, REACH_RATIO, RIGID_FREEDOMS
+from stereoservo.trajectory.primitives import (
+    DEGENERATE_RATIO,
+    NOISE_RATIO,
+    RANK_RATIO,
+    REACH_RATIO,
+    RIGID_FREEDOMS,
+)
 from stereoservo.trajectory.three_points import COINCIDENT, FLAT_FACE, VISIBILITY_SHARE, ComponentStatus
 
 MOVES = int(ComponentStatus.MOVES)
@@ -115,7 +121,8 @@ def _primitive(
     x, smallest, second, largest = null_direction(reduced)
     if rank == 1:
         second = 1.0
-    if second <= DEGENERATE_RATIO * largest or smallest > REACH_RATIO * second:
+    threshold = NOISE_RATIO if rank == RIGID_FREEDOMS else REACH_RATIO
+    if second <= DEGENERATE_RATIO * largest or smallest > threshold * second:
         return False
     for i in range(4):
         for k in range(4):

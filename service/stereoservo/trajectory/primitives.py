@@ -20,10 +20,11 @@ from stereoservo.geometry.homogeneous import FloatArray, line_of_planes, planes_
 RANK_RATIO = 1e-4
 """Singular value of the stacked operators, relative to the largest, below which a freedom is lost."""
 
-REACH_RATIO = 0.1
-"""Smallest to second singular value above which the arm cannot make the motion: it would leak that much of
-others.
-"""
+REACH_RATIO = 0.03
+"""Smallest to second singular value above which an arm of fewer than six freedoms cannot make the motion."""
+
+NOISE_RATIO = 0.5
+"""The same for an arm of six freedoms, which can make any: what is left there is error of the operators."""
 
 DEGENERATE_RATIO = 1e-9
 """Second to largest singular value below which a system names no single motion."""
@@ -173,8 +174,9 @@ def _kernel(operators: FloatArray, system: FloatArray, freedoms: Freedoms | None
         raise DegenerateStepError(
             f"{freedom}: more than one motion fits (second singular value {second:.3g})"
         )
-    if smallest > REACH_RATIO * second:
-        raise NotReachableError(freedom, smallest / second, REACH_RATIO)
+    threshold = NOISE_RATIO if rank == RIGID_FREEDOMS else REACH_RATIO
+    if smallest > threshold * second:
+        raise NotReachableError(freedom, smallest / second, threshold)
     screw = basis @ rows[rank - 1]
     return Primitive(screw, np.tensordot(screw, operators, axes=1), smallest, second, largest)
 

@@ -128,6 +128,7 @@ def decompose(
             hinge = _component(primitive, theta, bound)
             A_r = A_tc @ exp_rotation(primitive.operator, -theta).T  # (7.24)
         except (NotReachableError, DegenerateStepError) as error:
+            # no operator, no measure of the angle: that of the planes' coordinates tells that there is one
             angle = math.acos(min(1.0, max(-1.0, float(a @ a_t))))
             hinge = _nothing(operators, angle, ComponentStatus.NOT_REACHABLE, str(error))
 
