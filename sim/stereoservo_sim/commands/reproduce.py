@@ -144,12 +144,11 @@ def _find(name: str) -> Experiment:
 
 
 def _fail(error: ExperimentError | OSError, as_json: bool) -> None:
-    """Say what went wrong, as JSON on stdout or as text on stderr, and leave with code 1."""
+    """Say what went wrong on stderr, and with ``--json`` on stdout; leave with code 1."""
+    print(f"error: {error}", file=sys.stderr)
     if as_json:
         code, data = (error.code, error.data) if isinstance(error, ExperimentError) else ("file", {})
-        print(json.dumps({"error": {"code": code, "message": str(error), "data": data}}))
-    else:
-        print(f"error: {error}", file=sys.stderr)
+        print(json.dumps({"error": {"code": code, "message": str(error), **data}}))
     raise typer.Exit(1)
 
 

@@ -64,12 +64,11 @@ class TagViews:
 
 @dataclass(frozen=True)
 class DrivenCameras:
-    """A fit: ``Ps`` (c, 3, 4) from the arm's base [m] to undistorted pixels, ``radial`` (c,), ``corners`` (k,
-    3) [m].
+    """A fit: ``Ps`` (c, 3, 4) from the arm's base [m] to undistorted pixels, ``radial`` (c,), ``corners``.
 
-    ``sizes`` (c, 2): image width and height [px]. ``inliers`` (v,) of the fitted views; ``rss`` [px²] their
-    squared residuals; ``starts``: how many guesses of the offset came through to a bundle, and their robust
-    costs.
+    ``corners`` (k, 3) in the hand [m]. ``sizes`` (c, 2): image width and height [px]. ``inliers`` (v,) of the
+    fitted views; ``rss`` [px²] their squared residuals; ``costs`` [px²]: robust costs of the bundled guesses,
+    best guess first.
     """
 
     Ps: FloatArray
@@ -113,8 +112,7 @@ def undistort(pixels: FloatArray, radial: FloatArray, sizes: IntArray) -> FloatA
 def fit_driven_cameras(
     displacements: FloatArray, views: TagViews, sizes: IntArray, rng: np.random.Generator
 ) -> DrivenCameras:
-    """Cameras without a radial term and corners of least reprojection error, from several guesses of the
-    offset.
+    """Cameras without radial terms, and corners, of least reprojection error; several guesses of the offset.
 
     For each guess: linear cameras from the tag's middle, corners and cameras in turn, then a robust bundle of
     the best few; the best of these, and last a plain least-squares bundle on its inliers. Raises
