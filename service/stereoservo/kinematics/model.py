@@ -39,8 +39,8 @@ class JointStatistics(msgspec.Struct, frozen=True):
 class FitStatistics(msgspec.Struct, frozen=True, eq=False):
     """Statistics of the final least-squares fit.
 
-    ``chi2`` is the sum of squared residuals in sigmas, with ``degrees_of_freedom`` = measurements - parameters net of
-    gauge; ``chi2_ok``: inside the two-sided 99.9 % interval.
+    ``chi2`` is the sum of squared residuals in sigmas, with ``degrees_of_freedom`` = measurements -
+    parameters net of gauge; ``chi2_ok``: inside the two-sided 99.9 % interval.
     """
 
     rms_px: float
@@ -57,14 +57,14 @@ class FitStatistics(msgspec.Struct, frozen=True, eq=False):
 class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Projective kinematics, cameras and markers in one projective frame.
 
-    ``generators`` (n, 4, 4): joint operators at ``zero`` (n,), revolute ones with eigenvalues (0, 0, i, -i), prismatic
-    ones nilpotent (5.18). ``marker_points`` (m, 4): markers at the zero, orbital heights such that
-    ``plane_at_infinity @ M == 1``. ``projective_to_euclidean`` (4, 4): H_PE up to one global scale, where the stratum is
-    ``metric``. ``epoch`` is unique for each model a cell ever had.
+    ``generators`` (n, 4, 4): joint operators at ``zero`` (n,), revolute ones with eigenvalues (0, 0, i, -i),
+    prismatic ones nilpotent (5.18). ``marker_points`` (m, 4): markers at the zero, orbital heights such that
+    ``plane_at_infinity @ M == 1``. ``projective_to_euclidean`` (4, 4): H_PE up to one global scale, where the
+    stratum is ``metric``. ``epoch`` is unique for each model a cell ever had.
 
-    Stratum ``projective``: the plane at infinity is not identifiable (all axes parallel, say); ``plane_at_infinity`` is
-    then the least singular vector of (5.59): joints keep the heights ``a @ M`` that it gives, but parallelism must not
-    be read from it.
+    Stratum ``projective``: the plane at infinity is not identifiable (all axes parallel, say);
+    ``plane_at_infinity`` is then the least singular vector of (5.59): joints keep the heights ``a @ M`` that
+    it gives, but parallelism must not be read from it.
     """
 
     schema: int
@@ -120,7 +120,9 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         raise ModelFileError(path, "cameras", "is empty; a model has at least one camera")
     if len(model.joint_kinds) != n:
         raise ModelFileError(
-            path, "joint_kinds", f"has {len(model.joint_kinds)} entries; one for each of the {n} joint_names is needed"
+            path,
+            "joint_kinds",
+            f"has {len(model.joint_kinds)} entries; one for each of the {n} joint_names is needed",
         )
     for key, names in (
         ("joint_names", model.joint_names),
@@ -128,7 +130,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         ("cameras", tuple(camera.name for camera in model.cameras)),
     ):
         for name in names:
-            if names.count(name) > 1:  # type: ignore[arg-type]
+            if names.count(name) > 1:
                 raise ModelFileError(path, key, f"{name!r} stands twice; entries must differ")
     arrays: list[tuple[str, FloatArray, tuple[int, ...]]] = [
         ("zero", model.zero, (n,)),
@@ -148,7 +150,9 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
     for i, camera in enumerate(model.cameras):
         if camera.width < 1 or camera.height < 1:
             raise ModelFileError(
-                path, f"cameras[{i}]", f"{camera.name!r}: image size {camera.width}x{camera.height} px is not positive"
+                path,
+                f"cameras[{i}]",
+                f"{camera.name!r}: image size {camera.width}x{camera.height} px is not positive",
             )
     _check_algebra(model, path)
 
@@ -164,7 +168,8 @@ def _check_algebra(model: CellModel, path: Path | str) -> None:
             raise ModelFileError(
                 path,
                 f"generators[{j}]",
-                f"joint {model.joint_names[j]!r} is {kind} but ‖{law.replace(' = ', ' - ').replace('- -', '+ ')}‖ is "
+                f"joint {model.joint_names[j]!r} is {kind} but "
+                f"‖{law.replace(' = ', ' - ').replace('- -', '+ ')}‖ is "
                 f"{np.linalg.norm(defect):.2e} with ‖Ĥ‖ {size:.2e}; {law} is needed",
             )
     heights = model.marker_points @ model.plane_at_infinity
@@ -179,7 +184,8 @@ def _check_algebra(model: CellModel, path: Path | str) -> None:
         raise ModelFileError(
             path,
             "projective_to_euclidean",
-            f"is {'missing' if model.projective_to_euclidean is None else 'given'} with stratum {model.stratum!r}; "
+            f"is {'missing' if model.projective_to_euclidean is None else 'given'} with stratum "
+            f"{model.stratum!r}; "
             "it is there in the metric stratum, and only there",
         )
 
@@ -198,7 +204,9 @@ def _decode_array(kind: type, value: object) -> object:
 
 
 def encode_model(model: CellModel) -> bytes:
-    """A model as one JSON object, arrays as nested lists with every bit of a float64. Raises ModelFileError."""
+    """A model as one JSON object, arrays as nested lists with every bit of a float64. Raises
+    ModelFileError.
+    """
     check_model(model)
     return msgspec.json.format(msgspec.json.encode(model, enc_hook=_encode_array), indent=1) + b"\n"
 

@@ -1,4 +1,6 @@
-"""A Euclidean cell as independent truth: Denavit-Hartenberg arms, pinhole cameras, trial motions with noise."""
+"""A Euclidean cell as independent truth: Denavit-Hartenberg arms, pinhole cameras, trial motions with
+noise.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,7 @@ def two_faces():
     """14 dots on two faces of a body, 7 each, about 12 cm across."""
     face = np.array([(-45, -30), (0, -32), (45, -28), (-48, 5), (10, 0), (-40, 34), (42, 30)]) / 1000
     front = np.hstack([face, np.full((7, 1), 0.05)])
-    side = (rotation("y", 50)[:3, :3] @ front.T).T + [0.07, 0.0, -0.02]
+    side = front @ rotation("y", 50)[:3, :3].T + np.array([0.07, 0.0, -0.02])
     return np.vstack([front, side])
 
 
@@ -123,7 +125,9 @@ def stereo_rig(count=2):
 
 
 def placed(kinds, links, body, home, ranges, facing, cameras=2, distance=1.3):
-    """The cell with the body's middle ``distance`` in front of the rig at home, its flange turned by ``facing``."""
+    """The cell with the body's middle ``distance`` in front of the rig at home, its flange turned by
+    ``facing``.
+    """
     K, poses = stereo_rig(cameras)
     home, ranges = np.asarray(home, dtype=float), np.asarray(ranges, dtype=float)
     cell = Cell(np.eye(4), tuple(kinds), tuple(links), body, K, poses, home, ranges)
@@ -138,7 +142,16 @@ def rx90(body=None, cameras=2, distance=1.3):
     home = np.radians([10, -60, 120, 20, 40, 15])
     ranges = np.radians([15, 15, 15, 30, 30, 40])
     facing = rotation("x", 180) @ rotation("y", 15) @ rotation("x", 10)
-    return placed(["revolute"] * 6, links, two_faces() if body is None else body, home, ranges, facing, cameras, distance)
+    return placed(
+        ["revolute"] * 6,
+        links,
+        two_faces() if body is None else body,
+        home,
+        ranges,
+        facing,
+        cameras,
+        distance,
+    )
 
 
 def gantry():
@@ -153,7 +166,14 @@ def scara():
     links = [translation(0.35, 0, 0.2), translation(0.3, 0, 0), np.eye(4), translation(0, 0, 0.03)]
     ranges = [*np.radians([15, 20]), 0.1, np.radians(40)]
     facing = rotation("x", 150) @ rotation("y", 25)
-    return placed(["revolute", "revolute", "prismatic", "revolute"], links, two_faces(), [0.3, 0.5, 0, 0.2], ranges, facing)
+    return placed(
+        ["revolute", "revolute", "prismatic", "revolute"],
+        links,
+        two_faces(),
+        [0.3, 0.5, 0, 0.2],
+        ranges,
+        facing,
+    )
 
 
 def mixed():
@@ -162,7 +182,14 @@ def mixed():
              translation(0, 0, 0.1)]  # fmt: skip
     ranges = [0.15, *np.radians([25, 30, 35])]
     facing = rotation("x", 170) @ rotation("y", 20)
-    return placed(["prismatic", "revolute", "revolute", "revolute"], links, two_faces(), [0, 0.3, 0.4, 0.2], ranges, facing)
+    return placed(
+        ["prismatic", "revolute", "revolute", "revolute"],
+        links,
+        two_faces(),
+        [0, 0.3, 0.4, 0.2],
+        ranges,
+        facing,
+    )
 
 
 def parallel():

@@ -1,7 +1,9 @@
-"""Rigid bundle of generators, cameras and markers in any stratum (5.53, 5.55-5.57): residuals, Jacobian, solution.
+"""Rigid bundle of generators, cameras and markers in any stratum (5.53, 5.55-5.57): residuals, Jacobian,
+solution.
 
 Angles are exact; pixels carry the noise. All quantities are moved along the minimal charts of
-:mod:`stereoservo.kinematics.calibration.charts`, so that the Jacobian has full rank where the data identify the model.
+:mod:`stereoservo.kinematics.calibration.charts`, so that the Jacobian has full rank where the data identify
+the model.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Rig:
-    """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4), ``points`` (m, 4) at joint offset 0."""
+    """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4), ``points`` (m, 4) at
+    joint offset 0.
+    """
 
     kinds: tuple[Kind, ...]
     generators: FloatArray
@@ -54,7 +58,12 @@ class Measurements:
     def select(self, keep: npt.NDArray[np.bool_]) -> Measurements:
         """The measurements where ``keep`` (k,) holds."""
         return Measurements(
-            self.offsets, self.camera[keep], self.stop[keep], self.marker[keep], self.pixels[keep], self.sigmas[keep]
+            self.offsets,
+            self.camera[keep],
+            self.stop[keep],
+            self.marker[keep],
+            self.pixels[keep],
+            self.sigmas[keep],
         )
 
 
@@ -75,8 +84,8 @@ class Charts:
 def full_charts(rig: Rig, stratum: Stratum, *, cameras: bool = True, points: bool = True) -> Charts:
     """Minimal charts around ``rig``; cameras or points may be kept fixed.
 
-    With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second loses the
-    remaining gauge, further ones are free.
+    With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
+    loses the remaining gauge, further ones are free.
     """
     none = np.zeros((0, 3, 4))
     matrices: tuple[FloatArray, ...] = tuple(none for _ in rig.cameras)
@@ -96,10 +105,33 @@ def full_charts(rig: Rig, stratum: Stratum, *, cameras: bool = True, points: boo
     )
 
 
+def unit_charts(
+    rig: Rig, data: Measurements, stratum: Stratum, *, cameras: bool = True, points: bool = True
+) -> Charts:
+    """``full_charts`` scaled so that the columns of the Jacobian have unit length: chart coordinates in
+    sigmas.
+    """
+    charts = full_charts(rig, stratum, cameras=cameras, points=points)
+    sizes = np.linalg.norm(jacobian(rig, charts, np.zeros(charts.size), data), axis=0)
+    sizes[sizes == 0.0] = 1.0
+    at = 0
+    scaled: list[tuple[FloatArray, ...]] = []
+    for part in (charts.generators, charts.cameras, charts.points):
+        bases = []
+        for basis in part:
+            size = sizes[at : at + len(basis)]
+            bases.append(basis / size.reshape(-1, *(1,) * (basis.ndim - 1)))
+            at += len(basis)
+        scaled.append(tuple(bases))
+    return Charts(scaled[0], scaled[1], scaled[2])
+
+
 def moved(rig: Rig, charts: Charts, x: FloatArray) -> Rig:
     """The rig at chart coordinates ``x``."""
     at = 0
-    generators, cameras, points = [], [], []
+    generators: list[FloatArray] = []
+    cameras: list[FloatArray] = []
+    points: list[FloatArray] = []
     for generator, basis in zip(rig.generators, charts.generators, strict=True):
         frame, _ = conjugation(basis, x[at : at + len(basis)])
         generators.append(frame @ generator @ np.linalg.inv(frame))
@@ -112,7 +144,9 @@ def moved(rig: Rig, charts: Charts, x: FloatArray) -> Rig:
 
 
 def displaced(rig: Rig, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Partial products ``E_1 … E_j`` (n + 1, s, 4, 4) and ``E_{j+1} … E_n M`` (n + 1, s, m, 4), j = 0 … n (5.18)."""
+    """Partial products ``E_1 … E_j`` (n + 1, s, 4, 4) and ``E_{j+1} … E_n M`` (n + 1, s, m, 4), j = 0 … n
+    (5.18).
+    """
     steps = exponentials(rig.generators, rig.kinds, offsets)
     s, n = offsets.shape
     before = np.empty((n + 1, s, 4, 4))
@@ -134,7 +168,9 @@ def predicted(rig: Rig, data: Measurements) -> FloatArray:
 
 
 def residuals(rig: Rig, data: Measurements) -> FloatArray:
-    """Weighted residuals (2 k,): prediction minus measurement in sigmas, u and v of each measurement together."""
+    """Weighted residuals (2 k,): prediction minus measurement in sigmas, u and v of each measurement
+    together.
+    """
     return ((predicted(rig, data) - data.pixels) / data.sigmas[:, None]).ravel()
 
 
@@ -189,7 +225,9 @@ def jacobian(rig: Rig, charts: Charts, x: FloatArray, data: Measurements) -> Flo
 
 @dataclass(frozen=True)
 class Solution:
-    """A solved bundle: the rig, its charts there, ``cost`` = sum of squared weighted residuals, and the Jacobian."""
+    """A solved bundle: the rig, its charts there, ``cost`` = sum of squared weighted residuals, and the
+    Jacobian.
+    """
 
     rig: Rig
     charts: Charts
@@ -216,22 +254,32 @@ def solve(
 ) -> Solution:
     """Least squares over the minimal charts of ``stratum``, re-centred between ``rounds``.
 
-    ``loss_scale`` [sigmas] for the robust losses. Never raises on a bad fit: look at ``converged`` and ``cost``.
+    ``loss_scale`` [sigmas] for the robust losses. Never raises on a bad fit: look at ``converged`` and
+    ``cost``.
     """
     evaluations = 0
     converged = False
     for _ in range(rounds):
-        start, charts = rig, full_charts(rig, stratum, cameras=cameras, points=points)
+        start, charts = rig, unit_charts(rig, data, stratum, cameras=cameras, points=points)
+
+        def error_at(x: FloatArray, start: Rig = start, charts: Charts = charts) -> FloatArray:
+            return residuals(moved(start, charts, x), data)
+
+        def slope_at(x: FloatArray, start: Rig = start, charts: Charts = charts) -> FloatArray:
+            return jacobian(start, charts, x, data)
+
         fit = least_squares(
-            lambda x, start=start, charts=charts: residuals(moved(start, charts, x), data),
+            error_at,
             np.zeros(charts.size),
-            jac=lambda x, start=start, charts=charts: jacobian(start, charts, x, data),
+            jac=slope_at,
             x_scale="jac",
             loss=loss,
             f_scale=loss_scale,
             ftol=tolerance,
-            xtol=1e-12,
-            gtol=1e-12,
+            xtol=1e-10,
+            # Columns have unit length: a gradient so small moves no parameter by a notable part of its
+            # deviation.
+            gtol=1e-6,
             max_nfev=max_evaluations,
         )
         rig = moved(start, charts, fit.x)
@@ -239,7 +287,7 @@ def solve(
         converged = fit.status > 0
         if converged and fit.nfev <= 3:
             break
-    charts = full_charts(rig, stratum, cameras=cameras, points=points)
+    charts = unit_charts(rig, data, stratum, cameras=cameras, points=points)
     error = residuals(rig, data)
     slope = jacobian(rig, charts, np.zeros(charts.size), data)
     return Solution(rig, charts, stratum, float(error @ error), error, slope, converged, evaluations)

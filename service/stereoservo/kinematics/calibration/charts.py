@@ -1,8 +1,9 @@
-"""Minimal charts around generators, cameras and points, without the gauge freedoms of each stratum (thesis 4.4, 5.4.2).
+"""Minimal charts around generators, cameras and points, without the gauge freedoms of each stratum (thesis
+4.4, 5.4.2).
 
-A generator keeps its spectrum when it is conjugated, so its neighbours are ``T Ĥ₀ T⁻¹`` with ``T`` from the structure
-group of the stratum: GL(4), the affine or the similarity group. Directions of the group's algebra that commute with
-``Ĥ₀`` change nothing; the chart is spanned by the rest. Their number is the minimal one:
+A generator keeps its spectrum when it is conjugated, so its neighbours are ``T Ĥ₀ T⁻¹`` with ``T`` from the
+structure group of the stratum: GL(4), the affine or the similarity group. Directions of the group's algebra
+that commute with ``Ĥ₀`` change nothing; the chart is spanned by the rest. Their number is the minimal one:
 
     stratum      revolute   prismatic
     projective   10         6
@@ -52,7 +53,8 @@ def algebra(stratum: Stratum) -> FloatArray:
 
 
 def generator_basis(generator: FloatArray, kind: Kind, stratum: Stratum) -> FloatArray:
-    """Directions ``Δ_k`` (p, 4, 4) in which a conjugation changes ``generator`` (4, 4), each by about one unit.
+    """Directions ``Δ_k`` (p, 4, 4) in which a conjugation changes ``generator`` (4, 4), each by about one
+    unit.
 
     Orthogonal complement of the commutant of the generator in the stratum's algebra; p as in ``CHART_SIZE``.
     """
@@ -66,9 +68,11 @@ def generator_basis(generator: FloatArray, kind: Kind, stratum: Stratum) -> Floa
 
 
 def conjugation(basis: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Group element ``T(x)`` (4, 4) of a chart and its left-trivialised derivatives ``dT/dx_k T⁻¹`` (p, 4, 4).
+    """Group element ``T(x)`` (4, 4) of a chart and its left-trivialised derivatives ``dT/dx_k T⁻¹`` (p, 4,
+    4).
 
-    Cayley's map ``(I - Δ/2)⁻¹ (I + Δ/2)``: it stays in each of the three groups, and ``dT T⁻¹ = (I - Δ/2)⁻¹ dΔ (I + Δ/2)⁻¹``.
+    Cayley's map ``(I - Δ/2)⁻¹ (I + Δ/2)``: it stays in each of the three groups, and ``dT T⁻¹ = (I - Δ/2)⁻¹
+    dΔ (I + Δ/2)⁻¹``.
     """
     half = 0.5 * np.einsum("p,pij->ij", x, basis)
     left = np.linalg.inv(np.eye(4) - half)
@@ -82,12 +86,14 @@ def exponentials(generators: FloatArray, kinds: tuple[Kind, ...], q: FloatArray)
     return np.stack(steps, axis=1)
 
 
-def camera_basis(matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum) -> FloatArray:
+def camera_basis(
+    matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum
+) -> FloatArray:
     """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) that are no gauge.
 
-    ``other``: all but the matrix's own scale (11). ``right``: in addition without what a change of frame that keeps the
-    left camera does: 4 freedoms in the projective (7 left), 1 in the affine and metric strata (10 left).
-    ``left_metric``: the five entries of ``K`` in ``K [I | 0]``.
+    ``other``: all but the matrix's own scale (11). ``right``: in addition without what a change of frame that
+    keeps the left camera does: 4 freedoms in the projective (7 left), 1 in the affine and metric strata (10
+    left). ``left_metric``: the five entries of ``K`` in ``K [I | 0]``.
     """
     if role == "left_metric":
         basis = np.zeros((5, 3, 4))
@@ -105,7 +111,9 @@ def camera_basis(matrix: FloatArray, role: Literal["right", "other", "left_metri
 
 
 def point_basis(point: FloatArray, stratum: Stratum) -> FloatArray:
-    """Directions (3, 4) of a point (4,): all but its scale, or the three finite coordinates of affine strata."""
+    """Directions (3, 4) of a point (4,): all but its scale, or the three finite coordinates of affine
+    strata.
+    """
     if stratum != "projective":
         return np.eye(4)[:3]
     return np.linalg.svd(point[None, :])[2][1:]

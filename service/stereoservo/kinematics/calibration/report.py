@@ -6,10 +6,16 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import rq
-from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.kinematics.calibration import upgrade
-from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, jacobian, predicted
+from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, predicted
+from stereoservo.kinematics.calibration.statistics import (
+    chi2_within,
+    covariance_root,
+    degrees_of_freedom,
+    prediction_deviations,
+    variance_factor,
+)
 from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo.kinematics.model import (
     MODEL_SCHEMA,
@@ -24,14 +30,10 @@ from stereoservo.kinematics.model import (
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-CHI2_TAIL = 0.0005
-"""Probability of each tail outside the two-sided 99.9 % interval."""
-RANK_TOLERANCE = 1e-9
-"""Singular value of the column-normalised Jacobian, relative to the largest, below which a direction is not known."""
-
 
 class CameraReport(msgspec.Struct, frozen=True):
-    """Fit of one camera: residual rms [px], pixels used, pixels left out; intrinsics [px] in the metric stratum.
+    """Fit of one camera: residual rms [px], pixels used, pixels left out; intrinsics [px] in the metric
+    stratum.
 
     ``intrinsics``: fx, skew, fy, u0, v0.
     """
@@ -55,10 +57,11 @@ class Outlier(msgspec.Struct, frozen=True):
 class CalibrationReport(msgspec.Struct, frozen=True):
     """What is known about a fit beside the model's own statistics.
 
-    ``sigma_factor``: estimated over stated standard deviation of the pixels (square root of the variance factor).
-    ``prediction_rms_px``, ``prediction_max_px``: standard deviation of the predicted pixels a coordinate,
-    ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of fx, skew, fy, u0, v0 [px].
-    ``projective_chi2``, ``projective_degrees_of_freedom``: of the projective bundle, which the stratum's is nested in.
+    ``sigma_factor``: estimated over stated standard deviation of the pixels (square root of the variance
+    factor). ``prediction_rms_px``, ``prediction_max_px``: standard deviation of the predicted pixels a
+    coordinate, ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of
+    fx, skew, fy, u0, v0 [px]. ``projective_chi2``, ``projective_degrees_of_freedom``: of the projective
+    bundle, which the stratum's is nested in.
     """
 
     stratum: Stratum
@@ -83,54 +86,6 @@ class CalibrationResult(msgspec.Struct, frozen=True, eq=False):
 
     model: CellModel
     report: CalibrationReport
-
-
-def degrees_of_freedom(solution: Solution) -> int:
-    """Measurements minus parameters net of gauge."""
-    return len(solution.residuals) - solution.charts.size
-
-
-def variance_factor(solution: Solution) -> float:
-    """Estimated over stated variance of the pixels."""
-    return solution.cost / max(1, degrees_of_freedom(solution))
-
-
-def chi2_within(chi2: float, freedom: int) -> bool:
-    """Whether ``chi2`` lies inside the two-sided 99.9 % interval of ``freedom`` degrees of freedom."""
-    low, high = chi2_distribution.ppf([CHI2_TAIL, 1.0 - CHI2_TAIL], freedom)
-    return bool(low <= chi2 <= high)
-
-
-def rank_of(solution: Solution) -> int:
-    """How many parameter directions the data determine."""
-    size = np.linalg.norm(solution.jacobian, axis=0)
-    if solution.jacobian.shape[0] < solution.jacobian.shape[1] or not (size > 0).all():
-        return int((size > 0).sum()) if solution.jacobian.shape[0] >= solution.jacobian.shape[1] else 0
-    values = np.linalg.svd(np.linalg.qr(solution.jacobian / size, mode="r"), compute_uv=False)
-    return int((values > RANK_TOLERANCE * values[0]).sum())
-
-
-def covariance_root(solution: Solution) -> FloatArray:
-    """``R⁻¹`` (p, p) with ``R⁻¹ R⁻ᵀ = (Jᵀ J)⁻¹``: the parameters' covariance at the stated sigmas, as a root."""
-    size = np.linalg.norm(solution.jacobian, axis=0)
-    triangle = np.linalg.qr(solution.jacobian / size, mode="r")
-    root: FloatArray = np.linalg.inv(triangle) / size[:, None]
-    return root
-
-
-def prediction_deviations(solution: Solution, offsets: FloatArray) -> FloatArray:
-    """Standard deviation (c, s, m) [px, rms of the two coordinates] of pixels predicted at ``offsets`` (s, n).
-
-    ``J Cov Jᵀ`` with the larger of the stated and the estimated noise.
-    """
-    c, s, m = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
-    camera, stop, marker = (index.ravel() for index in np.indices((c, s, m)))
-    k = len(camera)
-    grid = Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
-    slopes = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), grid) @ covariance_root(solution)
-    variances = (slopes.reshape(k, 2, -1) ** 2).sum(axis=(1, 2)) / 2 * max(1.0, variance_factor(solution))
-    result: FloatArray = np.sqrt(variances).reshape(c, s, m)
-    return result
 
 
 def build_result(
@@ -207,17 +162,19 @@ def build_model(
     epoch: int,
     created: str,
 ) -> CellModel:
-    """The model in the canonical projective frame: ``P_left = [N⁻¹ | 0]``, heights 1 by the plane at infinity."""
+    """The model in the canonical projective frame: ``P_left = [N⁻¹ | 0]``, heights 1 by the plane at
+    infinity.
+    """
     rig, stratum = solution.rig, solution.stratum
     if stratum == "projective":
-        frame = np.eye(4)
+        frame: FloatArray = np.eye(4)
     elif stratum == "affine":
         affine_to_projective = np.eye(4)
         affine_to_projective[3] = np.append(-plane[:3], 1.0) / plane[3]
         frame = affine_to_projective
     else:
         frame = upgrade.projective_frame(normaliser, rig.cameras[0][:, :3], plane)
-    back = np.linalg.inv(frame)
+    back: FloatArray = np.asarray(np.linalg.inv(frame), dtype=np.float64)
     points = rig.points @ frame.T
     points = points / (points @ plane)[:, None]
     cameras = rig.cameras @ back
@@ -258,12 +215,16 @@ def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
 
 def _left_intrinsics_std(solution: Solution) -> tuple[float, ...]:
     at = sum(len(basis) for basis in solution.charts.generators)
-    variances = (covariance_root(solution)[at : at + 5] ** 2).sum(axis=1) * max(1.0, variance_factor(solution))
+    scale = np.array([np.abs(basis).max() for basis in solution.charts.cameras[0]])
+    variances = (covariance_root(solution)[at : at + 5] ** 2).sum(axis=1) * scale**2
+    variances *= max(1.0, variance_factor(solution))
     fx, skew, u0, fy, v0 = (float(value) for value in np.sqrt(variances))
     return fx, skew, fy, u0, v0
 
 
-def _joint_statistics(trials: TrialData, joint: int, squares: FloatArray, data: Measurements) -> JointStatistics:
+def _joint_statistics(
+    trials: TrialData, joint: int, squares: FloatArray, data: Measurements
+) -> JointStatistics:
     own = np.flatnonzero(trials.trials == joint)
     positions = trials.positions[own, joint]
     return JointStatistics(

@@ -14,7 +14,7 @@ from stereoservo.geometry.displacements import (
 )
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, residuals, solve
-from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, finite_rows
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -35,10 +35,11 @@ MISFIT = 20.0
 
 @dataclass(frozen=True)
 class JointTrial:
-    """A joint's own trial: ``stops`` (k,), ``base`` (n,) the locked configuration, ``reference`` its middle position.
+    """A joint's own trial: ``stops`` (k,), ``base`` (n,) the locked configuration, ``reference`` its middle
+    position.
 
-    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base with the joint at ``reference``, NaN for markers
-    that the trial does not show.
+    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base with the joint at ``reference``, NaN for
+    markers that the trial does not show.
     """
 
     joint: int
@@ -91,8 +92,10 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
         lost, strayed = int((own & ~shown).sum()), int((own & ~still).sum())
         raise CalibrationError(
             "too_few_stops",
-            f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of {int(own.sum())} stops, "
-            f"{lost} show fewer than {MIN_MARKERS} markers in two cameras and at {strayed} other joints strayed by more "
+            f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of "
+            f"{int(own.sum())} stops, "
+            f"{lost} show fewer than {MIN_MARKERS} markers in two cameras and at {strayed} other joints "
+            "strayed by more "
             f"than {STILL:g}",
             joint=name,
             stops=distinct,
@@ -103,7 +106,8 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
     if float(np.ptp(positions[stops, joint])) < MIN_RANGE:
         raise CalibrationError(
             "joint_did_not_move",
-            f"joint {name!r}: the stops that show markers span {np.ptp(positions[stops, joint]):.4g} {unit}; at least "
+            f"joint {name!r}: the stops that show markers span {np.ptp(positions[stops, joint]):.4g} "
+            f"{unit}; at least "
             f"{MIN_RANGE:g} {unit} is needed",
             joint=name,
             range=float(np.ptp(positions[stops, joint])),
@@ -118,43 +122,52 @@ def separate_joint(
 ) -> JointTrial:
     """Generator of ``joint`` and the markers from its own trial, cameras (c, 3, 4) fixed (5.52).
 
-    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). A linear start over all pairs of stops, then least squares
-    with free markers. Raises CalibrationError naming the joint.
+    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). A linear start over all pairs of stops, then
+    least squares with free markers. Raises CalibrationError naming the joint.
     """
     name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
     stops, base = trial_stops(trials, points, joint)
     angles = trials.positions[stops, joint] - base[joint]
-    here = usable[:, stops] & np.isfinite(points[stops]).all(axis=2)
+    here: BoolArray = usable[:, stops] & np.isfinite(points[stops]).all(axis=2)
     generator = linear_generator(trials, cameras, points[stops], here, stops, angles, joint)
     structure = _common_points(generator, kind, points[stops], angles)
-    seen = np.isfinite(structure).all(axis=1)
+    seen = finite_rows(structure)
     if int(seen.sum()) < MIN_MARKERS:
         raise CalibrationError(
             "too_few_markers",
-            f"joint {name!r}: {int(seen.sum())} markers are seen by two cameras in its trial; at least {MIN_MARKERS} are needed",
+            f"joint {name!r}: {int(seen.sum())} markers are seen by two cameras in its trial; at least "
+            f"{MIN_MARKERS} are needed",
             joint=name,
             markers=int(seen.sum()),
             minimum=MIN_MARKERS,
         )
     offsets = np.zeros((len(trials.positions), 1))
     offsets[stops, 0] = angles
-    mask = np.zeros_like(usable)
+    mask: BoolArray = np.zeros(usable.shape, dtype=bool)
     mask[:, stops] = here
     data = measurements(trials, mask, offsets)
-    rig = Rig((kind,), generator[None], cameras, np.where(seen[:, None], structure, np.array([0.0, 0.0, 1.0, 0.0])))
-    fit = solve(rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=3.0, rounds=2, max_evaluations=40)
+    rig = Rig(
+        (kind,), generator[None], cameras, np.where(seen[:, None], structure, np.array([0.0, 0.0, 1.0, 0.0]))
+    )
+    fit = solve(
+        rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=3.0, rounds=2, max_evaluations=40
+    )
     typical = float(np.median(np.hypot(*residuals(fit.rig, data).reshape(-1, 2).T)) / np.sqrt(np.log(4.0)))
     if not typical < MISFIT:
         raise CalibrationError(
             "joint_kind",
-            f"joint {name!r}: its trial does not look like a {'rotation' if kind == 'revolute' else 'translation'} by the "
-            f"reported positions: typical residual {typical:.3g} sigmas, at most {MISFIT:g} expected. Is the joint "
+            f"joint {name!r}: its trial does not look like a "
+            f"{'rotation' if kind == 'revolute' else 'translation'} by the "
+            f"reported positions: typical residual {typical:.3g} sigmas, at most {MISFIT:g} expected. Is "
+            "the joint "
             f"{kind}, are its positions right, did only it move?",
             joint=name,
             residual_sigmas=typical,
             maximum=MISFIT,
         )
-    return JointTrial(joint, stops, base, fit.rig.generators[0], np.where(seen[:, None], fit.rig.points, np.nan))
+    return JointTrial(
+        joint, stops, base, fit.rig.generators[0], np.where(seen[:, None], fit.rig.points, np.nan)
+    )
 
 
 def linear_generator(
@@ -168,37 +181,44 @@ def linear_generator(
 ) -> FloatArray:
     """Generator (4, 4) by linear least squares over all ordered pairs of stops, then the nearest exact one.
 
-    A revolute joint takes a point ``M_k`` of stop k to ``M_k + sin Δ Ĥ M_k + (1 - cos Δ) Ĥ² M_k`` at stop l (4.27), linear
-    in ``Ĥ`` and ``Ĥ²`` taken as unknowns of their own; seen in pixels of stop l, the heights drop out. Any steps will do,
-    equal or not, and the union over pairs spans space for a planar target, too (5.4). ``points`` (k, m, 4),
-    ``usable`` (c, k, m). Raises CalibrationError (``joint_kind``).
+    A revolute joint takes a point ``M_k`` of stop k to ``M_k + sin Δ Ĥ M_k + (1 - cos Δ) Ĥ² M_k`` at stop l
+    (4.27), linear in ``Ĥ`` and ``Ĥ²`` taken as unknowns of their own; seen in pixels of stop l, the heights
+    drop out. Any steps will do, equal or not, and the union over pairs spans space for a planar target, too
+    (5.4). ``points`` (k, m, 4), ``usable`` (c, k, m). Raises CalibrationError (``joint_kind``).
     """
     kind = trials.joint_kinds[joint]
     span = float(np.ptp(angles))
     first, second = np.nonzero(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
-    valid = np.isfinite(points).all(axis=2)
+    valid = finite_rows(points)
     pair, marker = np.nonzero(valid[first] & valid[second])
-    k, l = first[pair], second[pair]
-    step = angles[l] - angles[k]
-    source = points[k, marker]
+    here, there = first[pair], second[pair]
+    step = angles[there] - angles[here]
+    source = points[here, marker]
     blocks, rights = [], []
     for c, P in enumerate(cameras):
-        keep = usable[c, l, marker]
-        target = trials.pixels[c, stops[l], marker][keep]
-        weight = 1.0 / (trials.sigmas[c, stops[l], marker][keep] * (points[l, marker][keep] @ P[2]))
+        keep = usable[c, there, marker]
+        target = trials.pixels[c, stops[there], marker][keep]
+        weight = 1.0 / (trials.sigmas[c, stops[there], marker][keep] * (points[there, marker][keep] @ P[2]))
         rows = (P[None, :2] - target[:, :, None] * P[None, 2:]) * weight[:, None, None]
         moment = rows[:, :, :, None] * source[keep][:, None, None, :]
-        parts = [np.sin(step[keep]), 2.0 * np.sin(0.5 * step[keep]) ** 2] if kind == "revolute" else [step[keep]]
+        parts = (
+            [np.sin(step[keep]), 2.0 * np.sin(0.5 * step[keep]) ** 2] if kind == "revolute" else [step[keep]]
+        )
         blocks.append(
             np.concatenate([(part[:, None, None, None] * moment).reshape(-1, 16) for part in parts], axis=1)
         )
         rights.append(-np.einsum("kij,kj->ki", rows, source[keep]).ravel())
     system, right = np.concatenate(blocks), np.concatenate(rights)
-    # The scale of a point moved by the identity alone is fixed: the system is inhomogeneous, its unit eigenvalue exact.
+    # The scale of a point moved by the identity alone is fixed: the system is inhomogeneous, its unit
+    # eigenvalue exact.
     solution = _robust_least_squares(system, right)
     try:
         matrix = solution[:16].reshape(4, 4)
-        return nearest_rotation_generator(matrix) if kind == "revolute" else nearest_translation_generator(matrix)
+        return (
+            nearest_rotation_generator(matrix)
+            if kind == "revolute"
+            else nearest_translation_generator(matrix)
+        )
     except GeometryError as error:
         name = trials.joint_names[joint]
         raise CalibrationError(
@@ -224,7 +244,9 @@ def _robust_least_squares(system: FloatArray, right: FloatArray, rounds: int = 8
 
 
 def _common_points(generator: FloatArray, kind: str, points: FloatArray, angles: FloatArray) -> FloatArray:
-    """Markers (m, 4) at angle 0: the median over stops of the points (k, m, 4) brought there, depth 1; NaN if never seen."""
+    """Markers (m, 4) at angle 0: the median over stops of the points (k, m, 4) brought there, depth 1; NaN
+    if never seen.
+    """
     back = exp_generator(kind, generator, -angles)
     moved = np.einsum("kij,kmj->kmi", back, points)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -252,7 +274,8 @@ def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
     if largest < MIN_IMAGE_MOTION:
         raise CalibrationError(
             "joint_without_effect",
-            f"joint {name!r} reports motion, but no marker moved by more than {largest:.3g} sigmas in any image; at "
+            f"joint {name!r} reports motion, but no marker moved by more than {largest:.3g} sigmas in any "
+            "image; at "
             f"least {MIN_IMAGE_MOTION:g} are needed. Does it drive what the cameras see?",
             joint=name,
             motion_sigmas=largest,

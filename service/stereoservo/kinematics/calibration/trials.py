@@ -1,4 +1,6 @@
-"""What a calibration starts from: pixels of the markers at stops of joint-wise trial motions; one npz file."""
+"""What a calibration starts from: pixels of the markers at stops of joint-wise trial motions; one npz
+file.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ class CalibrationError(Exception):
     """A calibration cannot give a model; the text says why, with the value and what would have been valid.
 
     Attributes:
-        code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``, ``too_few_stops``,
+        code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
+            ``too_few_stops``,
             ``joint_did_not_move``, ``joint_without_effect``, ``joint_kind``, ``views_degenerate``,
             ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``.
         data: the values the message speaks of.
@@ -34,6 +37,11 @@ class CalibrationError(Exception):
         self.code = code
         self.message = message
         self.data = data
+
+
+def finite_rows(array: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which rows (...) of an array (..., k) are finite in all k entries."""
+    return np.asarray(np.isfinite(array).all(axis=-1), dtype=bool)
 
 
 class TrialCamera(msgspec.Struct, frozen=True):
@@ -47,10 +55,10 @@ class TrialCamera(msgspec.Struct, frozen=True):
 class TrialData(msgspec.Struct, frozen=True, eq=False):
     """Stops of trial motions and what the cameras saw there.
 
-    Joints stand base first. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1 for free
-    poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not seen; ``sigmas``
-    (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left one.
-    ``images``: how many images were averaged into the pixels (for the record).
+    Joints stand base first. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1
+    for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
+    seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
+    one. ``images``: how many images were averaged into the pixels (for the record).
     """
 
     joint_names: tuple[str, ...]
@@ -66,7 +74,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
         """(c, s, m): which pixels were measured."""
-        return np.isfinite(self.pixels).all(axis=-1)
+        return finite_rows(self.pixels)
 
 
 class _Header(msgspec.Struct, forbid_unknown_fields=True):
@@ -79,13 +87,16 @@ class _Header(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def check_trials(trials: TrialData) -> None:
-    """Check shapes and numbers. Raises CalibrationError (``bad_data``, ``too_few_cameras``) with what does not fit."""
+    """Check shapes and numbers. Raises CalibrationError (``bad_data``, ``too_few_cameras``) with what does
+    not fit.
+    """
     n, m, c = len(trials.joint_names), len(trials.marker_ids), len(trials.cameras)
     s = trials.positions.shape[0] if trials.positions.ndim else 0
     if n < 1 or len(trials.joint_kinds) != n:
         raise CalibrationError(
             "bad_data",
-            f"{n} joint names and {len(trials.joint_kinds)} kinds; one kind for each of at least one joint is needed",
+            f"{n} joint names and {len(trials.joint_kinds)} kinds; one kind for each of at least one joint "
+            "is needed",
         )
     if c < 2:
         raise CalibrationError(
@@ -112,17 +123,22 @@ def check_trials(trials: TrialData) -> None:
             raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
     if not np.isfinite(trials.positions).all():
         stop = int(np.argwhere(~np.isfinite(trials.positions))[0, 0])
-        raise CalibrationError("bad_data", f"positions of stop {stop} are not finite", key="positions", stop=stop)
+        raise CalibrationError(
+            "bad_data", f"positions of stop {stop} are not finite", key="positions", stop=stop
+        )
     if s and (trials.trials.min() < -1 or trials.trials.max() >= n):
         raise CalibrationError(
             "bad_data",
-            f"trial indices reach from {trials.trials.min()} to {trials.trials.max()}; -1 to {n - 1} are joints",
+            f"trial indices reach from {trials.trials.min()} to {trials.trials.max()}; -1 to {n - 1} are "
+            "joints",
             key="trials",
         )
     sigmas = trials.sigmas[trials.visible]
     if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
         worst = sigmas[~(np.isfinite(sigmas) & (sigmas > 0))][0]
-        raise CalibrationError("bad_data", f"a sigma is {worst} px; positive finite ones are needed", key="sigmas")
+        raise CalibrationError(
+            "bad_data", f"a sigma is {worst} px; positive finite ones are needed", key="sigmas"
+        )
 
 
 def encode_trials(trials: TrialData) -> bytes:
@@ -155,7 +171,9 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             arrays = {key: archive[key] for key in archive.files}
         header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_Header)
         if header.schema != TRIALS_SCHEMA:
-            raise CalibrationError("bad_data", f"{path}: schema is {header.schema}; this version reads {TRIALS_SCHEMA}")
+            raise CalibrationError(
+                "bad_data", f"{path}: schema is {header.schema}; this version reads {TRIALS_SCHEMA}"
+            )
         trials = TrialData(
             joint_names=header.joint_names,
             joint_kinds=header.joint_kinds,

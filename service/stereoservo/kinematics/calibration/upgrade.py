@@ -1,40 +1,49 @@
-"""From the projective to the affine and metric strata: plane at infinity (5.59), intrinsics, metric start (5.4.3-5.4.4).
+"""From the projective to the affine and metric strata: plane at infinity (5.59), intrinsics, metric start
+(5.4.3-5.4.4).
 
-Frames: projective ``P`` with ``P_left = [N⁻¹ | 0]``; affine ``A`` with the plane at infinity (0, 0, 0, 1) and the same left
-camera; Euclidean ``E`` with ``P_left = [K | 0]``. A generator's upper block in ``A`` is ``K̃ [w]ₓ K̃⁻¹`` with ``K̃ = N K``.
+Frames: projective ``P`` with ``P_left = [N⁻¹ | 0]``; affine ``A`` with the plane at infinity (0, 0, 0, 1) and
+the same left camera; Euclidean ``E`` with ``P_left = [K | 0]``. A generator's upper block in ``A`` is ``K̃
+[w]ₓ K̃⁻¹`` with ``K̃ = N K``.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
-from stereoservo.geometry.displacements import nearest_rotation_generator, nearest_translation_generator
+from stereoservo.geometry.displacements import exp_rotation, nearest_rotation_generator
 from stereoservo.kinematics.calibration.bundle import Rig
 
 FloatArray = npt.NDArray[np.float64]
 
 SEPARATION = 10.0
 """How far a singular value must stand above its noise to count as not zero."""
+NOMINAL_FOCALS = (2.0, 3.0, 1.4)
+"""Focal lengths [half image widths] to start from where the linear estimate fails: 53°, 37° and 71°
+across.
+"""
 
 
-def plane_at_infinity(generators: FloatArray, noise: float) -> tuple[FloatArray, bool]:
-    """Plane (4,) that all generators (n, 4, 4) leave fixed, and whether it is the only one: ``ker`` of the stack of ``-Ĥᵀ``.
+def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Candidates (4,) for the plane that all generators (n, 4, 4) leave fixed, ``ker`` of the stack of
+    ``-Ĥᵀ`` (5.59).
 
-    ``noise``: standard deviation of a generator's entries. Where axes are parallel a pencil of planes is left; then
-    the one nearest to (0, 0, 0, 1), the infinity of the canonical frame's nominal cameras, is given.
+    Rows are weighted by ``noise`` (n,), the standard deviation of each generator's entries. First the least
+    singular vector; then, of all that vanish within their noise, the one nearest to (0, 0, 0, 1), which is
+    the infinity of the canonical frame's nominal cameras: where axes are parallel a pencil of planes is left.
     """
-    stack = -generators.transpose(0, 2, 1).reshape(-1, 4)
+    stack = (-generators.transpose(0, 2, 1) / noise[:, None, None]).reshape(-1, 4)
     _, values, rows = np.linalg.svd(stack)
-    floor = max(SEPARATION * noise * np.sqrt(len(stack)), 1e-9 * values[0])
-    unique = bool(values[2] > floor and values[2] > SEPARATION * values[3])
-    kernel = rows[3:] if unique else rows[values <= max(floor, values[3])]
-    plane: FloatArray = kernel.T @ kernel[:, 3]
-    return plane, unique
+    kernel = rows[values <= max(SEPARATION * np.sqrt(len(stack)), 1e-9 * values[0], values[3])]
+    nearest: FloatArray = kernel.T @ kernel[:, 3]
+    return rows[3], nearest
 
 
 def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
-    """``plane`` (4,) scaled to mean height 1 over points (m, 4) of depth 1; None when it passes between the points."""
+    """``plane`` (4,) scaled to mean height 1 over points (m, 4) of depth 1; None when it passes between
+    the points.
+    """
     heights = points @ plane / points[:, 2]
     mean = float(heights.mean())
     if mean == 0.0 or (heights / mean).min() <= 0.0:
@@ -43,86 +52,115 @@ def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
     return result
 
 
-def affine_rig(rig: Rig, plane: FloatArray) -> tuple[Rig, FloatArray]:
-    """The rig in the affine frame of ``plane`` (4,), generators snapped to it, and ``H_PA`` (4, 4)."""
+def affine_rig(rig: Rig, plane: FloatArray) -> Rig:
+    """The projective ``rig`` in the affine frame of ``plane`` (4,), generators snapped to it.
+
+    Raises GeometryError where a generator is no rotation there: the plane is far from being left fixed.
+    """
+    moved = _transformed(rig, plane, np.eye(3))
+    for j, kind in enumerate(rig.kinds):
+        moved.generators[j, 3] = 0.0
+        if kind == "revolute":
+            moved.generators[j] = nearest_rotation_generator(moved.generators[j])
+            moved.generators[j, 3] = 0.0
+        else:
+            moved.generators[j, :, :3] = 0.0
+    return moved
+
+
+def metric_rig(rig: Rig, plane: FloatArray, intrinsics: FloatArray, spans: FloatArray) -> Rig:
+    """The projective ``rig`` in the Euclidean frame of ``plane`` (4,) and ``K̃`` (3, 3), generators unit
+    twists.
+
+    A revolute joint gets the rigid rotation nearest to what it does to the markers over half of its trial's
+    range ``spans`` (n,) [rad]. That needs no exact frame, and asks nothing of a generator where the markers
+    do not go: off the plane of a flat target that turns in itself, it is unknown.
+    """
+    moved = _transformed(rig, plane, intrinsics)
+    for j, kind in enumerate(rig.kinds):
+        if kind == "revolute":
+            half = 0.25 * spans[j]
+            ends = [moved.points @ exp_rotation(moved.generators[j], angle).T for angle in (-half, half)]
+            moved.generators[j] = _twist_between(*(end[:, :3] / end[:, 3:] for end in ends))
+        else:
+            moved.generators[j, 3] = 0.0
+            moved.generators[j, :, :3] = 0.0
+    return moved
+
+
+def _transformed(rig: Rig, plane: FloatArray, intrinsics: FloatArray) -> Rig:
     upgrade = np.eye(4)
+    upgrade[:3, :3] = np.linalg.inv(intrinsics)
     upgrade[3] = plane
     back = np.linalg.inv(upgrade)
     points = rig.points @ upgrade.T
-    points = points / points[:, 3:]
-    generators = upgrade @ rig.generators @ back
-    generators[:, 3] = 0.0
-    for j, kind in enumerate(rig.kinds):
-        if kind == "revolute":
-            generators[j] = nearest_rotation_generator(generators[j])
-            generators[j, 3] = 0.0
-        else:
-            generators[j] = _translation(generators[j])
-    return Rig(rig.kinds, generators, rig.cameras @ back, points), upgrade
+    return Rig(rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:])
 
 
-def _translation(generator: FloatArray) -> FloatArray:
-    result = np.zeros((4, 4))
-    result[:3, 3] = generator[:3, 3]
-    # A direction that vanishes in the noise has no chart; the nilpotent form keeps its main part.
-    return result if np.linalg.norm(result) > 0 else nearest_translation_generator(generator)
-
-
-def image_of_absolute_conic(generators: FloatArray, revolute: npt.NDArray[np.bool_], noise: float) -> FloatArray | None:
-    """Dual image ``Ω = K̃ K̃ᵀ`` (3, 3), ``Ω₃₃ = 1``, from affine generators (n, 4, 4): ``A Ω + Ω Aᵀ = 0``, linear.
-
-    None where the rotations do not determine it (fewer than two directions of axes) or noise leaves it indefinite.
+def _twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Unit twist (4, 4), without pitch, of the rigid motion that best takes points (m, 3) to others
+    (Kabsch).
     """
-    blocks = generators[revolute, :3, :3]
-    if len(blocks) < 2:
+    middle, middle_after = before.mean(axis=0), after.mean(axis=0)
+    u, _, vt = np.linalg.svd((after - middle_after).T @ (before - middle))
+    u[:, 2] *= np.linalg.det(u @ vt)
+    turn = Rotation.from_matrix(u @ vt).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    axis = turn / angle
+    # The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
+    chord = middle_after - middle
+    chord = chord - axis * (axis @ chord)
+    centre = middle + 0.5 * chord + 0.5 * np.cross(axis, chord) / np.tan(0.5 * angle)
+    result = np.zeros((4, 4))
+    x, y, z = axis
+    result[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    result[:3, 3] = -np.cross(axis, centre)
+    return result
+
+
+def intrinsics_linear(
+    generators: FloatArray, revolute: npt.NDArray[np.bool_], noise: FloatArray
+) -> FloatArray | None:
+    """``K̃`` (3, 3) from affine generators (n, 4, 4) by ``A Ω + Ω Aᵀ = 0``, ``Ω = K̃ K̃ᵀ``, linear, weighted
+    by ``noise`` (n,).
+
+    None where noise leaves ``Ω`` indefinite.
+    """
+    blocks = generators[revolute, :3, :3] / noise[revolute, None, None]
+    if not len(blocks):
         return None
     basis = np.zeros((6, 3, 3))
     for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
         basis[k, i, j] = basis[k, j, i] = 1.0
     system = blocks[:, None] @ basis + basis @ blocks[:, None].transpose(0, 1, 3, 2)
-    _, values, rows = np.linalg.svd(system.transpose(0, 2, 3, 1).reshape(-1, 6))
-    if values[4] <= max(SEPARATION * noise * np.sqrt(9 * len(blocks)), 3.0 * values[5], 1e-9 * values[0]):
-        return None
-    omega = np.tensordot(rows[5], basis, axes=1)
-    if omega[2, 2] == 0.0:
-        return None
-    omega = omega / omega[2, 2]
-    return omega if np.linalg.eigvalsh(omega)[0] > 0.0 else None
+    omega = np.tensordot(np.linalg.svd(system.transpose(0, 2, 3, 1).reshape(-1, 6))[2][5], basis, axes=1)
+    omega = omega * np.sign(omega[2, 2])
+    return triangular_root(omega) if np.linalg.eigvalsh(omega)[0] > 0.0 else None
 
 
 def triangular_root(omega: FloatArray) -> FloatArray:
-    """Upper triangular ``K̃`` (3, 3), positive diagonal, ``K̃₃₃ = 1``, with ``K̃ K̃ᵀ ~ Ω``. Raises LinAlgError if indefinite."""
+    """Upper triangular ``K̃`` (3, 3), positive diagonal, ``K̃₃₃ = 1``, with ``K̃ K̃ᵀ ~ Ω``. Raises
+    LinAlgError if indefinite.
+    """
     flip = np.eye(3)[::-1]
-    root: FloatArray = flip @ np.linalg.cholesky(flip @ omega @ flip) @ flip
-    return root / root[2, 2]
-
-
-def metric_rig(rig: Rig, intrinsics: FloatArray) -> Rig:
-    """The affine ``rig`` in the Euclidean frame of ``K̃`` (3, 3): generators snapped to unit twists without pitch."""
-    back = np.eye(4)
-    back[:3, :3] = intrinsics
-    upgrade = np.linalg.inv(back)
-    generators = upgrade @ rig.generators @ back
-    for j, kind in enumerate(rig.kinds):
-        if kind == "revolute":
-            generators[j] = _unit_twist(generators[j])
-    return Rig(rig.kinds, generators, rig.cameras @ back, rig.points @ upgrade.T)
-
-
-def _unit_twist(generator: FloatArray) -> FloatArray:
-    skew = 0.5 * (generator[:3, :3] - generator[:3, :3].T)
-    axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-    axis /= np.linalg.norm(axis)
-    result = np.zeros((4, 4))
-    result[:3, :3] = [[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]]
-    result[:3, 3] = generator[:3, 3] - axis * (axis @ generator[:3, 3])
+    root = flip @ np.linalg.cholesky(flip @ omega @ flip) @ flip
+    result: FloatArray = root / root[2, 2]
     return result
 
 
-def projective_frame(normaliser: FloatArray, intrinsics: FloatArray, plane: FloatArray) -> FloatArray:
-    """``H_EP`` (4, 4): Euclidean points into the projective frame in which ``plane`` (4,) is the plane at infinity.
+def nominal_intrinsics(focal: float) -> FloatArray:
+    """``K̃`` (3, 3) of a camera with square pixels, its principal point in the middle and ``focal`` [half
+    widths].
+    """
+    return np.diag([focal, focal, 1.0])
 
-    ``intrinsics`` (3, 3) = K; the left camera becomes ``[N⁻¹ | 0]`` and ``plane @ (H_EP X) = 1`` for ``X`` of height 1.
+
+def projective_frame(normaliser: FloatArray, intrinsics: FloatArray, plane: FloatArray) -> FloatArray:
+    """``H_EP`` (4, 4): Euclidean points into the projective frame in which ``plane`` (4,) is the plane at
+    infinity.
+
+    ``intrinsics`` (3, 3) = K; the left camera becomes ``[N⁻¹ | 0]`` and ``plane @ (H_EP X) = 1`` for ``X`` of
+    height 1.
     """
     frame = np.zeros((4, 4))
     frame[:3, :3] = normaliser @ intrinsics

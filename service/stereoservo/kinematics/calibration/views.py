@@ -1,4 +1,6 @@
-"""Cameras and points before any kinematics: F over all stops, the canonical pair, further cameras, triangulation."""
+"""Cameras and points before any kinematics: F over all stops, the canonical pair, further cameras,
+triangulation.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,12 @@ import numpy.typing as npt
 
 from stereoservo.geometry.cameras import canonical_pair, resection, triangulate
 from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.fundamental import fundamental_robust
+from stereoservo.geometry.fundamental import (
+    INLIER_SIGMAS,
+    fundamental_refine,
+    fundamental_robust,
+    sampson_distances,
+)
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 
 FloatArray = npt.NDArray[np.float64]
@@ -16,14 +23,20 @@ BoolArray = npt.NDArray[np.bool_]
 MIN_MATCHES = 16
 """Matches between two cameras below which the epipolar geometry is not worth a robust search."""
 MIN_AGREEMENT = 0.6
-"""Share of matches that must fit one epipolar geometry; below it the stated sigmas are widened once or twice."""
+"""Share of matches that must fit one epipolar geometry; below it the stated sigmas are widened once or
+twice.
+"""
+NARROW = 1.0 / 3.0
+"""Second try where the search refuses a scene that is nearly a plane: it must be a plane to a third of the
+margin.
+"""
 
 
 def first_views(trials: TrialData) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Cameras (c, 3, 4) in the canonical frame, points (s, m, 4) of each stop, and usable pixels (c, s, m).
 
-    Points have depth 1 in the left camera, NaN where they are not usable in two cameras. Raises CalibrationError
-    (``too_few_markers``, ``views_degenerate``).
+    Points have depth 1 in the left camera, NaN where they are not usable in two cameras. Raises
+    CalibrationError (``too_few_markers``, ``views_degenerate``).
     """
     c, s, m = trials.sigmas.shape
     flat = trials.pixels.reshape(c, s * m, 2)
@@ -71,27 +84,33 @@ def _epipolar(
     if int(seen.sum()) < MIN_MATCHES:
         raise CalibrationError(
             "too_few_markers",
-            f"cameras {names} see {int(seen.sum())} markers in common over all stops; at least {MIN_MATCHES} are needed",
+            f"cameras {names} see {int(seen.sum())} markers in common over all stops; at least "
+            f"{MIN_MATCHES} are needed",
             matches=int(seen.sum()),
             minimum=MIN_MATCHES,
         )
     sigma = float(np.sqrt(np.median(sigmas[0, seen] ** 2 + sigmas[k, seen] ** 2) / 2))
-    failure: GeometryError | None = None
-    for wider in (1.0, 4.0, 16.0):
+    best = 0.0
+    for scale in (1.0, NARROW, 4.0, 16.0):
         try:
-            F, fits = fundamental_robust(flat[0, seen], flat[k, seen], wider * sigma)
+            F, _ = fundamental_robust(flat[0, seen], flat[k, seen], scale * sigma)
         except GeometryError as error:
-            failure = error
+            if scale == NARROW and error.code == "degenerate":
+                raise _degenerate(trials, k, error) from error
             continue
-        if fits.mean() >= MIN_AGREEMENT:
-            return F, fits, seen
-    if failure is not None:
-        raise _degenerate(trials, k, failure) from failure
+        fits = (
+            np.abs(sampson_distances(F, flat[0, seen], flat[k, seen]))
+            <= INLIER_SIGMAS * max(1.0, scale) * sigma
+        )
+        best = max(best, float(fits.mean()))
+        if best >= MIN_AGREEMENT:
+            return fundamental_refine(F, flat[0, seen][fits], flat[k, seen][fits], sigma), fits, seen
     raise CalibrationError(
         "views_degenerate",
-        f"only {fits.mean():.0%} of the matches of cameras {names} fit one epipolar geometry at 16 sigmas "
-        f"({16 * sigma:.3g} px); at least {MIN_AGREEMENT:.0%} must. Did a camera move, or are markers mixed up?",
-        agreement=float(fits.mean()),
+        f"only {best:.0%} of the matches of cameras {names} fit one epipolar geometry at 16 sigmas "
+        f"({16 * sigma:.3g} px); at least {MIN_AGREEMENT:.0%} must. Did a camera move, or are markers mixed "
+        "up?",
+        agreement=best,
         minimum=MIN_AGREEMENT,
     )
 
@@ -100,7 +119,8 @@ def _degenerate(trials: TrialData, k: int, error: GeometryError) -> CalibrationE
     names = f"{trials.cameras[0].name!r} and {trials.cameras[k].name!r}"
     return CalibrationError(
         "views_degenerate",
-        f"the views of cameras {names} do not determine their geometry: {error}. The cameras must stand apart, and "
+        f"the views of cameras {names} do not determine their geometry: {error}. The cameras must stand "
+        "apart, and "
         "the markers must not stay in one plane over all trials",
         cause=error.code,
         cameras=[trials.cameras[0].name, trials.cameras[k].name],

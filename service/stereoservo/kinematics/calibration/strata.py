@@ -1,0 +1,205 @@
+"""The highest stratum that the data identify: metric, affine or projective (5.4.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.kinematics.calibration import upgrade
+from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, solve
+from stereoservo.kinematics.calibration.statistics import (
+    covariance_root,
+    generator_noise,
+    rank_of,
+    variance_factor,
+)
+from stereoservo.kinematics.calibration.trials import CalibrationError
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Thresholds of the fit.
+
+    ``outlier_chi2``: a pixel (2 degrees of freedom) farther than this from the model is left out; 25 loses 4
+    in a million good ones. ``max_outliers``: share of pixels that may be left out. ``max_sigma_factor``: how
+    many times the stated sigmas the residuals may be before the fit is refused; detectors misjudge their
+    noise, a wrong model misses by far more. ``metric_loss``: how much worse, in variance, the metric bundle
+    may fit than the projective one. ``max_spread``: largest relative standard deviation of focal lengths
+    (metric) and depths (metric, affine) with which a stratum is believed.
+    """
+
+    outlier_chi2: float = 25.0
+    max_outliers: float = 0.3
+    max_sigma_factor: float = 3.0
+    metric_loss: float = 1.3
+    max_spread: float = 0.2
+
+
+DEFAULTS = FitOptions()
+
+NOMINAL_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
+"""Infinity of the canonical frame's nominal cameras."""
+NESTED_TAIL = 1e-6
+"""Probability with which a true constraint is taken for a wrong one."""
+
+
+@dataclass
+class Judge:
+    """Judges bundles of higher strata beside the ``projective`` one, and keeps what is second best.
+
+    A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
+    is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
+    nearly.
+    """
+
+    projective: Solution
+    options: FitOptions
+    notes: list[str] = field(default_factory=list)
+    reserve: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    hopeless: bool = False
+
+    def passes(self, solution: Solution, plane: FloatArray) -> bool:
+        """Whether ``solution`` may be taken as it is. Sets ``hopeless`` where another start will not help."""
+        own, beside = variance_factor(solution), max(1.0, variance_factor(self.projective))
+        fewer = self.projective.charts.size - solution.charts.size
+        costs = solution.cost - self.projective.cost
+        allowed = float(chi2_distribution.isf(NESTED_TAIL, max(1, fewer))) * beside
+        if own > self.options.metric_loss * beside:
+            self._note(solution, f"variance factor {own:.3g} beside {beside:.3g} of the projective bundle")
+            return False
+        problem = self._unidentified(solution)
+        if problem:
+            self._note(solution, problem)
+            self.hopeless = True
+            return False
+        if not solution.converged:
+            self._note(solution, f"no convergence in {solution.evaluations} evaluations")
+            return False
+        if costs > allowed:
+            # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
+            self.hopeless = any(
+                abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve
+            )
+            self.reserve.append((solution, plane))
+            return False
+        return True
+
+    def second_best(self) -> tuple[Solution, FloatArray] | None:
+        """The best of the reserve, with a note of what it costs."""
+        if not self.reserve:
+            return None
+        solution, plane = min(self.reserve, key=lambda entry: entry[0].cost)
+        self.notes.append(
+            f"the {solution.stratum} constraints cost a chi-square of "
+            f"{solution.cost - self.projective.cost:.4g} for "
+            f"{self.projective.charts.size - solution.charts.size} parameters: the cameras or joints follow "
+            "the model "
+            "only nearly (lens distortion, play)"
+        )
+        return solution, plane
+
+    def _unidentified(self, solution: Solution) -> str:
+        rank = rank_of(solution)
+        if rank < solution.charts.size:
+            return f"the trials determine {rank} of {solution.charts.size} parameters"
+        factor = max(1.0, variance_factor(solution))
+        deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
+        m = len(solution.rig.points)
+        scale = np.array([basis[2, 2] for basis in solution.charts.points])
+        depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
+        spreads = {"depths are": float(depths.max())}
+        if solution.stratum == "metric":
+            at = sum(len(basis) for basis in solution.charts.generators)
+            scale = np.array([solution.charts.cameras[0][k, i, i] for k, i in ((0, 0), (3, 1))])
+            focal = deviations[[at, at + 3]] * scale / np.abs(np.diag(solution.rig.cameras[0][:2, :2]))
+            spreads["the focal length is"] = float(focal.max())
+        limit = self.options.max_spread
+        return "; ".join(
+            f"{what} known to {spread:.0%} only, {limit:.0%} needed"
+            for what, spread in spreads.items()
+            if spread > limit
+        )
+
+    def _note(self, solution: Solution, text: str) -> None:
+        note = f"{solution.stratum} stratum refused: {text}"
+        if note not in self.notes:
+            self.notes.append(note)
+
+
+def upgraded(
+    solution: Solution, data: Measurements, options: FitOptions
+) -> tuple[Solution, FloatArray, tuple[str, ...]]:
+    """The highest stratum that the data identify, its plane at infinity in the projective frame (4,), and
+    notes.
+
+    Metric and affine bundles start from the linear estimates and, where those fail, from nominal cameras;
+    whether they are believed is judged on the constrained bundle itself, which is far better conditioned than
+    the projective.
+    """
+    noise = generator_noise(solution)
+    judge = Judge(solution, options)
+    candidates = (*upgrade.planes_at_infinity(solution.rig.generators, noise), NOMINAL_PLANE)
+    planes = [upgrade.scaled_plane(plane, solution.rig.points) for plane in candidates]
+    finite: list[FloatArray] = []
+    for plane in planes:
+        if plane is not None and not any(np.allclose(plane, other, rtol=1e-3, atol=1e-6) for other in finite):
+            finite.append(plane)
+    if not finite:
+        raise CalibrationError(
+            "views_degenerate", "every candidate for the plane at infinity passes between the markers"
+        )
+    for start, plane in _metric_starts(solution.rig, finite, noise, np.ptp(data.offsets, axis=0)):
+        # Cameras that are not right yet must not be bent to a chain that is not: settle the chain first.
+        chain = solve(
+            start, data, "metric", cameras=False, loss="soft_l1", rounds=1, max_evaluations=20, tolerance=1e-2
+        )
+        metric = solve(chain.rig, data, "metric", rounds=2, max_evaluations=40)
+        if judge.passes(metric, plane):
+            return metric, plane, ()
+        if judge.hopeless:
+            break
+    second = judge.second_best()
+    if second is None:
+        judge.hopeless = False
+        for plane in finite:
+            try:
+                start = upgrade.affine_rig(solution.rig, plane)
+            except GeometryError as error:
+                judge.notes.append(f"no affine start: {error}")
+                continue
+            affine = solve(start, data, "affine", rounds=2, max_evaluations=40)
+            if judge.passes(affine, plane):
+                return affine, plane, tuple(judge.notes)
+            if judge.hopeless:
+                break
+        second = judge.second_best()
+    best, plane = second or (solution, finite[-1])
+    return best, plane, tuple(judge.notes)
+
+
+def _metric_starts(
+    rig: Rig, planes: list[FloatArray], noise: FloatArray, spans: FloatArray
+) -> Iterator[tuple[Rig, FloatArray]]:
+    """Metric rigs to start from and their planes: with the linear estimate of the intrinsics, then nominal
+    ones.
+    """
+    revolute = np.array([kind == "revolute" for kind in rig.kinds])
+    if int(revolute.sum()) < 2:
+        return
+    for plane in planes:
+        try:
+            affine = upgrade.affine_rig(rig, plane)
+            linear = upgrade.intrinsics_linear(affine.generators, revolute, noise)
+        except GeometryError:
+            linear = None  # this plane is no start for the linear estimate; nominal cameras follow
+        if linear is not None:
+            yield upgrade.metric_rig(rig, plane, linear, spans), plane
+        for focal in upgrade.NOMINAL_FOCALS:
+            yield upgrade.metric_rig(rig, plane, upgrade.nominal_intrinsics(focal), spans), plane
