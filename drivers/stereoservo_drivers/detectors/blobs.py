@@ -18,7 +18,9 @@ MAX_ASPECT = 6.0
 
 
 def noise_level(image: npt.NDArray[np.uint8]) -> float:
-    """Standard deviation of the noise [grey levels] of an image (h, w), from differences of neighbours on every 16th row."""
+    """Standard deviation of the noise [grey levels] of an image (h, w), from differences of neighbours on
+    every 16th row.
+    """
     rows = image[::16].astype(np.int16)
     differences = np.abs(rows[:, 1:] - rows[:, :-1])
     # the median of |difference| in whole levels, interpolated within its level
@@ -44,8 +46,8 @@ def find_spots(
 ) -> npt.NDArray[np.float64]:
     """Measurements (m, FIELDS) of the whole, elliptical spots of an image (h, w), at most ``most`` of them.
 
-    A pixel is bright when it exceeds the mean of its surroundings (a tenth of the image's width, so that gradients do not
-    matter) by half the least contrast or four times the noise.
+    A pixel is bright when it exceeds the mean of its surroundings (a tenth of the image's width, so that
+    gradients do not matter) by half the least contrast or four times the noise.
     """
     bright = cv2.bitwise_not(image) if dark else image
     side = max(31, image.shape[1] // 10) | 1
@@ -67,7 +69,8 @@ def find_spots(
     )
     spots = np.zeros((len(windows), FIELDS))
     status = measure_windows(image, dark, windows, centres, min_contrast, 5, labels, stack, spots)
-    spots = spots[(status == centroids.OK) & whole(spots, lopsided)]
+    spots = spots[status == centroids.OK]
+    spots = spots[whole(spots, lopsided)]
     # a component may be measured from two sides of a larger one
     order = np.argsort(spots[:, centroids.LOPSIDED], kind="stable")[: 2 * most]
     spots = spots[order]

@@ -1,9 +1,12 @@
-"""The dot detector: faces of seven dots, found anywhere, then tracked in windows placed by the core's priors."""
+"""The dot detector: faces of seven dots, found anywhere, then tracked in windows placed by the core's
+priors.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -24,8 +27,8 @@ from stereoservo.runtime.ports import (
 from stereoservo_drivers.detectors.blobs import find_spots
 from stereoservo_drivers.detectors.centroids import AREA, CXX, CXY, CYY, FIELDS, NOISE, scratch
 from stereoservo_drivers.detectors.patterns import find_face
-from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY, DotFace
-from stereoservo_drivers.detectors.tracking import agree_with_prior, settle_face, track_face
+from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY
+from stereoservo_drivers.detectors.tracking import settle_face, track
 
 QUANTISATION = 1.0 / 12.0
 """Least noise variance [grey levels squared]: rounding to whole levels."""
@@ -34,7 +37,9 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class FaceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A face of one's own: ids and positions of its dots [any unit], four corners clockwise first; radius in that unit."""
+    """A face of one's own: ids and positions of its dots [any unit], four corners clockwise first; radius
+    in that unit.
+    """
 
     name: str
     ids: tuple[int, ...]
@@ -65,7 +70,9 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lopsided: Positive = 0.02
     """Largest odd harmonic of a whole dot's edge; a cut of 0.5 px makes 0.02, of 1 px 0.04."""
     floor_px: Annotated[float, Meta(ge=0)] = 0.002
-    """Systematic standard deviation [px] added to every covariance: sampling of sharp edges (measured 0.0005-0.003)."""
+    """Systematic standard deviation [px] added to every covariance: sampling of sharp edges (measured
+    0.0005-0.003).
+    """
     max_spots: Annotated[int, Meta(ge=7, le=100)] = 48
     """Dot-like spots that acquisition looks at, the roundest first."""
 
@@ -81,15 +88,20 @@ class _Pattern:
     spare_bases: npt.NDArray[np.int64]
 
 
+_Found = tuple[FloatArray, npt.NDArray[np.bool_]]
+"""Measurements (faces, 7, FIELDS) and which of them are accepted (faces, 7)."""
+
+
 class DotDetector:
     """Dots of self-identifying faces with ids, centres and calibrated covariances. One thread at a time.
 
-    With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are found, the whole
-    image is searched and every face identified on its own. A face with fewer than four accepted dots is not reported: fewer
-    cannot be checked. Ids are reported in ascending order. The same frame and prior give the same observation.
+    With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are
+    found, the whole image is searched and every face identified on its own. A face with fewer than four
+    accepted dots is not reported: fewer cannot be checked. Ids are reported in ascending order. The same
+    frame and prior give the same observation.
 
-    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for frames that are
-    not what was announced. Content never raises.
+    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for
+    frames that are not what was announced. Content never raises.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
@@ -107,8 +119,10 @@ class DotDetector:
         self._dark = self.options.polarity == "dark"
         self._labels, self._stack = scratch()
         self._size = self.options.image_size
-        every = np.concatenate([pattern.ids for pattern in self._patterns])
-        self._ids = tuple(int(i) for i in np.sort(every))
+        self._every_id = np.array([pattern.ids for pattern in self._patterns])
+        self._positions = np.array([pattern.positions for pattern in self._patterns])
+        self._radii = np.array([pattern.radius for pattern in self._patterns])
+        self._ids = tuple(sorted(self._every_id.ravel().tolist()))
         self._place = {int(i): (f, r) for f, p in enumerate(self._patterns) for r, i in enumerate(p.ids)}
 
     def describe(self) -> DetectorDescription:
@@ -118,12 +132,11 @@ class DotDetector:
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """Dots of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
         image = self._checked(frame)
-        found: list[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]] = []
         if prior is not None and self._fresh(frame, prior):
             found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9)
-        if sum(int(used.sum()) for _, _, used in found) < self.options.min_dots:
-            found = self._acquire(image)
-        return self._observation(frame, found)
+            if found[1].sum() >= self.options.min_dots:
+                return self._observation(frame, found)
+        return self._observation(frame, self._acquire(image))
 
     def _fresh(self, frame: Frame, prior: Prior) -> bool:
         age_s = abs(frame.t_shutter_ns - prior.t_ns) * 1e-9
@@ -154,51 +167,33 @@ class DotDetector:
             )
         return np.ascontiguousarray(image)
 
-    def _track(
-        self, image: ImageArray, prior: Prior, dt_s: float
-    ) -> list[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]]:
+    def _track(self, image: ImageArray, prior: Prior, dt_s: float) -> _Found:
         options = self.options
         motion = prior.velocities * dt_s
         predicted = prior.pixels + motion
-        covariances = prior.covariances
-        middle = 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
-        half = 0.5 * (covariances[:, 0, 0] - covariances[:, 1, 1])
-        largest = middle + np.hypot(half, covariances[:, 0, 1])
-        spread = 3.0 * np.sqrt(np.maximum(largest, 0.0)) + 0.25 * np.hypot(motion[:, 0], motion[:, 1])
-        usable = np.isfinite(predicted).all(axis=1) & np.isfinite(spread)
-        n_faces = len(self._patterns)
-        places = np.zeros((n_faces, 7, 2))
-        spreads = np.zeros((n_faces, 7))
-        present = np.zeros((n_faces, 7), np.bool_)
-        rows = np.zeros((n_faces, 7), np.int64)
+        xx, xy, yy = prior.covariances[:, 0, 0], prior.covariances[:, 0, 1], prior.covariances[:, 1, 1]
+        largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        spread = 3.0 * np.sqrt(np.maximum(largest, 0.0)) + 0.25 * np.abs(motion).sum(axis=1)
+        usable = np.isfinite(predicted.sum(axis=1) + spread)
+        shape = self._every_id.shape
+        places, spreads = np.zeros((*shape, 2)), np.zeros(shape)
+        present, gates = np.zeros(shape, np.bool_), np.zeros((*shape, 3))
         for k, marker in enumerate(prior.ids.tolist()):
             where = self._place.get(marker)
             if where is not None and usable[k]:
                 places[where] = predicted[k]
                 spreads[where] = spread[k]
                 present[where] = True
-                rows[where] = k
-        others = places[present]
-        found = []
-        for f, pattern in enumerate(self._patterns):
-            dots = np.zeros((7, FIELDS))
-            used = np.zeros(7, np.bool_)
-            count = track_face(
-                image, self._dark, pattern.positions, pattern.radius, places[f], spreads[f], present[f], others,
-                options.min_contrast, options.lopsided, self._labels, self._stack, dots, used,
-            )  # fmt: skip
-            if options.gate_sigma and count:
-                used &= _within(dots[:, :2] - places[f], covariances[rows[f]], options.gate_sigma)
-                count = int(used.sum())
-            if count == 4 and not agree_with_prior(places[f], dots, used, 1.0):
-                continue
-            if count >= 4 and settle_face(
-                pattern.positions, pattern.radius, dots, used, options.consistency_px
-            ):
-                found.append((pattern, dots, used))
-        return found
+                if options.gate_sigma:
+                    gates[where] = _gate(prior.covariances[k], options.gate_sigma)
+        dots, used = np.zeros((*shape, FIELDS)), np.zeros(shape, np.bool_)
+        track(
+            image, self._dark, self._positions, self._radii, places, spreads, present, gates, options.min_contrast,
+            options.lopsided, options.consistency_px, self._labels, self._stack, dots, used,
+        )  # fmt: skip
+        return dots, used
 
-    def _acquire(self, image: ImageArray) -> list[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]]:
+    def _acquire(self, image: ImageArray) -> _Found:
         options = self.options
         spots = find_spots(
             image,
@@ -209,58 +204,55 @@ class DotDetector:
             self._labels,
             self._stack,
         )
-        owners = []
-        for pattern in self._patterns:
-            owner = np.full(7, -1, np.int64)
+        centres, areas = np.ascontiguousarray(spots[:, :2]), np.ascontiguousarray(spots[:, AREA])
+        owners = np.full(self._every_id.shape, -1, np.int64)
+        for pattern, owner in zip(self._patterns, owners, strict=True):
             count = 0
             for bases in (pattern.bases, pattern.spare_bases):
                 # the spare bases stand in for a hidden corner
-                if count == 0 and len(spots) >= options.acquire_dots and len(bases):
+                if count == 0 and len(spots) >= options.acquire_dots:
                     count = find_face(
-                        pattern.positions, pattern.radius, np.ascontiguousarray(spots[:, :2]), spots[:, AREA].copy(),
-                        bases, options.acquire_dots, 1.5, options.consistency_px, owner,
+                        pattern.positions, pattern.radius, centres, areas, bases, options.acquire_dots, 1.5,
+                        options.consistency_px, owner,
                     )  # fmt: skip
-            owners.append(owner)
         owners = _without_conflicts(owners)
-        found = []
-        for pattern, owner in zip(self._patterns, owners, strict=True):
-            used = owner >= 0
-            dots = np.zeros((7, FIELDS))
-            dots[used] = spots[owner[used]]
-            if used.any() and settle_face(
-                pattern.positions, pattern.radius, dots, used, options.consistency_px
-            ):
-                found.append((pattern, dots, used))
-        return found
+        used = owners >= 0
+        dots = np.zeros((*used.shape, FIELDS))
+        dots[used] = spots[owners[used]]
+        for f, pattern in enumerate(self._patterns):
+            if used[f].any():
+                settle_face(
+                    pattern.positions,
+                    pattern.radius,
+                    dots[f],
+                    used[f],
+                    options.consistency_px,
+                    options.acquire_dots,
+                )
+        return dots, used
 
-    def _observation(
-        self, frame: Frame, found: Sequence[tuple[_Pattern, FloatArray, npt.NDArray[np.bool_]]]
-    ) -> CameraObservation:
-        if found:
-            ids = np.concatenate([pattern.ids[used] for pattern, _, used in found])
-            dots = np.concatenate([dots[used] for _, dots, used in found])
-        else:
-            ids, dots = np.zeros(0, np.int64), np.zeros((0, FIELDS))
+    def _observation(self, frame: Frame, found: _Found) -> CameraObservation:
+        dots, used = found
+        ids, chosen = self._every_id[used], dots[used]
         order = np.argsort(ids)
-        ids, dots = ids[order], dots[order]
-        covariances = np.empty((len(ids), 2, 2))
-        variance = noise_variances(dots[:, NOISE])
-        covariances[:, 0, 0] = variance * dots[:, CXX] + self.options.floor_px**2
-        covariances[:, 1, 1] = variance * dots[:, CYY] + self.options.floor_px**2
-        covariances[:, 0, 1] = covariances[:, 1, 0] = variance * dots[:, CXY]
+        ids, chosen = ids[order], chosen[order]
+        variance = noise_variances(chosen[:, NOISE])
+        covariances = variance[:, None, None] * chosen[:, [CXX, CXY, CXY, CYY]].reshape(-1, 2, 2)
+        covariances += self.options.floor_px**2 * np.eye(2)
         return CameraObservation(
             camera=frame.camera,
             seq=frame.seq,
             t_shutter_ns=frame.t_shutter_ns,
             t_received_ns=frame.t_received_ns,
             ids=ids,
-            pixels=np.ascontiguousarray(dots[:, :2]),
+            pixels=np.ascontiguousarray(chosen[:, :2]),
             covariances=covariances,
         )
 
 
 def noise_variances(measured: FloatArray) -> FloatArray:
-    """Noise variance of each dot's surroundings (k,) from the measured ones (k,), -1 where there is none [levels²].
+    """Noise variance of each dot's surroundings (k,) from the measured ones (k,), -1 where there is none
+    [levels²].
 
     One picture has one noise: each gets the median over all dots, which is steadier (a dot's own: 15 % standard deviation),
     unless its own surroundings are more than twice as restless.
@@ -272,23 +264,23 @@ def noise_variances(measured: FloatArray) -> FloatArray:
     return np.where(measured > 2.0 * common, measured, common)
 
 
-def _within(offsets: FloatArray, covariances: FloatArray, sigma: float) -> npt.NDArray[np.bool_]:
-    """Which offsets (k, 2) [px] lie within ``sigma`` standard deviations of covariances (k, 2, 2)."""
-    solved = np.linalg.solve(covariances + 1e-9 * np.eye(2), offsets[:, :, None])[:, :, 0]
-    inside: npt.NDArray[np.bool_] = (offsets * solved).sum(axis=1) <= sigma**2
-    return inside
+def _gate(covariance: FloatArray, sigma: float) -> tuple[float, float, float]:
+    """Inverse of a covariance (2, 2), (xx, xy, yy), over ``sigma`` squared; all 0, no gate, where it is
+    singular.
+    """
+    xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    scale = (xx * yy - xy * xy) * sigma**2
+    return (yy / scale, -xy / scale, xx / scale) if scale > 0.0 else (0.0, 0.0, 0.0)
 
 
-def _without_conflicts(owners: list[npt.NDArray[np.int64]]) -> list[npt.NDArray[np.int64]]:
-    """Faces that share a spot: the one with more dots stays; of equals, none."""
-    kept = []
+def _without_conflicts(owners: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Faces (f, 7) that share a spot: the one with more dots stays; of equals, none."""
+    kept = owners.copy()
     for f, owner in enumerate(owners):
-        mine = set(owner[owner >= 0].tolist())
-        beaten = any(
-            g != f and mine & set(other[other >= 0].tolist()) and (other >= 0).sum() >= len(mine)
-            for g, other in enumerate(owners)
-        )
-        kept.append(np.full(len(owner), -1, np.int64) if beaten else owner)
+        mine = owner[owner >= 0]
+        for g, other in enumerate(owners):
+            if f != g and np.isin(mine, other).any() and (other >= 0).sum() >= len(mine):
+                kept[f] = -1
     return kept
 
 
@@ -336,15 +328,15 @@ def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float
 
 
 def _spare_basis(positions: FloatArray, missing: int) -> tuple[int, int, int, int]:
-    """Four dots without ``missing``, convex and clockwise where possible, whose smallest triangle is largest."""
-    from itertools import permutations
+    """Four dots without ``missing``, convex and clockwise where possible, whose smallest triangle is
+    largest.
+    """
+    points = [complex(x, y) for x, y in positions]
 
     def quality(rows: tuple[int, ...]) -> float:
-        p = positions[list(rows)]
+        p = [points[i] for i in rows]
         triangles = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
-        return min(
-            float(np.cross(np.append(p[b] - p[a], 0), np.append(p[c] - p[a], 0))[2]) for a, b, c in triangles
-        )
+        return min(((p[b] - p[a]).conjugate() * (p[c] - p[a])).imag for a, b, c in triangles)
 
     others = [i for i in range(len(positions)) if i != missing]
     best = max(permutations(others, 4), key=quality)

@@ -1,7 +1,8 @@
 """Planar dot patterns under homographies: fit, check, search. Numba kernels; no state.
 
-Pattern coordinates are those of :class:`~stereoservo_drivers.detectors.plates.DotFace` in units of half its corner distance.
-A face seen from in front has a homography of positive determinant and positive depths; a mirrored pattern has not.
+Pattern coordinates are those of :class:`~stereoservo_drivers.detectors.plates.DotFace` in units of half its
+corner distance. A face seen from in front has a homography of positive determinant and positive depths; a
+mirrored pattern has not.
 """
 
 from __future__ import annotations
@@ -42,82 +43,108 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
-    """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,), into ``H``.
+def _normal_matrix(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
+    """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = middle and scale
+    of the pixels.
+    """
+    A[:] = 0.0
+    b[:] = 0.0
+    row = np.zeros(8)
+    for i in range(used.size):
+        if not used[i]:
+            continue
+        depth = h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0
+        if depth < 1e-3:
+            return False
+        for axis in range(2):
+            target = (pixels[i, axis] - frame[axis]) / frame[2]
+            _row(pattern[i], axis, target, depth, row)
+            for j in range(8):
+                if row[j] != 0.0:
+                    for k in range(8):
+                        A[j, k] += row[j] * row[k]
+                    b[j] += row[j] * target / depth
+    return True
 
-    Scaled to H[2, 2] = 1. Algebraic residuals reweighted by depth, so that the minimum is that of the pixel residuals to
-    first order. False where fewer than four rows are used, they are degenerate or depths are not positive.
+
+@njit(cache=True)
+def _row(point, axis, target, depth, row):  # type: ignore[no-untyped-def]
+    row[:] = 0.0
+    row[3 * axis] = point[0] / depth
+    row[3 * axis + 1] = point[1] / depth
+    row[3 * axis + 2] = 1.0 / depth
+    row[6] = -target * point[0] / depth
+    row[7] = -target * point[1] / depth
+
+
+@njit(cache=True)
+def _fit(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
+    """Homography in normalised pixels into ``h`` (8,). False where it is undetermined or depths are not
+    positive.
     """
     n = 0
-    mu = mv = 0.0
+    frame[:] = 0.0
     for i in range(used.size):
         if used[i]:
             n += 1
-            mu += pixels[i, 0]
-            mv += pixels[i, 1]
+            frame[0] += pixels[i, 0]
+            frame[1] += pixels[i, 1]
     if n < 4:
         return False
-    mu /= n
-    mv /= n
-    spread = 0.0
+    frame[0] /= n
+    frame[1] /= n
     for i in range(used.size):
         if used[i]:
-            spread += (pixels[i, 0] - mu) ** 2 + (pixels[i, 1] - mv) ** 2
-    s = np.sqrt(spread / n)
-    if s < 1e-6:
+            frame[2] += (pixels[i, 0] - frame[0]) ** 2 + (pixels[i, 1] - frame[1]) ** 2
+    frame[2] = np.sqrt(frame[2] / n)
+    if frame[2] < 1e-6:
         return False
-    A = np.zeros((8, 8))
-    b = np.zeros(8)
-    row = np.zeros(8)
-    h = np.zeros(8)
-    for step in range(3):
-        A[:] = 0.0
-        b[:] = 0.0
-        for i in range(used.size):
-            if not used[i]:
-                continue
-            x, y = pattern[i, 0], pattern[i, 1]
-            depth = 1.0 if step == 0 else h[6] * x + h[7] * y + 1.0
-            if depth < 1e-3:
-                return False
-            for axis in range(2):
-                target = ((pixels[i, 0] - mu) if axis == 0 else (pixels[i, 1] - mv)) / s
-                row[:] = 0.0
-                row[3 * axis] = x
-                row[3 * axis + 1] = y
-                row[3 * axis + 2] = 1.0
-                row[6] = -target * x
-                row[7] = -target * y
-                w = 1.0 / (depth * depth)
-                for j in range(8):
-                    if row[j] == 0.0:
-                        continue
-                    for k in range(8):
-                        A[j, k] += w * row[j] * row[k]
-                    b[j] += w * row[j] * target
-        if not _solve(A, b):
+    h[:] = 0.0
+    for _ in range(1 if n == 4 else 3):
+        if not _normal_matrix(pattern, pixels, used, frame, h, A, b) or not _solve(A, b):
             return False
         h[:] = b
-        if n == 4:
-            break
     for i in range(used.size):
         if h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0 < 1e-3:
             return False
+    return True
+
+
+@njit(cache=True)
+def _in_pixels(frame, h, H):  # type: ignore[no-untyped-def]
     for j in range(2):
-        m = mu if j == 0 else mv
-        H[j, 0] = s * h[3 * j] + m * h[6]
-        H[j, 1] = s * h[3 * j + 1] + m * h[7]
-        H[j, 2] = s * h[3 * j + 2] + m
+        H[j, 0] = frame[2] * h[3 * j] + frame[j] * h[6]
+        H[j, 1] = frame[2] * h[3 * j + 1] + frame[j] * h[7]
+        H[j, 2] = frame[2] * h[3 * j + 2] + frame[j]
     H[2, 0] = h[6]
     H[2, 1] = h[7]
     H[2, 2] = 1.0
+
+
+@njit(cache=True)
+def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
+    """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,),
+    into ``H``.
+
+    Scaled to H[2, 2] = 1. Algebraic residuals reweighted by depth, so that the minimum is that of the pixel
+    residuals to first order. False where fewer than four rows are used, they are degenerate or depths are
+    not positive.
+    """
+    frame = np.zeros(3)
+    h = np.zeros(8)
+    A = np.zeros((8, 8))
+    b = np.zeros(8)
+    if not _fit(pattern, pixels, used, frame, h, A, b):
+        return False
+    _in_pixels(frame, h, H)
     return True
 
 
 @njit(cache=True)
 def image_of_circle(H, x, y, radius, out):  # type: ignore[no-untyped-def]
-    """The picture of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's centre, ellipse
-    area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen from in front.
+    """The picture of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's
+    centre, ellipse area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen
+    from in front.
     """
     w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
     if w <= 0.0:
@@ -167,42 +194,84 @@ def misfits(pattern, pixels, used, H, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def drop_outliers(pattern, pixels, used, tolerance, least, H):  # type: ignore[no-untyped-def]
-    """Clear rows of ``used`` until the rest fits a homography within ``tolerance`` [px]. False if ``least`` rows cannot.
+def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):  # type: ignore[no-untyped-def]
+    """The dot that fits the others least, -1 where each lies where the others put it.
 
-    The row whose removal leaves the smallest misfit goes; with five rows left nothing tells which one is wrong, so that
-    ``least`` must be at least 5 for a removal to be meaningful.
+    A dot's distance from the homography of the others, to first order, is |(I - L)⁻¹ e|, e its residual and
+    L (2, 2) its leverage; a homography bends to a single bad dot, so that e alone may hide most of its
+    error. It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root of (I - L)⁻¹. Of the dots beyond,
+    the one with the largest studentised residual goes. -2 where the fit is degenerate.
     """
-    distances = np.zeros(used.size)
+    if not _normal_matrix(pattern, pixels, used, frame, h, A, b):
+        return -2
+    rows = np.zeros((2, 8))
+    solved = np.zeros((2, 8))
+    work = np.zeros((8, 8))
+    worst = -1
+    largest = 0.0
+    for i in range(used.size):
+        if not used[i]:
+            continue
+        depth = h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0
+        e = np.zeros(2)
+        for axis in range(2):
+            target = (pixels[i, axis] - frame[axis]) / frame[2]
+            _row(pattern[i], axis, target, depth, rows[axis])
+            e[axis] = target / depth
+            for j in range(8):
+                e[axis] -= rows[axis, j] * h[j]
+            work[:] = A
+            solved[axis] = rows[axis]
+            if not _solve(work, solved[axis]):
+                return -2
+        m11, m12, m22 = 1.0, 0.0, 1.0
+        for j in range(8):
+            m11 -= rows[0, j] * solved[0, j]
+            m12 -= rows[0, j] * solved[1, j]
+            m22 -= rows[1, j] * solved[1, j]
+        det = m11 * m22 - m12 * m12
+        least = 0.5 * (m11 + m22) - np.sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12)
+        if least < 1e-6 or det <= 0.0:
+            # the others say nothing of this dot: five dots, three of them collinear
+            continue
+        a = frame[2] * (m22 * e[0] - m12 * e[1]) / det
+        c = frame[2] * (m11 * e[1] - m12 * e[0]) / det
+        if np.sqrt(a * a + c * c) > tolerance + 5.0 * sigma / np.sqrt(least):
+            studentised = (a * e[0] + c * e[1]) * frame[2]
+            if studentised > largest:
+                largest = studentised
+                worst = i
+    return worst
+
+
+@njit(cache=True)
+def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):  # type: ignore[no-untyped-def]
+    """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of where the others
+    put it.
+
+    ``sigma`` [px]: standard deviation of a dot, allowed for on top. False where fewer than ``least`` dots
+    would remain; with five dots left nothing tells which one is wrong, so that ``least`` must be at least
+    5. ``H`` gets the homography.
+    """
+    frame = np.zeros(3)
+    h = np.zeros(8)
+    A = np.zeros((8, 8))
+    b = np.zeros(8)
     count = 0
     for i in range(used.size):
         count += 1 if used[i] else 0
-    if count < least or not fit_homography(pattern, pixels, used, H):
-        return False
-    worst = misfits(pattern, pixels, used, H, distances)
-    while worst > tolerance:
-        if count - 1 < least:
+    while count >= least:
+        if not _fit(pattern, pixels, used, frame, h, A, b):
             return False
-        best = -1
-        best_worst = 1e30
-        for i in range(used.size):
-            if not used[i]:
-                continue
-            used[i] = False
-            if fit_homography(pattern, pixels, used, H):
-                rest = misfits(pattern, pixels, used, H, distances)
-                if rest < best_worst:
-                    best_worst = rest
-                    best = i
-            used[i] = True
-        if best < 0:
+        worst = _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma)
+        if worst == -1:
+            _in_pixels(frame, h, H)
+            return True
+        if worst == -2:
             return False
-        used[best] = False
+        used[worst] = False
         count -= 1
-        if not fit_homography(pattern, pixels, used, H):
-            return False
-        worst = misfits(pattern, pixels, used, H, distances)
-    return True
+    return False
 
 
 @njit(cache=True)
@@ -240,6 +309,30 @@ def _hypothesis(p, q, r, s, inverse, H):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _promising(pattern, pixels, basis, least, reach, H):  # type: ignore[no-untyped-def]
+    """Whether enough dots outside the basis have something near their place."""
+    missing = pattern.shape[0] - least
+    for i in range(pattern.shape[0]):
+        if i == basis[0] or i == basis[1] or i == basis[2] or i == basis[3]:
+            continue
+        w = H[2, 0] * pattern[i, 0] + H[2, 1] * pattern[i, 1] + H[2, 2]
+        if w <= 0.0:
+            return False
+        u = (H[0, 0] * pattern[i, 0] + H[0, 1] * pattern[i, 1] + H[0, 2]) / w
+        v = (H[1, 0] * pattern[i, 0] + H[1, 1] * pattern[i, 1] + H[1, 2]) / w
+        near = False
+        for k in range(pixels.shape[0]):
+            if abs(pixels[k, 0] - u) < reach and abs(pixels[k, 1] - v) < reach:
+                near = True
+                break
+        if not near:
+            missing -= 1
+            if missing < 0:
+                return False
+    return True
+
+
+@njit(cache=True)
 def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: ignore[no-untyped-def]
     """Dots nearest to the projected pattern into ``owner`` (n,), -1 where none has the right place and size.
 
@@ -272,12 +365,14 @@ def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: i
 
 @njit(cache=True)
 def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, owner):  # type: ignore[no-untyped-def]
-    """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas`` (m,) [px²].
+    """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas``
+    (m,) [px²].
 
-    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4), pruned by the signs and sizes of its
-    triangles, which the dots' areas foretell. A hypothesis counts when ``least`` dots or more lie within ``tolerance`` [px]
-    of the homography fitted to all of them and are of the right size. ``owner`` (n,) gets the dots' rows, -1 for missing ones.
-    Returns the number found; 0 if none, or if another assignment explains as many dots nearly as well.
+    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4), pruned by the signs and
+    sizes of its triangles, which the dots' areas foretell. A hypothesis counts when ``least`` dots or more
+    lie within ``tolerance`` [px] of the homography fitted to all of them and are of the right size. ``owner`` (n,) gets the dots' rows,
+    -1 for missing ones. Returns the number found; 0 if none, or if another assignment explains as many dots
+    nearly as well.
     """
     n = pattern.shape[0]
     m = pixels.shape[0]
@@ -305,14 +400,14 @@ def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, ow
                 if j == i or areas[j] > 3.0 * areas[i] or areas[i] > 3.0 * areas[j]:
                     continue
                 for k in range(m):
-                    if k == i or k == j:
+                    if k in (i, j):
                         continue
                     ratio = _turn(pixels[i], pixels[j], pixels[k]) / t012
                     foretold = (areas[i] + areas[j] + areas[k]) / (3.0 * unit)
                     if ratio < 0.4 * foretold or ratio > 2.0 * foretold:
                         continue
                     for l in range(m):  # noqa: E741
-                        if l == i or l == j or l == k:
+                        if l in (i, j, k):
                             continue
                         if _turn(pixels[i], pixels[j], pixels[l]) / t013 < 0.3 * foretold:
                             continue
@@ -321,6 +416,8 @@ def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, ow
                         if _turn(pixels[j], pixels[k], pixels[l]) / t123 < 0.3 * foretold:
                             continue
                         if not _hypothesis(pixels[i], pixels[j], pixels[k], pixels[l], inverse, H):
+                            continue
+                        if not _promising(pattern, pixels, basis, max(least, best_count), reach + 0.5, H):
                             continue
                         count = _assign(pattern, radius, pixels, areas, reach, H, trial, circle)
                         if count < least or count < best_count:

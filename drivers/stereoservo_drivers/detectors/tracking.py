@@ -9,6 +9,8 @@ from numba import njit
 from stereoservo_drivers.detectors.centroids import (
     AREA,
     CONTRAST,
+    CXX,
+    CYY,
     LOPSIDED,
     LOPSIDED_NOISE,
     NOISE,
@@ -17,8 +19,9 @@ from stereoservo_drivers.detectors.centroids import (
     QXY,
     QYY,
     measure,
+    smaller_half_axis,
 )
-from stereoservo_drivers.detectors.patterns import drop_outliers, fit_homography, image_of_circle
+from stereoservo_drivers.detectors.patterns import drop_strangers, fit_homography, image_of_circle
 
 MIN_HALF_WINDOW = 14
 MAX_HALF_WINDOW = 64
@@ -26,6 +29,9 @@ SHAPE_MARGIN = 6
 """Pixels between a dot's expected outline and the rim of its window, beside the prior's uncertainty."""
 THINNEST = 1.0
 """Half axis [px] below which a dot is too thin to measure."""
+
+FEW_TOLERANCE = 0.7
+"""How far four or five dots of a face may lie from their predictions, up to a similarity [px]."""
 
 Measurements = npt.NDArray[np.float64]
 
@@ -44,10 +50,7 @@ def measure_windows(image, dark, windows, near, min_contrast, min_area, labels, 
 
 @njit(cache=True)
 def _is_whole(dot, lopsided):  # type: ignore[no-untyped-def]
-    det = dot[QXX] * dot[QYY] - dot[QXY] * dot[QXY]
-    trace = dot[QXX] + dot[QYY]
-    # the larger eigenvalue of Q belongs to the smaller half axis
-    thin = 1.0 / np.sqrt(0.5 * (trace + np.sqrt(max(trace * trace - 4.0 * det, 0.0))))
+    thin = smaller_half_axis(dot[QXX], dot[QXY], dot[QYY])
     # thin dots suffer from sampling: measured 0.04 at 2 px, 0.13 at 1.4 px
     limit = lopsided + np.exp(-1.4 * thin) + 2.5 * dot[LOPSIDED_NOISE] * np.sqrt(max(dot[NOISE], 0.08))
     return dot[LOPSIDED] < limit
@@ -70,10 +73,12 @@ def _median(values, used):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def track_face(image, dark, pattern, radius, predicted, spread, present, others, min_contrast, lopsided, labels, stack, out, used):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Measure the dots of one face near ``predicted`` (n, 2) [px] where ``present`` (n,), into ``out`` (n, FIELDS).
+    """Measure the dots of one face near ``predicted`` (n, 2) [px] where ``present`` (n,), into ``out`` (n,
+    FIELDS).
 
-    ``spread`` (n,) [px]: how far a dot may be from its prediction. ``others`` (k, 2): predictions of all dots of the prior;
-    a dot must lie nearer to its own than to any other. ``used`` (n,) gets what passed the gates. Returns the number.
+    ``spread`` (n,) [px]: how far a dot may be from its prediction. ``others`` (k, 2): predictions of all
+    dots of the prior; a dot must lie nearer to its own than to any other. ``used`` (n,) gets what passed
+    the gates. Returns the number.
     """
     n = pattern.shape[0]
     used[:] = False
@@ -149,7 +154,10 @@ def track_face(image, dark, pattern, radius, predicted, spread, present, others,
 
 @njit(cache=True)
 def agree_with_prior(predicted, dots, used, tolerance):  # type: ignore[no-untyped-def]
-    """Whether four or more dots (n, FIELDS) sit on their predictions (n, 2) up to an affine map, within ``tolerance`` [px]."""
+    """Whether dots (n, FIELDS) lie on their predictions (n, 2) up to a similarity, within ``tolerance`` [px].
+
+    For faces with too few dots to check one another: a prior may be off, but smoothly.
+    """
     n = 0
     mean = np.zeros(4)
     for i in range(used.size):
@@ -159,29 +167,24 @@ def agree_with_prior(predicted, dots, used, tolerance):  # type: ignore[no-untyp
             mean[1] += predicted[i, 1]
             mean[2] += dots[i, 0]
             mean[3] += dots[i, 1]
-    if n < 4:
-        return False
     mean /= n
-    sxx = sxy = syy = 0.0
-    b = np.zeros(4)
+    spread = a = b = 0.0
     for i in range(used.size):
         if used[i]:
             x, y = predicted[i, 0] - mean[0], predicted[i, 1] - mean[1]
             u, v = dots[i, 0] - mean[2], dots[i, 1] - mean[3]
-            sxx += x * x
-            sxy += x * y
-            syy += y * y
-            b += np.array([x * u, y * u, x * v, y * v])
-    det = sxx * syy - sxy * sxy
-    if det <= 1e-9 * (sxx + syy) ** 2:
+            spread += x * x + y * y
+            a += x * u + y * v
+            b += x * v - y * u
+    if spread <= 0.0:
         return False
-    a11, a12 = (syy * b[0] - sxy * b[1]) / det, (sxx * b[1] - sxy * b[0]) / det
-    a21, a22 = (syy * b[2] - sxy * b[3]) / det, (sxx * b[3] - sxy * b[2]) / det
+    a /= spread
+    b /= spread
     for i in range(used.size):
         if used[i]:
             x, y = predicted[i, 0] - mean[0], predicted[i, 1] - mean[1]
             u, v = dots[i, 0] - mean[2], dots[i, 1] - mean[3]
-            if (a11 * x + a12 * y - u) ** 2 + (a21 * x + a22 * y - v) ** 2 > tolerance * tolerance:
+            if (a * x - b * y - u) ** 2 + (b * x + a * y - v) ** 2 > tolerance * tolerance:
                 return False
     return True
 
@@ -200,25 +203,35 @@ def _remove_shift(pattern, radius, raw, used, H, dots):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def settle_face(pattern, radius, dots, used, tolerance):  # type: ignore[no-untyped-def]
-    """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to the dots' own.
+def settle_face(pattern, radius, dots, used, tolerance, least):  # type: ignore[no-untyped-def]
+    """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to
+    the dots' own.
 
-    Rows of ``used`` that do not fit are cleared (five must remain; four are taken as they are). The picture of a circle's
-    centre is not the centre of its picture; the face's homography tells the difference, no camera needed. Returns the number.
+    Rows of ``used`` that do not fit the others are cleared (of five or more; four are taken as they are);
+    all are, where fewer than ``least`` remain. The picture of a circle's centre is not the centre of its
+    picture; the face's homography tells the difference, no camera needed. Returns the number that remains.
     """
     n = pattern.shape[0]
     H = np.zeros((3, 3))
     raw = dots[:, :2].copy()
-    # twice: a first shift under the homography of the ellipses' centres, which hardly differs, then the checked one
+    count = 0
+    unit = 0.0
+    for i in range(n):
+        if used[i]:
+            count += 1
+            unit += 0.5 * (dots[i, CXX] + dots[i, CYY])
+    if count < least:
+        used[:] = False
+        return 0
+    sigma = np.sqrt(unit / count * max(_median(dots[:, NOISE], used), 0.08))
+    # twice: a first shift under the homography of the ellipses' centres, which hardly differs, then the
+    # checked one
     for step in range(2):
-        if step == 1:
-            count = 0
-            for i in range(n):
-                count += 1 if used[i] else 0
-            if count >= 5 and not drop_outliers(pattern, dots, used, tolerance, 5, H):
+        if step == 1 and count >= 5:
+            if not drop_strangers(pattern, dots, used, tolerance, sigma, max(least, 5), H):
                 used[:] = False
                 return 0
-        if not fit_homography(pattern, dots, used, H):
+        elif not fit_homography(pattern, dots, used, H):
             used[:] = False
             return 0
         _remove_shift(pattern, radius, raw, used, H, dots)
@@ -226,3 +239,40 @@ def settle_face(pattern, radius, dots, used, tolerance):  # type: ignore[no-unty
     for i in range(n):
         count += 1 if used[i] else 0
     return count
+
+
+@njit(cache=True)
+def track(image, dark, patterns, radii, predicted, spreads, present, gates, min_contrast, lopsided, tolerance, labels, stack, dots, used):  # type: ignore[no-untyped-def]  # fmt: skip
+    """All faces: ``patterns`` (f, n, 2), ``radii`` (f,), ``predicted`` (f, n, 2) [px], ``spreads`` (f, n)
+    [px], ``present`` (f, n), ``gates`` (f, n, 3) inverse covariances (xx, xy, yy) divided by the squared
+    gate, 0 for none. Writes ``dots`` (f, n, FIELDS) and ``used`` (f, n). Returns the number of dots.
+    """
+    faces, n = present.shape
+    others = np.zeros((faces * n, 2))
+    k = 0
+    for f in range(faces):
+        for i in range(n):
+            if present[f, i]:
+                others[k] = predicted[f, i]
+                k += 1
+    others = others[:k]
+    total = 0
+    for f in range(faces):
+        count = track_face(
+            image, dark, patterns[f], radii[f], predicted[f], spreads[f], present[f], others, min_contrast, lopsided,
+            labels, stack, dots[f], used[f],
+        )  # fmt: skip
+        for i in range(n):
+            if used[f, i]:
+                du = dots[f, i, 0] - predicted[f, i, 0]
+                dv = dots[f, i, 1] - predicted[f, i, 1]
+                gate = gates[f, i]
+                if gate[0] * du * du + 2.0 * gate[1] * du * dv + gate[2] * dv * dv > 1.0:
+                    used[f, i] = False
+                    count -= 1
+        count = settle_face(patterns[f], radii[f], dots[f], used[f], tolerance, 4) if count >= 4 else 0
+        if count == 0 or (count <= 5 and not agree_with_prior(predicted[f], dots[f], used[f], FEW_TOLERANCE)):
+            used[f] = False
+            continue
+        total += count
+    return total

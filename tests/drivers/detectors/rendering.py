@@ -1,7 +1,8 @@
 """Exact pictures of dots for tests; knows neither the detector nor the simulation.
 
-A dot is a circle in its face's plane; its picture under a homography is a conic. Coverage of a pixel is exact along u (a
-scan line meets a conic in a closed-form interval) and a midpoint rule of 32 lines a pixel along v: centre errors < 2e-4 px.
+A dot is a circle in its face's plane; its picture under a homography is a conic. Coverage of a pixel is
+exact along u (a scan line meets a conic in a closed-form interval) and a midpoint rule of 32 lines a pixel
+along v: centre errors < 2e-4 px.
 """
 
 from __future__ import annotations
@@ -85,7 +86,9 @@ def add_blurred(coverage: Array, conic: Array, sigma: float) -> None:
 
 @dataclass
 class Scene:
-    """What is drawn: faces as (homography, positions (n, 2), radius, half_side), then free ellipses (conics)."""
+    """What is drawn: faces as (homography, positions (n, 2), radius, half_side), then free ellipses
+    (conics).
+    """
 
     faces: list[tuple[Array, Array, float, float]] = field(default_factory=list)
     clutter: list[Array] = field(default_factory=list)
@@ -94,7 +97,9 @@ class Scene:
     white: float = 220.0
     wall: float = 30.0
     blur: float = 0.0
-    """Gaussian blur of the sampled picture [px], as a renderer does it: it keeps the aliasing of the pixels."""
+    """Gaussian blur of the sampled picture [px], as a renderer does it: it keeps the aliasing of the
+    pixels.
+    """
     lens_blur: float = 0.7
     """Gaussian blur of the dots before they are sampled [px], as a lens does it."""
     noise: float = 0.0
