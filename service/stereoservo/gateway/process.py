@@ -184,6 +184,7 @@ class Gateway:
         self._handled_path = directories.runtime / "handled"
         self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
         self._greeted = False
+        self._announced = False
 
     def _declare(self) -> None:
         session, keys = self._session, self.keys
@@ -430,6 +431,9 @@ class Gateway:
         state = self._link.state()
         if state is not None:
             self._state_heard = now
+            if not self._announced:
+                self._announced = True
+                self._announce()
             self._state = state_message(
                 self.plan, self.boot, state, servo_alive=True, last_event=self.log.last
             )
@@ -481,8 +485,8 @@ class Gateway:
 
     # -- life -----------------------------------------------------------------------------------------------
 
-    def announce(self) -> None:
-        """Say that the daemon is up: ``daemon.json``."""
+    def _announce(self) -> None:
+        """Say that the daemon is up: ``daemon.json``. Not before the servo process shows its state."""
         plan = self.plan
         info = DaemonInfo(
             cell=plan.cell.cell.name, endpoint=self.endpoint, boot=self.boot, pid=os.getppid(), cell_path=plan.cell_path,
@@ -523,7 +527,6 @@ def run(plan: RunPlan, termination: Termination) -> None:
     """Run until asked to end."""
     gateway = Gateway(plan)
     try:
-        gateway.announce()
         while not termination.asked:
             if not gateway.turn():
                 time.sleep(IDLE_S)

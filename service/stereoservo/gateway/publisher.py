@@ -106,7 +106,7 @@ class EventLog:
     def since(self, number: int) -> EventList:
         """Events from ``number`` on, as many as fit into one reply."""
         first = self._kept[0].seq if self._kept else self.last + 1
-        begin = max(number, first)
+        begin = min(max(number, first), self.last + 1)
         offset = begin - first
         some = tuple(self._kept[i] for i in range(offset, min(offset + EVENTS_A_REPLY, len(self._kept))))
         return EventList(self._boot, first, begin + len(some), some)

@@ -59,6 +59,7 @@ from stereoservo.runtime.ports import (
 from stereoservo.runtime.record import encode_step, fingerprint
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import encode_state
+from stereoservo.runtime.warmup import warm_up
 
 GATEWAY_SILENCE_S = 0.5
 """Without a heartbeat of the gateway for so long, a moving arm is held."""
@@ -410,6 +411,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
     locks = [FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}")]
     if hardware is not None:
         locks.append(FileLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
+    warm_up()  # compiled kernels are loaded now, not in the middle of a cycle
     core = ServoCore(plan.settings())
     driver = make_driver(plan, clock)
     rate_hz = plan.cell.servo.rate_hz

@@ -14,7 +14,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from stereoservo.runtime.cellfile import load_cell_file
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.describe import PlanOptions
 from stereoservo.runtime.directories import CellDirectories, cell_directories, create_directories
-from stereoservo.runtime.handover import StopSlot, create_slot, create_stop_slot
+from stereoservo.runtime.handover import create_slot, create_stop_slot
 from stereoservo.runtime.interprocess import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -144,11 +143,6 @@ class Supervisor:
 
     def stop(self) -> None:
         """Stop the arm first, then the rest; every child is reaped."""
-        if self.servo.process is not None and self.servo.process.poll() is None:
-            with suppress(OSError):
-                slot = StopSlot(self.plan.directories.stop_slot)
-                slot.raise_stop()
-                slot.close()
         _end([self.servo], SERVO_END_S)
         _end([child for child in self.children if child is not self.servo], OTHERS_END_S)
 
