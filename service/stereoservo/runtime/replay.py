@@ -14,7 +14,7 @@ from mcap.records import Channel, Header, Message
 from mcap.stream_reader import StreamReader
 
 from stereoservo.runtime.core import ServoCore
-from stereoservo.runtime.cycle import decode_array
+from stereoservo.runtime.cycle import StepInputs, StepOutputs, decode_array
 from stereoservo.runtime.record import Fingerprint, StepRecord, decode_step, encode_step, fingerprint
 from stereoservo.runtime.recorder import FORMAT
 from stereoservo.runtime.settings import CoreSettings
@@ -44,8 +44,15 @@ class ReplayResult:
     fingerprint: Fingerprint
 
 
-def replay(path: Path, progress: Callable[[int], None] | None = None) -> ReplayResult:
-    """Run a recording through a fresh core. Raises RecordingError on a damaged or foreign file."""
+def replay(
+    path: Path,
+    progress: Callable[[int], None] | None = None,
+    observe: Callable[[StepInputs, StepOutputs], None] | None = None,
+) -> ReplayResult:
+    """Run a recording through a fresh core. Raises RecordingError on a damaged or foreign file.
+
+    ``observe`` sees every step's inputs and outputs: reports and debuggers read a recording through it.
+    """
     core: ServoCore | None = None
     settings: CoreSettings | None = None
     recorded: Fingerprint | None = None
@@ -70,7 +77,10 @@ def replay(path: Path, progress: Callable[[int], None] | None = None) -> ReplayR
                     differs = step
             elif topic == "step" and core is not None:
                 record = decode_step(data)
-                same, error = _compare(core, record)
+                outputs = core.step(record.inputs)
+                if observe is not None:
+                    observe(record.inputs, outputs)
+                same, error = _compare(record, outputs)
                 worst = max(worst, error)
                 if not same and differs is None:
                     differs = record.step
@@ -95,9 +105,8 @@ def replay(path: Path, progress: Callable[[int], None] | None = None) -> ReplayR
     )
 
 
-def _compare(core: ServoCore, record: StepRecord) -> tuple[bool, float]:
+def _compare(record: StepRecord, outputs: StepOutputs) -> tuple[bool, float]:
     """Whether all outputs agree bit for bit, and the largest relative difference of the raw joint velocity."""
-    outputs = core.step(record.inputs)
     again = decode_step(encode_step(record.inputs, outputs))
     difference = float(np.abs(again.raw - record.raw).max(initial=0.0))
     scale = float(np.abs(record.raw).max(initial=0.0))

@@ -1,0 +1,160 @@
+"""Judges the demonstration from its flight recording and the simulated truth, out of the controller's sight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.runtime.calibration_job import CalibrationJob
+from stereoservo.runtime.cycle import Event, StepInputs, StepOutputs
+from stereoservo.runtime.replay import ReplayResult, replay
+from stereoservo.runtime.settings import CoreSettings
+from stereoservo_sim.world import SimulatedCell
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+JUDGED_S = 1.0
+
+
+@dataclass
+class Flight:
+    """What a recording shows when it is replayed: every status, every event, the calibration's stops."""
+
+    result: ReplayResult
+    t_ns: IntArray
+    error_px: FloatArray
+    commands: FloatArray
+    goal_ids: list[str]
+    events: list[Event]
+    trials: TrialData | None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One goal against the truth. Errors are of the mean over one second after the arm came to rest at the goal."""
+
+    name: str
+    law: str
+    outcome: str
+    final_error_px: float
+    final_error_mm: float
+    max_line_deviation_mm: float
+    rotation_deg: float
+    distance_mm: float
+    steps: int
+    seconds: float
+    times_s: FloatArray = field(repr=False)
+    error_px: FloatArray = field(repr=False)
+    velocities: FloatArray = field(repr=False)
+    path_m: FloatArray = field(repr=False)
+    line_m: FloatArray = field(repr=False)
+
+
+def read_flight(recording: Path, settings: CoreSettings) -> Flight:
+    """Replay a recording and keep what the report needs. Raises RecordingError."""
+    times: list[int] = []
+    errors: list[float] = []
+    commands: list[FloatArray] = []
+    goals: list[str] = []
+    events: list[Event] = []
+    job = CalibrationJob(settings)
+
+    def observe(inputs: StepInputs, outputs: StepOutputs) -> None:
+        times.append(inputs.now_ns)
+        status = outputs.status
+        errors.append(np.nan if status.error_px is None else status.error_px)
+        commands.append(status.command)
+        goals.append(status.goal)
+        events.extend(outputs.events)
+        for event in outputs.events:
+            job.add(event)
+
+    result = replay(recording, observe=observe)
+    return Flight(
+        result, np.array(times), np.array(errors), np.array(commands), goals, events, job.trials() if job.stops else None
+    )
+
+
+def judge_goal(
+    name: str, law: str, outcome: str, flight: Flight, truth_t: IntArray, truth_q: FloatArray, cell: SimulatedCell
+) -> Judgement:
+    """Judge the goal that was taught as ``name`` and run with ``law``. Raises LookupError where it was not flown."""
+    taught = next((e for e in flight.events if e.kind == "taught" and e.name == name), None)
+    if taught is None:
+        raise LookupError(f"goal {name!r} was never taught")
+    start, end = _flown(name, flight)
+    shown = _during(truth_t, truth_q, taught.t_ns - int(0.5e9), taught.t_ns)
+    reached = _during(truth_t, truth_q, end.t_ns + int(0.1e9), end.t_ns + int((0.1 + JUDGED_S) * 1e9))
+    way = (truth_t >= start.t_ns) & (truth_t <= end.t_ns)
+    path = np.array([cell.marker_positions_rig(q).mean(axis=0) for q in truth_q[way][:: max(1, int(way.sum()) // 400)]])
+    shown_points = np.mean([cell.marker_positions_rig(q) for q in shown], axis=0)
+    start_points = cell.marker_positions_rig(truth_q[way][0])
+    reached_points = np.mean([cell.marker_positions_rig(q) for q in reached], axis=0)
+    line = np.array([path[0], shown_points.mean(axis=0)])
+    steps = (flight.t_ns >= start.t_ns) & (flight.t_ns <= end.t_ns)
+    return Judgement(
+        name=name,
+        law=law,
+        outcome=outcome,
+        final_error_px=_pixel_error(cell, reached, shown),
+        final_error_mm=float(1e3 * np.linalg.norm(reached_points - shown_points, axis=1).max()),
+        max_line_deviation_mm=float(1e3 * _line_distance(path, line).max()),
+        rotation_deg=_rotation_deg(start_points, shown_points),
+        distance_mm=float(1e3 * np.linalg.norm(line[1] - line[0])),
+        steps=int(steps.sum()),
+        seconds=(end.t_ns - start.t_ns) * 1e-9,
+        times_s=(flight.t_ns[steps] - start.t_ns) * 1e-9,
+        error_px=flight.error_px[steps],
+        velocities=flight.commands[steps],
+        path_m=path,
+        line_m=line,
+    )
+
+
+def _flown(name: str, flight: Flight) -> tuple[Event, Event]:
+    """Start and end of the visual goal that came after all teaching: the n-th taught is the n-th flown."""
+    taught = [e.name for e in flight.events if e.kind == "taught"]
+    begun = [e for e in flight.events if e.kind == "goal_started" and e.name in ("stereo", "cartesian3")]
+    order = taught.index(name)
+    if order >= len(begun):
+        raise LookupError(f"goal {name!r} was never started; visual goals started: {len(begun)}")
+    start = begun[order]
+    terminal = ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted")
+    return start, next(e for e in flight.events if e.kind in terminal and e.id == start.id)
+
+
+def _during(times: IntArray, positions: FloatArray, start_ns: int, end_ns: int) -> FloatArray:
+    """Every fifth true sample of a span. Raises LookupError where there is none."""
+    inside = positions[(times >= start_ns) & (times <= end_ns)]
+    if len(inside) == 0:
+        raise LookupError(f"no true joint position between {start_ns} and {end_ns} ns")
+    return inside[::5]
+
+
+def _pixel_error(cell: SimulatedCell, reached: FloatArray, shown: FloatArray) -> float:
+    """Largest distance, over cameras and markers seen at the goal, of the mean noise-free reprojections [px]."""
+    worst = 0.0
+    for camera in cell.rig.cameras:
+        seen = cell.visible(shown[0], camera)
+        a = np.mean([cell.truth_pixels(q)[camera.name] for q in reached], axis=0)
+        b = np.mean([cell.truth_pixels(q)[camera.name] for q in shown], axis=0)
+        worst = max(worst, float(np.linalg.norm(a - b, axis=1)[seen].max()))
+    return worst
+
+
+def _line_distance(points: FloatArray, line: FloatArray) -> FloatArray:
+    direction = (line[1] - line[0]) / np.linalg.norm(line[1] - line[0])
+    offset = points - line[0]
+    distance: FloatArray = np.linalg.norm(offset - (offset @ direction)[:, None] * direction, axis=1)
+    return distance
+
+
+def _rotation_deg(start: FloatArray, goal: FloatArray) -> float:
+    """Angle between two poses of one point set (Kabsch)."""
+    u, _, vt = np.linalg.svd((goal - goal.mean(axis=0)).T @ (start - start.mean(axis=0)))
+    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0))))

@@ -1,0 +1,84 @@
+"""What the demonstration does: which goals are shown, with which law each is reached again, and in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from stereoservo.kinematics.model import CellModel
+
+TEACH_FRAMES = 20
+REST_S = 0.4  # after a move, before the cameras are believed
+JUDGE_S = 1.2  # rest after a goal, of which one second is judged
+
+
+@dataclass(frozen=True)
+class ShownGoal:
+    """A goal of the demonstration: where the arm stands when it is shown [deg], and the law that reaches it again."""
+
+    name: str
+    joints_deg: tuple[float, ...]
+    law: str
+
+
+GOALS = (
+    ShownGoal("near", (9.0, -86.0, -19.0, -19.0, 69.0, -5.0), "stereo"),
+    ShownGoal("turned", (0.0, -63.0, -18.0, -25.0, 43.0, 97.0), "cartesian3"),
+    ShownGoal("rolled", (4.0, -83.0, -29.0, -24.0, 53.0, -90.0), "cartesian3"),
+)
+"""From home: about 45, 85 and 105 degrees of rotation and 0.2 to 0.3 m."""
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What the calibration gave, and how long trial motions and fit took [s]."""
+
+    model: CellModel
+    seconds: float
+
+
+class Operator(Protocol):
+    """Who works the cell: a client over zenoh, or the same in lockstep. Every call ends when the arm has done it."""
+
+    def enable(self) -> None: ...
+
+    def calibrate(self) -> Calibrated: ...
+
+    def move(self, joints: dict[str, float]) -> None: ...
+
+    def teach(self, name: str, frames: int) -> None: ...
+
+    def home(self) -> None: ...
+
+    def servo(self, name: str, law: str) -> str:
+        """Run a taught goal; gives its outcome: ``reached`` or what else ended it, with the message."""
+        ...
+
+    def rest(self, seconds: float) -> None: ...
+
+
+def perform(operator: Operator, joint_names: tuple[str, ...], tell: Callable[[str], None]) -> tuple[Calibrated, dict[str, str]]:
+    """The whole demonstration; gives the calibration and each goal's outcome."""
+    operator.enable()
+    tell("calibrating: each joint moves alone in view of both cameras")
+    calibrated = operator.calibrate()
+    statistics = calibrated.model.statistics
+    rms = "" if statistics is None else f", residual {statistics.rms_px:.4f} px"
+    tell(f"calibrated in {calibrated.seconds:.0f} s{rms}")
+    for goal in GOALS:
+        tell(f"showing goal {goal.name!r}")
+        operator.move(dict(zip(joint_names, np.deg2rad(goal.joints_deg).tolist(), strict=True)))
+        operator.rest(REST_S)
+        operator.teach(goal.name, TEACH_FRAMES)
+    outcomes = {}
+    for goal in GOALS:
+        operator.home()
+        operator.rest(REST_S)
+        tell(f"goal {goal.name!r} with law {goal.law}")
+        outcomes[goal.name] = operator.servo(goal.name, goal.law)
+        operator.rest(JUDGE_S)
+        tell(f"goal {goal.name!r}: {outcomes[goal.name]}")
+    return calibrated, outcomes

@@ -1,0 +1,55 @@
+"""Where the simulated arm truly was, kept while the demonstration runs, so that it can be judged afterwards."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo_sim.history import FILE_NAME, JointHistory
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+POLL_S = 1.0
+
+
+class TruthLog:
+    """Copies the arm's true joint positions out of its history before the ring overwrites them."""
+
+    def __init__(self, history: JointHistory) -> None:
+        self._history = history
+        self._next = 0
+        self._times: list[IntArray] = []
+        self._positions: list[FloatArray] = []
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @classmethod
+    def of_directory(cls, runtime_dir: Path) -> TruthLog:
+        """The log of the arm whose joint driver runs in ``runtime_dir``. Raises HistoryError."""
+        return cls(JointHistory.open(runtime_dir / FILE_NAME))
+
+    def take(self) -> None:
+        """Copy what is new."""
+        self._next, times, positions = self._history.since(self._next)
+        self._times.append(times)
+        self._positions.append(positions)
+
+    def follow(self) -> None:
+        """Copy from time to time, in a thread, until ``end``."""
+        self._thread = threading.Thread(target=self._run, name="truth-log", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ended.wait(POLL_S):
+            self.take()
+
+    def end(self) -> tuple[IntArray, FloatArray]:
+        """Stop following; times (k,) [ns] and positions (k, n)."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        self.take()
+        return np.concatenate(self._times), np.concatenate(self._positions)
