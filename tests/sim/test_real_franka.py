@@ -132,6 +132,7 @@ def test_another_set_with_another_tag_and_no_table_tags_meets_its_truth(rendered
         "real-franka", "--data", str(rendered), "--hand-tag", str(HAND_TAG), "--plot", str(tmp_path / "plots")
     )
     assert code == 0
+    assert "error" not in answer
     assert answer["images"]["with_hand_tag"] >= 24
     assert answer["images"]["registered"] == answer["images"]["with_hand_tag"]
     assert answer["median_px"] < 0.1
@@ -296,6 +297,16 @@ def test_an_arm_that_did_not_move_is_refused(rendered, tmp_path):
     (directory / "ee_poses.csv").write_text("\n".join(lines))
     code, answer = run("real-franka", "--data", str(directory), "--hand-tag", str(HAND_TAG))
     assert (code, answer["error"]["code"]) == (1, "no_motion")
+
+
+def test_a_tag_that_does_not_follow_the_hand_is_refused(rendered, tmp_path):
+    directory = copy_set(rendered, tmp_path / "set")
+    for path in directory.glob("pose*_cam*.png"):
+        if path.name[:6] != "pose01":
+            shutil.copy(directory / f"pose01_{path.name[7:]}", path)
+    code, answer = run("real-franka", "--data", str(directory), "--hand-tag", str(HAND_TAG))
+    assert (code, answer["error"]["code"]) == (1, "tag_stands_still")
+    assert answer["error"]["tag"] == HAND_TAG
 
 
 def test_an_unknown_experiment_lists_the_known_ones():

@@ -86,6 +86,10 @@ def show_real_franka(answer: dict[str, Any], console: Console) -> None:
     console.print(variants)
     images = answer["images"]
     console.print(f"{images['with_hand_tag']} of {images['read']} images show tag {answer['hand_tag']}")
+    if answer["not_predicted"]:
+        console.print(
+            f"{answer['not_predicted']} corners not predicted: too few views of that camera are left"
+        )
     for path in answer.get("plots", []):
         console.print(f"wrote {path}")
 

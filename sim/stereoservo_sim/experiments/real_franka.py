@@ -43,6 +43,8 @@ Progress = Callable[[str, int, int], None]
 
 FOLDS = 5
 TABLE_TAGS = (0, 2, 3)
+STILL_PX, STILL_M = 3.0, 0.05
+"""A tag that moves by less in every image while the hand moves by more is not on the hand."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ def run_real_franka(
     guesses.
 
     Raises ExperimentError: what :func:`load_hand_eye_set` and :func:`fit_driven_cameras` raise, ``tag_id``,
-    ``image``, ``image_size``, ``tag_not_seen``, ``too_few_poses``.
+    ``image``, ``image_size``, ``tag_not_seen``, ``tag_stands_still``, ``too_few_poses``.
     """
     for tag in (hand_tag, *table_tags):
         if not 0 <= tag < TAG_IDS:
@@ -148,6 +150,7 @@ def run_real_franka(
     displacements = np.stack([data.poses[i] for i in indices])
     views = TagViews(seen.camera, np.searchsorted(indices, seen.pose), seen.pixels)
     opencv_views = TagViews(views.camera, views.pose, seen.start)
+    _check_that_tag_follows(seen, hand_tag, views, displacements)
     fold = seen.pose % FOLDS
     tell("fit", 0, 3)
     fits = fit_both(displacements, views, seen.sizes, seed)
@@ -206,6 +209,23 @@ def observe(data: HandEyeSet, hand_tag: int, table_tags: tuple[int, ...], progre
         backgrounds,
         standing,
     )
+
+
+def _check_that_tag_follows(
+    seen: Observations, hand_tag: int, views: TagViews, displacements: FloatArray
+) -> None:
+    """Raise ``tag_stands_still`` where the hand moved but the tag did not, in any camera."""
+    middles = seen.pixels.mean(axis=1)
+    spread = [np.ptp(middles[seen.camera == c], axis=0).max(initial=0.0) for c in np.unique(seen.camera)]
+    travel = float(np.ptp(displacements[views.pose][:, :3, 3], axis=0).max())
+    if len(seen.pose) > 1 and max(spread) < STILL_PX and travel > STILL_M:
+        raise ExperimentError(
+            "tag_stands_still",
+            f"tag {hand_tag} moves by {max(spread):.2f} px at most while the hand moves by {travel:.2f} m; "
+            "is it on the table? --hand-tag names the one on the hand",
+            tag=hand_tag,
+            travel_m=travel,
+        )
 
 
 def fit_both(displacements: FloatArray, views: TagViews, sizes: IntArray, seed: int) -> Fits:

@@ -55,7 +55,7 @@ def report(result: RealFrankaResult) -> dict[str, Any]:
         "table_corners": len(table.points),
         "reference": REFERENCE,
         "thesis": THESIS,
-        "error": STATE,
+        "error_is": STATE,
         "folds": f"pose index modulo {FOLDS}",
         "rows": _rows(result),
         "variants": {
