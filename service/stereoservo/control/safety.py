@@ -45,7 +45,8 @@ class SafetyLimits:
     ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box. The
     boxes and the position range are kept away from by ``position_margin``. ``coast_s``: how long a law may
     run on prediction; ``features_fresh_s``: the age of the newest features up to which a law does not coast
-    at all (a frame or two). Raises SafetyConfigurationError.
+    at all (a frame or two); the arm brakes when they are older than both. Raises
+    SafetyConfigurationError.
     """
 
     joint_names: tuple[str, ...]

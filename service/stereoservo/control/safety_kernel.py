@@ -138,10 +138,12 @@ def limit_velocity(
     low_by, high_by = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     ahead, behind = np.empty(n), np.empty(n)
     for j in range(n):
+        # since the sample the joint may have been faster than now, by what it can have braked
         drift = before[j] * sample_age
+        faster = 0.5 * acceleration_max[j] * sample_age * sample_age
         position = positions[j] if math.isfinite(positions[j]) else math.nan
-        ahead[j] = position + max(0.0, drift)
-        behind[j] = position + min(0.0, drift)
+        ahead[j] = position + max(0.0, drift + faster)
+        behind[j] = position + min(0.0, drift - faster)
     _position_caps(
         ahead, behind, before, dt, position_min, position_max, velocity_max, acceleration_max, margin,
         keep_outs, low, high, low_by, high_by,
