@@ -55,11 +55,12 @@ class LockstepCell:
         runtime_dir: Path,
         seed: int = 0,
         recording: Path | None = None,
+        services: dict[str, Any] | None = None,
         on_step: Callable[[StepInputs, StepOutputs], None] | None = None,
     ) -> None:
         self.cell = cell
         self.clock = VirtualClock()
-        self.services: dict[str, Any] = {}
+        self.services: dict[str, Any] = {} if services is None else services
         self.events: list[Event] = []
         self.status: Status | None = None
         self._context = (cell.cell.name, runtime_dir, cell_dir, seed)

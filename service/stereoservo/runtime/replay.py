@@ -48,10 +48,12 @@ def replay(
     path: Path,
     progress: Callable[[int], None] | None = None,
     observe: Callable[[StepInputs, StepOutputs], None] | None = None,
+    header: Callable[[CoreSettings], None] | None = None,
 ) -> ReplayResult:
     """Run a recording through a fresh core. Raises RecordingError on a damaged or foreign file.
 
-    ``observe`` sees every step's inputs and outputs: reports and debuggers read a recording through it.
+    ``header`` is given the core's settings, ``observe`` every step's inputs and outputs: reports and debuggers read a
+    recording through them.
     """
     core: ServoCore | None = None
     settings: CoreSettings | None = None
@@ -62,9 +64,11 @@ def replay(
     for topic, data in _messages(path):
         try:
             if topic == "header":
-                header = msgspec.msgpack.decode(data)
-                recorded = msgspec.convert(header["fingerprint"], Fingerprint)
-                settings = msgspec.msgpack.decode(header["settings"], type=CoreSettings, dec_hook=decode_array)
+                first = msgspec.msgpack.decode(data)
+                recorded = msgspec.convert(first["fingerprint"], Fingerprint)
+                settings = msgspec.msgpack.decode(first["settings"], type=CoreSettings, dec_hook=decode_array)
+                if header is not None:
+                    header(settings)
             elif topic == "gap":
                 core = None
                 gaps += 1

@@ -54,15 +54,13 @@ class Judgement:
     line_m: FloatArray = field(repr=False)
 
 
-def read_flight(recording: Path, settings: CoreSettings) -> Flight:
+def read_flight(recording: Path) -> Flight:
     """Replay a recording and keep what the report needs. Raises RecordingError."""
     times: list[int] = []
     errors: list[float] = []
     commands: list[FloatArray] = []
     goals: list[str] = []
     events: list[Event] = []
-    job = CalibrationJob(settings)
-
     def observe(inputs: StepInputs, outputs: StepOutputs) -> None:
         times.append(inputs.now_ns)
         status = outputs.status
@@ -70,10 +68,12 @@ def read_flight(recording: Path, settings: CoreSettings) -> Flight:
         commands.append(status.command)
         goals.append(status.goal)
         events.extend(outputs.events)
-        for event in outputs.events:
-            job.add(event)
 
-    result = replay(recording, observe=observe)
+    settings: list[CoreSettings] = []
+    result = replay(recording, observe=observe, header=settings.append)
+    job = CalibrationJob(settings[0])
+    for event in events:
+        job.add(event)
     return Flight(
         result, np.array(times), np.array(errors), np.array(commands), goals, events, job.trials() if job.stops else None
     )

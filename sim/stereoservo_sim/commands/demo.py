@@ -1,0 +1,94 @@
+"""``stereoservo demo``: the main job on the embedded simulated cell."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo_sim.demonstration.conduct import DEMO_CELL, DemoFailedError, Stage, conduct_live, conduct_lockstep
+from stereoservo_sim.demonstration.results import summary
+
+
+def demo(
+    json: Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")] = False,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="One process on a virtual clock: deterministic given the seed.")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated noise.")] = 0,
+    out: Annotated[
+        Path, typer.Option("--out", help="Directory for report, recording and model (made where missing).")
+    ] = Path("stereoservo-demo"),
+    cell: Annotated[
+        Path | None, typer.Option("--cell", help="Another cell file of the simulated cell.")
+    ] = None,
+) -> None:
+    """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
+    path = DEMO_CELL if cell is None else cell
+    load_cell_file(path)
+    out.mkdir(parents=True, exist_ok=True)
+    conduct = conduct_lockstep if lockstep else conduct_live
+    started = time.monotonic()
+    with _telling() as stage:
+        demonstration = conduct(path, out.resolve(), seed, stage)
+    result = summary(demonstration, seconds=time.monotonic() - started)
+    if json:
+        sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
+        sys.stdout.flush()
+    else:
+        _print(result)
+    if not result["converged"]:
+        failed = [f"{goal['name']} ({goal['outcome']})" for goal in result["goals"] if goal["outcome"] != "reached"]
+        if json:
+            raise SystemExit(1)
+        raise DemoFailedError(f"goals not reached well enough: {', '.join(failed) or 'see the table'}; report: {result['report']}")
+
+
+@contextmanager
+def _telling() -> Iterator[Stage]:
+    """Progress on a terminal, plain lines elsewhere; both on stderr."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield Stage(tell=_line(console), progress=lambda _: None)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("stereoservo demo", total=1.0)
+
+        def tell(text: str) -> None:
+            bar.console.print(text, highlight=False)
+            bar.update(task, description=text[:60])
+
+        yield Stage(tell=tell, progress=lambda fraction: bar.update(task, completed=fraction))
+
+
+def _line(console: Console) -> Callable[[str], None]:
+    start = time.monotonic()
+    return lambda text: console.print(f"{time.monotonic() - start:6.1f} s  {text}", highlight=False)
+
+
+def _print(result: dict[str, Any]) -> None:
+    console = Console()
+    console.print(
+        f"calibration: residual {result['calibration']['rms_px']:.4f} px over {result['calibration']['images']} images, "
+        f"chi-square {result['calibration']['chi2']:.0f} for {result['calibration']['degrees_of_freedom']} degrees of freedom",
+        highlight=False,
+    )
+    console.print("goal      law         rotation  distance  error px  error mm  line mm  seconds", highlight=False)
+    for goal in result["goals"]:
+        console.print(
+            f"{goal['name']:<9} {goal['law']:<11} {goal['rotation_deg']:6.0f}°  {goal['distance_mm']:6.0f} mm  "
+            f"{goal['final_error_px']:8.4f}  {goal['final_error_mm']:8.4f}  {goal['max_line_deviation_mm']:7.2f}  "
+            f"{goal['seconds']:7.1f}  {goal['outcome']}",
+            highlight=False,
+        )
+    console.print(f"report: {result['report']}", highlight=False)

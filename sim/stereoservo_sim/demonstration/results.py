@@ -1,0 +1,100 @@
+"""Judges a demonstration, writes its report, and sums it up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from stereoservo.kinematics.model import CellModel
+from stereoservo_sim.demonstration.conduct import Demonstration
+from stereoservo_sim.demonstration.judge import Judgement, judge_goal, read_flight
+from stereoservo_sim.demonstration.pages import write_pages
+from stereoservo_sim.demonstration.scenario import GOALS
+from stereoservo_sim.world import demo_cell
+
+MAX_ERROR_PX = 0.3
+MAX_ERROR_MM = 0.5
+
+
+def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
+    """Judge, write ``report.html``, and give what ``demo --json`` prints.
+
+    ``seconds``: how long the demonstration took. Raises RecordingError, LookupError where a goal was never flown.
+    """
+    flight = read_flight(demonstration.recording)
+    goals = [
+        judge_goal(
+            goal.name, goal.law, demonstration.outcomes[goal.name], flight, demonstration.truth_t, demonstration.truth_q,
+            demo_cell(),
+        )
+        for goal in GOALS
+    ]  # fmt: skip
+    report = demonstration.out / "report.html"
+    write_pages(report, demonstration, flight, goals)
+    model = demonstration.calibrated.model
+    return {
+        "converged": good_calibration(model) and all(good_goal(goal) for goal in goals),
+        "goals": [_row(goal) for goal in goals],
+        "calibration": _calibration(model, demonstration.calibrated.seconds),
+        "loop": _loop(demonstration),
+        "replay": {
+            "identical": flight.result.identical,
+            "steps": flight.result.steps,
+            "gaps": flight.result.gaps,
+            "max_relative_error": flight.result.max_relative_error,
+        },
+        "report": str(report),
+        "recording": str(demonstration.recording),
+        "model": str(demonstration.out / "model.json"),
+        "seed": demonstration.seed,
+        "lockstep": demonstration.lockstep,
+        "seconds": seconds,
+    }
+
+
+def good_goal(goal: Judgement) -> bool:
+    """Whether a goal was reached, and truly."""
+    return (
+        goal.outcome == "reached" and goal.final_error_px <= MAX_ERROR_PX and goal.final_error_mm <= MAX_ERROR_MM
+    )
+
+
+def good_calibration(model: CellModel) -> bool:
+    """Whether the residual is what the measurement noise explains: two-sided chi-square at 99.9 %."""
+    return model.statistics is not None and model.statistics.chi2_ok
+
+
+def _row(goal: Judgement) -> dict[str, Any]:
+    plain = ("name", "law", "outcome", "final_error_px", "final_error_mm", "max_line_deviation_mm", "rotation_deg",
+             "distance_mm", "steps", "seconds")  # fmt: skip
+    return {name: getattr(goal, name) for name in plain}
+
+
+def _calibration(model: CellModel, seconds: float) -> dict[str, Any]:
+    statistics = model.statistics
+    if statistics is None:
+        raise AssertionError("a fitted model has statistics")
+    return {
+        "rms_px": statistics.rms_px,
+        "joints": len(model.joint_names),
+        "images": statistics.images,
+        "seconds": seconds,
+        "chi2": statistics.chi2,
+        "degrees_of_freedom": statistics.degrees_of_freedom,
+        "chi2_ok": statistics.chi2_ok,
+        "measurements": statistics.measurements,
+        "parameters": statistics.parameters,
+        "outliers": statistics.outliers,
+        "per_joint_px": {joint.name: joint.rms_px for joint in statistics.joints},
+        "stratum": model.stratum,
+    }
+
+
+def _loop(demonstration: Demonstration) -> dict[str, Any]:
+    if demonstration.loop is None:  # virtual time is never late
+        return {
+            "rate_hz": demonstration.cell.servo.rate_hz, "overruns": 0,
+            "lateness_us": {"p50": 0.0, "p99": 0.0, "max": 0.0}, "virtual": True,
+        }  # fmt: skip
+    return {**msgspec.to_builtins(demonstration.loop), "virtual": False}
