@@ -123,7 +123,7 @@ def test_positions_never_leave_their_range(start, seed, dt, persistence, age):
 @given(seed=st.integers(0, 10**6), lag=st.integers(1, 20), persistence=st.integers(5, 200))
 def test_samples_that_lag_behind_are_reckoned_with(seed, lag, persistence):
     rng = np.random.default_rng(seed)
-    limits = make_limits()
+    limits = make_limits(position_min=np.full(3, -0.3), position_max=np.full(3, 0.4))
     q, command = np.zeros(3), np.zeros(3)
     track = [q] * (lag + 1)
     for step in range(600):
