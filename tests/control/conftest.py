@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from stereoservo.kinematics.kernels import triangulate
@@ -34,6 +33,15 @@ def screw(axis, point=None):
         G[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
         G[:3, 3] = -np.cross(axis, point)
     return G
+
+
+def exponential(G, amount):
+    """Rodrigues, or a translation."""
+    return (
+        np.eye(4) + np.sin(amount) * G + (1 - np.cos(amount)) * G @ G
+        if G[:3, :3].any()
+        else np.eye(4) + amount * G
+    )
 
 
 def dh_screws(rows):
@@ -69,7 +77,7 @@ class World:
     def displacement(self, q):
         H = np.eye(4)
         for angle, G in zip(q, self.generators, strict=True):
-            H = H @ expm(angle * G)
+            H = H @ exponential(G, angle)
         return H
 
     def plate_pose(self, q=None):
@@ -84,7 +92,7 @@ class World:
         H, operators = np.eye(4), []
         for angle, G in zip(self.q if q is None else q, self.generators, strict=True):
             operators.append(H @ G @ np.linalg.inv(H))
-            H = H @ expm(angle * G)
+            H = H @ exponential(G, angle)
         return self.frame @ np.array(operators) @ np.linalg.inv(self.frame)
 
     def pixels(self, X):
@@ -134,7 +142,7 @@ def rx90(rng, q=RX90_MIDDLE, T0=None, rows=RX90):
     mount = pose(Rotation.from_euler("xz", [25, 10], degrees=True), [0.03, 0.02, 0.1])
     H = np.eye(4)
     for angle, G in zip(q, generators, strict=True):
-        H = H @ expm(angle * G)
+        H = H @ exponential(G, angle)
     rig_from_base = T0 @ np.linalg.inv(H @ flange @ mount)
     inverse = np.linalg.inv(rig_from_base)
     return World(rig_from_base @ generators @ inverse, rig_from_base @ flange @ mount, random_frame(rng), q)
