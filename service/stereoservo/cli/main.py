@@ -131,6 +131,8 @@ def invoke(arguments: list[str]) -> int:
             traceback.print_exc()
         fail(error, as_json)
         return EXIT_FAILED
+    if code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this
+        fail(CommandError("interrupted", "interrupted"), as_json)
     return code if isinstance(code, int) else 0
 
 

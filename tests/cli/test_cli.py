@@ -1,0 +1,226 @@
+"""The command line's contract: one JSON object, errors as JSON, exit codes, broken plug-ins."""
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stereoservo.cli import main as cli
+from stereoservo.runtime.cellfile import load_cell_file
+
+Run = Callable[..., tuple[int, Any, str]]
+
+
+@pytest.fixture(autouse=True)
+def roots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STEREOSERVO_RUNTIME_DIR", str(tmp_path / "run"))
+    monkeypatch.setenv("STEREOSERVO_STATE_DIR", str(tmp_path / "state"))
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str]) -> Run:
+    """Run a command line with --json; gives exit code, the object and stderr."""
+
+    def run_it(*arguments: str) -> tuple[int, Any, str]:
+        code = cli.invoke([*arguments, "--json"])
+        out, err = capfd.readouterr()
+        assert out.count("\n") == 1, out
+        return code, json.loads(out), err
+
+    return run_it
+
+
+@pytest.fixture
+def cell(tmp_path: Path, run: Run) -> Path:
+    """A cell file as `init` writes it."""
+    path = tmp_path / "cell.toml"
+    assert run("init", str(path))[0] == 0
+    return path
+
+
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
+def test_every_command_has_help(command: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.invoke([command, "--help"]) == 0
+    out = capfd.readouterr().out
+    assert "Usage: stereoservo" in out
+    assert "--json" in out
+
+
+def test_help_lists_all_commands_and_those_of_entry_points(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.invoke(["--help"]) == 0
+    out = capfd.readouterr().out
+    for command in (*cli.COMMANDS, "reproduce"):
+        assert f"\n  {command} " in out
+
+
+def test_init_writes_a_file_that_loads_with_every_joint_limited(tmp_path: Path, run: Run) -> None:
+    path = tmp_path / "line-1.toml"
+    code, result, _ = run("init", str(path), "--camera", "right")
+    assert code == 0
+    assert result == {"cell": "line-1", "file": str(path)}
+    loaded = load_cell_file(path)
+    assert [camera.name for camera in loaded.camera] == ["right"]
+    assert len(loaded.safety.limit) == 6
+    assert "# " in path.read_text()
+    assert tomllib.loads(path.read_text())["schema"] == 1
+
+
+def test_init_does_not_overwrite_and_refuses_names_that_cannot_be_cells(
+    tmp_path: Path, run: Run, cell: Path
+) -> None:
+    before = cell.read_text()
+    code, result, _ = run("init", str(cell))
+    assert (code, result["error"]["code"]) == (1, "exists")
+    assert cell.read_text() == before
+    code, result, _ = run("init", str(tmp_path / "bad name.toml"))
+    assert code == 1
+    assert "bad name" in result["error"]["message"]
+    assert run("init", str(cell), "--force")[0] == 0
+
+
+def test_init_with_an_unknown_driver_lists_those_there_are(tmp_path: Path, run: Run) -> None:
+    code, result, _ = run("init", str(tmp_path / "x.toml"), "--joint-driver", "kuka")
+    assert code == 1
+    assert "no joint driver 'kuka'; there are: " in result["error"]["message"]
+    assert "fake" in result["error"]["message"]
+
+
+def test_doctor_checks_a_good_cell(run: Run, cell: Path) -> None:
+    code, result, _ = run("doctor", str(cell))
+    assert code == 0
+    found = {check["name"]: check["ok"] for check in result["checks"]}
+    assert found["drivers"] is True
+    assert found["zenoh"] is True
+    assert found["model"] is None  # none yet
+
+
+def edited(cell: Path, old: str, new: str) -> str:
+    text = cell.read_text()
+    assert old in text
+    cell.write_text(text.replace(old, new, 1))
+    return str(cell)
+
+
+@pytest.mark.parametrize("command", ["doctor", "run"])
+def test_an_unknown_key_is_named_with_the_known_ones(command: str, run: Run, cell: Path) -> None:
+    code, result, err = run(command, edited(cell, "[servo]", "[servo]\nspeed = 3"))
+    assert code == 1
+    assert "servo" in result["error"]["message"]
+    assert "unknown field `speed`" in result["error"]["message"]
+    assert "known keys: rate_hz, law" in result["error"]["message"]
+    assert result["error"]["message"] in err
+
+
+def test_a_joint_without_limits_is_named(run: Run, cell: Path) -> None:
+    code, result, _ = run("doctor", edited(cell, 'joint = "j3"', 'joint = "j33"'))
+    assert code == 1
+    assert "j3" in result["error"]["message"]
+    assert (
+        "no [[safety.limit]]" in result["error"]["message"] or "has no limits" in result["error"]["message"]
+    )
+
+
+def test_a_cell_that_would_listen_to_everybody_fails_its_check(run: Run, cell: Path) -> None:
+    with cell.open("a") as file:
+        file.write('\n[zenoh]\nendpoints = ["tcp/0.0.0.0:7447"]\n')
+    code, result, _ = run("doctor", str(cell))
+    assert code == 1
+    assert "every host" in result["error"]["message"]
+    assert result["error"]["checks"]
+
+
+def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: Run) -> None:
+    code, result, _ = run("run", str(tmp_path / "none.toml"))
+    assert code == 1
+    assert "none.toml: cannot be read" in result["error"]["message"]
+    code, result, _ = run("status", "nowhere")
+    assert code == 1
+    assert result["error"]["code"] == "not_running"
+    assert "no daemon runs for cell 'nowhere'; running: none" in result["error"]["message"]
+    assert run("stop", "nowhere")[0] == 1
+    assert run("ls") == (0, {"cells": []}, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("goal", "nowhere"), "one of NAME"),
+        (("goal", "nowhere", "pick", "--joint", "j1=0"), "one of NAME"),
+        (("goal", "nowhere", "--joint", "j1=nan"), "NAME=NUMBER with a finite number"),
+        (("goal", "nowhere", "--joint", "j1"), "NAME=NUMBER"),
+        (("goal", "nowhere", "pick", "--law", "magic"), "Invalid enum value 'magic'"),
+        (("goal", "nowhere", "pick", "--gain", "-1"), "gain: Expected `float` > 0"),
+        (("goal", "nowhere", "--set-points", "/none.json"), "/none.json: No such file"),
+        (("jog", "nowhere", "j1=fast"), "NAME=NUMBER"),
+    ],
+)
+def test_arguments_are_checked_before_anything_is_asked(
+    arguments: tuple[str, ...], text: str, run: Run
+) -> None:
+    code, result, _ = run(*arguments)
+    assert code == 1
+    assert text in result["error"]["message"]
+
+
+def test_usage_errors_are_json_too_and_exit_with_2(run: Run) -> None:
+    code, result, _ = run("goal")
+    assert (code, result["error"]["code"]) == (2, "usage")
+    code, result, _ = run("fly")
+    assert code == 2
+    assert "fly" in result["error"]["message"]
+
+
+def test_drivers_lists_plugins_with_their_errors(run: Run) -> None:
+    code, result, _ = run("drivers")
+    assert code == 0
+    assert {entry["name"] for entry in result["joint_drivers"]} >= {"fake", "pybullet"}
+    assert all(entry["error"] is None for entry in result["joint_drivers"])
+
+
+def test_a_broken_command_is_listed_and_fails_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], run: Run
+) -> None:
+    info = tmp_path / "acme-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[stereoservo.commands]\nacme-dance = acme_commands_broken:dance\n"
+    )
+    (tmp_path / "acme_commands_broken.py").write_text("raise RuntimeError('two left feet')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert cli.invoke(["--help"]) == 0
+    assert "acme-dance" in capfd.readouterr().out
+    code, result, _ = run("acme-dance")
+    assert code == 1
+    assert "two left feet" in result["error"]["message"]
+    assert run("ls")[0] == 0
+
+
+def test_a_damaged_recording_is_an_error_with_the_file(tmp_path: Path, run: Run) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"no recording")
+    code, result, _ = run("replay", str(path))
+    assert code == 1
+    assert "x.mcap" in result["error"]["message"]
+
+
+def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    def interrupted() -> list[Any]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stereoservo.cli.ls.live_cells", interrupted)
+    code, result, _ = run("ls")
+    assert (code, result["error"]["code"]) == (130, "interrupted")
+
+
+def test_an_unexpected_error_shows_its_traceback_and_still_one_json_object(
+    monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    monkeypatch.setattr("stereoservo.cli.ls.live_cells", lambda: 1 / 0)
+    code, result, err = run("ls")
+    assert code == 1
+    assert result["error"]["message"] == "division by zero"
+    assert "Traceback" in err

@@ -1,0 +1,212 @@
+"""Goals and commands from queries to the core and back, with stand-ins for zenoh and the servo process."""
+
+import msgspec
+import pytest
+
+from stereoservo.gateway import intake as intake_module
+from stereoservo.gateway.intake import Intake
+from stereoservo.gateway.keys import KeySpace
+from stereoservo.gateway.messages import Reply, encode
+from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.validation import GoalContext
+from stereoservo.runtime.commands import (
+    Command,
+    FeatureTarget,
+    Goal,
+    Hold,
+    JointTarget,
+    RenewGoal,
+    RunGoal,
+    TaughtTarget,
+)
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.warmup import _settings
+
+ID = "12345678-aaaa"
+KEYS = KeySpace("demo")
+POINTS = {"left": {0: (10.0, 10.0), 1: (20.0, 10.0), 2: (20.0, 20.0)}}
+
+
+class Bytes:
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def to_bytes(self) -> bytes:
+        return self.data
+
+
+class Message:
+    """A query or a sample."""
+
+    def __init__(self, key: str, payload: bytes | None) -> None:
+        self.key_expr = key
+        self.payload = None if payload is None else Bytes(payload)
+
+
+class StubLink:
+    def __init__(self) -> None:
+        self.asked: list[tuple[Command, str]] = []
+        self.up = True
+
+    def ask(self, command: Command, operator: str) -> int | None:
+        if not self.up:
+            return None
+        self.asked.append((command, operator))
+        return len(self.asked)
+
+
+class StubReplies:
+    def __init__(self) -> None:
+        self.sent: list[tuple[Message, Reply]] = []
+
+    def reply(self, query: Message, payload: bytes) -> None:
+        self.sent.append((query, msgspec.json.decode(payload, type=Reply)))
+
+
+class StubTaught:
+    def target(self, name: str) -> FeatureTarget:
+        return FeatureTarget(POINTS, 7)
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.link, self.replies = StubLink(), StubReplies()
+        self.published: list[bytes] = []
+        self.log = EventLog("boot", self.published.append)
+        self.intake = Intake(
+            KEYS,
+            self.link,
+            self.replies,
+            self.log,
+            lambda: GoalContext(_settings(), ("pick",), None),
+            StubTaught(),
+            "boot",
+        )  # type: ignore[arg-type]
+
+    def goal(self, goal: Goal, operator: str = "anna") -> Message:
+        query = Message(KEYS.goal(operator), encode(goal))
+        self.intake.goal_query(query)
+        return query
+
+    def answer(self, request: int, accepted: bool, message: str = "") -> None:
+        self.intake.core_reply(
+            Event(9, 9, "reply", request=request, accepted=accepted, message=message, id=ID)
+        )
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.log.since(1).events]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_goal_is_answered_when_the_core_has_answered(bench: Bench) -> None:
+    query = bench.goal(Goal(ID, JointTarget({"j1": 0.1})))
+    assert bench.replies.sent == []
+    bench.answer(1, True, "accepted")
+    ((asked, reply),) = bench.replies.sent
+    assert asked is query
+    assert (reply.accepted, reply.request, reply.id) == (True, 1, ID)
+    assert bench.kinds() == ["goal_accepted"]
+
+
+def test_a_goal_that_cannot_be_never_reaches_the_core(bench: Bench) -> None:
+    bench.goal(Goal(ID, JointTarget({"j9": 0.1})))
+    assert bench.link.asked == []
+    reply = bench.replies.sent[0][1]
+    assert not reply.accepted
+    assert "no joint 'j9'" in reply.problems[0]
+
+
+def test_a_retry_is_harmless_and_a_renewal_when_there_is_a_lease(bench: Bench) -> None:
+    goal = Goal(ID, JointTarget({"j1": 0.1}))
+    bench.goal(goal)
+    bench.answer(1, True)
+    bench.goal(goal)
+    assert len(bench.link.asked) == 1
+    assert [reply.accepted for _, reply in bench.replies.sent] == [True, True]
+    bench.goal(msgspec.structs.replace(goal, lease_s=1.0))
+    assert bench.link.asked[1][0] == RenewGoal(ID)
+
+
+def test_a_refused_goal_may_be_sent_again(bench: Bench) -> None:
+    goal = Goal(ID, JointTarget({"j1": 0.1}))
+    bench.goal(goal)
+    bench.answer(1, False, "enable first")
+    bench.goal(goal)
+    assert len(bench.link.asked) == 2
+
+
+def test_a_taught_goal_reaches_the_core_as_set_points_with_its_epoch(bench: Bench) -> None:
+    bench.goal(Goal(ID, TaughtTarget("pick"), law="stereo"))
+    command = bench.link.asked[0][0]
+    assert isinstance(command, RunGoal)
+    assert command.goal.target == FeatureTarget(POINTS, 7)
+    assert command.goal.law == "stereo"
+
+
+def test_a_put_goal_is_told_by_an_event_when_it_is_refused(bench: Bench) -> None:
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), b'{"id": "x"}'))
+    bench.intake.goal_sample(
+        Message("stereoservo/v1/demo/goal/**", encode(Goal(ID, JointTarget({"j1": 0.1}))))
+    )
+    assert bench.kinds() == ["goal_refused", "goal_refused"]
+    assert bench.link.asked == []
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), encode(RenewGoal(ID))))
+    assert bench.link.asked == [(RenewGoal(ID), "anna")]
+
+
+def test_commands_carry_their_operator(bench: Bench) -> None:
+    bench.intake.command_query(Message(KEYS.command("hold", "bob"), None))
+    assert bench.link.asked == [(Hold(), "bob")]
+    bench.answer(1, True)
+    assert bench.replies.sent[0][1].accepted
+
+
+def test_bad_commands_are_refused_with_the_place(bench: Bench) -> None:
+    bench.intake.command_query(Message(KEYS.command("jog", "bob"), b'{"velocities": {"j1": NaN}}'))
+    bench.intake.command_query(Message("stereoservo/v1/demo/command/*/bob", b""))
+    bench.intake.command_query(Message(KEYS.command("jog", "bob"), b'{"velocities": {"j1": 99}}'))
+    texts = [" ".join(reply.problems) for _, reply in bench.replies.sent]
+    assert "NaN is not a JSON number" in texts[0]
+    assert "there are: stop, enable" in texts[1]
+    assert "-1 to 1 is valid" in texts[2]
+    assert bench.link.asked == []
+
+
+def test_an_unanswered_request_is_answered_at_its_deadline_and_a_late_answer_is_dropped(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
+    bench.intake.command_query(Message(KEYS.command("hold", "bob"), None))
+    bench.intake.expire()
+    assert bench.replies.sent == []
+    now += intake_module.REPLY_TIMEOUT_S + 0.01
+    bench.intake.expire()
+    assert "did not answer" in bench.replies.sent[0][1].message
+    bench.answer(1, True)
+    assert len(bench.replies.sent) == 1
+
+
+def test_a_servo_process_that_is_gone_means_refused(bench: Bench) -> None:
+    bench.link.up = False
+    bench.goal(Goal(ID, JointTarget({"j1": 0.1})))
+    assert "does not take requests" in bench.replies.sent[0][1].message
+
+
+def test_the_event_log_numbers_without_gaps_and_pages() -> None:
+    log = EventLog("boot", lambda payload: None)
+    for k in range(700):
+        log.add("warning", message=str(k))
+    first = log.since(1)
+    assert (first.first, first.next, len(first.events)) == (1, 301, 300)
+    rest = log.since(first.next)
+    last = log.since(rest.next)
+    assert last.next == 701
+    assert [e.seq for e in (*first.events, *rest.events, *last.events)] == list(range(1, 701))
+    assert log.since(10**6) == log.since(701)
+    assert log.since(701).events == ()
+    assert log.since(701).next == 701

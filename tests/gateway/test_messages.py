@@ -1,0 +1,119 @@
+"""Messages: strict at the intake, tolerant at readers, finite on both sides."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereoservo.gateway.messages import (
+    COMMANDS,
+    MAX_PAYLOAD_BYTES,
+    SCHEMAS,
+    EventMessage,
+    MessageError,
+    Reply,
+    decode,
+    decode_command,
+    encode,
+    require_finite,
+    schema,
+)
+from stereoservo.runtime.commands import FeatureTarget, Goal, Hold, Jog, JointTarget
+
+ID = "12345678-1234"
+GOAL = {"id": ID, "target": {"kind": "features", "set_points": {"left": {"3": [1.5, 2.5]}}}}
+
+
+def test_a_goal_survives_the_wire() -> None:
+    goal = Goal(ID, FeatureTarget({"left": {3: (1.5, 2.5)}}), law="stereo", lease_s=1.0)
+    assert decode(encode(goal), Goal) == goal
+    assert decode(msgspec.json.encode(GOAL), Goal).target == goal.target
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"law": "magic"}, "law: Invalid enum value 'magic'"),
+        ({"gain": -1.0}, "gain: Expected `float` > 0"),
+        ({"speed_scale": 1.5}, "speed_scale: Expected `float` <= 1"),
+        ({"hurry": True}, "unknown field `hurry`"),
+        ({"id": "x"}, "id: Expected `str` matching regex"),
+        ({"target": {"kind": "wish"}}, "target"),
+        ({"target": {"kind": "features", "set_points": {"left": {"three": [1, 2]}}}}, "set_points"),
+        ({"lease_s": 0.01}, "lease_s: Expected `float` >= 0.3"),
+    ],
+)
+def test_the_intake_refuses_and_names_the_place(change: dict[str, Any], text: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        decode(msgspec.json.encode(GOAL | change), Goal)
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("word", [b"NaN", b"Infinity", b"-Infinity", b"1e999", b"null"])
+def test_numbers_that_are_none_are_refused_by_name(word: bytes) -> None:
+    with pytest.raises(MessageError) as caught:
+        decode_command("jog", b'{"velocities": {"j1": %s}}' % word)
+    if word in (b"NaN", b"Infinity", b"-Infinity"):
+        assert f"{word.decode()} is not a JSON number" in str(caught.value)
+
+
+def test_a_name_that_contains_nan_is_no_number() -> None:
+    with pytest.raises(MessageError, match="is not JSON"):
+        decode(b'{"id": "12345678", "nan" oops}', Goal)
+
+
+def test_size_is_bounded() -> None:
+    with pytest.raises(MessageError, match=f"at most {MAX_PAYLOAD_BYTES}"):
+        decode(b" " * (MAX_PAYLOAD_BYTES + 1), Goal)
+
+
+@given(st.binary(max_size=200))
+def test_junk_is_refused_with_a_message_and_nothing_else(junk: bytes) -> None:
+    for verb in COMMANDS:
+        try:
+            decode_command(verb, junk)
+        except MessageError as error:
+            assert str(error)
+
+
+def test_commands_without_arguments_take_an_empty_payload() -> None:
+    assert decode_command("hold", b"") == Hold()
+    assert decode_command("hold", b'{"command": "hold"}') == Hold()
+    with pytest.raises(MessageError, match="Invalid value 'resume'"):
+        decode_command("hold", b'{"command": "resume"}')
+    assert decode_command("jog", b'{"velocities": {"a": 1}}') == Jog({"a": 1.0})
+
+
+def test_readers_take_fields_that_they_do_not_know() -> None:
+    reply = msgspec.json.decode(b'{"accepted": true, "mood": "good"}', type=Reply)
+    assert reply == Reply(True)
+    event = msgspec.json.decode(
+        b'{"seq":1,"boot":"b","t_ns":1,"t_wall":1,"kind":"new-kind","more":[1]}', type=EventMessage
+    )
+    assert event.kind == "new-kind"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_writer_cannot_send_what_json_would_turn_into_null(value: float) -> None:
+    with pytest.raises(MessageError, match=r"target\.positions\.j2 is (nan|-?inf)"):
+        encode(Goal(ID, JointTarget({"j1": 0.0, "j2": value})))
+    with pytest.raises(MessageError, match=r"set_points\.left\.3\[1\]"):
+        encode(Goal(ID, FeatureTarget({"left": {3: (0.0, value)}})))
+
+
+def test_require_finite_looks_everywhere() -> None:
+    require_finite({"a": [1, 2.0, {"b": (3.0,)}], "c": "nan"})
+    with pytest.raises(MessageError, match=r"a\[1\]\.b\[0\]"):
+        require_finite({"a": [1, {"b": (math.nan,)}]})
+
+
+def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> None:
+    for name in SCHEMAS:
+        tree = msgspec.json.decode(schema(name))
+        assert "$defs" in tree
+    assert "lease_s" in schema("goal").decode()
+    with pytest.raises(MessageError, match=r"no schema 'gaol'; there are: goal"):
+        schema("gaol")
