@@ -66,7 +66,7 @@ class PybulletPlant:
         self._bullet.setGravity(0, 0, -9.81, physicsClientId=self._client)
         self._arm = self._load(robot)
         self._joints = list(range(self._count))
-        for joint, position in zip(self._joints, positions.tolist(), strict=True):
+        for joint in self._joints:
             self._bullet.changeDynamics(
                 self._arm,
                 joint,
@@ -75,6 +75,11 @@ class PybulletPlant:
                 jointDamping=0,
                 physicsClientId=self._client,
             )
+        self.place(positions)
+
+    def place(self, positions: FloatArray) -> None:
+        """Set the joints to ``positions`` (n,), at rest, without moving there."""
+        for joint, position in zip(self._joints, positions.tolist(), strict=True):
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         self.positions = positions.copy()
         self.velocities = np.zeros(self._count)

@@ -116,3 +116,16 @@ def demo_cell() -> SimulatedCell:
     eye = target + 1.4 * pose[:3, 2]
     rig = stereo_rig(look_at(eye, target, np.array([0.0, 0.0, 1.0])))
     return SimulatedCell(robot=RX90, body=body, rig=rig, base=base)
+
+
+DEMO_GOALS: dict[str, FloatArray] = {
+    "near": np.array([-0.01, -1.44, -0.16, 1.13, 0.17, -0.79]),
+    "roll": np.array([-0.18, -1.44, -0.36, 0.36, 1.07, -2.44]),
+    "far": np.array([0.20, -1.52, -0.57, 0.33, 0.61, -1.82]),
+}
+"""Configurations [rad] worth going to. Both cameras see every marker at them and on the way between any
+two of them or the base, along straight lines in joint space and in Cartesian space.
+
+From the base: ``near`` is 29 degrees and 0.12 m away, ``roll`` 132 degrees (nearly about the line of
+sight) and 0.13 m, ``far`` 94 degrees and 0.37 m.
+"""

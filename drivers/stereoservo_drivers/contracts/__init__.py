@@ -1,0 +1,18 @@
+"""Contract suites: what every joint driver, camera driver and detector has to keep, as pytest classes.
+
+Subclass one in your own tests, say how to make your driver, and run pytest::
+
+    from stereoservo_drivers.contracts import JointDriverContract
+
+    class TestMyArm(JointDriverContract):
+        def make_driver(self, context):
+            return MyArm({"port": "/dev/ttyUSB0"}, context)
+
+Needs pytest, which the service itself does not.
+"""
+
+from stereoservo_drivers.contracts.camera import CameraDriverContract
+from stereoservo_drivers.contracts.detector import DetectorContract
+from stereoservo_drivers.contracts.joints import JointDriverContract
+
+__all__ = ["CameraDriverContract", "DetectorContract", "JointDriverContract"]

@@ -1,0 +1,190 @@
+"""The contract of camera drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoservo.runtime.ports import (
+    CameraDriver,
+    CameraObservation,
+    DriverContext,
+    DriverError,
+    Frame,
+)
+from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_budget
+
+
+class CameraDriverContract(PacedSuite):
+    """Subclass under pytest and override :meth:`make_driver`; the camera is called :attr:`camera_name`."""
+
+    camera_name = "left"
+    frames = 5
+    """How many frames a test waits for."""
+    patience_s = 5.0
+    """How long a test waits for them on the driver's clock."""
+
+    def make_driver(self, context: DriverContext) -> CameraDriver:
+        """A new driver, connected to nothing."""
+        raise NotImplementedError("override make_driver(context)")
+
+    def make_context(self, tmp_path: Path) -> DriverContext:
+        """The context given to the driver."""
+        return replace(super().make_context(tmp_path), camera=self.camera_name)
+
+    @pytest.fixture
+    def driver(self, context: DriverContext) -> Iterator[CameraDriver]:
+        """A fresh driver, closed after the test."""
+        driver = self.make_driver(context)
+        yield driver
+        driver.close()
+
+    @pytest.fixture
+    def active(self, driver: CameraDriver) -> CameraDriver:
+        """An active driver."""
+        driver.configure()
+        driver.activate()
+        return driver
+
+    def collect(
+        self, driver: CameraDriver, context: DriverContext, count: int
+    ) -> list[Frame | CameraObservation]:
+        """Poll until ``count`` items arrived. Fails the test when they do not come in time."""
+        period = 1.0 / driver.describe().rate_hz
+        items: list[Frame | CameraObservation] = []
+        for _ in range(round(self.patience_s / period * 4)):
+            self.wait(context, period / 4)
+            items.extend(driver.poll())
+            if len(items) >= count:
+                return items
+        pytest.fail(f"{len(items)} of {count} items within {self.patience_s} s")
+
+    def test_is_a_camera_driver(self, driver: CameraDriver) -> None:
+        assert isinstance(driver, CameraDriver)
+
+    def test_describes_itself_before_it_is_configured(self, driver: CameraDriver) -> None:
+        description = driver.describe()
+        assert description.name == self.camera_name
+        assert description.width > 0
+        assert description.height > 0
+        assert description.rate_hz > 0
+        assert description.call_budget_us > 0
+        if description.delivers == "observations":
+            assert description.marker_ids
+            assert len(set(description.marker_ids)) == len(description.marker_ids)
+
+    def test_polling_before_activate_is_refused(self, driver: CameraDriver) -> None:
+        with pytest.raises(DriverError):
+            driver.poll()
+        driver.configure()
+        with pytest.raises(DriverError):
+            driver.poll()
+
+    def test_activate_before_configure_is_refused(self, driver: CameraDriver) -> None:
+        with pytest.raises(DriverError):
+            driver.activate()
+
+    def test_delivers_what_it_says(self, active: CameraDriver, context: DriverContext) -> None:
+        description = active.describe()
+        for item in self.collect(active, context, self.frames):
+            assert item.camera == self.camera_name
+            if description.delivers == "frames":
+                assert isinstance(item, Frame)
+                assert item.image.shape == (description.height, description.width)
+                assert item.image.dtype == np.uint8
+                assert item.image.flags.c_contiguous
+            else:
+                assert isinstance(item, CameraObservation)
+                check_observation(item, description.marker_ids, description.width, description.height)
+
+    def test_stamps_and_numbers_grow_and_are_in_order(
+        self, active: CameraDriver, context: DriverContext
+    ) -> None:
+        items = self.collect(active, context, self.frames)
+        for item in items:
+            assert item.t_shutter_ns <= item.t_received_ns <= context.clock.now_ns()
+        for before, after in zip(items, items[1:], strict=False):
+            assert after.seq > before.seq
+            assert after.t_shutter_ns > before.t_shutter_ns
+            assert after.t_received_ns >= before.t_received_ns
+
+    def test_a_frame_is_delivered_once(self, active: CameraDriver, context: DriverContext) -> None:
+        numbers = [item.seq for item in self.collect(active, context, self.frames)]
+        assert len(set(numbers)) == len(numbers)
+        if not self.real_time:
+            assert active.poll() == []
+
+    def test_items_are_not_changed_by_later_polls(self, active: CameraDriver, context: DriverContext) -> None:
+        item = self.collect(active, context, 1)[0]
+        data = item.image if isinstance(item, Frame) else item.pixels
+        before = data.copy()
+        self.collect(active, context, 2)
+        assert np.array_equal(data, before)
+
+    def test_polling_after_deactivate_is_refused(self, active: CameraDriver) -> None:
+        active.deactivate()
+        with pytest.raises(DriverError):
+            active.poll()
+
+    def test_can_be_activated_again(self, active: CameraDriver, context: DriverContext) -> None:
+        first = self.collect(active, context, 1)[-1]
+        active.deactivate()
+        active.activate()
+        again = self.collect(active, context, 1)[0]
+        assert again.t_shutter_ns > first.t_shutter_ns
+        assert again.seq > first.seq
+
+    def test_deactivate_and_close_are_idempotent(self, active: CameraDriver) -> None:
+        active.deactivate()
+        active.deactivate()
+        active.close()
+        active.close()
+
+    def test_close_never_raises_in_any_state(self, context: DriverContext) -> None:
+        fresh = self.make_driver(context)
+        fresh.close()
+        configured = self.make_driver(context)
+        configured.configure()
+        configured.close()
+        with pytest.raises(DriverError):
+            configured.poll()
+
+    def test_call_times_beside_the_budget(
+        self,
+        active: CameraDriver,
+        context: DriverContext,
+        record_property: Callable[[str, object], None],
+    ) -> None:
+        description = active.describe()
+
+        def poll() -> None:
+            self.wait(context, 0.0 if self.real_time else 1.0 / description.rate_hz)
+            active.poll()
+
+        figures = measure(50, poll)
+        report_budget(record_property, description.driver, description.call_budget_us, poll=figures)
+        assert figures["median_us"] > 0
+
+
+def check_observation(
+    observation: CameraObservation, marker_ids: tuple[int, ...], width: int, height: int
+) -> None:
+    """Assert that an observation is well formed: shapes, known and unique ids, pixels inside, covariances
+    positive.
+    """
+    k = len(observation.ids)
+    assert observation.ids.dtype == np.int64
+    assert len(set(observation.ids.tolist())) == k
+    assert set(observation.ids.tolist()) <= set(marker_ids)
+    assert observation.pixels.shape == (k, 2)
+    assert observation.covariances.shape == (k, 2, 2)
+    assert np.all(np.isfinite(observation.pixels))
+    assert np.all(observation.pixels > -0.5)
+    assert np.all(observation.pixels < np.array([width, height]) - 0.5)
+    assert np.array_equal(observation.covariances, np.swapaxes(observation.covariances, 1, 2))
+    if k:
+        assert np.all(np.linalg.eigvalsh(observation.covariances) > 0)

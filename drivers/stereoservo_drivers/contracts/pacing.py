@@ -1,0 +1,66 @@
+"""Time in contract suites: virtual where the device simulates, real where it does not; and measured call
+budgets.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stereoservo.runtime.clock import MonotonicClock, VirtualClock
+from stereoservo.runtime.ports import DriverContext
+
+
+class PacedSuite:
+    """What the suites share. Override :attr:`real_time` and :meth:`make_context` where a device needs it."""
+
+    real_time = False
+    """True: the device lives in real time (hardware, another process). False: it follows the context's
+    clock.
+    """
+
+    def make_context(self, tmp_path: Path) -> DriverContext:
+        """The context given to the driver."""
+        clock = MonotonicClock() if self.real_time else VirtualClock()
+        return DriverContext(clock=clock, cell="contract", runtime_dir=tmp_path, cell_dir=tmp_path, seed=1)
+
+    @pytest.fixture
+    def context(self, tmp_path: Path) -> DriverContext:
+        """A context of its own for each test."""
+        return self.make_context(tmp_path)
+
+    def wait(self, context: DriverContext, seconds: float) -> None:
+        """Let ``seconds`` pass on the driver's clock."""
+        if isinstance(context.clock, VirtualClock):
+            context.clock.advance_to(context.clock.now_ns() + round(seconds * 1e9))
+        else:
+            time.sleep(seconds)
+
+
+def measure(calls: int, call: Callable[[], Any]) -> dict[str, float]:
+    """Median, 99th percentile and maximum [us] of ``calls`` calls."""
+    times = np.empty(calls)
+    for i in range(calls):
+        start = time.perf_counter_ns()
+        call()
+        times[i] = (time.perf_counter_ns() - start) * 1e-3
+    median, p99 = np.percentile(times, [50, 99])
+    return {"median_us": float(median), "p99_us": float(p99), "max_us": float(times.max())}
+
+
+def report_budget(
+    record: Callable[[str, object], None], name: str, budget_us: float, **calls: dict[str, float]
+) -> None:
+    """Print what calls took beside the declared budget, and put it into the JUnit report. Machines stall:
+    no verdict.
+    """
+    for call, figures in calls.items():
+        text = ", ".join(f"{key[:-3]} {value:.0f}" for key, value in figures.items())
+        print(f"{name}.{call}: {text} us; declared budget {budget_us:.0f} us")
+        record(f"{name}.{call}", figures)
+    record(f"{name}.call_budget_us", budget_us)
