@@ -11,17 +11,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from stereoservo_sim.report import (
-    CalibrationPlots,
-    GoalPlots,
-    ReportData,
-    draw_errors,
-    draw_paths,
-    draw_residuals,
-    draw_velocities,
-    render_report,
-    write_report,
-)
+from stereoservo_sim.report import CalibrationPlots, GoalPlots, ReportData, render_report, write_report
+from stereoservo_sim.report_figures import draw_errors, draw_paths, draw_residuals, draw_velocities
 
 JOINTS = tuple(f"j{i + 1}" for i in range(6))
 

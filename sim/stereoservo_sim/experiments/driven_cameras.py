@@ -319,10 +319,17 @@ class _Problem:
         chart[-rest:, -rest:] = np.eye(rest)
         used = np.ones(len(self.turned), dtype=bool) if inliers is None else inliers
 
+        def residuals(y: FloatArray) -> FloatArray:
+            return self._residuals(start + chart @ y)[used].ravel()
+
+        def jacobian(y: FloatArray) -> FloatArray:
+            product: FloatArray = self._jacobian(start + chart @ y)[used].reshape(-1, len(start)) @ chart
+            return product
+
         fit = least_squares(
-            lambda y: self._residuals(start + chart @ y)[used].ravel(),
+            residuals,
             np.zeros(chart.shape[1]),
-            jac=lambda y: self._jacobian(start + chart @ y)[used].reshape(-1, len(start)) @ chart,
+            jac=jacobian,
             loss="soft_l1" if robust else "linear",
             f_scale=ROBUST_SCALE,
             x_scale="jac",
