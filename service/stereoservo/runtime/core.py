@@ -45,6 +45,8 @@ PRIOR_RATE_HZ = 125.0
 VELOCITY_FILTER_S = 0.01
 AT_REST = 1e-3  # [rad/s or m/s]
 TEACH_TIMEOUT_S = 20.0
+FRESH_S = 0.15
+FRESH_FRAMES = 2.5  # without a frame for so many periods a law is said to coast
 
 
 class ServoCore:
@@ -68,6 +70,7 @@ class ServoCore:
             keep_out_names=limits.keep_out_names,
             joint_timeout_s=limits.joint_timeout_s,
             coast_s=limits.coast_s,
+            features_fresh_s=max(FRESH_S, FRESH_FRAMES / min((c.rate_hz for c in settings.cameras), default=30.0)),
         )
         self._prior_every = max(1, round(settings.rate_hz / PRIOR_RATE_HZ))
 

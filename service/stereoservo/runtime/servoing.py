@@ -42,7 +42,8 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         )
     face: IntArray = np.zeros(3, np.int64)
     centre = np.zeros(4)
-    if law == "cartesian3" or int(known.sum()) >= MIN_MARKERS:
+    pose_known = law == "cartesian3" or int(known.sum()) >= MIN_MARKERS
+    if pose_known:
         face = _face(set_points, known, arrays)
         target_points = _goal_points(present, arrays, target_points, known, face, set_points, wanted)
         centre = target_points[known].sum(axis=0) / float(known.sum())
@@ -61,6 +62,7 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         wanted=wanted,
         target_points=target_points,
         target_known=known.astype(np.float64),
+        pose_known=pose_known,
         centre_target=centre,
         face=face,
         last_frames=sum(e.frames for e in present.state.cameras),
@@ -173,11 +175,17 @@ def _reached(source: Servoing, present: Present, error_px: float | None) -> bool
 
 
 def _stereo(source: Servoing, present: Present, arrays: ModelArrays, active: FloatArray, error_px: float | None) -> Motion:
-    """(8.36) with the Jacobian developed around triangulated (8.34) or predicted points (8.35)."""
+    """(8.36) with the Jacobian developed around triangulated (8.34) or predicted points (8.35).
+
+    Where the goal's pose is known it is the mean of the current and the desired Jacobian (8.1.1), which converges from
+    much farther than either.
+    """
     prediction, pixels = present.prediction, present.pixels
     assert prediction is not None and pixels is not None
     points = _points(source, present, arrays)
     jacobian = image_jacobian(prediction.operators, arrays.matrices, points)
+    if source.pose_known:
+        jacobian = 0.5 * (jacobian + image_jacobian(prediction.operators, arrays.matrices, source.target_points))
     velocity, _, conditioning = stereo_step(jacobian, pixels, source.set_points, active, source.gain, STEREO_DAMPING)
     reasons: tuple[Reason, ...] = ()
     if conditioning < ILL_CONDITIONED:

@@ -72,8 +72,8 @@ class JointMove(msgspec.Struct, tag="joints", eq=False):
 class Servoing(msgspec.Struct, tag="law", eq=False):
     """A law drives the arm to set-points.
 
-    ``set_points`` (c, m, 2) [px] with ``wanted`` (c, m) 1 or 0; ``target_points`` (m, 4) with ``target_known`` (m,);
-    ``face`` (3,) marker indices for cartesian3.
+    ``set_points`` (c, m, 2) [px] with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the goal, where
+    ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): indices of three that span it.
     """
 
     goal: Goal
@@ -89,6 +89,7 @@ class Servoing(msgspec.Struct, tag="law", eq=False):
     wanted: FloatArray
     target_points: FloatArray
     target_known: FloatArray
+    pose_known: bool
     centre_target: FloatArray
     face: IntArray
     moved_s: float = 0.0

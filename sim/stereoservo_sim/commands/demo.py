@@ -13,6 +13,7 @@ import msgspec
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 from stereoservo.runtime.cellfile import load_cell_file
 from stereoservo_sim.demonstration.conduct import DEMO_CELL, DemoFailedError, Stage, conduct_live, conduct_lockstep
@@ -78,17 +79,18 @@ def _line(console: Console) -> Callable[[str], None]:
 
 def _print(result: dict[str, Any]) -> None:
     console = Console()
+    calibration = result["calibration"]
     console.print(
-        f"calibration: residual {result['calibration']['rms_px']:.4f} px over {result['calibration']['images']} images, "
-        f"chi-square {result['calibration']['chi2']:.0f} for {result['calibration']['degrees_of_freedom']} degrees of freedom",
+        f"calibration: residual {calibration['rms_px']:.4f} px over {calibration['images']} images, chi-square "
+        f"{calibration['chi2']:.0f} for {calibration['degrees_of_freedom']} degrees of freedom",
         highlight=False,
     )
-    console.print("goal      law         rotation  distance  error px  error mm  line mm  seconds", highlight=False)
+    table = Table("goal", "law", "rotation", "distance", "error px", "error mm", "off line", "time", "outcome")
     for goal in result["goals"]:
-        console.print(
-            f"{goal['name']:<9} {goal['law']:<11} {goal['rotation_deg']:6.0f}°  {goal['distance_mm']:6.0f} mm  "
-            f"{goal['final_error_px']:8.4f}  {goal['final_error_mm']:8.4f}  {goal['max_line_deviation_mm']:7.2f}  "
-            f"{goal['seconds']:7.1f}  {goal['outcome']}",
-            highlight=False,
-        )
-    console.print(f"report: {result['report']}", highlight=False)
+        table.add_row(
+            goal["name"], goal["law"], f"{goal['rotation_deg']:.0f}°", f"{goal['distance_mm']:.0f} mm",
+            f"{goal['final_error_px']:.4f}", f"{goal['final_error_mm']:.4f}", f"{goal['max_line_deviation_mm']:.2f} mm",
+            f"{goal['seconds']:.1f} s", goal["outcome"],
+        )  # fmt: skip
+    console.print(table)
+    console.print(f"report: {result['report']}", highlight=False, soft_wrap=True)

@@ -52,6 +52,7 @@ class Judgement:
     velocities: FloatArray = field(repr=False)
     path_m: FloatArray = field(repr=False)
     line_m: FloatArray = field(repr=False)
+    joints: FloatArray = field(repr=False)
 
 
 def read_flight(recording: Path) -> Flight:
@@ -112,6 +113,7 @@ def judge_goal(
         velocities=flight.commands[steps],
         path_m=path,
         line_m=line,
+        joints=truth_q[way],
     )
 
 
