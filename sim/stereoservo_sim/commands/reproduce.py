@@ -4,6 +4,7 @@ ours."""
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,6 +46,8 @@ class Experiment:
 
 def run_real_franka_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
     """The real-arm experiment from its options. Raises ExperimentError."""
+    # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from stereoservo_sim.experiments.real_franka import TABLE_TAGS, run_real_franka
     from stereoservo_sim.experiments.real_franka_report import draw, report
 
