@@ -85,12 +85,12 @@ def _print(result: dict[str, Any]) -> None:
         f"{calibration['chi2']:.0f} for {calibration['degrees_of_freedom']} degrees of freedom",
         highlight=False,
     )
-    table = Table("goal", "law", "rotation", "distance", "error px", "error mm", "off line", "time", "outcome")
+    table = Table("goal", "law", "turn °", "way mm", "error px", "error mm", "off line mm", "s", "outcome", box=None)
     for goal in result["goals"]:
         table.add_row(
-            goal["name"], goal["law"], f"{goal['rotation_deg']:.0f}°", f"{goal['distance_mm']:.0f} mm",
-            f"{goal['final_error_px']:.4f}", f"{goal['final_error_mm']:.4f}", f"{goal['max_line_deviation_mm']:.2f} mm",
-            f"{goal['seconds']:.1f} s", goal["outcome"],
+            goal["name"], goal["law"], f"{goal['rotation_deg']:.0f}", f"{goal['distance_mm']:.0f}",
+            f"{goal['final_error_px']:.3f}", f"{goal['final_error_mm']:.3f}", f"{goal['max_line_deviation_mm']:.2f}",
+            f"{goal['seconds']:.1f}", goal["outcome"],
         )  # fmt: skip
     console.print(table)
     console.print(f"report: {result['report']}", highlight=False, soft_wrap=True)

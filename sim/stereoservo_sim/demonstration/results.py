@@ -9,6 +9,7 @@ import msgspec
 from stereoservo.kinematics.model import CellModel
 from stereoservo_sim.demonstration.conduct import Demonstration
 from stereoservo_sim.demonstration.judge import Judgement, judge_goal, read_flight
+from stereoservo_sim.demonstration.overview import write_overview
 from stereoservo_sim.demonstration.pages import write_pages
 from stereoservo_sim.demonstration.scenario import GOALS
 from stereoservo_sim.world import demo_cell
@@ -18,7 +19,7 @@ MAX_ERROR_MM = 0.5
 
 
 def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
-    """Judge, write ``report.html``, and give what ``demo --json`` prints.
+    """Judge, write ``report.html`` and ``overview.png``, and give what ``demo --json`` prints.
 
     ``seconds``: how long the demonstration took. Raises RecordingError, LookupError where a goal was never flown.
     """
@@ -32,6 +33,7 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     ]  # fmt: skip
     report = demonstration.out / "report.html"
     write_pages(report, demonstration, flight, goals)
+    write_overview(demonstration.out / "overview.png", goals, demo_cell(), demonstration.cell.servo.tolerance_px)
     model = demonstration.calibrated.model
     return {
         "converged": good_calibration(model) and all(good_goal(goal) for goal in goals),
