@@ -11,24 +11,27 @@ import numpy as np
 import numpy.typing as npt
 
 LINES = 16
-"""Lines a pixel row on which spans are exact; between them the midpoint rule."""
+"""Lines a pixel row, or the part of it that a shape reaches, on which spans are exact; between them the
+midpoint rule."""
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _add_span(row: npt.NDArray[np.float64], first: int, u0: float, u1: float) -> None:
-    """Add the overlap of [u0, u1] with each pixel's extent to ``row``, whose item 0 is pixel ``first``."""
+def _add_span(row: npt.NDArray[np.float64], first: int, u0: float, u1: float, weight: float) -> None:
+    """Add ``weight`` times the overlap of [u0, u1] with each pixel to ``row``, whose item 0 is pixel
+    ``first``.
+    """
     last = first + row.shape[0] - 1
     u0, u1 = max(u0, first - 0.5), min(u1, last + 0.5)
     if u1 <= u0:
         return
     i0, i1 = min(math.floor(u0 + 0.5), last), min(math.floor(u1 + 0.5), last)
     if i0 == i1:
-        row[i0 - first] += u1 - u0
+        row[i0 - first] += weight * (u1 - u0)
         return
-    row[i0 - first] += i0 + 0.5 - u0
+    row[i0 - first] += weight * (i0 + 0.5 - u0)
     for i in range(i0 + 1, i1):
-        row[i - first] += 1.0
-    row[i1 - first] += u1 - (i1 - 0.5)
+        row[i - first] += weight
+    row[i1 - first] += weight * (u1 - (i1 - 0.5))
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
@@ -37,7 +40,7 @@ def _blend(
 ) -> None:
     for i in range(row.shape[0]):
         if row[i] > 0.0:
-            c = row[i] / LINES
+            c = min(row[i], 1.0)
             image[v, first + i] = image[v, first + i] * (1.0 - c) + level * c
             row[i] = 0.0
 
@@ -59,20 +62,22 @@ def blend_ellipse(image: npt.NDArray[np.float32], conic: npt.NDArray[np.float64]
     half_u, half_v = math.sqrt(k * c / det), math.sqrt(k * a / det)
     first = max(math.floor(uc - half_u), 0)
     last = min(math.ceil(uc + half_u), image.shape[1] - 1)
-    top = max(math.floor(vc - half_v), 0)
-    bottom = min(math.ceil(vc + half_v), image.shape[0] - 1)
+    top = max(math.floor(vc - half_v + 0.5), 0)
+    bottom = min(math.floor(vc + half_v + 0.5), image.shape[0] - 1)
     if last < first:
         return
     row = np.zeros(last - first + 1)
     for v in range(top, bottom + 1):
+        low, high = max(v - 0.5, vc - half_v), min(v + 0.5, vc + half_v)
+        weight = (high - low) / LINES
         for line in range(LINES):
-            dv = v + (line + 0.5) / LINES - 0.5 - vc
+            dv = low + (line + 0.5) * weight - vc
             # a du^2 + 2 b du dv + c dv^2 = k
             inside = (b * dv) ** 2 - a * (c * dv * dv - k)
             if inside > 0.0:
                 half = math.sqrt(inside) / a
                 middle = uc - b * dv / a
-                _add_span(row, first, middle - half, middle + half)
+                _add_span(row, first, middle - half, middle + half, weight)
         _blend(image, v, first, row, level)
 
 
@@ -81,15 +86,18 @@ def blend_polygon(image: npt.NDArray[np.float32], corners: npt.NDArray[np.float6
     """Blend a convex polygon, ``corners`` (k, 2) in order, at ``level`` into ``image``."""
     first = max(math.floor(corners[:, 0].min()), 0)
     last = min(math.ceil(corners[:, 0].max()), image.shape[1] - 1)
-    top = max(math.floor(corners[:, 1].min()), 0)
-    bottom = min(math.ceil(corners[:, 1].max()), image.shape[0] - 1)
+    lowest, highest = corners[:, 1].min(), corners[:, 1].max()
+    top = max(math.floor(lowest + 0.5), 0)
+    bottom = min(math.floor(highest + 0.5), image.shape[0] - 1)
     if last < first:
         return
     n = corners.shape[0]
     row = np.zeros(last - first + 1)
     for v in range(top, bottom + 1):
+        start, end = max(v - 0.5, lowest), min(v + 0.5, highest)
+        weight = (end - start) / LINES
         for line in range(LINES):
-            y = v + (line + 0.5) / LINES - 0.5
+            y = start + (line + 0.5) * weight
             low, high = np.inf, -np.inf
             for i in range(n):
                 u0, v0 = corners[i, 0], corners[i, 1]
@@ -98,5 +106,5 @@ def blend_polygon(image: npt.NDArray[np.float32], corners: npt.NDArray[np.float6
                     u = u0 + (y - v0) / (v1 - v0) * (u1 - u0)
                     low, high = min(low, u), max(high, u)
             if high > low:
-                _add_span(row, first, low, high)
+                _add_span(row, first, low, high, weight)
         _blend(image, v, first, row, level)

@@ -51,7 +51,7 @@ def test_metric_positions_are_the_world_seen_from_the_rig():
     assert np.allclose(
         np.linalg.norm(world[:, None] - world[None], axis=2), np.linalg.norm(rig[:, None] - rig[None], axis=2)
     )
-    # A pinhole in the rig's own frame, written out: the left camera stands at x = -0.1, turned by +10 degrees.
+    # A pinhole in the rig frame, written out: the left camera stands at x = -0.1, turned by +10 degrees.
     c, s = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
     shifted = rig + np.array([0.1, 0, 0])
     x, z = c * shifted[:, 0] - s * shifted[:, 2], s * shifted[:, 0] + c * shifted[:, 2]

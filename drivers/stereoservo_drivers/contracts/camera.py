@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +108,7 @@ class CameraDriverContract(PacedSuite):
         items = self.collect(active, context, self.frames)
         for item in items:
             assert item.t_shutter_ns <= item.t_received_ns <= context.clock.now_ns()
-        for before, after in zip(items, items[1:], strict=False):
+        for before, after in pairwise(items):
             assert after.seq > before.seq
             assert after.t_shutter_ns > before.t_shutter_ns
             assert after.t_received_ns >= before.t_received_ns

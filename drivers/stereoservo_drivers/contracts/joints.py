@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -154,9 +155,9 @@ class JointDriverContract(PacedSuite):
             state = active.read_state()
             assert state.t_ns <= context.clock.now_ns()
             states.append(state)
-        assert all(b.t_ns >= a.t_ns for a, b in zip(states, states[1:], strict=False))
+        assert all(b.t_ns >= a.t_ns for a, b in pairwise(states))
         assert states[-1].t_ns > states[0].t_ns
-        assert all(b.seq >= a.seq for a, b in zip(states, states[1:], strict=False))
+        assert all(b.seq >= a.seq for a, b in pairwise(states))
         assert states[-1].seq > states[0].seq
 
     def test_a_state_is_not_changed_by_later_reads(self, active: JointDriver, context: DriverContext) -> None:
