@@ -178,8 +178,12 @@ def scara():
 
 def mixed():
     """A linear axis under a wrist: P, R, R, R with different directions."""
-    links = [rotation("x", 90), translation(0.2, 0, 0) @ rotation("x", 90), translation(0.1, 0, 0.1) @ rotation("x", -70),
-             translation(0, 0, 0.1)]  # fmt: skip
+    links = [
+        rotation("x", 90),
+        translation(0.2, 0, 0) @ rotation("x", 90),
+        translation(0.1, 0, 0.1) @ rotation("x", -70),
+        translation(0, 0, 0.1),
+    ]
     ranges = [0.15, *np.radians([25, 30, 35])]
     facing = rotation("x", 170) @ rotation("y", 20)
     return placed(
@@ -192,23 +196,30 @@ def mixed():
     )
 
 
-def parallel():
+def parallel(body=None):
     """Three parallel revolute axes: no plane at infinity."""
     links = [translation(0.3, 0, 0), translation(0.25, 0, 0), translation(0.05, 0, 0)]
     facing = rotation("x", 150) @ rotation("y", 25)
-    return placed(["revolute"] * 3, links, two_faces(), [0.3, 0.5, 0.2], np.radians([18, 22, 40]), facing)
+    return placed(
+        ["revolute"] * 3,
+        links,
+        two_faces() if body is None else body,
+        [0.3, 0.5, 0.2],
+        np.radians([18, 22, 40]),
+        facing,
+    )
 
 
 ARMS = {"rx90": rx90, "gantry": gantry, "scara": scara, "mixed": mixed, "parallel": parallel}
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def arms():
     """Makers of cells by name."""
     return ARMS
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def plate():
     """Four dots of a plane."""
     return PLATE

@@ -34,10 +34,13 @@ CHART_SIZE: dict[tuple[Stratum, Kind], int] = {
 }
 
 
-def algebra(stratum: Stratum) -> FloatArray:
-    """Basis (a, 4, 4) of the Lie algebra of the stratum's group: gl(4), aff(3) or the similarities' sim(3).
+def algebra(stratum: Stratum, kind: Kind) -> FloatArray:
+    """Basis (a, 4, 4) of the Lie algebra that moves a joint of ``kind``: gl(4), aff(3), or that of the
+    similarities.
 
-    Affine and metric algebras stand in a frame whose plane at infinity is (0, 0, 0, 1).
+    Affine and metric algebras stand in a frame whose plane at infinity is (0, 0, 0, 1). Metric revolute
+    joints do without the scale: a scaling moves no axis that a translation does not, and Cayley's map of both
+    at once leaves the group.
     """
     full = np.eye(16).reshape(16, 4, 4)
     if stratum == "projective":
@@ -49,7 +52,7 @@ def algebra(stratum: Stratum) -> FloatArray:
         basis[k, i, j], basis[k, j, i] = 1.0, -1.0
         basis[3 + k, k, 3] = 1.0
     basis[6, :3, :3] = np.eye(3)
-    return basis
+    return basis[:6] if kind == "revolute" else basis
 
 
 def generator_basis(generator: FloatArray, kind: Kind, stratum: Stratum) -> FloatArray:
@@ -58,7 +61,7 @@ def generator_basis(generator: FloatArray, kind: Kind, stratum: Stratum) -> Floa
 
     Orthogonal complement of the commutant of the generator in the stratum's algebra; p as in ``CHART_SIZE``.
     """
-    directions = algebra(stratum)
+    directions = algebra(stratum, kind)
     changes = directions @ generator - generator @ directions
     _, values, rows = np.linalg.svd(changes.reshape(len(directions), 16).T)
     p = CHART_SIZE[stratum, kind]
@@ -71,7 +74,8 @@ def conjugation(basis: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArra
     """Group element ``T(x)`` (4, 4) of a chart and its left-trivialised derivatives ``dT/dx_k T⁻¹`` (p, 4,
     4).
 
-    Cayley's map ``(I - Δ/2)⁻¹ (I + Δ/2)``: it stays in each of the three groups, and ``dT T⁻¹ = (I - Δ/2)⁻¹
+    Cayley's map ``(I - Δ/2)⁻¹ (I + Δ/2)``: it stays in GL(4), in the affine and in the
+    Euclidean group, and ``dT T⁻¹ = (I - Δ/2)⁻¹
     dΔ (I + Δ/2)⁻¹``.
     """
     half = 0.5 * np.einsum("p,pij->ij", x, basis)

@@ -63,14 +63,13 @@ def fit_model(
     tell("rigid bundle", 0.6)
     robust = solve(linked.rig, clean, "projective", loss="soft_l1", loss_scale=2.0, rounds=1, tolerance=1e-4)
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
-    # to
-    # walk such a valley to its end here.
+    # to walk such a valley to its end here.
     solution, inliers = settled(robust.rig, every, "projective", options, tolerance=1e-6)
-    _refuse_misfit(trials, solution, every.select(inliers), inliers, options)
+    _refuse_misfit(trials, solution, every, inliers, options)
     tell("metric bundle", 0.8)
     final, plane, notes = upgraded(solution, every.select(inliers), options)
     final, inliers = settled(final.rig, every, final.stratum, options)
-    _refuse_misfit(trials, final, every.select(inliers), inliers, options)
+    _refuse_misfit(trials, final, every, inliers, options)
     _refuse_open(final, notes)
     tell("report", 0.95)
     result = build_result(
@@ -174,8 +173,9 @@ def settled(
         raise CalibrationError(
             "no_convergence",
             f"the set of outliers does not settle: {int((~inliers).sum())} of {len(inliers)} pixels in the "
-            "last round",
+            "last round. Did a camera move, are positions wrong?",
             outliers=int((~inliers).sum()),
+            pixels=len(inliers),
         )
     return solution, inliers
 
@@ -192,7 +192,7 @@ def gate(rig: Rig, every: Measurements, options: FitOptions) -> BoolArray:
 
 
 def _refuse_misfit(
-    trials: TrialData, solution: Solution, data: Measurements, inliers: BoolArray, options: FitOptions
+    trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
 ) -> None:
     share = float((~inliers).mean())
     if share > options.max_outliers:
@@ -203,6 +203,20 @@ def _refuse_misfit(
             share=share,
             maximum=options.max_outliers,
         )
+    for j, name in enumerate(trials.joint_names):
+        own = trials.trials[every.stop] == j
+        lost = float((~inliers[own]).mean()) if own.any() else 0.0
+        if lost > options.max_trial_outliers:
+            raise CalibrationError(
+                "too_many_outliers",
+                f"{lost:.0%} of the pixels of joint {name!r}'s trial do not fit the {solution.stratum} "
+                "model; at "
+                f"most {options.max_trial_outliers:.0%} may. Are its positions right, did only it move?",
+                joint=name,
+                share=lost,
+                maximum=options.max_trial_outliers,
+            )
+    data = every.select(inliers)
     freedom = 2 * len(data.pixels) - solution.charts.size
     if freedom <= 0:
         raise CalibrationError(

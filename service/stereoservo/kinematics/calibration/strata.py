@@ -28,18 +28,20 @@ class FitOptions:
     """Thresholds of the fit.
 
     ``outlier_chi2``: a pixel (2 degrees of freedom) farther than this from the model is left out; 25 loses 4
-    in a million good ones. ``max_outliers``: share of pixels that may be left out. ``max_sigma_factor``: how
-    many times the stated sigmas the residuals may be before the fit is refused; detectors misjudge their
-    noise, a wrong model misses by far more. ``metric_loss``: how much worse, in variance, the metric bundle
-    may fit than the projective one. ``max_spread``: largest relative standard deviation of focal lengths
-    (metric) and depths (metric, affine) with which a stratum is believed.
+    in a million good ones. ``max_outliers``, ``max_trial_outliers``: share of pixels that may be left out of
+    all, and of one joint's trial. ``max_sigma_factor``: how many times the stated sigmas the residuals may be
+    before the fit is refused; detectors misjudge their noise, a wrong model misses by far more.
+    ``metric_loss``: how much worse, in variance, the metric bundle may fit than the projective one where it
+    is not certain that the metric is identifiable. ``max_spread``: largest relative standard deviation of
+    focal lengths (metric) and depths (metric, affine) with which a stratum is believed.
     """
 
     outlier_chi2: float = 25.0
-    max_outliers: float = 0.3
+    max_outliers: float = 0.25
+    max_trial_outliers: float = 0.5
     max_sigma_factor: float = 3.0
     metric_loss: float = 1.3
-    max_spread: float = 0.2
+    max_spread: float = 0.1
 
 
 DEFAULTS = FitOptions()
@@ -67,43 +69,47 @@ class Judge:
 
     def passes(self, solution: Solution, plane: FloatArray) -> bool:
         """Whether ``solution`` may be taken as it is. Sets ``hopeless`` where another start will not help."""
-        own, beside = variance_factor(solution), max(1.0, variance_factor(self.projective))
-        fewer = self.projective.charts.size - solution.charts.size
-        costs = solution.cost - self.projective.cost
-        allowed = float(chi2_distribution.isf(NESTED_TAIL, max(1, fewer))) * beside
-        if own > self.options.metric_loss * beside:
-            self._note(solution, f"variance factor {own:.3g} beside {beside:.3g} of the projective bundle")
-            return False
         problem = self._unidentified(solution)
         if problem:
             self._note(solution, problem)
-            self.hopeless = True
+            # A good fit that leaves directions open, converged along them or not: so will any other.
+            self.hopeless = self._close(solution)
             return False
         if not solution.converged:
             self._note(solution, f"no convergence in {solution.evaluations} evaluations")
             return False
-        if costs > allowed:
-            # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
-            self.hopeless = any(
-                abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve
-            )
-            self.reserve.append((solution, plane))
-            return False
-        return True
+        fewer = self.projective.charts.size - solution.charts.size
+        beside = max(1.0, variance_factor(self.projective))
+        allowed = float(chi2_distribution.isf(NESTED_TAIL, max(1, fewer))) * beside
+        if solution.cost - self.projective.cost <= allowed:
+            return True
+        # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
+        self.hopeless = any(
+            abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve
+        )
+        self.reserve.append((solution, plane))
+        return False
 
-    def second_best(self) -> tuple[Solution, FloatArray] | None:
-        """The best of the reserve, with a note of what it costs."""
+    def second_best(self, certain: bool) -> tuple[Solution, FloatArray] | None:
+        """The best of the reserve, with a note of what it costs; None where it must not be taken.
+
+        ``certain``: the data identify the stratum beyond doubt, so that what does not fit it is wrong, not
+        the stratum.
+        """
         if not self.reserve:
             return None
         solution, plane = min(self.reserve, key=lambda entry: entry[0].cost)
         self.notes.append(
             f"the {solution.stratum} constraints cost a chi-square of "
             f"{solution.cost - self.projective.cost:.4g} for "
-            f"{self.projective.charts.size - solution.charts.size} parameters: the cameras or joints follow "
-            "the model "
-            "only nearly (lens distortion, play)"
+            f"{self.projective.charts.size - solution.charts.size} parameters: cameras or joints follow the "
+            "model only nearly (lens distortion, play, positions)"
         )
-        return solution, plane
+        return (solution, plane) if certain or self._close(solution) else None
+
+    def _close(self, solution: Solution) -> bool:
+        beside = max(1.0, variance_factor(self.projective))
+        return variance_factor(solution) <= self.options.metric_loss * beside
 
     def _unidentified(self, solution: Solution) -> str:
         rank = rank_of(solution)
@@ -145,12 +151,12 @@ def upgraded(
     """
     noise = generator_noise(solution)
     judge = Judge(solution, options)
-    candidates = (*upgrade.planes_at_infinity(solution.rig.generators, noise), NOMINAL_PLANE)
-    planes = [upgrade.scaled_plane(plane, solution.rig.points) for plane in candidates]
+    least, nearest, unique = upgrade.planes_at_infinity(solution.rig.generators, noise)
     finite: list[FloatArray] = []
-    for plane in planes:
-        if plane is not None and not any(np.allclose(plane, other, rtol=1e-3, atol=1e-6) for other in finite):
-            finite.append(plane)
+    for candidate in (nearest, least, NOMINAL_PLANE):
+        scaled = upgrade.scaled_plane(candidate, solution.rig.points)
+        if scaled is not None and not any(np.allclose(scaled, p, rtol=1e-3, atol=1e-6) for p in finite):
+            finite.append(scaled)
     if not finite:
         raise CalibrationError(
             "views_degenerate", "every candidate for the plane at infinity passes between the markers"
@@ -165,9 +171,9 @@ def upgraded(
             return metric, plane, ()
         if judge.hopeless:
             break
-    second = judge.second_best()
+    second = judge.second_best(unique and _several_directions(solution.rig, finite[0], noise))
     if second is None:
-        judge.hopeless = False
+        judge.hopeless, judge.reserve = False, []
         for plane in finite:
             try:
                 start = upgrade.affine_rig(solution.rig, plane)
@@ -179,9 +185,18 @@ def upgraded(
                 return affine, plane, tuple(judge.notes)
             if judge.hopeless:
                 break
-        second = judge.second_best()
-    best, plane = second or (solution, finite[-1])
+        second = judge.second_best(unique)
+    best, plane = second or (solution, finite[0])
     return best, plane, tuple(judge.notes)
+
+
+def _several_directions(rig: Rig, plane: FloatArray, noise: FloatArray) -> bool:
+    """Whether rotations about axes of different directions determine the intrinsics beyond doubt."""
+    revolute = np.array([kind == "revolute" for kind in rig.kinds])
+    try:
+        return upgrade.intrinsics_linear(upgrade.affine_rig(rig, plane).generators, revolute, noise)[1]
+    except GeometryError:
+        return False
 
 
 def _metric_starts(
@@ -196,7 +211,7 @@ def _metric_starts(
     for plane in planes:
         try:
             affine = upgrade.affine_rig(rig, plane)
-            linear = upgrade.intrinsics_linear(affine.generators, revolute, noise)
+            linear, _ = upgrade.intrinsics_linear(affine.generators, revolute, noise)
         except GeometryError:
             linear = None  # this plane is no start for the linear estimate; nominal cameras follow
         if linear is not None:

@@ -25,7 +25,7 @@ across.
 """
 
 
-def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
     """Candidates (4,) for the plane that all generators (n, 4, 4) leave fixed, ``ker`` of the stack of
     ``-Ĥᵀ`` (5.59).
 
@@ -37,7 +37,7 @@ def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[Float
     _, values, rows = np.linalg.svd(stack)
     kernel = rows[values <= max(SEPARATION * np.sqrt(len(stack)), 1e-9 * values[0], values[3])]
     nearest: FloatArray = kernel.T @ kernel[:, 3]
-    return rows[3], nearest
+    return rows[3], nearest, len(kernel) == 1
 
 
 def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
@@ -81,7 +81,7 @@ def metric_rig(rig: Rig, plane: FloatArray, intrinsics: FloatArray, spans: Float
         if kind == "revolute":
             half = 0.25 * spans[j]
             ends = [moved.points @ exp_rotation(moved.generators[j], angle).T for angle in (-half, half)]
-            moved.generators[j] = _twist_between(*(end[:, :3] / end[:, 3:] for end in ends))
+            moved.generators[j] = twist_between(*(end[:, :3] / end[:, 3:] for end in ends))
         else:
             moved.generators[j, 3] = 0.0
             moved.generators[j, :, :3] = 0.0
@@ -97,7 +97,7 @@ def _transformed(rig: Rig, plane: FloatArray, intrinsics: FloatArray) -> Rig:
     return Rig(rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:])
 
 
-def _twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
+def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
     """Unit twist (4, 4), without pitch, of the rigid motion that best takes points (m, 3) to others
     (Kabsch).
     """
@@ -120,22 +120,24 @@ def _twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
 
 def intrinsics_linear(
     generators: FloatArray, revolute: npt.NDArray[np.bool_], noise: FloatArray
-) -> FloatArray | None:
+) -> tuple[FloatArray | None, bool]:
     """``K̃`` (3, 3) from affine generators (n, 4, 4) by ``A Ω + Ω Aᵀ = 0``, ``Ω = K̃ K̃ᵀ``, linear, weighted
     by ``noise`` (n,).
 
-    None where noise leaves ``Ω`` indefinite.
+    None where noise leaves ``Ω`` indefinite. Second, whether ``Ω`` is unique beyond its noise.
     """
     blocks = generators[revolute, :3, :3] / noise[revolute, None, None]
     if not len(blocks):
-        return None
+        return None, False
     basis = np.zeros((6, 3, 3))
     for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
         basis[k, i, j] = basis[k, j, i] = 1.0
     system = blocks[:, None] @ basis + basis @ blocks[:, None].transpose(0, 1, 3, 2)
-    omega = np.tensordot(np.linalg.svd(system.transpose(0, 2, 3, 1).reshape(-1, 6))[2][5], basis, axes=1)
+    _, values, rows = np.linalg.svd(system.transpose(0, 2, 3, 1).reshape(-1, 6))
+    omega = np.tensordot(rows[5], basis, axes=1)
     omega = omega * np.sign(omega[2, 2])
-    return triangular_root(omega) if np.linalg.eigvalsh(omega)[0] > 0.0 else None
+    unique = bool(values[4] > SEPARATION * np.sqrt(9 * len(blocks)))
+    return (triangular_root(omega) if np.linalg.eigvalsh(omega)[0] > 0.0 else None), unique
 
 
 def triangular_root(omega: FloatArray) -> FloatArray:

@@ -96,7 +96,15 @@ def _epipolar(
             F, _ = fundamental_robust(flat[0, seen], flat[k, seen], scale * sigma)
         except GeometryError as error:
             if scale == NARROW and error.code == "degenerate":
-                raise _degenerate(trials, k, error) from error
+                rms = float(error.data.get("rms_px", np.nan))
+                raise CalibrationError(
+                    "views_degenerate",
+                    f"a plane explains what cameras {names} see in common to {rms:.3g} px, with sigmas of "
+                    f"{sigma:.3g} px: their geometry stays open. The markers must not stay in one plane over "
+                    "all trials, and the cameras must stand apart",
+                    rms_px=rms,
+                    sigma_px=sigma,
+                ) from error
             continue
         fits = (
             np.abs(sampson_distances(F, flat[0, seen], flat[k, seen]))

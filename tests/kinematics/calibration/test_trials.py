@@ -1,0 +1,75 @@
+"""Trial data: a file that comes back bit for bit, refusals that name what does not fit."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.kinematics.calibration.trials import (
+    CalibrationError,
+    check_trials,
+    decode_trials,
+    encode_trials,
+    load_trials,
+    save_trials,
+)
+
+
+@pytest.fixture
+def trials(arms):
+    rng = np.random.default_rng(1)
+    trials = arms["mixed"]().trials(0.1, rng, stops=4)
+    trials.pixels[0, 3, 2] = np.nan
+    trials.sigmas[0, 3, 2] = np.nan
+    return trials
+
+
+def test_round_trip_bit_for_bit(trials, tmp_path):
+    save_trials(trials, tmp_path / "trials.npz")
+    again = load_trials(tmp_path / "trials.npz")
+    for field in ("positions", "trials", "pixels", "sigmas"):
+        assert np.array_equal(
+            getattr(again, field), getattr(trials, field), equal_nan=field in ("pixels", "sigmas")
+        )
+    for field in ("joint_names", "joint_kinds", "cameras", "marker_ids", "images"):
+        assert getattr(again, field) == getattr(trials, field)
+    assert not again.visible[0, 3, 2]
+    assert [path.name for path in tmp_path.iterdir()] == ["trials.npz"]
+
+
+def holed(positions):
+    return np.where(np.arange(len(positions))[:, None] == 2, np.nan, positions)
+
+
+def wrong(data, /, **fields):
+    return msgspec.structs.replace(data, **fields)
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "fields"),
+    [
+        ("too_few_cameras", "1 camera", lambda t: {"cameras": t.cameras[:1]}),
+        ("bad_data", "kinds", lambda t: {"joint_kinds": t.joint_kinds[:2]}),
+        ("bad_data", "not all different", lambda t: {"marker_ids": (10,) * 14}),
+        ("bad_data", "not all different", lambda t: {"joint_names": ("a", "a", "b", "c")}),
+        ("bad_data", r"pixels has shape .* is needed", lambda t: {"pixels": t.pixels[:, 1:]}),
+        ("bad_data", r"sigmas has shape", lambda t: {"sigmas": t.sigmas[..., None]}),
+        ("bad_data", "positions of stop 2", lambda t: {"positions": holed(t.positions)}),
+        ("bad_data", "from -1 to 7; -1 to 3", lambda t: {"trials": np.array([-1, 7] * 8)}),
+        ("bad_data", "sigma is 0.0", lambda t: {"sigmas": np.zeros_like(t.sigmas)}),
+    ],
+)  # fmt: skip
+def test_refuses_what_does_not_fit(trials, code, words, fields):
+    with pytest.raises(CalibrationError, match=words) as caught:
+        check_trials(wrong(trials, **fields(trials)))
+    assert caught.value.code == code
+
+
+def test_refuses_broken_files(trials, tmp_path):
+    data = encode_trials(trials)
+    for broken in (b"", b"not a zip", data[: len(data) // 2], data.replace(b'"schema":1', b'"schema":9')):
+        with pytest.raises(CalibrationError) as caught:
+            decode_trials(broken, "here.npz")
+        assert caught.value.code == "bad_data"
+        assert "here.npz" in str(caught.value)
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        load_trials(tmp_path / "missing.npz")

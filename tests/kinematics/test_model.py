@@ -1,0 +1,198 @@
+"""Model files: every bit comes back, nothing half written, refusals that name the field."""
+
+import json
+import os
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from stereoservo.kinematics.model import (
+    MODEL_SCHEMA,
+    CameraModel,
+    CellModel,
+    FitStatistics,
+    JointStatistics,
+    ModelFileError,
+    check_model,
+    decode_model,
+    encode_model,
+    load_model,
+    save_model,
+)
+
+HOLED = np.where(np.arange(32).reshape(2, 4, 4) == 27, np.nan, 1.0)
+
+
+def rotation_generator(rng):
+    H = np.eye(4) + rng.normal(0, 0.2, (4, 4))
+    J = np.zeros((4, 4))
+    J[0, 1], J[1, 0] = -1.0, 1.0
+    return H @ J @ np.linalg.inv(H)
+
+
+def make_model(seed=0, **fields):
+    rng = np.random.default_rng(seed)
+    plane = rng.normal(0, 0.3, 4) + np.eye(4)[3]
+    points = rng.normal(0, 0.2, (5, 4)) + np.array([0.0, 0.0, 1.0, 1.0])
+    p, a = rng.normal(size=4), rng.normal(size=4)
+    model = CellModel(
+        schema=MODEL_SCHEMA,
+        epoch=4,
+        joint_names=("shoulder", "slide"),
+        joint_kinds=("revolute", "prismatic"),
+        zero=rng.normal(size=2),
+        generators=np.array([rotation_generator(rng), np.outer(p - a * (a @ p) / (a @ a), a)]),
+        cameras=(
+            CameraModel("left", rng.normal(size=(3, 4)), 640, 480),
+            CameraModel("right", rng.normal(size=(3, 4)), 800, 600),
+        ),
+        marker_ids=(3, 1, 4, 15, 9),
+        marker_points=points / (points @ plane)[:, None],
+        plane_at_infinity=plane,
+        stratum="metric",
+        projective_to_euclidean=rng.normal(size=(4, 4)),
+        statistics=FitStatistics(
+            0.1, 1000.5, 990, True, 1071, 81, 3, (JointStatistics("shoulder", 0.1 / 3, 9, 0.5),), 450
+        ),
+        created="2001-07-01T00:00:00Z",
+        source="trial motions",
+    )
+    return msgspec.structs.replace(model, **fields)
+
+
+def same(one, two):
+    for field in msgspec.structs.fields(CellModel):
+        a, b = getattr(one, field.name), getattr(two, field.name)
+        if isinstance(a, np.ndarray):
+            assert a.tobytes() == b.tobytes(), field.name
+            assert a.shape == b.shape
+        elif field.name == "cameras":
+            for x, y in zip(a, b, strict=True):
+                assert x.matrix.tobytes() == y.matrix.tobytes()
+                assert (x.name, x.width, x.height) == (y.name, y.width, y.height)
+        elif field.name == "statistics" and a is not None:
+            assert msgspec.structs.asdict(a) == msgspec.structs.asdict(b)
+        else:
+            assert a == b, field.name
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    zero=hnp.arrays(np.float64, 2, elements=st.floats(allow_nan=False, allow_infinity=False)),
+)
+@settings(max_examples=40, deadline=None)
+def test_round_trip_keeps_every_bit(seed, zero):
+    model = make_model(seed, zero=zero)
+    same(decode_model(encode_model(model)), model)
+
+
+def test_file_round_trip(tmp_path):
+    path = tmp_path / "model.json"
+    model = make_model(1, stratum="affine", projective_to_euclidean=None, statistics=None)
+    save_model(model, path)
+    same(load_model(path), model)
+    assert json.loads(path.read_text())["generators"][0][0] == model.generators[0, 0].tolist()
+    assert [p.name for p in tmp_path.iterdir()] == ["model.json"]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "model.json"
+    save_model(make_model(1), path)
+    old = path.read_bytes()
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save_model(make_model(2), path)
+    monkeypatch.undo()
+    with pytest.raises(ModelFileError):
+        save_model(make_model(2, epoch=-1), path)
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["model.json"]
+
+
+@pytest.mark.parametrize(
+    ("key", "words", "fields"),
+    [
+        ("schema", "is 9; this version reads 1", {"schema": 9}),
+        ("epoch", "-1", {"epoch": -1}),
+        ("joint_kinds", "has 1 entries", {"joint_kinds": ("revolute",)}),
+        ("joint_names", "'a' stands twice", {"joint_names": ("a", "a")}),
+        ("joint_names", "empty", {"joint_names": ()}),
+        ("marker_ids", "empty", {"marker_ids": ()}),
+        ("cameras", "empty", {"cameras": ()}),
+        ("zero", r"shape \(3,\); \(2,\) is needed", {"zero": np.zeros(3)}),
+        ("generators", r"entry \(1, 2, 3\) is nan", {"generators": HOLED}),
+        ("marker_points", r"shape \(4, 4\)", {"marker_points": np.ones((4, 4))}),
+        ("generators[0]", "'shoulder' is revolute", {"generators": np.ones((2, 4, 4))}),
+        ("marker_points[0]", "marker 3", {"marker_points": np.ones((5, 4)) * 9}),
+        ("projective_to_euclidean", "missing", {"projective_to_euclidean": None}),
+        ("projective_to_euclidean", "given", {"stratum": "affine"}),
+        ("projective_to_euclidean", r"shape \(3, 3\)", {"projective_to_euclidean": np.eye(3)}),
+        ("cameras[0]", "0x480", {"cameras": (CameraModel("left", np.ones((3, 4)), 0, 480),)}),
+        ("cameras[0].matrix", r"shape \(4, 4\)", {"cameras": (CameraModel("left", np.eye(4), 640, 480),)}),
+    ],
+)  # fmt: skip
+def test_refuses_what_does_not_fit(key, words, fields):
+    with pytest.raises(ModelFileError, match=words) as caught:
+        check_model(make_model(0, **fields), "cell.json")
+    assert caught.value.key == key
+    assert caught.value.path == "cell.json"
+    assert str(caught.value).startswith("cell.json: ")
+
+
+def test_prismatic_generator_must_be_nilpotent():
+    model = make_model(0)
+    generators = model.generators.copy()
+    generators[1] += 1e-3 * np.eye(4)
+    with pytest.raises(ModelFileError, match=r"generators\[1\].*'slide' is prismatic"):
+        check_model(msgspec.structs.replace(model, generators=generators))
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (lambda t: t.update(schema=2), "schema", "is 2"),
+        (lambda t: t.pop("schema"), "schema", "is None"),
+        (lambda t: t.pop("zero"), "", "zero"),
+        (lambda t: t.update(epoch="four"), "epoch", "int"),
+        (lambda t: t.update(zero="0 0"), "zero", "list"),
+        (lambda t: t.update(zero=[0.0, None]), "zero", "finite"),
+        (lambda t: t.update(zero=[[0.0], [0.0, 1.0]]), "zero", "inhomogeneous"),
+        (lambda t: t.update(stratum="conformal"), "stratum", "conformal"),
+        (lambda t: t["cameras"][1].pop("matrix"), "cameras[1]", "matrix"),
+    ],
+)
+def test_refuses_tampered_files(tmp_path, change, key, words):
+    tree = json.loads(encode_model(make_model(0)))
+    change(tree)
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(tree))
+    with pytest.raises(ModelFileError, match=words) as caught:
+        load_model(path)
+    assert caught.value.key.startswith(key)
+    assert caught.value.path == str(path)
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"[1]", b"\xff\xfe"])
+def test_refuses_what_is_no_json_object(data):
+    with pytest.raises(ModelFileError):
+        decode_model(data)
+
+
+def test_says_that_a_file_is_missing(tmp_path):
+    with pytest.raises(ModelFileError, match="cannot be read: No such file"):
+        load_model(tmp_path / "model.json")
+
+
+def test_a_newer_reader_tolerates_new_fields():
+    """Readers of files written by a later version with the same schema keep working."""
+    tree = json.loads(encode_model(make_model(0)))
+    tree["colour"] = "blue"
+    same(decode_model(json.dumps(tree).encode()), make_model(0))
