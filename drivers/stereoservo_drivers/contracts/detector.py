@@ -44,9 +44,9 @@ class DetectorContract(PacedSuite):
         """A fresh detector."""
         return self.make_detector(context)
 
-    @pytest.fixture(scope="class")
+    @pytest.fixture
     def scene(self) -> tuple[np.ndarray, dict[int, tuple[float, float]]]:
-        """The scene, drawn once a class."""
+        """The scene."""
         return self.make_scene()
 
     def frame(self, image: np.ndarray, seq: int = 7) -> Frame:
