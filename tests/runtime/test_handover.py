@@ -102,7 +102,7 @@ def test_layout_capacity_and_existence_are_checked(tmp_path: Path) -> None:
     with pytest.raises(SlotError, match="no such slot"):
         SlotReader(path, LAYOUT)
     create_slot(path, 10, LAYOUT)
-    with pytest.raises(SlotError, match="not a slot of layout 'Other.1'"):
+    with pytest.raises(SlotError, match=r"not a slot of layout 'Other\.1'"):
         SlotReader(path, "Other.1")
     with (
         SlotWriter(path, 10, LAYOUT) as writer,

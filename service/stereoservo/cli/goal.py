@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -19,7 +20,7 @@ from stereoservo.cli.output import (
     note,
     pairs,
 )
-from stereoservo.gateway.client import Client, GoalHandle
+from stereoservo.gateway.client import Client, ClientError, GoalHandle
 from stereoservo.gateway.messages import decode
 from stereoservo.runtime.commands import FeatureTarget, Goal, JointTarget, Target, TaughtTarget
 
@@ -78,21 +79,22 @@ def goal(
             reply = client.check(wanted)
             emit(reply, reply.message, json)
             return
-        handle = client.send(wanted)
-        note(f"goal {handle.id} accepted")
-        if not wait:
-            emit({"id": handle.id, "accepted": True}, handle.id, json)
-            return
-        follow(handle, json)
+        try:
+            handle = client.send(wanted)
+            note(f"goal {handle.id} accepted")
+            if wait:
+                follow(handle, json)
+            else:
+                emit({"id": handle.id, "accepted": True}, handle.id, json)
+        except KeyboardInterrupt:
+            with suppress(ClientError):  # not accepted yet, or ended already
+                client.cancel(wanted.id)
+            raise
 
 
 def follow(handle: GoalHandle, as_json: bool) -> None:
-    """Wait for a goal's end and print it; Ctrl-C cancels it. Raises CommandError unless it was reached."""
-    try:
-        result = handle.wait()
-    except KeyboardInterrupt:
-        handle.cancel()
-        raise
+    """Wait for a goal's end and print it. Raises CommandError unless it was reached."""
+    result = handle.wait()
     if result.outcome != "reached":
         tree = cast("dict[str, Any]", msgspec.to_builtins(result))
         raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.message}", goal=tree)

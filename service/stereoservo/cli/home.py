@@ -19,5 +19,5 @@ def home(
     json: JsonOption = False,
 ) -> None:
     """Move every joint to the cell's home position. Ctrl-C cancels."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
-        follow(client.home(speed_scale), json)
+    with Client(cell, endpoint=endpoint, operator=operator) as client, client.home(speed_scale) as handle:
+        follow(handle, json)

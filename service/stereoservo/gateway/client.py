@@ -54,6 +54,7 @@ from stereoservo.runtime.daemon import find_daemon
 
 POLL_S = 0.01
 ALIVE_EVERY_S = 1.0
+DRAIN = 32
 TERMINAL = {
     "goal_reached": "reached",
     "goal_aborted": "aborted",
@@ -335,7 +336,10 @@ class Client:
             while True:
                 idle = True
                 for subscriber, kind in subscribers:
-                    while (sample := subscriber.try_recv()) is not None:
+                    for _ in range(DRAIN):  # bounded: a caller that causes events must not starve the others
+                        sample = subscriber.try_recv()
+                        if sample is None:
+                            break
                         idle = False
                         heard = time.monotonic()
                         yield msgspec.json.decode(sample.payload.to_bytes(), type=kind)

@@ -228,6 +228,9 @@ class Gateway:
         self._take_reports()
         self._record()
         self._follow_fit()
+        if not self._announced and self._greeted and self._state is not None:
+            self._announced = True
+            self._announce()
         return busy
 
     def _queries(self) -> bool:
@@ -431,9 +434,6 @@ class Gateway:
         state = self._link.state()
         if state is not None:
             self._state_heard = now
-            if not self._announced:
-                self._announced = True
-                self._announce()
             self._state = state_message(
                 self.plan, self.boot, state, servo_alive=True, last_event=self.log.last
             )
@@ -486,7 +486,7 @@ class Gateway:
     # -- life -----------------------------------------------------------------------------------------------
 
     def _announce(self) -> None:
-        """Say that the daemon is up: ``daemon.json``. Not before the servo process shows its state."""
+        """Say that the daemon is up: ``daemon.json``. Not before the servo process takes requests."""
         plan = self.plan
         info = DaemonInfo(
             cell=plan.cell.cell.name, endpoint=self.endpoint, boot=self.boot, pid=os.getppid(), cell_path=plan.cell_path,

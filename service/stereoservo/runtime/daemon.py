@@ -99,7 +99,6 @@ class DaemonProcess:
         environment: dict[str, str] | None = None,
     ) -> None:
         self.cell_path = cell_path
-        self._cell = load_cell_file(cell_path).cell.name
         self._log = log
         stream = log.open("wb") if log is not None else None
         try:
@@ -115,8 +114,7 @@ class DaemonProcess:
                 stream.close()
 
     def wait_ready(self, timeout_s: float = 90.0) -> DaemonInfo:
-        """Wait until it listens. Raises DaemonError with what it said."""
-        directories = cell_directories(self._cell)
+        """Wait until it takes requests. Raises DaemonError with what it said."""
         until = time.monotonic() + timeout_s
         while time.monotonic() < until:
             code = self.process.poll()
@@ -124,9 +122,9 @@ class DaemonProcess:
                 raise DaemonError(
                     f"the daemon ended at its start (exit code {code}): {self.output()}", code, self.output()
                 )
-            info = daemon_info(directories)
-            if info is not None and info.pid == self.process.pid:
-                return info
+            for info in live_cells():
+                if info.pid == self.process.pid:
+                    return info
             time.sleep(0.05)
         raise DaemonError(f"the daemon was not ready within {timeout_s:g} s", None, self.output())
 

@@ -1,0 +1,181 @@
+"""A real daemon on the fake cell: separate processes, zenoh on a unix socket, real time."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from stereoservo.cli import main as cli
+from stereoservo.gateway.client import Client
+from stereoservo.runtime.daemon import DaemonProcess
+from stereoservo.runtime.directories import CellDirectories, cell_directories
+
+CELL = "hil"
+QUICK_CALIBRATION = """
+[calibration]
+stops = 5
+frames = 2
+settle_s = 0.05
+"""
+
+
+def eventually(what: str, wanted: Callable[[], object], timeout_s: float = 20.0) -> None:
+    """Wait until ``wanted`` is true; how long it takes is not judged, only that it happens."""
+    until = time.monotonic() + timeout_s
+    while not wanted():
+        if time.monotonic() > until:
+            raise AssertionError(f"never happened: {what}")
+        time.sleep(0.05)
+
+
+def processes(directories: CellDirectories) -> dict[str, int]:
+    """Live processes of a cell by what they are, found by its runtime directory on their command lines."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            words = (entry / "cmdline").read_bytes().decode().split("\0")
+            state = re.search(r"^State:\s+(\w)", (entry / "status").read_text(), re.MULTILINE)
+        except OSError:
+            continue
+        if str(directories.runtime) in words and state is not None and state[1] not in "ZX":
+            module = next((word for word in words if word.startswith("stereoservo.")), "?").rpartition(".")[2]
+            module = "gateway" if module == "process" else module
+            name = (
+                f"{module}-{words[words.index(str(directories.runtime)) + 2]}"
+                if module == "vision"
+                else module
+            )
+            found[name] = int(entry.name)
+    return found
+
+
+@pytest.fixture(scope="session")
+def roots() -> Iterator[Path]:
+    """Short directories of their own (a socket's path is limited) for everything that these tests start."""
+    root = Path(tempfile.mkdtemp(prefix="sshil", dir="/tmp"))
+    before = {key: os.environ.get(key) for key in ("STEREOSERVO_RUNTIME_DIR", "STEREOSERVO_STATE_DIR")}
+    os.environ["STEREOSERVO_RUNTIME_DIR"] = str(root / "r")
+    os.environ["STEREOSERVO_STATE_DIR"] = str(root / "s")
+    yield root
+    for key, value in before.items():
+        if value is None:
+            os.environ.pop(key)
+        else:
+            os.environ[key] = value
+    shutil.rmtree(root)
+
+
+@pytest.fixture(scope="session")
+def cell_file(roots: Path) -> Path:
+    """The fake cell, with a quick calibration around the simulated cell's base."""
+    from stereoservo_sim.world import demo_cell
+
+    path = roots / f"{CELL}.toml"
+    assert cli.invoke(["init", str(path)]) == 0
+    head = path.read_text().partition("# Trial motions")[0]
+    world = demo_cell()
+    names = [joint.name for joint in world.robot.joints]
+    base = "\n".join(f"{name} = {float(q)!r}" for name, q in zip(names, world.base, strict=True))
+    ranges = "\n".join(f"{name} = 0.15" for name in names)
+    path.write_text(
+        f"{head}{QUICK_CALIBRATION}\n[calibration.base]\n{base}\n\n[calibration.range]\n{ranges}\n"
+    )
+    return path
+
+
+@pytest.fixture(scope="session")
+def directories(cell_file: Path) -> CellDirectories:
+    """Where the cell lives."""
+    return cell_directories(CELL)
+
+
+@pytest.fixture(scope="session")
+def calibrated(cell_file: Path, roots: Path) -> Path:
+    """The cell file of a cell that has calibrated itself and knows a goal, ``park``, shown at its base."""
+    with DaemonProcess(cell_file, log=roots / "calibrate.log") as daemon:
+        daemon.wait_ready()
+        with Client(CELL) as client:
+            client.enable()
+            result = client.calibrate(timeout_s=120.0)
+            assert result.covariance_ok
+            client.teach("park", frames=5)
+    return cell_file
+
+
+@pytest.fixture
+def start(
+    cell_file: Path, directories: CellDirectories, roots: Path
+) -> Iterator[Callable[..., DaemonProcess]]:
+    """Starts daemons; whatever a test does, they end with it and leave no process behind."""
+    started: list[DaemonProcess] = []
+
+    def start_it(path: Path = cell_file, *options: str, ready: bool = True) -> DaemonProcess:
+        daemon = DaemonProcess(path, options=options, log=roots / f"run-{len(started)}.log")
+        started.append(daemon)
+        if ready:
+            daemon.wait_ready()
+        return daemon
+
+    yield start_it
+    for daemon in started:
+        daemon.stop()
+    eventually("no process is left", lambda: not processes(directories))
+
+
+@pytest.fixture(scope="module")
+def shared(calibrated: Path, directories: CellDirectories, roots: Path) -> Iterator[DaemonProcess]:
+    """A daemon of the calibrated cell for all tests of a module that leave it alive."""
+    with DaemonProcess(calibrated, log=roots / "shared.log") as daemon:
+        daemon.wait_ready()
+        yield daemon
+    eventually("no process is left", lambda: not processes(directories))
+
+
+@pytest.fixture
+def client(shared: DaemonProcess) -> Iterator[Client]:
+    """A client of it, with the arm enabled, at rest and without a goal."""
+    with Client(CELL) as client:
+        yield _ready(client)
+
+
+@pytest.fixture
+def live(calibrated: Path, start: Callable[..., DaemonProcess]) -> DaemonProcess:
+    """A running daemon of the calibrated cell that a test may end."""
+    return start(calibrated)
+
+
+@pytest.fixture
+def own(live: DaemonProcess) -> Iterator[Client]:
+    """A client of it."""
+    with Client(CELL) as client:
+        yield _ready(client)
+
+
+def _ready(client: Client) -> Client:
+    client.enable()
+    goal = client.status().goal
+    if goal:
+        client.cancel(goal)
+    eventually("the arm rests", lambda: at_rest(client))
+    return client
+
+
+def at_rest(client: Client) -> bool:
+    """Whether the commanded velocity is zero."""
+    return not any(client.status().command.values())
+
+
+def moved_away(client: Client) -> None:
+    """Put the arm somewhere that is not ``park``."""
+    start = client.status().joints
+    away = {name: value + 0.12 for name, value in start.items() if name in ("j1", "j4")}
+    client.goal(away).reached(60.0)

@@ -1,0 +1,204 @@
+"""The daemon as real processes: goals over zenoh, bad goals, clients that die."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stereoservo.gateway.client import Client, ClientError, EventWatch, RefusedError
+from stereoservo.gateway.messages import Reply, decode
+from stereoservo.runtime.commands import FeatureTarget
+from stereoservo.runtime.daemon import DaemonProcess
+from stereoservo.runtime.directories import CellDirectories
+
+from .conftest import CELL, at_rest, eventually, moved_away, processes
+
+pytestmark = pytest.mark.process
+
+
+# -- the main line ------------------------------------------------------------------------------------------
+
+
+def test_a_goal_is_servoed_over_zenoh_by_either_law(client: Client) -> None:
+    for law in ("stereo", "cartesian3"):
+        moved_away(client)
+        result = client.goal("park", law=law, tolerance_px=0.5, hold_frames=3).reached(60.0)  # type: ignore[arg-type]
+        assert result.error_px is not None
+        assert result.error_px <= 0.5
+    info = client.info()
+    assert [taught.name for taught in info.taught] == ["park"]
+    assert info.model is not None
+
+
+def test_the_servo_process_maps_no_library_that_could_delay_it(
+    shared: DaemonProcess, directories: CellDirectories
+) -> None:
+    maps = Path(f"/proc/{processes(directories)['servo']}/maps").read_text()
+    assert "numba" in maps
+    for library in ("zenoh", "cv2", "scipy/optimize", "pybullet", "matplotlib"):
+        assert library not in maps, library
+    environment = Path(f"/proc/{processes(directories)['servo']}/environ").read_text()
+    assert "OPENBLAS_NUM_THREADS=1" in environment
+
+
+def test_events_are_numbered_and_can_be_read_from_any_number(client: Client) -> None:
+    client.hold()
+    client.resume()
+    page = client.events(1)
+    assert [event.seq for event in page.events] == list(range(1, page.next))
+    assert {event.boot for event in page.events} == {page.boot}
+    later = client.events(page.next - 1)
+    assert [event.seq for event in later.events] == [page.next - 1]
+
+
+def test_watch_shows_state_events_and_features(client: Client) -> None:
+    seen = set()
+    stream = client.watch(features=True)
+    client.hold()
+    for message in stream:
+        seen.add(type(message).__name__)
+        if len(seen) == 3:
+            break
+        client.resume()
+        client.hold()
+    client.resume()
+
+
+def test_home_jog_and_cli_verbs(client: Client) -> None:
+    moved_away(client)
+    before = client.status().joints["j2"]
+
+    def cli(*arguments: str) -> tuple[int, dict[str, object]]:
+        done = subprocess.run(
+            [sys.executable, "-m", "stereoservo.cli.main", *arguments, "--json"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.returncode, json.loads(done.stdout)
+
+    code, state = cli("jog", CELL, "j2=0.1", "--seconds", "0.3")
+    assert code == 0
+    assert state["joints"]["j2"] > before + 0.01  # type: ignore[index]
+    code, reached = cli("home", CELL)
+    assert (code, reached["outcome"]) == (0, "reached")
+    code, checked = cli("goal", CELL, "park", "--check")
+    assert (code, checked["accepted"]) == (0, True)
+    code, stopped = cli("stop", CELL)
+    assert (code, stopped["accepted"]) == (0, True)
+    code, refused = cli("goal", CELL, "park")
+    assert code == 1
+    assert "resume" in refused["error"]["message"]  # type: ignore[index]
+    assert cli("resume", CELL)[0] == 0
+    code, aborted = cli("goal", CELL, "park", "--time-limit", "0.001", "--tolerance", "0.0001")
+    assert code == 1
+    assert aborted["error"]["code"] == "goal_aborted"  # type: ignore[index]
+
+
+# -- bad input ----------------------------------------------------------------------------------------------
+
+
+def park_points(client: Client) -> dict[str, dict[int, tuple[float, float]]]:
+    """Set-points where the markers are now."""
+    points: dict[str, dict[int, tuple[float, float]]] = {}
+    for message in client.watch(features=True):
+        if type(message).__name__ == "FeaturesMessage":
+            points[message.camera] = dict(zip(message.ids, message.pixels, strict=True))  # type: ignore[union-attr]
+        if len(points) == 2:
+            return points
+    raise AssertionError("the stream ended")
+
+
+def test_goals_that_cannot_be_are_refused_with_what_would_be_valid(client: Client) -> None:
+    points = park_points(client)
+    wrong_marker = {"left": {**points["left"], 99: (5.0, 5.0)}}
+    with pytest.raises(RefusedError, match=r"knows no marker 99; it knows: 0, 1, 2"):
+        client.goal(FeatureTarget(wrong_marker))
+    with pytest.raises(RefusedError, match=r"pixel \(700, 5\) is outside the image; u from -0\.5 to 639\.5"):
+        client.goal(FeatureTarget({"left": {**points["left"], 0: (700.0, 5.0)}}))
+    with pytest.raises(RefusedError, match=r"'stereo' works on set-points in images"):
+        client.goal({"j1": 0.0}, law="stereo")
+    with pytest.raises(RefusedError, match=r"no taught goal 'pork'; taught: park"):
+        client.goal("pork")
+    with pytest.raises(ValueError, match=r"target\.positions\.j1 is nan"):
+        client.goal({"j1": float("nan")})
+    raw = b'{"id":"12345678","target":{"kind":"joints","positions":{"j1":NaN}}}'
+    for reply in client.session.get(client.keys.goal("raw"), payload=raw, timeout=2.0):
+        answer = decode(reply.ok.payload.to_bytes(), Reply)
+        assert not answer.accepted
+        assert "NaN is not a JSON number" in answer.problems[0]
+        break
+    else:
+        raise AssertionError("no reply")
+    with pytest.raises(RefusedError, match="taught with model epoch 77"):
+        client.goal(FeatureTarget(points, model_epoch=77))
+    assert at_rest(client)
+    assert client.status().goal == ""
+
+
+def test_a_client_that_dies_in_mid_goal_stops_the_arm_when_its_lease_runs_out(client: Client) -> None:
+    moved_away(client)
+    code = f"""
+import time
+from stereoservo.gateway.client import Client
+client = Client({CELL!r})
+handle = client.goal("park", gain=0.05, lease_s=0.6, time_limit_s=60.0, tolerance_px=0.01)
+print(handle.id, flush=True)
+time.sleep(60)
+"""
+    with EventWatch(client) as watch:
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        goal = process.stdout.readline().strip()
+        assert goal
+        # It lives on its renewals for longer than its lease ...
+        with pytest.raises(ClientError, match="nothing within"):
+            watch.wait(
+                lambda e: e.id == goal and e.kind != "goal_accepted" and e.kind != "goal_started", "goal", 1.5
+            )
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        # ... and not without them.
+        event = watch.wait(lambda e: e.id == goal and e.kind == "goal_aborted", "the abort", 10.0)
+    assert event.reasons[0].code == "LEASE_EXPIRED"
+    eventually("the arm rests", lambda: at_rest(client))
+
+
+def test_every_goal_has_one_terminal_event(client: Client) -> None:
+    moved_away(client)
+    ends = ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted")
+    with EventWatch(client) as watch:
+        first = client.goal("park", gain=0.05)
+        second = client.goal("park", gain=0.05)
+        second.cancel()
+        third = client.goal("park", gain=0.05)
+        client.stop()
+        assert first.wait(10.0).outcome == "preempted"
+        assert second.wait(10.0).outcome == "cancelled"
+        assert third.wait(10.0).outcome == "aborted"
+        client.resume()
+        client.goal({"j1": client.status().joints["j1"]}).reached(30.0)
+        ended = [event.id for event in watch.poll() if event.kind in ends]
+    for handle in (first, second, third):
+        assert ended.count(handle.id) == 1
+
+
+def test_ctrl_c_in_a_goal_cancels_it(client: Client) -> None:
+    moved_away(client)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stereoservo.cli.main", "goal", CELL, "park", "--gain", "0.05", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    assert "accepted" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=30.0)
+    assert process.returncode == 130
+    assert json.loads(out)["error"]["code"] == "interrupted"
+    eventually("the arm rests", lambda: at_rest(client) and client.status().goal == "")

@@ -1,0 +1,236 @@
+"""The daemon as real processes: starts that fail, modes, and the death of each process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from stereoservo.gateway.client import Client, DaemonLostError, EventWatch, NoReplyError, RefusedError
+from stereoservo.gateway.messages import EventMessage
+from stereoservo.gateway.session import SessionError
+from stereoservo.runtime.commands import Goal, JointTarget
+from stereoservo.runtime.daemon import DaemonError, DaemonProcess, NotRunningError, find_daemon, live_cells
+from stereoservo.runtime.directories import CellDirectories
+from stereoservo.runtime.handover import StopSlot
+from stereoservo.runtime.replay import replay
+
+from .conftest import CELL, at_rest, eventually, moved_away, processes
+
+pytestmark = pytest.mark.process
+
+Start = Callable[..., DaemonProcess]
+
+# -- starts that fail ---------------------------------------------------------------------------------------
+
+
+def test_two_daemons_on_one_cell(live: DaemonProcess, start: Start, calibrated: Path) -> None:
+    second = start(calibrated, ready=False)
+    assert second.process.wait(60.0) == 1
+    assert f"cell '{CELL}' is already in use by process {live.process.pid}" in second.output()
+    assert f"kill {live.process.pid}" in second.output()
+    assert live.process.poll() is None
+    with Client(CELL) as client:
+        assert client.status().servo_alive
+
+
+def changed(cell_file: Path, old: str, new: str) -> Path:
+    text = cell_file.read_text()
+    assert old in text
+    path = cell_file.with_name("changed.toml")
+    path.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[servo]", "[servo]\nspeed = 1", "unknown field `speed`"),
+        ('driver = "fake"\n#', 'driver = "kuka"\n#', "no joint driver 'kuka'; there are:"),
+        ('joint = "j6"', 'joint = "j7"', "j6"),
+        (
+            'driver = "fake"\nmount',
+            'driver = "fake"\ndetector = "dots"\nmount',
+            "delivers observations; leave the detector out",
+        ),
+        ("schema = 1", "schema = 1\n[zenoh]\nendpoints = ['tcp/0.0.0.0:7447']", "every host"),
+    ],
+)
+def test_a_cell_that_cannot_run_says_why_and_leaves_nothing(
+    old: str, new: str, message: str, cell_file: Path, start: Start, directories: CellDirectories
+) -> None:
+    daemon = start(changed(cell_file, old, new), ready=False)
+    assert daemon.process.wait(90.0) == 1
+    assert message in daemon.output()
+    assert not processes(directories)
+    assert not directories.daemon.exists()
+
+
+def moving(client: Client) -> None:
+    """A slow goal that is under way."""
+    moved_away(client)
+    client.goal("park", gain=0.05, time_limit_s=300.0, tolerance_px=0.01).abandon()
+    eventually("the arm moves", lambda: not at_rest(client))
+
+
+# -- deaths -------------------------------------------------------------------------------------------------
+
+
+def test_a_hung_gateway_means_hold(own: Client, directories: CellDirectories) -> None:
+    moving(own)
+    gateway = processes(directories)["gateway"]
+    os.kill(gateway, signal.SIGSTOP)
+    try:
+        with pytest.raises(NoReplyError):
+            own.status()
+    finally:
+        os.kill(gateway, signal.SIGCONT)
+    eventually("the cell is held", lambda: any(reason.code == "HELD" for reason in own.status().reasons))
+    assert at_rest(own)
+    own.resume()
+    eventually("the goal goes on", lambda: not at_rest(own))
+
+
+def test_a_stop_needs_no_gateway(own: Client, directories: CellDirectories) -> None:
+    moving(own)
+    gateway = processes(directories)["gateway"]
+    os.kill(gateway, signal.SIGSTOP)
+    try:
+        slot = StopSlot(directories.stop_slot)
+        word = slot.raise_stop()
+        eventually("the servo process has seen it", lambda: slot.acknowledged(word))
+    finally:
+        os.kill(gateway, signal.SIGCONT)
+    eventually("the arm rests", lambda: at_rest(own))
+
+
+def test_a_killed_gateway_holds_the_arm_and_comes_back_with_its_events(
+    own: Client, directories: CellDirectories
+) -> None:
+    moving(own)
+    old = processes(directories)["gateway"]
+    with EventWatch(own) as watch:
+        os.kill(old, signal.SIGKILL)
+        eventually("a new gateway", lambda: processes(directories).get("gateway", old) != old)
+        with pytest.raises(DaemonLostError):
+            watch.wait(lambda e: False, "nothing", 30.0)
+
+    def held() -> bool:
+        try:
+            with Client(CELL) as again:
+                events = again.events(1).events
+        except (NoReplyError, SessionError, NotRunningError, RefusedError):
+            return False
+        found: list[EventMessage] = [event for event in events if event.kind == "held"]
+        return bool(found) and any(event.kind == "goal_started" for event in events)
+
+    eventually("its events are there again, with the hold", held)
+    with Client(CELL) as again:
+        assert at_rest(again)
+        assert [taught.name for taught in again.info().taught] == ["park"]
+
+
+def test_a_killed_vision_process_comes_back(own: Client, directories: CellDirectories) -> None:
+    old = processes(directories)["vision-left"]
+    with EventWatch(own) as watch:
+        os.kill(old, signal.SIGKILL)
+        event = watch.wait(lambda e: e.kind == "process_ended", "the report", 20.0)
+        assert "vision-left ended by signal SIGKILL" in event.message
+    eventually("a new one", lambda: processes(directories).get("vision-left", old) != old)
+    eventually("it sees", lambda: own.status().visible["left"] > 0)
+    own.goal("park", tolerance_px=0.5, hold_frames=3).reached(60.0)
+
+
+def test_a_killed_servo_process_ends_everything_with_an_error(
+    live: DaemonProcess, directories: CellDirectories
+) -> None:
+    os.kill(processes(directories)["servo"], signal.SIGKILL)
+    assert live.process.wait(30.0) == 1
+    assert "the servo process ended by signal SIGKILL" in live.output()
+    assert not processes(directories)
+    assert live_cells() == []
+
+
+def test_a_killed_supervisor_leaves_no_orphan(live: DaemonProcess, directories: CellDirectories) -> None:
+    live.process.kill()
+    live.process.wait()
+    eventually("no process is left", lambda: not processes(directories))
+
+
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_signal_ends_it_with_the_arm_stopped(
+    how: signal.Signals, code: int, own: Client, live: DaemonProcess, directories: CellDirectories
+) -> None:
+    moving(own)
+    assert live.stop(how) == code
+    assert not processes(directories)
+    assert not directories.daemon.exists()
+    events = [json.loads(line) for line in directories.journal.read_text().splitlines()]
+    last = [event["kind"] for event in events if event["boot"] == events[-1]["boot"]]
+    assert "stopped" in last
+    with pytest.raises(NotRunningError):
+        find_daemon(CELL)
+
+
+def test_ctrl_c_while_it_starts_leaves_nothing(start: Start, directories: CellDirectories) -> None:
+    for wait in ("describe", "servo"):
+        daemon = start(ready=False)
+        eventually(f"{wait} runs", lambda name=wait: name in processes(directories))  # type: ignore[misc]
+        assert daemon.stop(signal.SIGINT) == 130
+        assert not processes(directories)
+
+
+# -- modes --------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_replays_bit_for_bit(calibrated: Path, start: Start, roots: Path) -> None:
+    path = roots / "flight.mcap"
+    daemon = start(calibrated, "--record", str(path))
+    with Client(CELL) as client:
+        client.enable()
+        moved_away(client)
+        client.goal("park", tolerance_px=0.5, hold_frames=3).reached(60.0)
+        assert client.info().recording == str(path)
+    assert daemon.stop() == 0
+    result = replay(path)
+    assert result.identical is True
+    assert result.steps > 500
+    assert result.checkpoints >= 1
+
+
+def test_a_dry_run_moves_nothing(calibrated: Path, start: Start) -> None:
+    start(calibrated, "--dry-run")
+    with Client(CELL) as client:
+        client.enable()
+        before = client.status().joints
+        handle = client.send(Goal("abcdef00", JointTarget({"j1": before["j1"] + 0.2}), time_limit_s=1.0))
+        assert handle.wait(30.0).outcome == "aborted"
+        assert client.status().joints == before
+        assert client.info().dry_run
+
+
+def test_commissioning_caps_the_speed(calibrated: Path, start: Start) -> None:
+    start(calibrated, "--commissioning")
+    with Client(CELL) as client:
+        client.enable()
+        limit = {joint.name: joint.velocity_max for joint in client.info().joints}
+        fastest = 0.0
+        client.goal({"j1": client.status().joints["j1"] + 0.5}, time_limit_s=2.0).abandon()
+        eventually("the goal is active", lambda: client.status().goal)
+        while client.status().goal:
+            fastest = max(fastest, abs(client.status().command["j1"]))
+        assert 0.0 < fastest <= 0.05 * limit["j1"] * (1 + 1e-9)
+
+
+def test_a_daemon_that_does_not_start_tells_its_starter(cell_file: Path, start: Start) -> None:
+    daemon = start(
+        changed(cell_file, 'driver = "fake"\n#', 'driver = "fake"\noptions = { colour = "red" }\n#'),
+        ready=False,
+    )
+    with pytest.raises(DaemonError, match="colour") as caught:
+        daemon.wait_ready()
+    assert caught.value.code == 1
