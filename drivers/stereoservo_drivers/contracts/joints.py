@@ -271,14 +271,18 @@ class JointDriverContract(PacedSuite):
         record_property: Callable[[str, object], None],
     ) -> None:
         description = active.describe()
-        velocity = np.zeros(len(description.joints))
+        velocity = self.slow(active)
+        period = 1.0 / description.rate_hz
 
-        def read() -> None:
-            self.wait(context, 1.0 / description.rate_hz)
-            active.read_state()
+        def cycle() -> None:
+            active.write_velocity(velocity)
+            self.wait(context, period)
 
-        reads = measure(100, read if not self.real_time else active.read_state)
-        writes = measure(100, lambda: active.write_velocity(velocity))
+        reads = measure(100, active.read_state, before=cycle)
+        writes = measure(
+            100, lambda: active.write_velocity(velocity), before=lambda: self.wait(context, period)
+        )
+        active.stop()
         budget = description.call_budget_us
         report_budget(record_property, description.driver, budget, read_state=reads, write_velocity=writes)
         assert reads["median_us"] > 0
