@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from stereoservo_drivers.detectors.compilation import kernel
 
 SKIRT = 2.2
 """Distance to the ellipse, to first order, up to which a pixel outside counts [px] (in truth up to 2.8 at 4
@@ -51,7 +52,7 @@ def scratch() -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
     return np.zeros((MAX_WINDOW, MAX_WINDOW), np.int32), np.zeros(MAX_WINDOW * MAX_WINDOW, np.int32)
 
 
-@njit(cache=True)
+@kernel
 def _median(histogram, count):  # type: ignore[no-untyped-def]
     half = (count + 1) // 2
     total = 0
@@ -62,7 +63,7 @@ def _median(histogram, count):  # type: ignore[no-untyped-def]
     return 255.0
 
 
-@njit(cache=True)
+@kernel
 def _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found):  # type: ignore[no-untyped-def]
     """Label the bright components of a window; the label of the one nearest to (pu, pv), 0 if there is none.
 
@@ -141,7 +142,7 @@ def _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, st
     return best
 
 
-@njit(cache=True)
+@kernel
 def _ring_level(image, dark, u_min, u_max, v_min, v_max):  # type: ignore[no-untyped-def]
     """Median level of the rectangular ring 3 to 4 px outside a bounding box (all inside the image)."""
     histogram = np.zeros(256, np.int32)
@@ -160,7 +161,7 @@ def _ring_level(image, dark, u_min, u_max, v_min, v_max):  # type: ignore[no-unt
     return _median(histogram, count)
 
 
-@njit(cache=True)
+@kernel
 def _ellipse(image, dark, box, labels, label, found, background, contrast, out):  # type: ignore[no-untyped-def]
     """Soft area, centre and ellipse matrix into ``out``. False where no ellipse can be had."""
     u0, v0, u1, v1 = box
@@ -215,21 +216,21 @@ def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
     return True
 
 
-@njit(cache=True)
+@kernel
 def smaller_half_axis(q11, q12, q22):  # type: ignore[no-untyped-def]
     """Smaller half axis [px] of the ellipse dᵀQd = 1."""
     middle = 0.5 * (q11 + q22)
     return 1.0 / np.sqrt(middle + np.sqrt(0.25 * (q11 - q22) ** 2 + q12 * q12))
 
 
-@njit(cache=True)
+@kernel
 def _reach(q11, q12, q22):  # type: ignore[no-untyped-def]
     """How far the window extends outside the ellipse [px], where the distance to first order is SKIRT."""
     thin = smaller_half_axis(q11, q12, q22)
     return SKIRT + np.sqrt(SKIRT * SKIRT + thin * thin) - thin
 
 
-@njit(cache=True)
+@kernel
 def _window_sums(image, dark, background, out, sums, edge):  # type: ignore[no-untyped-def]
     """S (2), J (4), sum T Tᵀ (3) at the centre in ``out``; where ``edge``, the odd harmonics of the edge's
     level.
@@ -302,7 +303,7 @@ def _window_sums(image, dark, background, out, sums, edge):  # type: ignore[no-u
     return True
 
 
-@njit(cache=True)
+@kernel
 def _noise(image, dark, background, out):  # type: ignore[no-untyped-def]
     """Variance of the dot's surroundings about a plane [grey levels squared]; -1 where there is too little
     to see.
@@ -373,7 +374,7 @@ def _noise(image, dark, background, out):  # type: ignore[no-untyped-def]
     return max(sii - a * sxi - b * syi, 0.0) / (n - 3.0)
 
 
-@njit(cache=True)
+@kernel
 def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels, stack, out):  # type: ignore[no-untyped-def]
     """Measure the dot nearest to (pu, pv) in the window [u0, u1) x [v0, v1) of ``image`` (h, w) uint8.
 

@@ -24,11 +24,12 @@ from stereoservo.runtime.ports import (
     ImageArray,
     Prior,
 )
+from stereoservo_drivers.detectors import patterns, tracking
 from stereoservo_drivers.detectors.blobs import find_spots
 from stereoservo_drivers.detectors.centroids import AREA, CXX, CXY, CYY, FIELDS, NOISE, scratch
-from stereoservo_drivers.detectors.patterns import find_face
+from stereoservo_drivers.detectors.patterns import basis_inverse, find_face
 from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY
-from stereoservo_drivers.detectors.tracking import settle_face, track
+from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, measure_windows, settle_face
 
 QUANTISATION = 1.0 / 12.0
 """Least noise variance [grey levels squared]: rounding to whole levels."""
@@ -85,7 +86,7 @@ class _Pattern:
     positions: FloatArray
     radius: float
     bases: npt.NDArray[np.int64]
-    spare_bases: npt.NDArray[np.int64]
+    inverses: FloatArray
 
 
 _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
@@ -118,12 +119,14 @@ class DotDetector:
         self._patterns = _patterns(self.options)
         self._dark = self.options.polarity == "dark"
         self._labels, self._stack = scratch()
+        patterns.compile_kernels()
+        tracking.compile_kernels()
         self._size = self.options.image_size
         self._every_id = np.array([pattern.ids for pattern in self._patterns])
         self._positions = np.array([pattern.positions for pattern in self._patterns])
         self._radii = np.array([pattern.radius for pattern in self._patterns])
         self._ids = tuple(sorted(self._every_id.ravel().tolist()))
-        self._place = {int(i): (f, r) for f, p in enumerate(self._patterns) for r, i in enumerate(p.ids)}
+        self._place = {marker: k for k, marker in enumerate(self._every_id.ravel().tolist())}
 
     def describe(self) -> DetectorDescription:
         """The marker ids of all faces."""
@@ -169,29 +172,32 @@ class DotDetector:
 
     def _track(self, image: ImageArray, prior: Prior, dt_s: float) -> _Found:
         options = self.options
-        motion = prior.velocities * dt_s
-        predicted = prior.pixels + motion
-        xx, xy, yy = prior.covariances[:, 0, 0], prior.covariances[:, 0, 1], prior.covariances[:, 1, 1]
-        largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        spread = 3.0 * np.sqrt(np.maximum(largest, 0.0)) + 0.25 * np.abs(motion).sum(axis=1)
-        usable = np.isfinite(predicted.sum(axis=1) + spread)
-        shape = self._every_id.shape
-        places, spreads = np.zeros((*shape, 2)), np.zeros(shape)
-        present, gates = np.zeros(shape, np.bool_), np.zeros((*shape, 3))
-        for k, marker in enumerate(prior.ids.tolist()):
-            where = self._place.get(marker)
-            if where is not None and usable[k]:
-                places[where] = predicted[k]
-                spreads[where] = spread[k]
-                present[where] = True
-                if options.gate_sigma:
-                    gates[where] = _gate(prior.covariances[k], options.gate_sigma)
-        dots, used = np.zeros((*shape, FIELDS)), np.zeros(shape, np.bool_)
-        track(
-            image, self._dark, self._positions, self._radii, places, spreads, present, gates, options.min_contrast,
-            options.lopsided, options.consistency_px, self._labels, self._stack, dots, used,
+        faces, n = self._every_id.shape
+        m = faces * n
+        predicted, present = np.zeros((m, 2)), np.zeros(m, np.bool_)
+        shapes, windows, least = np.zeros((m, SHAPE)), np.zeros((m, 4), np.int64), np.zeros(m, np.int64)
+        dots, used, status = np.zeros((m, FIELDS)), np.zeros(m, np.bool_), np.zeros(m, np.int64)
+        covariances = np.ascontiguousarray(prior.covariances, np.float64)
+        ids = np.ascontiguousarray(prior.ids, np.int64)
+        expect(
+            self._every_id, self._positions, self._radii, ids, np.ascontiguousarray(prior.pixels, np.float64),
+            np.ascontiguousarray(prior.velocities, np.float64), covariances, dt_s, predicted, present, shapes, windows,
+            least,
         )  # fmt: skip
-        return dots, used
+        measure_windows(
+            image, self._dark, windows, predicted, options.min_contrast, least, self._labels, self._stack,
+            dots, status
+        )  # fmt: skip
+        gates = np.zeros((m, 3))
+        if options.gate_sigma:
+            for k, marker in enumerate(ids.tolist()):
+                if marker in self._place:
+                    gates[self._place[marker]] = _gate(covariances[k], options.gate_sigma)
+        judge(
+            self._positions, self._radii, predicted, present, shapes, status, gates, options.lopsided,
+            options.consistency_px, dots, used,
+        )  # fmt: skip
+        return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
 
     def _acquire(self, image: ImageArray) -> _Found:
         options = self.options
@@ -208,12 +214,12 @@ class DotDetector:
         owners = np.full(self._every_id.shape, -1, np.int64)
         for pattern, owner in zip(self._patterns, owners, strict=True):
             count = 0
-            for bases in (pattern.bases, pattern.spare_bases):
-                # the spare bases stand in for a hidden corner
+            for bases in (slice(0, 1), slice(1, None)):
+                # the first basis is the corners, the others stand in where one is hidden
                 if count == 0 and len(spots) >= options.acquire_dots:
                     count = find_face(
-                        pattern.positions, pattern.radius, centres, areas, bases, options.acquire_dots, 1.5,
-                        options.consistency_px, owner,
+                        pattern.positions, pattern.radius, centres, areas, pattern.bases[bases],
+                        pattern.inverses[bases], options.acquire_dots, 1.5, options.consistency_px, owner,
                     )  # fmt: skip
         owners = _without_conflicts(owners)
         used = owners >= 0
@@ -318,12 +324,13 @@ def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float
         )
     unit = 0.5 * float(np.linalg.norm(edges, axis=1).mean())
     scaled = np.ascontiguousarray((positions - corners.mean(axis=0)) / unit)
+    bases = np.array([CORNERS, *(_spare_basis(scaled, corner) for corner in CORNERS)], np.int64)
     return _Pattern(
         ids=np.array(ids, np.int64),
         positions=scaled,
         radius=radius / unit,
-        bases=np.array([CORNERS], np.int64),
-        spare_bases=np.array([_spare_basis(scaled, corner) for corner in CORNERS], np.int64),
+        bases=bases,
+        inverses=np.array([basis_inverse(scaled[basis]) for basis in bases]),
     )
 
 

@@ -8,13 +8,17 @@ mirrored pattern has not.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
+
+from stereoservo_drivers.detectors.compilation import FLOAT, INT, compile_for, given, kernel, written
+
+FloatArray = npt.NDArray[np.float64]
 
 CLEAR = 1.6
 """Least ratio of misfits between the second-best and the best explanation of the same dots."""
 
 
-@njit(cache=True)
+@kernel
 def _solve(A, b):  # type: ignore[no-untyped-def]
     """Gaussian elimination with partial pivoting, in place; the solution is in ``b``. False if singular."""
     n = b.size
@@ -42,7 +46,7 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@kernel
 def _normal_matrix(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
     """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = middle and scale
     of the pixels.
@@ -67,7 +71,7 @@ def _normal_matrix(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-un
     return True
 
 
-@njit(cache=True)
+@kernel
 def _row(point, axis, target, depth, row):  # type: ignore[no-untyped-def]
     row[:] = 0.0
     row[3 * axis] = point[0] / depth
@@ -77,7 +81,7 @@ def _row(point, axis, target, depth, row):  # type: ignore[no-untyped-def]
     row[7] = -target * point[1] / depth
 
 
-@njit(cache=True)
+@kernel
 def _fit(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
     """Homography in normalised pixels into ``h`` (8,). False where it is undetermined or depths are not
     positive.
@@ -103,14 +107,15 @@ def _fit(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
     for _ in range(1 if n == 4 else 3):
         if not _normal_matrix(pattern, pixels, used, frame, h, A, b) or not _solve(A, b):
             return False
-        h[:] = b
+        for j in range(8):
+            h[j] = b[j]
+    nearest = 1.0
     for i in range(used.size):
-        if h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0 < 1e-3:
-            return False
-    return True
+        nearest = min(nearest, h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0)
+    return nearest > 1e-3
 
 
-@njit(cache=True)
+@kernel
 def _in_pixels(frame, h, H):  # type: ignore[no-untyped-def]
     for j in range(2):
         H[j, 0] = frame[2] * h[3 * j] + frame[j] * h[6]
@@ -121,7 +126,7 @@ def _in_pixels(frame, h, H):  # type: ignore[no-untyped-def]
     H[2, 2] = 1.0
 
 
-@njit(cache=True)
+@kernel
 def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
     """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,),
     into ``H``.
@@ -140,7 +145,7 @@ def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@kernel
 def image_of_circle(H, x, y, radius, out):  # type: ignore[no-untyped-def]
     """The picture of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's
     centre, ellipse area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen
@@ -177,7 +182,7 @@ def image_of_circle(H, x, y, radius, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@kernel
 def misfits(pattern, pixels, used, H, out):  # type: ignore[no-untyped-def]
     """Distances (n,) [px] between pixels and projected pattern; 0 where not used. Returns the largest."""
     worst = 0.0
@@ -193,7 +198,7 @@ def misfits(pattern, pixels, used, H, out):  # type: ignore[no-untyped-def]
     return worst
 
 
-@njit(cache=True)
+@kernel
 def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):  # type: ignore[no-untyped-def]
     """The dot that fits the others least, -1 where each lies where the others put it.
 
@@ -220,8 +225,10 @@ def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):  #
             e[axis] = target / depth
             for j in range(8):
                 e[axis] -= rows[axis, j] * h[j]
-            work[:] = A
-            solved[axis] = rows[axis]
+            for j in range(8):
+                solved[axis, j] = rows[axis, j]
+                for k in range(8):
+                    work[j, k] = A[j, k]
             if not _solve(work, solved[axis]):
                 return -2
         m11, m12, m22 = 1.0, 0.0, 1.0
@@ -244,7 +251,7 @@ def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):  #
     return worst
 
 
-@njit(cache=True)
+@kernel
 def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):  # type: ignore[no-untyped-def]
     """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of where the others
     put it.
@@ -274,23 +281,22 @@ def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):  # type: 
     return False
 
 
-@njit(cache=True)
+@kernel
 def _turn(a, b, c):  # type: ignore[no-untyped-def]
     """Twice the signed area of a triangle; positive when clockwise as seen (v down)."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-@njit(cache=True)
-def _basis_inverse(pattern, basis, inverse):  # type: ignore[no-untyped-def]
-    """Inverse (3, 3) of the matrix that maps the standard projective basis to four pattern points."""
-    p, q, r, s = pattern[basis[0]], pattern[basis[1]], pattern[basis[2]], pattern[basis[3]]
-    whole = _turn(p, q, r)
-    a, b, c = _turn(s, q, r) / whole, _turn(p, s, r) / whole, _turn(p, q, s) / whole
-    M = np.array([[a * p[0], b * q[0], c * r[0]], [a * p[1], b * q[1], c * r[1]], [a, b, c]])
-    inverse[:] = np.linalg.inv(M)
+def basis_inverse(positions: FloatArray) -> FloatArray:
+    """Inverse (3, 3) of the matrix that maps the standard projective basis to four points (4, 2), scales
+    included.
+    """
+    M = np.column_stack([positions, np.ones(4)]).T
+    scaled: FloatArray = M[:, :3] * np.linalg.solve(M[:, :3], M[:, 3])
+    return np.linalg.inv(scaled)
 
 
-@njit(cache=True)
+@kernel
 def _hypothesis(p, q, r, s, inverse, H):  # type: ignore[no-untyped-def]
     """Homography of four pattern points (by ``inverse``) to four pixels, H[2, 2] > 0."""
     whole = _turn(p, q, r)
@@ -308,7 +314,7 @@ def _hypothesis(p, q, r, s, inverse, H):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@kernel
 def _promising(pattern, pixels, basis, least, reach, H):  # type: ignore[no-untyped-def]
     """Whether enough dots outside the basis have something near their place."""
     missing = pattern.shape[0] - least
@@ -332,7 +338,7 @@ def _promising(pattern, pixels, basis, least, reach, H):  # type: ignore[no-unty
     return True
 
 
-@njit(cache=True)
+@kernel
 def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: ignore[no-untyped-def]
     """Dots nearest to the projected pattern into ``owner`` (n,), -1 where none has the right place and size.
 
@@ -363,14 +369,14 @@ def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: i
     return count
 
 
-@njit(cache=True)
-def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, owner):  # type: ignore[no-untyped-def]
+@kernel
+def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tolerance, owner):  # type: ignore[no-untyped-def]
     """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas``
     (m,) [px²].
 
-    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4), pruned by the signs and
-    sizes of its triangles, which the dots' areas foretell. A hypothesis counts when ``least`` dots or more
-    lie within ``tolerance`` [px] of the homography fitted to all of them and are of the right size. ``owner`` (n,) gets the dots' rows,
+    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4) with its ``inverses`` (b,
+    3, 3), pruned by the signs and sizes of its triangles, which the dots' areas foretell. A hypothesis
+    counts when ``least`` dots or more lie within ``tolerance`` [px] of the homography fitted to all of them and are of the right size. ``owner`` (n,) gets the dots' rows,
     -1 for missing ones. Returns the number found; 0 if none, or if another assignment explains as many dots
     nearly as well.
     """
@@ -378,7 +384,6 @@ def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, ow
     m = pixels.shape[0]
     unit = np.pi * radius * radius
     H = np.zeros((3, 3))
-    inverse = np.zeros((3, 3))
     circle = np.zeros(7)
     trial = np.zeros(n, np.int64)
     used = np.zeros(n, np.bool_)
@@ -394,7 +399,7 @@ def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, ow
         t013 = _turn(pattern[basis[0]], pattern[basis[1]], pattern[basis[3]])
         t023 = _turn(pattern[basis[0]], pattern[basis[2]], pattern[basis[3]])
         t123 = _turn(pattern[basis[1]], pattern[basis[2]], pattern[basis[3]])
-        _basis_inverse(pattern, basis, inverse)
+        inverse = inverses[row]
         for i in range(m):
             for j in range(m):
                 if j == i or areas[j] > 3.0 * areas[i] or areas[i] > 3.0 * areas[j]:
@@ -449,8 +454,17 @@ def find_face(pattern, radius, pixels, areas, bases, least, reach, tolerance, ow
                             rival = best_misfit
                         best_count = count
                         best_misfit = misfit
-                        owner[:] = trial
+                        for d in range(n):
+                            owner[d] = trial[d]
     if best_count == 0 or rival < CLEAR * best_misfit or rival < 0.5 * tolerance:
         owner[:] = -1
         return 0
     return best_count
+
+
+def compile_kernels() -> None:
+    """Compile what the detector calls, or load it from the cache."""
+    compile_for(
+        find_face, given(FLOAT, 2), FLOAT, given(FLOAT, 2), given(FLOAT, 1), given(INT, 2), given(FLOAT, 3), INT, FLOAT, FLOAT,
+        written(INT, 1),
+    )  # fmt: skip

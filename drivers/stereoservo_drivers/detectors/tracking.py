@@ -1,10 +1,13 @@
-"""Tracking: one face's dots in windows placed by a prior. Numba kernels; no state."""
+"""Tracking: faces of dots in windows placed by a prior. Numba kernels; no state.
+
+Three steps: :func:`expect` turns a prior into windows and expected shapes, :func:`measure_windows`
+measures, :func:`judge` accepts. Arrays of dots are flat over the faces: dot ``i`` of face ``f`` is row ``f
+n + i``.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
-from numba import njit
 
 from stereoservo_drivers.detectors.centroids import (
     AREA,
@@ -21,6 +24,17 @@ from stereoservo_drivers.detectors.centroids import (
     measure,
     smaller_half_axis,
 )
+from stereoservo_drivers.detectors.compilation import (
+    BOOL,
+    FLOAT,
+    IMAGE,
+    INT,
+    INT32,
+    compile_for,
+    given,
+    kernel,
+    written,
+)
 from stereoservo_drivers.detectors.patterns import drop_strangers, fit_homography, image_of_circle
 
 MIN_HALF_WINDOW = 14
@@ -29,130 +43,167 @@ SHAPE_MARGIN = 6
 """Pixels between a dot's expected outline and the rim of its window, beside the prior's uncertainty."""
 THINNEST = 1.0
 """Half axis [px] below which a dot is too thin to measure."""
-
 FEW_TOLERANCE = 0.7
 """How far four or five dots of a face may lie from their predictions, up to a similarity [px]."""
+SHAPE = 7
+"""Columns of an expected dot, as :func:`~stereoservo_drivers.detectors.patterns.image_of_circle` writes
+them.
+"""
 
-Measurements = npt.NDArray[np.float64]
 
+@kernel
+def measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, out, status):  # type: ignore[no-untyped-def]
+    """:func:`measure` in windows (k, 4) about points (k, 2) [px], components of ``least`` (k,) pixels or
+    more.
 
-@njit(cache=True)
-def measure_windows(image, dark, windows, near, min_contrast, min_area, labels, stack, out):  # type: ignore[no-untyped-def]
-    """:func:`measure` over windows (k, 4) about points (k, 2); returns the statuses (k,)."""
-    status = np.zeros(windows.shape[0], np.int64)
+    Writes ``out`` (k, FIELDS) and ``status`` (k,); empty windows are skipped with ``BORDER``.
+    """
     for k in range(windows.shape[0]):
         u0, v0, u1, v1 = windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3]
         status[k] = measure(
-            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, min_area, labels, stack, out[k]
+            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, least[k], labels, stack, out[k]
         )
-    return status
 
 
-@njit(cache=True)
-def _is_whole(dot, lopsided):  # type: ignore[no-untyped-def]
+@kernel
+def whole(dot, lopsided):  # type: ignore[no-untyped-def]
+    """Whether a measurement (FIELDS,) is of a whole dot: not cut, not merged with something else."""
     thin = smaller_half_axis(dot[QXX], dot[QXY], dot[QYY])
     # thin dots suffer from sampling: measured 0.04 at 2 px, 0.13 at 1.4 px
     limit = lopsided + np.exp(-1.4 * thin) + 2.5 * dot[LOPSIDED_NOISE] * np.sqrt(max(dot[NOISE], 0.08))
     return dot[LOPSIDED] < limit
 
 
-@njit(cache=True)
-def whole(dots, lopsided):  # type: ignore[no-untyped-def]
-    """Which measurements (k, FIELDS) are of whole dots: not cut, not merged with something else."""
-    result = np.zeros(dots.shape[0], np.bool_)
-    for k in range(dots.shape[0]):
-        result[k] = _is_whole(dots[k], lopsided)
-    return result
-
-
-@njit(cache=True)
+@kernel
 def _median(values, used):  # type: ignore[no-untyped-def]
-    chosen = np.sort(values[used])
-    return chosen[(chosen.size - 1) // 2] if chosen.size else 0.0
-
-
-@njit(cache=True)
-def track_face(image, dark, pattern, radius, predicted, spread, present, others, min_contrast, lopsided, labels, stack, out, used):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Measure the dots of one face near ``predicted`` (n, 2) [px] where ``present`` (n,), into ``out`` (n,
-    FIELDS).
-
-    ``spread`` (n,) [px]: how far a dot may be from its prediction. ``others`` (k, 2): predictions of all
-    dots of the prior; a dot must lie nearer to its own than to any other. ``used`` (n,) gets what passed
-    the gates. Returns the number.
-    """
-    n = pattern.shape[0]
-    used[:] = False
-    H = np.zeros((3, 3))
-    if not fit_homography(pattern, predicted, present, H):
-        return 0
-    circles = np.zeros((n, 7))
-    for i in range(n):
-        if not image_of_circle(H, pattern[i, 0], pattern[i, 1], radius, circles[i]):
-            return 0
-        if present[i] and circles[i, 6] < THINNEST:
-            return 0
-    for i in range(n):
-        if not present[i]:
-            continue
-        half = int(np.ceil(circles[i, 5] + spread[i])) + SHAPE_MARGIN
-        if half > MAX_HALF_WINDOW:
-            return 0
-        half = max(half, MIN_HALF_WINDOW)
-        pu, pv = predicted[i, 0], predicted[i, 1]
-        if not (-1e6 < pu < 1e6 and -1e6 < pv < 1e6):
-            continue
-        u, v = int(np.floor(pu + 0.5)), int(np.floor(pv + 0.5))
-        dot = out[i]
-        least = max(5, int(0.4 * circles[i, 4]))
-        if (
-            measure(
-                image,
-                dark,
-                u - half,
-                v - half,
-                u + half + 1,
-                v + half + 1,
-                pu,
-                pv,
-                min_contrast,
-                least,
-                labels,
-                stack,
-                dot,
-            )
-            != OK
-        ):
-            continue
-        most = np.pi * (circles[i, 5] + 1.0) * (circles[i, 6] + 1.0) * 1.4
-        if dot[AREA] < 0.6 * circles[i, 4] or dot[AREA] > most or not _is_whole(dot, lopsided):
-            continue
-        own = (dot[0] - pu) ** 2 + (dot[1] - pv) ** 2
-        nearest = True
-        for k in range(others.shape[0]):
-            d = (dot[0] - others[k, 0]) ** 2 + (dot[1] - others[k, 1]) ** 2
-            if d < own and (others[k, 0] != pu or others[k, 1] != pv):
-                nearest = False
-        if nearest:
-            used[i] = True
-    # against the neighbours: contrast, and area in units of the expected one
-    contrasts = np.zeros(n)
-    scales = np.zeros(n)
-    for i in range(n):
-        contrasts[i] = out[i, CONTRAST]
-        scales[i] = out[i, AREA] / circles[i, 4]
-    contrast = _median(contrasts, used)
-    scale = _median(scales, used)
-    count = 0
-    for i in range(n):
+    chosen = np.empty(values.size)
+    n = 0
+    for i in range(values.size):
         if used[i]:
-            used[i] = (
-                0.5 * contrast < contrasts[i] < 2.0 * contrast and 0.8 * scale < scales[i] < 1.25 * scale
-            )
-            count += 1 if used[i] else 0
+            k = n
+            while k > 0 and chosen[k - 1] > values[i]:
+                chosen[k] = chosen[k - 1]
+                k -= 1
+            chosen[k] = values[i]
+            n += 1
+    return chosen[(n - 1) // 2] if n else 0.0
+
+
+@kernel
+def expect(every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s, predicted, present, shapes, windows, least):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Windows for the dots of a prior of ``ids`` (k,), ``pixels``, ``velocities`` (k, 2), ``covariances``
+    (k, 2, 2).
+
+    ``every_id`` (f, n), ``patterns`` (f, n, 2), ``radii`` (f,) are the faces. Writes ``predicted`` (m, 2)
+    [px] at ``dt_s`` [s] after the prior, ``present`` (m,), ``shapes`` (m, SHAPE), ``windows`` (m, 4),
+    ``least`` (m,) pixels of a dot. Faces that the prior shows from behind, too thin, too uncertain or by
+    fewer than four dots stay empty. Returns the number of windows.
+    """
+    faces, n = every_id.shape
+    count = 0
+    H = np.zeros((3, 3))
+    spread = np.zeros(n)
+    for f in range(faces):
+        mine = present[f * n : (f + 1) * n]
+        places = predicted[f * n : (f + 1) * n]
+        for i in range(n):
+            for k in range(ids.size):
+                if ids[k] != every_id[f, i]:
+                    continue
+                du, dv = velocities[k, 0] * dt_s, velocities[k, 1] * dt_s
+                u, v = pixels[k, 0] + du, pixels[k, 1] + dv
+                xx, xy, yy = covariances[k, 0, 0], covariances[k, 0, 1], covariances[k, 1, 1]
+                largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+                reach = 3.0 * np.sqrt(max(largest, 0.0)) + 0.25 * (abs(du) + abs(dv))
+                # comparisons fail for NaN
+                if abs(u) < 1e6 and abs(v) < 1e6 and reach < MAX_HALF_WINDOW:
+                    places[i, 0] = u
+                    places[i, 1] = v
+                    spread[i] = reach
+                    mine[i] = True
+        good = fit_homography(patterns[f], places, mine, H)
+        for i in range(n):
+            shape = shapes[f * n + i]
+            if good and not image_of_circle(H, patterns[f, i, 0], patterns[f, i, 1], radii[f], shape):
+                good = False
+            if good and mine[i] and (shape[6] < THINNEST or shape[5] + spread[i] + SHAPE_MARGIN >
+            MAX_HALF_WINDOW):
+                good = False
+        for i in range(n):
+            if good and mine[i]:
+                shape = shapes[f * n + i]
+                half = max(int(np.ceil(shape[5] + spread[i])) + SHAPE_MARGIN, MIN_HALF_WINDOW)
+                u, v = int(np.floor(places[i, 0] + 0.5)), int(np.floor(places[i, 1] + 0.5))
+                window = windows[f * n + i]
+                window[0], window[1], window[2], window[3] = u - half, v - half, u + half + 1, v + half + 1
+                least[f * n + i] = max(5, int(0.4 * shape[4]))
+                count += 1
+        if not good:
+            mine[:] = False
     return count
 
 
-@njit(cache=True)
+@kernel
+def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):  # type: ignore[no-untyped-def]
+    """What each dot of a face must keep by itself and beside its neighbours, into ``used`` (n,)."""
+    n = used.size
+    contrasts = np.zeros(n)
+    scales = np.zeros(n)
+    for i in range(n):
+        used[i] = False
+        if not present[i] or status[i] != OK:
+            continue
+        area, shape, gate = dots[i, AREA], shapes[i], gates[i]
+        # blur inflates the area of thin dots
+        most = np.pi * (shape[5] + 1.0) * (shape[6] + 1.0) * 1.4
+        du, dv = dots[i, 0] - predicted[i, 0], dots[i, 1] - predicted[i, 1]
+        off = gate[0] * du * du + 2.0 * gate[1] * du * dv + gate[2] * dv * dv
+        contrasts[i] = dots[i, CONTRAST]
+        scales[i] = area / shape[4]
+        used[i] = area > 0.6 * shape[4] and area < most and off <= 1.0 and whole(dots[i], lopsided)
+    contrast = _median(contrasts, used)
+    scale = _median(scales, used)
+    for i in range(n):
+        if used[i]:
+            alike = contrasts[i] > 0.5 * contrast and contrasts[i] < 2.0 * contrast
+            used[i] = alike and scales[i] > 0.8 * scale and scales[i] < 1.25 * scale
+
+
+@kernel
+def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, tolerance, dots, used):  # type: ignore[no-untyped-def]
+    """Accept what was measured: whole, of the expected size, alike, nearest to its own prediction, fitting
+    its face.
+
+    ``gates`` (m, 3): inverse covariances (xx, xy, yy) of the prior over the squared gate, 0 for none;
+    ``lopsided``, ``tolerance`` [px] as in the options. Moves ``dots`` (m, FIELDS) to the dots' centres,
+    writes ``used`` (m,). Returns their number.
+    """
+    faces, n = patterns.shape[0], patterns.shape[1]
+    total = 0
+    for f in range(faces):
+        a, b = f * n, (f + 1) * n
+        mine = used[a:b]
+        _gates(predicted[a:b], present[a:b], shapes[a:b], status[a:b], gates[a:b], lopsided, dots[a:b], mine)
+        count = 0
+        for i in range(a, b):
+            if not used[i]:
+                continue
+            own = (dots[i, 0] - predicted[i, 0]) ** 2 + (dots[i, 1] - predicted[i, 1]) ** 2
+            for k in range(faces * n):
+                other = (dots[i, 0] - predicted[k, 0]) ** 2 + (dots[i, 1] - predicted[k, 1]) ** 2
+                if present[k] and other < own:
+                    used[i] = False
+            count += 1 if used[i] else 0
+        count = settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, 4) if count >= 4 else 0
+        if count == 0 or (count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine,
+        FEW_TOLERANCE)):
+            mine[:] = False
+            count = 0
+        total += count
+    return total
+
+
+@kernel
 def agree_with_prior(predicted, dots, used, tolerance):  # type: ignore[no-untyped-def]
     """Whether dots (n, FIELDS) lie on their predictions (n, 2) up to a similarity, within ``tolerance`` [px].
 
@@ -189,7 +240,7 @@ def agree_with_prior(predicted, dots, used, tolerance):  # type: ignore[no-untyp
     return True
 
 
-@njit(cache=True)
+@kernel
 def _remove_shift(pattern, radius, raw, used, H, dots):  # type: ignore[no-untyped-def]
     """``dots`` = ``raw`` minus the way from a dot's image to the centre of its ellipse."""
     circle = np.zeros(7)
@@ -202,7 +253,7 @@ def _remove_shift(pattern, radius, raw, used, H, dots):  # type: ignore[no-untyp
                 used[i] = False
 
 
-@njit(cache=True)
+@kernel
 def settle_face(pattern, radius, dots, used, tolerance, least):  # type: ignore[no-untyped-def]
     """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to
     the dots' own.
@@ -241,38 +292,21 @@ def settle_face(pattern, radius, dots, used, tolerance, least):  # type: ignore[
     return count
 
 
-@njit(cache=True)
-def track(image, dark, patterns, radii, predicted, spreads, present, gates, min_contrast, lopsided, tolerance, labels, stack, dots, used):  # type: ignore[no-untyped-def]  # fmt: skip
-    """All faces: ``patterns`` (f, n, 2), ``radii`` (f,), ``predicted`` (f, n, 2) [px], ``spreads`` (f, n)
-    [px], ``present`` (f, n), ``gates`` (f, n, 3) inverse covariances (xx, xy, yy) divided by the squared
-    gate, 0 for none. Writes ``dots`` (f, n, FIELDS) and ``used`` (f, n). Returns the number of dots.
-    """
-    faces, n = present.shape
-    others = np.zeros((faces * n, 2))
-    k = 0
-    for f in range(faces):
-        for i in range(n):
-            if present[f, i]:
-                others[k] = predicted[f, i]
-                k += 1
-    others = others[:k]
-    total = 0
-    for f in range(faces):
-        count = track_face(
-            image, dark, patterns[f], radii[f], predicted[f], spreads[f], present[f], others, min_contrast, lopsided,
-            labels, stack, dots[f], used[f],
-        )  # fmt: skip
-        for i in range(n):
-            if used[f, i]:
-                du = dots[f, i, 0] - predicted[f, i, 0]
-                dv = dots[f, i, 1] - predicted[f, i, 1]
-                gate = gates[f, i]
-                if gate[0] * du * du + 2.0 * gate[1] * du * dv + gate[2] * dv * dv > 1.0:
-                    used[f, i] = False
-                    count -= 1
-        count = settle_face(patterns[f], radii[f], dots[f], used[f], tolerance, 4) if count >= 4 else 0
-        if count == 0 or (count <= 5 and not agree_with_prior(predicted[f], dots[f], used[f], FEW_TOLERANCE)):
-            used[f] = False
-            continue
-        total += count
-    return total
+def compile_kernels() -> None:
+    """Compile what the detector calls, or load it from the cache."""
+    compile_for(
+        measure_windows, IMAGE, BOOL, given(INT, 2), given(FLOAT, 2), INT, given(INT, 1), written(INT32, 2),
+        written(INT32, 1), written(FLOAT, 2), written(INT, 1),
+    )  # fmt: skip
+    compile_for(
+        expect, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(FLOAT, 2), given(FLOAT, 2),
+        given(FLOAT, 3), FLOAT, written(FLOAT, 2), written(BOOL, 1), written(FLOAT, 2), written(INT, 2), written(INT, 1),
+    )  # fmt: skip
+    compile_for(
+        judge, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(BOOL, 1), given(FLOAT, 2), given(INT, 1),
+        given(FLOAT, 2), FLOAT, FLOAT, written(FLOAT, 2), written(BOOL, 1),
+    )  # fmt: skip
+    compile_for(
+        settle_face, given(FLOAT, 2), FLOAT, written(FLOAT, 2), written(BOOL, 1), FLOAT, INT
+    )  # fmt: skip
+    compile_for(whole, given(FLOAT, 1), FLOAT)
