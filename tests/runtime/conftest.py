@@ -29,7 +29,12 @@ def twist(axis: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 def link(a: float, alpha_deg: float, d: float, theta: float) -> np.ndarray:
     """Classic Denavit-Hartenberg transform."""
-    ca, sa, ct, st = np.cos(np.radians(alpha_deg)), np.sin(np.radians(alpha_deg)), np.cos(theta), np.sin(theta)
+    ca, sa, ct, st = (
+        np.cos(np.radians(alpha_deg)),
+        np.sin(np.radians(alpha_deg)),
+        np.cos(theta),
+        np.sin(theta),
+    )
     return np.array(
         [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0, sa, ca, d], [0, 0, 0, 1.0]]
     )
@@ -87,7 +92,10 @@ def make_truth(seed: int) -> Truth:
     side /= np.linalg.norm(side)
     K = np.array([[800, 0, 320], [0, 800, 240], [0, 0, 1.0]])
     cameras = np.array(
-        [(K @ np.linalg.inv(look_at(middle + 1.2 * outward + s * 0.15 * side + [0, 0, 0.1], middle))[:3]) for s in (-1, 1)]
+        [
+            (K @ np.linalg.inv(look_at(middle + 1.2 * outward + s * 0.15 * side + [0, 0, 0.1], middle))[:3])
+            for s in (-1, 1)
+        ]
     )
     H = np.eye(4) + 0.3 * rng.standard_normal((4, 4))  # projective -> Euclidean
     inverse = np.linalg.inv(H)
@@ -176,10 +184,20 @@ class Bench:
             if not self.cameras_on[c]:
                 continue
             inside = self.marker_mask & np.all((exact[c] >= 0) & (exact[c] < (640, 480)), axis=1)
-            pixels = exact[c, inside] + self.noise_px * self.rng.standard_normal((inside.sum(), 2)) + self.bias_px
+            pixels = (
+                exact[c, inside] + self.noise_px * self.rng.standard_normal((inside.sum(), 2)) + self.bias_px
+            )
             covariance = np.tile(np.eye(2) * max(self.noise_px, 0.01) ** 2, (inside.sum(), 1, 1))
             self.pending.append(
-                CameraObservation(name, self.seq, self.now_ns, self.now_ns + 20_000_000, np.flatnonzero(inside), pixels, covariance)
+                CameraObservation(
+                    name,
+                    self.seq,
+                    self.now_ns,
+                    self.now_ns + 20_000_000,
+                    np.flatnonzero(inside),
+                    pixels,
+                    covariance,
+                )
             )
 
     def run(self, seconds: float) -> StepOutputs:
@@ -194,7 +212,9 @@ class Bench:
             for event in self.events[start:]:
                 if wanted(event):
                     return event
-        raise AssertionError(f"not seen in {seconds} s; events: {[(e.kind, e.message) for e in self.events[start:]]}")
+        raise AssertionError(
+            f"not seen in {seconds} s; events: {[(e.kind, e.message) for e in self.events[start:]]}"
+        )
 
     def reply(self, command: Command) -> Event:
         return next(e for e in self.step(command).events if e.kind == "reply")
@@ -212,7 +232,8 @@ class Bench:
     def features(self, q: np.ndarray) -> dict[str, dict[int, tuple[float, float]]]:
         exact = self.truth.pixels(q)
         return {
-            name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])} for c, name in enumerate(("left", "right"))
+            name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])}
+            for c, name in enumerate(("left", "right"))
         }
 
     def error_px(self, q: np.ndarray) -> float:
@@ -231,4 +252,6 @@ def benches() -> Callable[..., Bench]:
 
 def make_bench(seed: int, noise_px: float = 0.0) -> Bench:
     settings = make_settings()
-    return Bench(make_truth(seed), settings, ServoCore(settings), np.random.default_rng(seed), BASE.copy(), noise_px)
+    return Bench(
+        make_truth(seed), settings, ServoCore(settings), np.random.default_rng(seed), BASE.copy(), noise_px
+    )

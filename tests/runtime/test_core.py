@@ -48,7 +48,9 @@ def ended(event: Any) -> bool:
 @pytest.mark.parametrize("law", ["stereo", "cartesian3"])
 @pytest.mark.parametrize("points", ["predicted", "triangulated"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_goal_is_reached_from_a_random_frame_with_noise(benches: Any, law: str, points: str, seed: int) -> None:
+def test_goal_is_reached_from_a_random_frame_with_noise(
+    benches: Any, law: str, points: str, seed: int
+) -> None:
     bench = benches(seed, noise_px=0.05).ready()
     target = bench.q + DISPLACED * (0.5 if law == "stereo" else 1.0)
     assert bench.reply(goal(bench, target, law=law, points=points)).accepted
@@ -152,7 +154,13 @@ def test_every_accepted_goal_ends_in_exactly_one_terminal_event(bench: Any) -> N
     ends = {i: [e.kind for e in bench.events if e.kind in TERMINAL and e.id == i] for i in ids}
     assert all(len(kinds) == 1 for kinds in ends.values()), ends
     # the preempting goal goes first, the queue stays
-    assert [ends[i][0] for i in ids] == ["goal_preempted", "goal_reached", "goal_reached", "goal_reached", "goal_cancelled"]
+    assert [ends[i][0] for i in ids] == [
+        "goal_preempted",
+        "goal_reached",
+        "goal_reached",
+        "goal_reached",
+        "goal_cancelled",
+    ]
 
 
 def test_goal_without_renewal_of_its_lease_is_aborted_and_the_arm_rests(bench: Any) -> None:
@@ -250,15 +258,27 @@ def test_images_that_contradict_the_model_make_it_suspect_and_abort(bench: Any) 
 def test_goal_can_be_taught_and_reached_again(bench: Any) -> None:
     bench.ready()
     shown = bench.q + 0.6 * DISPLACED
-    bench.reply(RunGoal(Goal(str(uuid.UUID(int=5)), JointTarget(dict(zip(bench.settings.joint_names, shown.tolist(), strict=True))))))
+    bench.reply(
+        RunGoal(
+            Goal(
+                str(uuid.UUID(int=5)),
+                JointTarget(dict(zip(bench.settings.joint_names, shown.tolist(), strict=True))),
+            )
+        )
+    )
     bench.until(ended, 10.0)
     bench.run(0.3)
     assert bench.reply(Teach("there", 5)).accepted
     taught = bench.until(lambda e: e.kind == "taught", 5.0)
     bench.reply(Home(str(uuid.UUID(int=6))))
     bench.until(ended, 10.0)
-    set_points = {s.camera: {int(i): (float(p[0]), float(p[1])) for i, p in zip(s.ids, s.pixels, strict=True)} for s in taught.samples}
-    assert bench.reply(RunGoal(Goal(str(uuid.UUID(int=7)), FeatureTarget(set_points, model_epoch=7)))).accepted
+    set_points = {
+        s.camera: {int(i): (float(p[0]), float(p[1])) for i, p in zip(s.ids, s.pixels, strict=True)}
+        for s in taught.samples
+    }
+    assert bench.reply(
+        RunGoal(Goal(str(uuid.UUID(int=7)), FeatureTarget(set_points, model_epoch=7)))
+    ).accepted
     assert bench.until(ended, 25.0).kind == "goal_reached"
     assert bench.error_px(shown) < 0.3
 
@@ -287,7 +307,32 @@ def test_trial_motions_name_the_joint_that_does_not_follow(bench: Any) -> None:
     event = bench.until(lambda e: e.kind == "calibration_aborted", 120.0)
     assert event.reasons[0].code == "JOINT_NOT_FOLLOWING"
     assert event.reasons[0].subject == "j3"
-    assert np.abs(bench.run(1.0).command).max() == 0.0
+    outputs = bench.run(1.0)
+    assert (outputs.status.lifecycle, outputs.command) == ("fault", None)
+    assert not bench.reply(Enable()).accepted
+
+
+def test_law_whose_encoder_stands_still_ends_in_a_latched_fault(bench: Any) -> None:
+    moving(bench)
+    bench.frozen_joint = 5
+    event = bench.until(ended, 3.0)
+    assert (event.reasons[0].code, event.reasons[0].subject) == ("JOINT_NOT_FOLLOWING", "j6")
+    assert bench.run(0.5).status.lifecycle == "fault"
+    bench.frozen_joint = -1
+    assert bench.reply(Reset()).accepted
+    bench.run(0.05)
+    assert bench.reply(Enable()).accepted
+    bench.run(3.0)  # the images contradicted the still encoder; now they agree again
+    assert bench.reply(goal(bench, bench.q + 0.3 * DISPLACED)).accepted
+    assert bench.until(ended, 25.0).kind == "goal_reached"
+
+
+def test_dry_run_expects_no_motion(benches: Any) -> None:
+    bench = benches(1)
+    bench.core = ServoCore(msgspec.structs.replace(bench.settings, watch_following=False))
+    moving(bench)
+    bench.frozen_joint = 5
+    assert bench.run(1.0).status.lifecycle == "active"
 
 
 def test_trial_motions_without_markers_name_the_camera(bench: Any) -> None:

@@ -15,7 +15,8 @@ def third_party(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-drivers\nVersion: 1.2\n")
     (info / "entry_points.txt").write_text(
-        "[stereoservo.joint_drivers]\nacme = acme_good:Driver\nacme-broken = acme_broken:Driver\nacme-gone = acme_good:Nothing\n"
+        "[stereoservo.joint_drivers]\nacme = acme_good:Driver\nacme-broken = "
+        "acme_broken:Driver\nacme-gone = acme_good:Nothing\n"
     )
     (tmp_path / "acme_good.py").write_text("class Driver: ...\n")
     (tmp_path / "acme_broken.py").write_text("raise RuntimeError('no such firmware')\n")

@@ -17,7 +17,15 @@ from stereoservo.runtime.replay import RecordingError, replay
 from stereoservo.runtime.state import encode_state
 
 
-def record(bench: Any, path: Path, *, seconds: float = 6.0, gap_at: int = -1, tamper_at: int = -1, foreign: bool = False) -> int:
+def record(
+    bench: Any,
+    path: Path,
+    *,
+    seconds: float = 6.0,
+    gap_at: int = -1,
+    tamper_at: int = -1,
+    foreign: bool = False,
+) -> int:
     """Fly a goal and record it; returns the number of steps."""
     bench.ready()
     print_of = fingerprint()
@@ -37,7 +45,10 @@ def record(bench: Any, path: Path, *, seconds: float = 6.0, gap_at: int = -1, ta
                 continue
             if k == tamper_at:
                 inputs = msgspec.structs.replace(
-                    inputs, joints=msgspec.structs.replace(inputs.joints, positions=inputs.joints.positions * (1 + 1e-12))
+                    inputs,
+                    joints=msgspec.structs.replace(
+                        inputs.joints, positions=inputs.joints.positions * (1 + 1e-12)
+                    ),
                 )
             recorder.step(encode_step(inputs, outputs), inputs.now_ns)
         return recorder.steps

@@ -66,7 +66,6 @@ class ServoSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     filter_s: NonNegative = 0.2
     """Time constant of the innovation filter [s]: 0 takes each frame as it is."""
     gate_sigma: Positive = 6.0
-    jog_acceleration_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
     priority: Annotated[int, Meta(ge=0, le=98)] = 50
     """SCHED_FIFO priority of the servo process; 0 leaves the scheduler alone."""
 
@@ -211,7 +210,9 @@ def _check_limits(cell: CellFile, path: Path | str) -> None:
         for joint in values:
             if joint not in seen:
                 raise CellFileError(
-                    path, key, f"joint {joint!r} has no [[safety.limit]]; joints with limits: {', '.join(seen) or 'none'}"
+                    path,
+                    key,
+                    f"joint {joint!r} has no [[safety.limit]]; joints with limits: {', '.join(seen) or 'none'}",
                 )
 
 
@@ -221,19 +222,30 @@ def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str 
     for name in joint_names:
         if name not in limited:
             raise CellFileError(
-                path, "safety.limit", f"joint {name!r} of driver {cell.joints.driver!r} has no limits; limits are given for: "
-                f"{', '.join(limited) or 'none'}"
+                path,
+                "safety.limit",
+                f"joint {name!r} of driver {cell.joints.driver!r} has no limits; limits are given for: "
+                f"{', '.join(limited) or 'none'}",
             )
     for name in limited:
         if name not in joint_names:
             raise CellFileError(
-                path, "safety.limit", f"no joint {name!r} in driver {cell.joints.driver!r}; its joints: {', '.join(joint_names)}"
+                path,
+                "safety.limit",
+                f"no joint {name!r} in driver {cell.joints.driver!r}; its joints: {', '.join(joint_names)}",
             )
     if cell.calibration is not None:
-        for key, values in (("calibration.base", cell.calibration.base), ("calibration.range", cell.calibration.range)):
+        for key, values in (
+            ("calibration.base", cell.calibration.base),
+            ("calibration.range", cell.calibration.range),
+        ):
             missing = [name for name in joint_names if name not in values]
             if missing:
-                raise CellFileError(path, key, f"missing for joint(s) {', '.join(missing)}; all of {', '.join(joint_names)} are needed")
+                raise CellFileError(
+                    path,
+                    key,
+                    f"missing for joint(s) {', '.join(missing)}; all of {', '.join(joint_names)} are needed",
+                )
 
 
 def _allowed(tree: dict[str, Any], text: str, key: str) -> str:

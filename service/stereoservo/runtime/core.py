@@ -9,11 +9,12 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import intake
+from stereoservo.runtime import following, intake
 from stereoservo.runtime.averaging import add_observation, averages
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
     SUSPECT_FRAMES,
+    TRUSTED_FRAMES,
     ModelArrays,
     accept_observation,
     joint_correction,
@@ -70,7 +71,9 @@ class ServoCore:
             keep_out_names=limits.keep_out_names,
             joint_timeout_s=limits.joint_timeout_s,
             coast_s=limits.coast_s,
-            features_fresh_s=max(FRESH_S, FRESH_FRAMES / min((c.rate_hz for c in settings.cameras), default=30.0)),
+            features_fresh_s=max(
+                FRESH_S, FRESH_FRAMES / min((c.rate_hz for c in settings.cameras), default=30.0)
+            ),
         )
         self._prior_every = max(1, round(settings.rate_hz / PRIOR_RATE_HZ))
 
@@ -92,6 +95,7 @@ class ServoCore:
             self._stop(present)
         for request in inputs.requests:
             intake.answer(request, present)
+        self._watch_following(present)
         self._teach(present)
         self._watch_model(present)
         intake.next_goal(present)
@@ -121,19 +125,26 @@ class ServoCore:
                 elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
                 previous = state.history.positions[(state.history.count - 1) % len(state.history.t_ns)]
                 share = elapsed_s / (elapsed_s + VELOCITY_FILTER_S)
-                state.velocities = state.velocities + share * ((sample.positions - previous) / elapsed_s - state.velocities)
+                state.velocities = state.velocities + share * (
+                    (sample.positions - previous) / elapsed_s - state.velocities
+                )
             remember_joints(state.history, sample)
             state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
         if state.history.count == 0:
             return np.zeros_like(state.command)
-        return state.history.positions[(state.history.count - 1) % len(state.history.t_ns)].copy()
+        newest: FloatArray = state.history.positions[(state.history.count - 1) % len(state.history.t_ns)].copy()
+        return newest
 
     def _follow_driver(self, inputs: StepInputs, emit: Any) -> None:
         """The lifecycle follows what the servo process did with the driver; a fault is latched."""
         state = self.state
         before = state.lifecycle
         if inputs.driver_fault is not None and (before != Lifecycle.FAULT or not state.fault):
-            reason = Reason("DRIVER_FAULT", "fault", hint=f"{inputs.driver_fault.code}: {inputs.driver_fault.message}; clear the cause, then reset")
+            reason = Reason(
+                "DRIVER_FAULT",
+                "fault",
+                hint=f"{inputs.driver_fault.code}: {inputs.driver_fault.message}; clear the cause, then reset",
+            )
             state.fault = [reason]
             state.lifecycle = Lifecycle.FAULT
             state.driver_request = "deactivate"
@@ -170,16 +181,22 @@ class ServoCore:
         state = self.state
         self._arrays = model_arrays(model, self.settings)
         state.model = model
-        good = model.statistics is not None and model.statistics.chi2_ok
-        state.readiness = ModelReadiness.VALID if good else ModelReadiness.CANDIDATE
+        state.readiness = self._fitted(model)
         state.cameras = [camera_estimate(len(model.marker_ids)) for _ in self.settings.cameras]
+
+    @staticmethod
+    def _fitted(model: CellModel) -> ModelReadiness:
+        good = model.statistics is not None and model.statistics.chi2_ok
+        return ModelReadiness.VALID if good else ModelReadiness.CANDIDATE
 
     def _present(self, inputs: StepInputs, q: FloatArray, emit: Any) -> Present:
         """Fold the observations in, each at its own stamp, and predict the present."""
         state = self.state
         fresh: list[CameraObservation] = []
         for observation in inputs.observations:
-            camera = next((i for i, c in enumerate(self.settings.cameras) if c.name == observation.camera), None)
+            camera = next(
+                (i for i, c in enumerate(self.settings.cameras) if c.name == observation.camera), None
+            )
             if camera is None or observation.seq <= state.cameras[camera].last_seq:
                 continue
             estimate = state.cameras[camera]
@@ -188,7 +205,9 @@ class ServoCore:
             fresh.append(observation)
             at_shutter = joints_at(state.history, observation.t_shutter_ns)
             if self._arrays is not None and at_shutter is not None:
-                accept_observation(estimate, camera, observation, at_shutter, state.velocities, self._arrays, self.settings)
+                accept_observation(
+                    estimate, camera, observation, at_shutter, state.velocities, self._arrays, self.settings
+                )
         common: dict[str, Any] = {
             "now_ns": inputs.now_ns, "dt_s": inputs.period_ns * 1e-9, "q": q, "state": state,
             "settings": self.settings, "observations": tuple(fresh), "emit": emit,
@@ -218,7 +237,13 @@ class ServoCore:
             return
         if bool((np.abs(self.state.command) > AT_REST).any()):
             self.state.teaching = None
-            present.emit("warning", request=teaching.request, accepted=False, name=teaching.name, message=f"teaching {teaching.name!r} failed: the arm moved")
+            present.emit(
+                "warning",
+                request=teaching.request,
+                accepted=False,
+                name=teaching.name,
+                message=f"teaching {teaching.name!r} failed: the arm moved",
+            )
             return
         for observation in present.observations:
             add_observation(teaching, self.settings, observation, teaching.frames_wanted, teaching.started_ns)
@@ -236,9 +261,30 @@ class ServoCore:
                 message=f"teaching {teaching.name!r} failed: camera {slow} gave {int(teaching.frames.min())} of {teaching.frames_wanted} frames in {TEACH_TIMEOUT_S:.0f} s",
             )  # fmt: skip
 
+    def _watch_following(self, present: Present) -> None:
+        """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
+        if not self.settings.watch_following or self.state.history.count == 0:
+            return
+        reason = following.watch(self.state, self.settings, present.q, present.dt_s)
+        if reason is None or self.state.lifecycle != Lifecycle.ACTIVE:
+            return  # an arm that is off may be moved by hand
+        intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+        intake.end_queue(present, (reason,), reason.hint)
+        self.state.fault = [reason]
+        self.state.lifecycle = Lifecycle.FAULT
+        self.state.driver_request = "deactivate"
+        present.emit("fault", message=reason.hint, reasons=(reason,))
+
     def _watch_model(self, present: Present) -> None:
-        """Images that contradict the model for many frames make it SUSPECT."""
+        """Images that contradict the model for many frames make it SUSPECT; ones that agree with it clear it."""
         state = self.state
+        if state.readiness == ModelReadiness.SUSPECT and state.model is not None:
+            if min(estimate.agreeing_frames for estimate in state.cameras) >= TRUSTED_FRAMES:
+                state.readiness = self._fitted(state.model)
+                present.emit(
+                    "model", message="the images agree with the model again", name=str(state.readiness)
+                )
+            return
         if state.readiness not in (ModelReadiness.VALID, ModelReadiness.CANDIDATE):
             return
         for camera, estimate in zip(self.settings.cameras, state.cameras, strict=True):
@@ -261,12 +307,26 @@ class ServoCore:
         if state.lifecycle != Lifecycle.ACTIVE:
             if not isinstance(state.source, Holding):
                 reason = Reason("NOT_ACTIVE", "hold", hint=f"the cell became {state.lifecycle}")
-                intake.end_source(present, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}")
+                intake.end_source(
+                    present, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}"
+                )
                 intake.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
             return rest
         source = state.source
-        if isinstance(source, Servoing) and source.goal.lease_s is not None and present.now_ns > source.lease_until_ns:
-            reason = Reason("LEASE_EXPIRED", "hold", "", source.goal.lease_s, source.goal.lease_s, "s", "the client did not renew its lease: is it alive?")
+        if (
+            isinstance(source, Servoing)
+            and source.goal.lease_s is not None
+            and present.now_ns > source.lease_until_ns
+        ):
+            reason = Reason(
+                "LEASE_EXPIRED",
+                "hold",
+                "",
+                source.goal.lease_s,
+                source.goal.lease_s,
+                "s",
+                "the client did not renew its lease: is it alive?",
+            )
             intake.end_source(present, "goal_aborted", (reason,), reason.hint)
             return rest
         if state.held or state.stopped:
@@ -307,7 +367,14 @@ class ServoCore:
     def _priors(self, present: Present) -> tuple[Any, ...]:
         if present.prediction is None or self._arrays is None or self.state.step % self._prior_every:
             return ()
-        return priors(self._arrays, self.settings, present.prediction, self.state.cameras, self.state.velocities, present.now_ns)
+        return priors(
+            self._arrays,
+            self.settings,
+            present.prediction,
+            self.state.cameras,
+            self.state.velocities,
+            present.now_ns,
+        )
 
     def _epoch(self) -> int:
         return 0 if self.state.model is None else self.state.model.epoch
@@ -345,8 +412,12 @@ class ServoCore:
             command=state.command.copy(),
             error_px=motion.error_px,
             task_error=motion.task_error,
-            innovation_px={c.name: e.rms_px for c, e in zip(self.settings.cameras, state.cameras, strict=True)},
-            visible={c.name: e.last_visible for c, e in zip(self.settings.cameras, state.cameras, strict=True)},
+            innovation_px={
+                c.name: e.rms_px for c, e in zip(self.settings.cameras, state.cameras, strict=True)
+            },
+            visible={
+                c.name: e.last_visible for c, e in zip(self.settings.cameras, state.cameras, strict=True)
+            },
         )
 
 

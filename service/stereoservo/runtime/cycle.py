@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -160,6 +160,7 @@ def encode_array(value: object) -> object:
 
 def decode_array(kind: type, value: object) -> object:
     """msgspec ``dec_hook``, inverse of :func:`encode_array`."""
-    dtype, shape, data = value  # type: ignore[misc]
+    parts: Any = value
+    dtype, shape, data = parts
     array: npt.NDArray[np.generic] = np.frombuffer(data, dtype=np.dtype(dtype)).reshape(shape).copy()
     return array

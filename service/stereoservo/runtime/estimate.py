@@ -31,7 +31,9 @@ MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
 TIMING_SIGMA_S = 0.003  # uncertainty of a shutter stamp against the joint stamps
 FIRST_SIGHT_SIGMA_PX = 6.0  # before a marker's innovation is known
 CORRECTION_DAMPING = 1e-4  # relative to the largest diagonal of the normal matrix
-SUSPECT_FRAMES = 8
+SUSPECT_FRAMES = 8  # refused ones in a row, of one camera
+TRUSTED_FRAMES = 30  # agreeing ones in a row, of every camera
+AGREEING_PX = 1.5
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,9 @@ class ModelArrays:
 def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
     """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
     if model.joint_names != settings.joint_names:
-        raise ValueError(f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}")
+        raise ValueError(
+            f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
+        )
     if model.joint_kinds != settings.joint_kinds:
         raise ValueError(f"model has joint kinds {model.joint_kinds}; the cell has {settings.joint_kinds}")
     by_name = {camera.name: camera for camera in model.cameras}
@@ -67,7 +71,9 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
                 f"model was made with {known.width}x{known.height} images of camera {camera.name!r}; "
                 f"it now delivers {camera.width}x{camera.height}"
             )
-    matrices = np.ascontiguousarray([by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64)
+    matrices = np.ascontiguousarray(
+        [by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64
+    )
     centres = np.array([camera_centre(P) for P in matrices])
     return ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
@@ -150,10 +156,11 @@ def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
         if t_ns < t0:
             continue
         if t1 == t0:
-            return history.positions[later].copy()
+            t0 -= 1  # one and the same moment: the later sample
         fraction = min((t_ns - t0) / (t1 - t0), 2.0)
         a, b = history.positions[earlier], history.positions[later]
-        return a + fraction * (b - a)
+        found: FloatArray = a + fraction * (b - a)
+        return found
     return None
 
 
@@ -182,7 +189,9 @@ def accept_observation(
         covariance = observation.covariances[k]
         variance = 0.5 * (covariance[0, 0] + covariance[1, 1])
         velocity = (prediction.jacobian[camera, i] * speed).sum(axis=-1)
-        motion = TIMING_SIGMA_S * TIMING_SIGMA_S * float(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        motion = (
+            TIMING_SIGMA_S * TIMING_SIGMA_S * float(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        )
         age_s = (observation.t_shutter_ns - int(estimate.seen_ns[i])) * 1e-9
         known = estimate.seen_ns[i] > 0 and age_s <= settings.limits.coast_s + 1.0
         model = MODEL_SIGMA_PX if known else FIRST_SIGHT_SIGMA_PX
@@ -202,6 +211,8 @@ def accept_observation(
     estimate.last_visible = accepted
     estimate.frames += 1
     estimate.rms_px = float(np.sqrt(squares / (2 * accepted))) if accepted else 0.0
+    agrees = accepted >= 3 and rejected == 0 and estimate.rms_px < AGREEING_PX
+    estimate.agreeing_frames = estimate.agreeing_frames + 1 if agrees else 0
     estimate.rejected_frames = estimate.rejected_frames + 1 if rejected > accepted else 0
     if accepted >= 3:
         estimate.accepted_ns = observation.t_shutter_ns
@@ -220,10 +231,13 @@ def marker_weights(cameras: list[CameraEstimate], now_ns: int, coast_s: float) -
 
 def pixels_now(prediction: Prediction, cameras: list[CameraEstimate]) -> FloatArray:
     """(c, m, 2) where the markers are now: prediction plus held innovation [px]."""
-    return prediction.pixels + np.array([e.innovation for e in cameras])
+    found: FloatArray = prediction.pixels + np.array([e.innovation for e in cameras])
+    return found
 
 
-def joint_correction(prediction: Prediction, cameras: list[CameraEstimate], weights: FloatArray) -> FloatArray:
+def joint_correction(
+    prediction: Prediction, cameras: list[CameraEstimate], weights: FloatArray
+) -> FloatArray:
     """Joint-space correction (n,) that explains the innovations best, so that corrected points stay one rigid body."""
     n = prediction.operators.shape[0]
     innovation = np.array([e.innovation for e in cameras])

@@ -1,4 +1,6 @@
-"""What the processes of one cell tell each other: structs and their msgpack codecs, and the capacities of the slots."""
+"""What the processes of one cell tell each other: structs and their msgpack codecs, and the capacities of
+the slots.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ COMMISSIONING_SPEED = 0.05
 
 
 class RunPlan(msgspec.Struct, frozen=True):
-    """What the supervisor decided at the start; every child reads this, none the cell file, so that all agree."""
+    """What the supervisor decided at the start; every child reads this, none the cell file, so that all
+    agree.
+    """
 
     cell: CellFile
     cell_path: str
@@ -50,11 +54,15 @@ class RunPlan(msgspec.Struct, frozen=True):
     def settings(self) -> CoreSettings:
         """The core's settings. Raises CellFileError where cell file and drivers do not fit."""
         cap = COMMISSIONING_SPEED if self.commissioning else 1.0
-        return core_settings(self.cell, self.joints, self.cameras, speed_cap=cap)
+        return core_settings(
+            self.cell, self.joints, self.cameras, speed_cap=cap, watch_following=not self.dry_run
+        )
 
 
 class Hello(msgspec.Struct, frozen=True, tag="hello"):
-    """The gateway has connected and knows the events up to ``last_event``; the servo process sends the later ones."""
+    """The gateway has connected and knows the events up to ``last_event``; the servo process sends the
+    later ones.
+    """
 
     last_event: int
 

@@ -69,7 +69,9 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
     )
 
 
-def _set_points(target: FeatureTarget, present: Present, arrays: ModelArrays) -> tuple[FloatArray, FloatArray]:
+def _set_points(
+    target: FeatureTarget, present: Present, arrays: ModelArrays
+) -> tuple[FloatArray, FloatArray]:
     """(c, m, 2) set-points and (c, m) wanted. Raises ValueError on a camera, marker or pixel that cannot be."""
     settings = present.settings
     c, m = len(settings.cameras), len(arrays.marker_ids)
@@ -108,7 +110,8 @@ def _face(set_points: FloatArray, known: FloatArray, arrays: ModelArrays) -> Int
     if float(areas[best]) < MIN_FACE_AREA_PX2:
         ids = [arrays.marker_ids[int(i)] for i in candidates]
         raise ValueError(f"the markers {ids} of the goal lie on one line; three that span a face are needed")
-    return triples[best]
+    found: IntArray = triples[best]
+    return found
 
 
 def _goal_points(
@@ -147,7 +150,13 @@ def servo_step(source: Servoing, present: Present) -> Motion:
             "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
             "no error was measured" if error_px is None else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
         )  # fmt: skip
-        present.emit("goal_aborted", id=source.goal.id, message="not reached in time", reasons=(reason,), error_px=error_px)
+        present.emit(
+            "goal_aborted",
+            id=source.goal.id,
+            message="not reached in time",
+            reasons=(reason,),
+            error_px=error_px,
+        )
         return Motion(zero, finished=True, error_px=error_px)
     if int((active.max(axis=0) > 0.0).sum()) < MIN_MARKERS:
         reason = Reason(
@@ -174,7 +183,9 @@ def _reached(source: Servoing, present: Present, error_px: float | None) -> bool
     return source.held >= source.hold_frames
 
 
-def _stereo(source: Servoing, present: Present, arrays: ModelArrays, active: FloatArray, error_px: float | None) -> Motion:
+def _stereo(
+    source: Servoing, present: Present, arrays: ModelArrays, active: FloatArray, error_px: float | None
+) -> Motion:
     """(8.36) with the Jacobian developed around triangulated (8.34) or predicted points (8.35).
 
     Where the goal's pose is known it is the mean of the current and the desired Jacobian (8.1.1), which converges from
@@ -185,8 +196,12 @@ def _stereo(source: Servoing, present: Present, arrays: ModelArrays, active: Flo
     points = _points(source, present, arrays)
     jacobian = image_jacobian(prediction.operators, arrays.matrices, points)
     if source.pose_known:
-        jacobian = 0.5 * (jacobian + image_jacobian(prediction.operators, arrays.matrices, source.target_points))
-    velocity, _, conditioning = stereo_step(jacobian, pixels, source.set_points, active, source.gain, STEREO_DAMPING)
+        jacobian = 0.5 * (
+            jacobian + image_jacobian(prediction.operators, arrays.matrices, source.target_points)
+        )
+    velocity, _, conditioning = stereo_step(
+        jacobian, pixels, source.set_points, active, source.gain, STEREO_DAMPING
+    )
     reasons: tuple[Reason, ...] = ()
     if conditioning < ILL_CONDITIONED:
         reasons = (
@@ -201,7 +216,13 @@ def _stereo(source: Servoing, present: Present, arrays: ModelArrays, active: Flo
 def _points(source: Servoing, present: Present, arrays: ModelArrays) -> FloatArray:
     assert present.prediction is not None and present.pixels is not None and present.weights is not None
     return points_now(
-        arrays, present.q, present.prediction, present.pixels, present.weights, present.state.correction, source.points
+        arrays,
+        present.q,
+        present.prediction,
+        present.pixels,
+        present.weights,
+        present.state.correction,
+        source.points,
     )
 
 
@@ -217,4 +238,6 @@ def _cartesian3(source: Servoing, present: Present, arrays: ModelArrays, error_p
         arrays.camera_centres, np.full(3, source.gain),
     )  # fmt: skip
     reasons = cartesian3_reasons(task_error, allowed, status)
-    return Motion(velocity, True, source.goal.speed_scale, error_px=error_px, task_error=task_error, reasons=reasons)
+    return Motion(
+        velocity, True, source.goal.speed_scale, error_px=error_px, task_error=task_error, reasons=reasons
+    )

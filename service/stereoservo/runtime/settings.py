@@ -7,7 +7,13 @@ import numpy as np
 
 from stereoservo.runtime.cellfile import CalibrationSection, CellFile, CellFileError, check_joints
 from stereoservo.runtime.commands import LawName, PointSource
-from stereoservo.runtime.ports import CameraDescription, FloatArray, JointDriverDescription, JointKindName, Mount
+from stereoservo.runtime.ports import (
+    CameraDescription,
+    FloatArray,
+    JointDriverDescription,
+    JointKindName,
+    Mount,
+)
 
 
 class CameraSettings(msgspec.Struct, frozen=True):
@@ -69,6 +75,8 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     time_limit_s: float
     filter_s: float
     gate_sigma: float
+    watch_following: bool = True
+    """Off where commands are computed and never written (dry run)."""
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
@@ -82,6 +90,7 @@ def core_settings(
     cameras: tuple[CameraDescription, ...],
     *,
     speed_cap: float = 1.0,
+    watch_following: bool = True,
 ) -> CoreSettings:
     """Bring cell file and driver descriptions together.
 
@@ -125,7 +134,9 @@ def core_settings(
             position_min=np.array([max(j.position_min, limits[j.name].min) for j in joints.joints]),
             position_max=np.array([min(j.position_max, limits[j.name].max) for j in joints.joints]),
             velocity_max=np.array([min(j.velocity_max, limits[j.name].velocity) for j in joints.joints]),
-            acceleration_max=np.array([min(j.acceleration_max, limits[j.name].acceleration) for j in joints.joints]),
+            acceleration_max=np.array(
+                [min(j.acceleration_max, limits[j.name].acceleration) for j in joints.joints]
+            ),
             position_margin=cell.safety.position_margin,
             keep_outs=np.array(
                 [[k.ranges.get(name, (-np.inf, np.inf)) for name in names] for k in cell.safety.keep_out]
@@ -146,6 +157,7 @@ def core_settings(
         time_limit_s=cell.servo.time_limit_s,
         filter_s=cell.servo.filter_s,
         gate_sigma=cell.servo.gate_sigma,
+        watch_following=watch_following,
     )
 
 

@@ -44,6 +44,8 @@ class CameraEstimate(msgspec.Struct, eq=False):
     frames: int = 0
     rejected_frames: int = 0
     """Consecutive frames of which the gate refused more than half of the markers."""
+    agreeing_frames: int = 0
+    """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
     rms_px: float = 0.0
 
 
@@ -109,8 +111,6 @@ class Trials(msgspec.Struct, tag="trials", eq=False):
     phase_ns: int
     start: FloatArray
     """Measured positions when the current move began."""
-    commanded: FloatArray
-    """Integral of the commanded velocity since the current move began."""
     counts: FloatArray
     """Sights of each marker in each camera at this stop, (c, m)."""
     sums: FloatArray
@@ -169,6 +169,12 @@ class CoreState(msgspec.Struct, eq=False):
     stopped: bool
     fault: list[Reason]
     driver_request: str
+    missing_travel: FloatArray
+    """Commanded less measured travel of late (n,) [rad or m]; see ``following``."""
+    untold_travel: FloatArray
+    """Commanded since the last joint sample (n,)."""
+    last_followed_ns: int
+    last_positions: FloatArray | None
     correction: FloatArray
     """Joint-space correction that explains the innovations best (n,)."""
 
@@ -197,6 +203,10 @@ def initial_state(settings: CoreSettings) -> CoreState:
         stopped=False,
         fault=[],
         driver_request="",
+        missing_travel=np.zeros(n),
+        untold_travel=np.zeros(n),
+        last_followed_ns=0,
+        last_positions=None,
         correction=np.zeros(n),
     )
 
