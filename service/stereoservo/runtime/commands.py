@@ -21,7 +21,9 @@ LawName = Literal["stereo", "cartesian3"]
 PointSource = Literal["triangulated", "predicted"]
 
 
-class FeatureTarget(msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True):
+class FeatureTarget(
+    msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True
+):
     """Set-points: for each camera, marker id -> (u, v) [px]. ``model_epoch``: None, or refuse another model."""
 
     set_points: dict[str, dict[int, tuple[float, float]]]
@@ -116,7 +118,9 @@ class Home(msgspec.Struct, frozen=True, tag="home", tag_field="command", forbid_
     speed_scale: Fraction = 1.0
 
 
-class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="command", forbid_unknown_fields=True):
+class Calibrate(
+    msgspec.Struct, frozen=True, tag="calibrate", tag_field="command", forbid_unknown_fields=True
+):
     """Run the trial motions of the cell file and fit a model."""
 
     id: GoalId

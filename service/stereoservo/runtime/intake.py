@@ -42,7 +42,16 @@ HOME_SPEED = 0.5
 class Refusal(Exception):
     """The core will not do what was asked; carries the reason."""
 
-    def __init__(self, code: str, hint: str, *, subject: str = "", value: float | None = None, threshold: float | None = None, unit: str = "") -> None:
+    def __init__(
+        self,
+        code: str,
+        hint: str,
+        *,
+        subject: str = "",
+        value: float | None = None,
+        threshold: float | None = None,
+        unit: str = "",
+    ) -> None:
         super().__init__(hint)
         self.reason = Reason(code, "info", subject, value, threshold, unit, hint)
 
@@ -54,7 +63,12 @@ def goal_of(source: Source) -> str:
     return source.id if isinstance(source, JointMove | Trials) else ""
 
 
-def end_source(present: Present, kind: Literal["goal_aborted", "goal_cancelled", "goal_preempted"], reasons: tuple[Reason, ...], message: str) -> None:
+def end_source(
+    present: Present,
+    kind: Literal["goal_aborted", "goal_cancelled", "goal_preempted"],
+    reasons: tuple[Reason, ...],
+    message: str,
+) -> None:
     """End the active source with its one terminal event; the arm then holds."""
     source = present.state.source
     present.state.source = Holding()
@@ -77,7 +91,12 @@ def answer(request: Request, present: Present) -> None:
         message = _carry_out(request, request.command, present)
     except Refusal as refusal:
         present.emit(
-            "reply", request=request.request, accepted=False, message=str(refusal), reasons=(refusal.reason,), id=_id(request.command)
+            "reply",
+            request=request.request,
+            accepted=False,
+            message=str(refusal),
+            reasons=(refusal.reason,),
+            id=_id(request.command),
         )
         return
     present.emit("reply", request=request.request, accepted=True, message=message, id=_id(request.command))
@@ -94,7 +113,12 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
     if isinstance(command, Enable):
         return _enable(present)
     if isinstance(command, Disable):
-        end_source(present, "goal_aborted", (Reason("DISABLED", "hold", hint="enable, then send the goal again"),), "disabled")
+        end_source(
+            present,
+            "goal_aborted",
+            (Reason("DISABLED", "hold", hint="enable, then send the goal again"),),
+            "disabled",
+        )
         end_queue(present, (), "disabled")
         state.driver_request = "deactivate"
         return "the arm is stopped and its drives go off"
@@ -142,7 +166,12 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
 def _enable(present: Present) -> str:
     state = present.state
     if state.lifecycle == Lifecycle.FAULT:
-        raise Refusal("IN_FAULT", "the cell is in fault: " + "; ".join(r.hint for r in state.fault) + ". Clear the cause, then reset")
+        raise Refusal(
+            "IN_FAULT",
+            "the cell is in fault: "
+            + "; ".join(r.hint for r in state.fault)
+            + ". Clear the cause, then reset",
+        )
     if state.lifecycle == Lifecycle.UNCONFIGURED:
         raise Refusal("NOT_CONFIGURED", "the joint driver is not configured yet")
     state.held = state.stopped = False
@@ -155,7 +184,10 @@ def _enable(present: Present) -> str:
 def _may_move(present: Present) -> None:
     state = present.state
     if state.lifecycle != Lifecycle.ACTIVE:
-        raise Refusal("NOT_ACTIVE", f"the cell is {state.lifecycle}; {'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first")
+        raise Refusal(
+            "NOT_ACTIVE",
+            f"the cell is {state.lifecycle}; {'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first",
+        )
     if state.stopped:
         raise Refusal("STOPPED", "the cell was stopped; resume it first")
     if state.held:
@@ -163,7 +195,12 @@ def _may_move(present: Present) -> None:
 
 
 def _preempt(present: Present, by: str) -> None:
-    end_source(present, "goal_preempted", (Reason("PREEMPTED", "info", hint=f"preempted by {by}"),), f"preempted by {by}")
+    end_source(
+        present,
+        "goal_preempted",
+        (Reason("PREEMPTED", "info", hint=f"preempted by {by}"),),
+        f"preempted by {by}",
+    )
 
 
 def _check_goal(goal: Goal, present: Present) -> Source:
@@ -175,7 +212,9 @@ def _check_goal(goal: Goal, present: Present) -> Source:
         _inside_limits(wanted, present)
         return _move(goal.id, wanted, goal.speed_scale, present, goal.time_limit_s)
     if isinstance(target, TaughtTarget):
-        raise Refusal("TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name)
+        raise Refusal(
+            "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
+        )
     return _feature_goal(goal, target, present)
 
 
@@ -184,7 +223,10 @@ def _feature_goal(goal: Goal, target: FeatureTarget, present: Present) -> Servoi
     if state.model is None or present.arrays is None or state.readiness == ModelReadiness.NONE:
         raise Refusal("NO_MODEL", "the cell has no model yet: calibrate first")
     if state.readiness == ModelReadiness.SUSPECT:
-        raise Refusal("MODEL_SUSPECT", "the model no longer explains the images: check the cameras and the markers, then calibrate")
+        raise Refusal(
+            "MODEL_SUSPECT",
+            "the model no longer explains the images: check the cameras and the markers, then calibrate",
+        )
     if target.model_epoch is not None and target.model_epoch != state.model.epoch:
         raise Refusal(
             "OTHER_MODEL", f"the goal was taught with model epoch {target.model_epoch}; the cell has epoch {state.model.epoch}: teach it again",
@@ -203,7 +245,12 @@ def _run_goal(goal: Goal, present: Present) -> str:
         return "already accepted"  # a client's retry
     if goal.mode == "queue" and goal_of(state.source):
         if len(state.queue) >= QUEUE_LENGTH:
-            raise Refusal("QUEUE_FULL", f"{QUEUE_LENGTH} goals are queued", value=float(len(state.queue)), threshold=float(QUEUE_LENGTH))
+            raise Refusal(
+                "QUEUE_FULL",
+                f"{QUEUE_LENGTH} goals are queued",
+                value=float(len(state.queue)),
+                threshold=float(QUEUE_LENGTH),
+            )
         state.queue.append(goal)
         return f"queued as number {len(state.queue)}"
     _preempt(present, f"goal {goal.id}")
@@ -214,7 +261,9 @@ def _run_goal(goal: Goal, present: Present) -> str:
 def begin(source: Source, present: Present) -> None:
     """Make ``source`` the active one."""
     present.state.source = source
-    present.emit("goal_started", id=goal_of(source), name=source.law if isinstance(source, Servoing) else "joints")
+    present.emit(
+        "goal_started", id=goal_of(source), name=source.law if isinstance(source, Servoing) else "joints"
+    )
 
 
 def next_goal(present: Present) -> None:
@@ -236,7 +285,11 @@ def _renew(command: RenewGoal, present: Present) -> str:
         return "renewed"
     if goal_of(source) == command.id or any(goal.id == command.id for goal in present.state.queue):
         return "renewed"
-    raise Refusal("NO_SUCH_GOAL", f"goal {command.id} is not active; active: {goal_of(source) or 'none'}", subject=command.id)
+    raise Refusal(
+        "NO_SUCH_GOAL",
+        f"goal {command.id} is not active; active: {goal_of(source) or 'none'}",
+        subject=command.id,
+    )
 
 
 def _cancel(command: CancelGoal, present: Present) -> str:
@@ -246,7 +299,11 @@ def _cancel(command: CancelGoal, present: Present) -> str:
         return "cancelled"
     kept = [goal for goal in state.queue if goal.id != command.id]
     if len(kept) == len(state.queue):
-        raise Refusal("NO_SUCH_GOAL", f"goal {command.id} is neither active nor queued; active: {goal_of(state.source) or 'none'}", subject=command.id)
+        raise Refusal(
+            "NO_SUCH_GOAL",
+            f"goal {command.id} is neither active nor queued; active: {goal_of(state.source) or 'none'}",
+            subject=command.id,
+        )
     state.queue = kept
     present.emit("goal_cancelled", id=command.id, message="cancelled while queued")
     return "cancelled"
@@ -255,11 +312,21 @@ def _cancel(command: CancelGoal, present: Present) -> str:
 def _teach(command: Teach, request: Request, present: Present) -> str:
     state = present.state
     if state.model is None:
-        raise Refusal("NO_MODEL", "the cell has no model yet: calibrate first, so that the goal can carry its epoch")
+        raise Refusal(
+            "NO_MODEL", "the cell has no model yet: calibrate first, so that the goal can carry its epoch"
+        )
     if state.teaching is not None:
-        raise Refusal("TEACHING", f"goal {state.teaching.name!r} is still being taught", subject=state.teaching.name)
+        raise Refusal(
+            "TEACHING", f"goal {state.teaching.name!r} is still being taught", subject=state.teaching.name
+        )
     if bool((np.abs(state.command) > 1e-3).any()):
-        raise Refusal("MOVING", "the arm moves; a goal is taught at rest", value=float(np.abs(state.command).max()), threshold=1e-3, unit="rad/s or m/s")
+        raise Refusal(
+            "MOVING",
+            "the arm moves; a goal is taught at rest",
+            value=float(np.abs(state.command).max()),
+            threshold=1e-3,
+            unit="rad/s or m/s",
+        )
     state.teaching = Teaching(
         command.name, request.request, command.frames, present.now_ns, **measurement_buffers(present.settings)
     )
@@ -276,7 +343,10 @@ def _joint(name: str, present: Present) -> int:
 def _inside_limits(target: FloatArray, present: Present) -> None:
     limits = present.settings.limits
     for i, name in enumerate(present.settings.joint_names):
-        low, high = limits.position_min[i] + limits.position_margin, limits.position_max[i] - limits.position_margin
+        low, high = (
+            limits.position_min[i] + limits.position_margin,
+            limits.position_max[i] - limits.position_margin,
+        )
         if not low <= target[i] <= high and target[i] != present.q[i]:
             raise Refusal(
                 "JOINT_LIMIT", f"joint {name}: {target[i]:.4f} is outside {low:.4f} … {high:.4f} (limits less the margin)",
@@ -284,7 +354,9 @@ def _inside_limits(target: FloatArray, present: Present) -> None:
             )  # fmt: skip
 
 
-def _move(goal_id: str, target: FloatArray, speed_scale: float, present: Present, time_limit_s: float | None = None) -> JointMove:
+def _move(
+    goal_id: str, target: FloatArray, speed_scale: float, present: Present, time_limit_s: float | None = None
+) -> JointMove:
     limit = present.settings.time_limit_s if time_limit_s is None else time_limit_s
     return JointMove(goal_id, np.array(target), speed_scale, present.now_ns, limit)
 
@@ -292,11 +364,17 @@ def _move(goal_id: str, target: FloatArray, speed_scale: float, present: Present
 def _jog(command: Jog, present: Present) -> str:
     state = present.state
     if not isinstance(state.source, Holding | Jogging):
-        raise Refusal("BUSY", f"a goal is active ({goal_of(state.source)}): cancel it before jogging", subject=goal_of(state.source))
+        raise Refusal(
+            "BUSY",
+            f"a goal is active ({goal_of(state.source)}): cancel it before jogging",
+            subject=goal_of(state.source),
+        )
     velocity = np.zeros_like(present.q)
     for name, speed in command.velocities.items():
         if not math.isfinite(speed):
-            raise Refusal("NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name)
+            raise Refusal(
+                "NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name
+            )
         velocity[_joint(name, present)] = speed
     state.source = Jogging(velocity, present.now_ns + int(command.lease_s * 1e9))
     return f"jogging for {command.lease_s} s"

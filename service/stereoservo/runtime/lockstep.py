@@ -75,14 +75,18 @@ class LockstepCell:
             camera = plugins.load(plugins.CAMERA_DRIVERS, section.driver)(section.options, context)
             detector = None
             if section.detector:
-                detector = plugins.load(plugins.DETECTORS, section.detector)(section.detector_options, context)
+                detector = plugins.load(plugins.DETECTORS, section.detector)(
+                    section.detector_options, context
+                )
             self.cameras.append(camera)
             self.detectors.append(detector)
             descriptions.append(described(camera, detector))
         self.descriptions = tuple(descriptions)
         self.settings: CoreSettings = core_settings(cell, self.joints.describe(), self.descriptions)
         self.core = ServoCore(self.settings)
-        self.recorder = FlightRecorder(recording, self.settings, fingerprint()) if recording is not None else None
+        self.recorder = (
+            FlightRecorder(recording, self.settings, fingerprint()) if recording is not None else None
+        )
         self.on_step = on_step
         self.period_ns = round(1e9 / self.settings.rate_hz)
         self._requests: list[Request] = []
@@ -134,7 +138,9 @@ class LockstepCell:
         return outputs
 
     def _checkpoint(self, now_ns: int) -> bytes | None:
-        due = self._last_checkpoint_ns == 0 or (now_ns - self._last_checkpoint_ns) * 1e-9 >= CHECKPOINT_EVERY_S
+        due = (
+            self._last_checkpoint_ns == 0 or (now_ns - self._last_checkpoint_ns) * 1e-9 >= CHECKPOINT_EVERY_S
+        )
         if self.recorder is None or not due:
             return None
         self._last_checkpoint_ns = now_ns
@@ -149,7 +155,9 @@ class LockstepCell:
 
     def _observe(self) -> list[CameraObservation]:
         found: list[CameraObservation] = []
-        for camera, detector, description in zip(self.cameras, self.detectors, self.descriptions, strict=True):
+        for camera, detector, description in zip(
+            self.cameras, self.detectors, self.descriptions, strict=True
+        ):
             try:
                 arrived = camera.poll()
             except DriverError:
@@ -229,7 +237,9 @@ class LockstepCell:
     def __enter__(self) -> LockstepCell:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
 

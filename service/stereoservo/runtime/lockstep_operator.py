@@ -9,7 +9,17 @@ from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.calibration_job import CalibrationJob
-from stereoservo.runtime.commands import Calibrate, Command, Enable, FeatureTarget, Goal, Home, JointTarget, RunGoal, Teach
+from stereoservo.runtime.commands import (
+    Calibrate,
+    Command,
+    Enable,
+    FeatureTarget,
+    Goal,
+    Home,
+    JointTarget,
+    RunGoal,
+    Teach,
+)
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelUpdate
 from stereoservo.runtime.lockstep import LockstepCell
 from stereoservo.runtime.taught import feature_target
@@ -48,7 +58,7 @@ class LockstepOperator:
         self._submit(Enable())
         self.cell.wait_for(lambda e: e.kind == "lifecycle" and e.name == Lifecycle.ACTIVE, 5.0, since - 1)
 
-    def calibrate(self, progress: Callable[[float, str], None] | None = None) -> CellModel:
+    def calibrate(self, progress: Callable[[str, float], None] | None = None) -> CellModel:
         """Trial motions, fit in this process, model into the core. Raises LockstepRefusal, CalibrationError."""
         first = len(self.cell.events)
         goal_id = str(next(self._ids))
@@ -80,7 +90,9 @@ class LockstepOperator:
         self.taught[name] = feature_target(event, self._epoch)
         return event
 
-    def goal(self, target: FeatureTarget | JointTarget | str, *, timeout_s: float = 120.0, **options: object) -> Event:
+    def goal(
+        self, target: FeatureTarget | JointTarget | str, *, timeout_s: float = 120.0, **options: object
+    ) -> Event:
         """Run a goal (a taught one by its name) to its terminal event. Raises LockstepRefusal when it is refused."""
         resolved = self.taught[target] if isinstance(target, str) else target
         goal = Goal(str(next(self._ids)), resolved, **options)  # type: ignore[arg-type]

@@ -86,7 +86,9 @@ def joint_move(move: JointMove, present: Present) -> Motion:
         )  # fmt: skip
         present.emit("goal_aborted", id=move.id, message="joint move not finished in time", reasons=(reason,))
         return Motion(np.zeros_like(present.q), finished=True)
-    return Motion(towards(present.q, move.target, present.settings, move.speed_scale), speed_scale=move.speed_scale)
+    return Motion(
+        towards(present.q, move.target, present.settings, move.speed_scale), speed_scale=move.speed_scale
+    )
 
 
 def measurement_buffers(settings: CoreSettings) -> dict[str, Any]:

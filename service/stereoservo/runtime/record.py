@@ -43,7 +43,11 @@ _decoder = msgspec.msgpack.Decoder(StepRecord, dec_hook=decode_array)
 def encode_step(inputs: StepInputs, outputs: StepOutputs) -> bytes:
     """A step record as bytes; the CRC covers every output."""
     record = StepRecord(
-        outputs.status.step, inputs, outputs.command, outputs.status.command_raw, zlib.crc32(_encoder.encode(outputs))
+        outputs.status.step,
+        inputs,
+        outputs.command,
+        outputs.status.command_raw,
+        zlib.crc32(_encoder.encode(outputs)),
     )
     return _encoder.encode(record)
 
@@ -69,7 +73,9 @@ def fingerprint() -> Fingerprint:
 def _processor() -> str:
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
-            found = [line.split(":", 1)[1].strip() for line in file if line.startswith(("model name", "flags"))]
+            found = [
+                line.split(":", 1)[1].strip() for line in file if line.startswith(("model name", "flags"))
+            ]
     except OSError:
         return platform.processor()
     flags = f"{zlib.crc32(found[1].encode()):08x}" if len(found) > 1 else ""

@@ -37,7 +37,9 @@ class FlightRecorder:
             for topic in ("header", "step", "checkpoint", "gap")
         }
         self._sequence = 0
-        header = msgspec.msgpack.encode({"fingerprint": msgspec.to_builtins(fingerprint), "settings": encoded})
+        header = msgspec.msgpack.encode(
+            {"fingerprint": msgspec.to_builtins(fingerprint), "settings": encoded}
+        )
         self._add("header", header, 0)
 
     def step(self, data: bytes, t_ns: int) -> None:
@@ -56,7 +58,11 @@ class FlightRecorder:
     def _add(self, topic: str, data: bytes, t_ns: int) -> None:
         self._sequence += 1
         self._writer.add_message(
-            channel_id=self._channels[topic], log_time=t_ns, publish_time=t_ns, sequence=self._sequence, data=data
+            channel_id=self._channels[topic],
+            log_time=t_ns,
+            publish_time=t_ns,
+            sequence=self._sequence,
+            data=data,
         )
 
     def close(self) -> None:
@@ -71,5 +77,7 @@ class FlightRecorder:
     def __enter__(self) -> FlightRecorder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()

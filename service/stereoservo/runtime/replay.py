@@ -126,7 +126,9 @@ def _messages(path: Path) -> Iterator[tuple[str, bytes]]:
         with path.open("rb") as stream:
             for record in StreamReader(stream, validate_crcs=True).records:
                 if isinstance(record, Header) and record.profile != FORMAT:
-                    raise RecordingError(path, 0, f"is of profile {record.profile!r}; this program reads {FORMAT!r}")
+                    raise RecordingError(
+                        path, 0, f"is of profile {record.profile!r}; this program reads {FORMAT!r}"
+                    )
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
@@ -136,4 +138,6 @@ def _messages(path: Path) -> Iterator[tuple[str, bytes]]:
     except OSError as error:
         raise RecordingError(path, steps, f"cannot be read: {error.strerror}") from error
     except (McapError, EOFError, ValueError, KeyError, struct.error) as error:
-        raise RecordingError(path, steps, f"is truncated or damaged ({type(error).__name__}: {error})") from error
+        raise RecordingError(
+            path, steps, f"is truncated or damaged ({type(error).__name__}: {error})"
+        ) from error

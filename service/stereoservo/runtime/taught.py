@@ -59,7 +59,9 @@ def load_taught(path: Path) -> dict[str, TaughtGoal]:
     try:
         found = msgspec.json.decode(path.read_bytes(), type=TaughtFile)
     except (OSError, msgspec.MsgspecError) as error:
-        raise TaughtFileError(f"{path}: cannot be read ({error}); move it away to start without taught goals") from error
+        raise TaughtFileError(
+            f"{path}: cannot be read ({error}); move it away to start without taught goals"
+        ) from error
     if found.schema != SCHEMA:
         raise TaughtFileError(f"{path}: schema {found.schema}; this program reads {SCHEMA}")
     return dict(found.goals)

@@ -16,7 +16,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from stereoservo.runtime.cellfile import load_cell_file
-from stereoservo_sim.demonstration.conduct import DEMO_CELL, DemoFailedError, Stage, conduct_live, conduct_lockstep
+from stereoservo_sim.demonstration.conduct import (
+    DEMO_CELL,
+    DemoFailedError,
+    Stage,
+    conduct_live,
+    conduct_lockstep,
+)
 from stereoservo_sim.demonstration.results import summary
 
 
@@ -48,10 +54,14 @@ def demo(
     else:
         _print(result)
     if not result["converged"]:
-        failed = [f"{goal['name']} ({goal['outcome']})" for goal in result["goals"] if goal["outcome"] != "reached"]
+        failed = [
+            f"{goal['name']} ({goal['outcome']})" for goal in result["goals"] if goal["outcome"] != "reached"
+        ]
         if json:
             raise SystemExit(1)
-        raise DemoFailedError(f"goals not reached well enough: {', '.join(failed) or 'see the table'}; report: {result['report']}")
+        raise DemoFailedError(
+            f"goals not reached well enough: {', '.join(failed) or 'see the table'}; report: {result['report']}"
+        )
 
 
 @contextmanager
@@ -85,7 +95,9 @@ def _print(result: dict[str, Any]) -> None:
         f"{calibration['chi2']:.0f} for {calibration['degrees_of_freedom']} degrees of freedom",
         highlight=False,
     )
-    table = Table("goal", "law", "turn °", "way mm", "error px", "error mm", "off line mm", "s", "outcome", box=None)
+    table = Table(
+        "goal", "law", "turn °", "way mm", "error px", "error mm", "off line mm", "s", "outcome", box=None
+    )
     for goal in result["goals"]:
         table.add_row(
             goal["name"], goal["law"], f"{goal['rotation_deg']:.0f}", f"{goal['distance_mm']:.0f}",

@@ -71,10 +71,14 @@ def conduct_lockstep(cell_path: Path, out: Path, seed: int, stage: Stage) -> Dem
             log = TruthLog(history)
             lockstep.on_step = _every(2000, log.take)
             names = lockstep.settings.joint_names
-            calibrated, outcomes = perform(LockstepDemonstrator(lockstep, seed, stage.progress), names, stage.tell)
+            calibrated, outcomes = perform(
+                LockstepDemonstrator(lockstep, seed, stage.progress), names, stage.tell
+            )
             times, positions = log.end()
     save_model(calibrated.model, out / "model.json")
-    return Demonstration(cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True)
+    return Demonstration(
+        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True
+    )
 
 
 def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], None]:
@@ -111,4 +115,6 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
             if code != 0:
                 raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
     save_model(calibrated.model, out / "model.json")
-    return Demonstration(cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False)
+    return Demonstration(
+        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False
+    )

@@ -62,6 +62,7 @@ def read_flight(recording: Path) -> Flight:
     commands: list[FloatArray] = []
     goals: list[str] = []
     events: list[Event] = []
+
     def observe(inputs: StepInputs, outputs: StepOutputs) -> None:
         times.append(inputs.now_ns)
         status = outputs.status
@@ -76,12 +77,24 @@ def read_flight(recording: Path) -> Flight:
     for event in events:
         job.add(event)
     return Flight(
-        result, np.array(times), np.array(errors), np.array(commands), goals, events, job.trials() if job.stops else None
+        result,
+        np.array(times),
+        np.array(errors),
+        np.array(commands),
+        goals,
+        events,
+        job.trials() if job.stops else None,
     )
 
 
 def judge_goal(
-    name: str, law: str, outcome: str, flight: Flight, truth_t: IntArray, truth_q: FloatArray, cell: SimulatedCell
+    name: str,
+    law: str,
+    outcome: str,
+    flight: Flight,
+    truth_t: IntArray,
+    truth_q: FloatArray,
+    cell: SimulatedCell,
 ) -> Judgement:
     """Judge the goal that was taught as ``name`` and run with ``law``. Raises LookupError where it was not flown."""
     taught = next((e for e in flight.events if e.kind == "taught" and e.name == name), None)
@@ -91,7 +104,9 @@ def judge_goal(
     shown = _during(truth_t, truth_q, taught.t_ns - int(0.5e9), taught.t_ns)
     reached = _during(truth_t, truth_q, end.t_ns + int(0.1e9), end.t_ns + int((0.1 + JUDGED_S) * 1e9))
     way = (truth_t >= start.t_ns) & (truth_t <= end.t_ns)
-    path = np.array([cell.marker_positions_rig(q).mean(axis=0) for q in truth_q[way][:: max(1, int(way.sum()) // 400)]])
+    path = np.array(
+        [cell.marker_positions_rig(q).mean(axis=0) for q in truth_q[way][:: max(1, int(way.sum()) // 400)]]
+    )
     shown_points = np.mean([cell.marker_positions_rig(q) for q in shown], axis=0)
     start_points = cell.marker_positions_rig(truth_q[way][0])
     reached_points = np.mean([cell.marker_positions_rig(q) for q in reached], axis=0)

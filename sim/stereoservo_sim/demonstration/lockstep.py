@@ -26,7 +26,7 @@ class LockstepDemonstrator:
     def calibrate(self) -> Calibrated:
         """Trial motions and fit; ``seconds`` are virtual."""
         start_ns = self._cell.clock.now_ns()
-        model = self._operator.calibrate(lambda fraction, _: self._progress(fraction))
+        model = self._operator.calibrate(lambda _, fraction: self._progress(fraction))
         return Calibrated(model, (self._cell.clock.now_ns() - start_ns) * 1e-9)
 
     def move(self, joints: dict[str, float]) -> None:
@@ -46,7 +46,11 @@ class LockstepDemonstrator:
     def servo(self, name: str, law: str) -> str:
         """Run a taught goal to its end."""
         event = self._operator.goal(name, law=law)
-        return "reached" if event.kind == "goal_reached" else f"{event.kind.removeprefix('goal_')}: {event.message}"
+        return (
+            "reached"
+            if event.kind == "goal_reached"
+            else f"{event.kind.removeprefix('goal_')}: {event.message}"
+        )
 
     def rest(self, seconds: float) -> None:
         """Let virtual time pass."""

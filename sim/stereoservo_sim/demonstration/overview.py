@@ -24,10 +24,18 @@ def write_overview(path: Path, goals: Sequence[Judgement], cell: SimulatedCell, 
         image = Renderer(cell, camera, RenderSettings()).render(goals[0].joints[0], np.random.default_rng(0))
         axis.imshow(image, cmap="gray", vmin=0, vmax=255)
         for k, goal in enumerate(goals):
-            tracks = np.array([cell.truth_pixels(q)[camera.name] for q in goal.joints[:: max(1, len(goal.joints) // 150)]])
+            tracks = np.array(
+                [cell.truth_pixels(q)[camera.name] for q in goal.joints[:: max(1, len(goal.joints) // 150)]]
+            )
             axis.plot(tracks[:, :, 0], tracks[:, :, 1], color=COLOURS[k], linewidth=0.8)
             axis.plot(tracks[-1, :, 0], tracks[-1, :, 1], "x", color=COLOURS[k], markersize=4)
-        axis.set(title=f"{camera.name} camera", xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
+        axis.set(
+            title=f"{camera.name} camera",
+            xlim=(0, camera.width),
+            ylim=(camera.height, 0),
+            xticks=[],
+            yticks=[],
+        )
     for k, goal in enumerate(goals):
         label = f"{goal.name}: {goal.law}, {goal.rotation_deg:.0f}°, {goal.distance_mm:.0f} mm"
         axes[2].semilogy(goal.times_s, goal.error_px, color=COLOURS[k], label=label)

@@ -34,7 +34,9 @@ def write_pages(path: Path, demonstration: Demonstration, flight: Flight, goals:
     }
     if demonstration.loop is not None:
         lateness = demonstration.loop.lateness_us
-        facts["lateness"] = f"p50 {lateness['p50']:.0f} µs, p99 {lateness['p99']:.0f} µs, max {lateness['max']:.0f} µs"
+        facts["lateness"] = (
+            f"p50 {lateness['p50']:.0f} µs, p99 {lateness['p99']:.0f} µs, max {lateness['max']:.0f} µs"
+        )
         facts["overruns"] = f"{demonstration.loop.overruns} of {demonstration.loop.cycles} cycles"
     data = ReportData(
         title="stereoservo demonstration",
@@ -83,7 +85,10 @@ def residuals(model: CellModel, trials: TrialData) -> FloatArray:
     matrices = np.array([camera.matrix for camera in model.cameras])
     rows = [model.marker_ids.index(marker) for marker in trials.marker_ids]
     predicted = np.array(
-        [project_many(matrices, model.marker_points[rows] @ chain.displacement(q).T) for q in trials.positions]
+        [
+            project_many(matrices, model.marker_points[rows] @ chain.displacement(q).T)
+            for q in trials.positions
+        ]
     )
     found: FloatArray = trials.pixels - predicted.transpose(1, 0, 2, 3)
     return found

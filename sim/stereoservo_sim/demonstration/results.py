@@ -33,7 +33,9 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     ]  # fmt: skip
     report = demonstration.out / "report.html"
     write_pages(report, demonstration, flight, goals)
-    write_overview(demonstration.out / "overview.png", goals, demo_cell(), demonstration.cell.servo.tolerance_px)
+    write_overview(
+        demonstration.out / "overview.png", goals, demo_cell(), demonstration.cell.servo.tolerance_px
+    )
     model = demonstration.calibrated.model
     return {
         "converged": good_calibration(model) and all(good_goal(goal) for goal in goals),
@@ -58,7 +60,9 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
 def good_goal(goal: Judgement) -> bool:
     """Whether a goal was reached, and truly."""
     return (
-        goal.outcome == "reached" and goal.final_error_px <= MAX_ERROR_PX and goal.final_error_mm <= MAX_ERROR_MM
+        goal.outcome == "reached"
+        and goal.final_error_px <= MAX_ERROR_PX
+        and goal.final_error_mm <= MAX_ERROR_MM
     )
 
 

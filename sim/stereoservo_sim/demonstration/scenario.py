@@ -60,7 +60,9 @@ class Operator(Protocol):
     def rest(self, seconds: float) -> None: ...
 
 
-def perform(operator: Operator, joint_names: tuple[str, ...], tell: Callable[[str], None]) -> tuple[Calibrated, dict[str, str]]:
+def perform(
+    operator: Operator, joint_names: tuple[str, ...], tell: Callable[[str], None]
+) -> tuple[Calibrated, dict[str, str]]:
     """The whole demonstration; gives the calibration and each goal's outcome."""
     operator.enable()
     tell("calibrating: each joint moves alone in view of both cameras")
