@@ -38,19 +38,40 @@ def test_good_goals_have_no_problem() -> None:
         (FeatureTarget({}), {}, "is empty; set-points for some of the cameras left, right"),
         (FeatureTarget({"middle": GOOD}), {}, "no camera 'middle'; cameras: left, right"),
         (FeatureTarget({"left": {}}), {}, "has no marker; markers: 0, 1, 2, 3"),
-        (FeatureTarget({"left": {**GOOD, 9: (1.0, 1.0)}}), {}, "left.9: the detector of camera 'left' knows no marker 9; it knows: 0, 1, 2, 3"),
-        (FeatureTarget({"left": {**GOOD, 3: (1.0, 1.0)}}), {}, "left.3: the model has no marker 3; it has: 0, 1, 2"),
-        (FeatureTarget({"left": {**GOOD, 0: (640.0, 1.0)}}), {}, "left.0: pixel (640, 1) is outside the image; u from -0.5 to 639.5, v from -0.5 to 479.5"),
+        (
+            FeatureTarget({"left": {**GOOD, 9: (1.0, 1.0)}}),
+            {},
+            "left.9: the detector of camera 'left' knows no marker 9; it knows: 0, 1, 2, 3",
+        ),
+        (
+            FeatureTarget({"left": {**GOOD, 3: (1.0, 1.0)}}),
+            {},
+            "left.3: the model has no marker 3; it has: 0, 1, 2",
+        ),
+        (
+            FeatureTarget({"left": {**GOOD, 0: (640.0, 1.0)}}),
+            {},
+            "left.0: pixel (640, 1) is outside the image; u from -0.5 to 639.5, v from -0.5 to 479.5",
+        ),
         (FeatureTarget({"right": {**GOOD, 0: (5.0, -3.0)}}), {}, "v from -0.5 to 239.5"),
         (FeatureTarget({"left": {0: (1.0, 1.0)}}), {}, "1 marker(s) (0); at least 3"),
         (TaughtTarget("pork"), {}, "no taught goal 'pork'; taught: park, pick"),
-        (JointTarget({"j1": 0.1}), {"law": "stereo"}, "law: 'stereo' works on set-points in images; a target of joints takes none of stereo, cartesian3"),
+        (
+            JointTarget({"j1": 0.1}),
+            {"law": "stereo"},
+            "law: 'stereo' works on set-points in images; a "
+            "target of joints takes none of stereo, cartesian3",
+        ),
         (JointTarget({"j1": 0.1}), {"gain": 2.0}, "gain: 2.0 belongs to an image law"),
         (JointTarget({}), {}, "is empty; joints: j1, j2"),
         (JointTarget({"j9": 0.1}), {}, "no joint 'j9'; joints: j1, j2, j3, j4, j5, j6"),
-        (JointTarget({"j1": 1.995}), {}, "positions.j1: 1.995 is outside the joint's limits; -1.99 to 1.99 is valid"),
+        (
+            JointTarget({"j1": 1.995}),
+            {},
+            "positions.j1: 1.995 is outside the joint's limits; -1.99 to 1.99 is valid",
+        ),
     ],
-)  # fmt: skip
+)
 def test_each_problem_says_what_would_have_been_valid(
     target: Any, options: dict[str, Any], expected: str
 ) -> None:

@@ -74,8 +74,10 @@ def _calibrate(client: Client) -> CalibrationResult:
 
 def _table(result: CalibrationResult) -> str:
     lines = [
-        f"model epoch {result.epoch} ({result.stratum}): {result.rms_px:.4f} px rms over {result.measurements} "
-        f"measurements, {result.outliers} left out, chi-square {'as expected' if result.covariance_ok else 'NOT as expected'}",
+        f"model epoch {result.epoch} ({result.stratum}): {result.rms_px:.4f} px rms over "
+        f"{result.measurements} "
+        f"measurements, {result.outliers} left out, chi-square "
+        f"{'as expected' if result.covariance_ok else 'NOT as expected'}",
         *(f"  {name:16} {rms:.4f} px" for name, rms in result.per_joint_px.items()),
         f"  {result.model}",
     ]

@@ -102,7 +102,8 @@ def _text(
             "",
         ]
     lines += [
-        "# Trial motions: each joint moves alone from base over base ± range. Choose base such that every camera",
+        "# Trial motions: each joint moves alone from base over base ± range. Choose base such that "
+        "every camera",
         "# sees the markers there, and ranges as large as the markers stay in view.",
         "[calibration]",
         "stops = 9",

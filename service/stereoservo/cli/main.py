@@ -46,7 +46,9 @@ _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class LazyGroup(TyperGroup):
-    """Imports a command when it is asked for. A broken plug-in is listed with its error and takes no other with it."""
+    """Imports a command when it is asked for. A broken plug-in is listed with its error and takes no other
+    with it.
+    """
 
     def list_commands(self, ctx: Any) -> list[str]:
         extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]

@@ -1,4 +1,6 @@
-"""What every command does alike: exactly one JSON object on stdout with ``--json``, messages on stderr, exit codes."""
+"""What every command does alike: exactly one JSON object on stdout with ``--json``, messages on stderr,
+exit codes.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def fail(error: BaseException, as_json: bool) -> None:
 
 
 def known(error: BaseException) -> bool:
-    """Whether an exception is one that this project raises on purpose: its text is the message, no traceback needed."""
+    """Whether an exception is one that this project raises on purpose: its text is the message, no
+    traceback needed.
+    """
     return type(error).__module__.split(".")[0].startswith("stereoservo") or isinstance(error, OSError)
 
 

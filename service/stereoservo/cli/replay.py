@@ -30,7 +30,8 @@ def replay(
     if result.identical is False:
         raise CommandError(
             "differs",
-            f"{file}: step {result.first_difference} differs, largest relative error {result.max_relative_error:.3g}",
+            f"{file}: step {result.first_difference} differs, largest relative error "
+            f"{result.max_relative_error:.3g}",
             **figures,
         )
     verdict = (

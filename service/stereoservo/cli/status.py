@@ -24,7 +24,8 @@ def describe(state: StateMessage) -> str:
     lines = [
         f"{state.cell}: {state.lifecycle}, model {state.model} (epoch {state.model_epoch}), {state.source}",
         f"  joints  {joints}",
-        f"  loop    {state.loop.rate_hz:g} Hz, {state.loop.cycles} cycles, {state.loop.overruns} overruns, lateness p99 "
+        f"  loop    {state.loop.rate_hz:g} Hz, {state.loop.cycles} cycles, {state.loop.overruns} "
+        f"overruns, lateness p99 "
         f"{state.loop.lateness_us['p99']:.0f} us, max {state.loop.lateness_us['max']:.0f} us",
         "  markers " + "  ".join(f"{camera} {count}" for camera, count in state.visible.items()),
     ]

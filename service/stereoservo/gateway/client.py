@@ -1,4 +1,6 @@
-"""A client of a cell: ten lines to servo an arm. Every call either succeeds or raises; "no reply" means refused."""
+"""A client of a cell: ten lines to servo an arm. Every call either succeeds or raises; "no reply" means
+refused.
+"""
 
 from __future__ import annotations
 
@@ -121,8 +123,8 @@ class GoalResult(msgspec.Struct, frozen=True):
 class Client:
     """A session with the daemon of one cell.
 
-    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this host.
-    Raises NotRunningError, SessionError.
+    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
+    host. Raises NotRunningError, SessionError.
     """
 
     def __init__(
@@ -248,15 +250,25 @@ class Client:
         time_limit_s: float | None = None,
         mode: Literal["preempt", "queue"] = "preempt",
     ) -> GoalHandle:
-        """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
+        """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by
+        camera.
 
         A lease is renewed by a thread of this client until the goal has ended or the client is closed.
         Raises RefusedError with every problem, NoReplyError.
         """
         goal = Goal(
-            id=str(uuid.uuid4()), target=as_target(target), law=law, points=points, gain=gain, tolerance_px=tolerance_px,
-            hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease_s, time_limit_s=time_limit_s, mode=mode,
-        )  # fmt: skip
+            id=str(uuid.uuid4()),
+            target=as_target(target),
+            law=law,
+            points=points,
+            gain=gain,
+            tolerance_px=tolerance_px,
+            hold_frames=hold_frames,
+            speed_scale=speed_scale,
+            lease_s=lease_s,
+            time_limit_s=time_limit_s,
+            mode=mode,
+        )
         return self.send(goal)
 
     def check(self, goal: Goal) -> Reply:
@@ -300,7 +312,9 @@ class Client:
     def calibrate(
         self, progress: Callable[[EventMessage], None] | None = None, timeout_s: float = 1800.0
     ) -> CalibrationResult:
-        """Trial motions, fit, model. ``progress`` hears every event of it. Raises RefusedError, FailedError."""
+        """Trial motions, fit, model. ``progress`` hears every event of it. Raises RefusedError,
+        FailedError.
+        """
         command = Calibrate(str(uuid.uuid4()))
         ends = ("calibrated", "calibration_failed", "calibration_aborted")
 

@@ -1,4 +1,5 @@
-"""Goals and commands from zenoh: decoded strictly, checked statically, forwarded to the core, answered when it has.
+"""Goals and commands from zenoh: decoded strictly, checked statically, forwarded to the core, answered
+when it has.
 
 Nothing here waits: an unanswered request is kept with its deadline.
 """
@@ -156,8 +157,12 @@ class Intake:
         now = time.monotonic()
         for number in [number for number, pending in self._pending.items() if now > pending.deadline]:
             pending = self._pending.pop(number)
-            text = f"the servo process did not answer within {REPLY_TIMEOUT_S:g} s; whether it took the request is unknown"
-            self._answer(pending.query, self._refused(text), pending.operator)
+            text = f"the servo process did not answer within {REPLY_TIMEOUT_S:g} s"
+            self._answer(
+                pending.query,
+                self._refused(f"{text}; whether it took the request is unknown"),
+                pending.operator,
+            )
 
     # -- answers --------------------------------------------------------------------------------------------
 

@@ -1,4 +1,6 @@
-"""The key space ``stereoservo/v1/<cell>/…`` (DESIGN 5). Names are checked: zenoh accepts nearly any bytes as a key."""
+"""The key space ``stereoservo/v1/<cell>/…`` (DESIGN 5). Names are checked: zenoh accepts nearly any bytes
+as a key.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ class KeySpace:
         return f"{self.prefix}/schema/{check_name('schema', name)}"
 
     def operator_of_goal(self, key: str) -> str:
-        """The operator of a concrete goal key. Raises InvalidKeyError (a wildcard put reaches every subscriber)."""
+        """The operator of a concrete goal key. Raises InvalidKeyError (a wildcard put reaches every
+        subscriber).
+        """
         return check_name("operator", self._rest(key, "goal", 1)[0])
 
     def command_of(self, key: str) -> tuple[str, str]:

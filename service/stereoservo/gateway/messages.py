@@ -1,4 +1,6 @@
-"""Messages on the wire: JSON by msgspec structs; strict at the daemon's intake, tolerant at readers (DESIGN 5)."""
+"""Messages on the wire: JSON by msgspec structs; strict at the daemon's intake, tolerant at readers
+(DESIGN 5).
+"""
 
 from __future__ import annotations
 
@@ -167,7 +169,9 @@ class FeaturesMessage(msgspec.Struct, frozen=True):
 
 
 class CalibrationResult(msgspec.Struct, frozen=True):
-    """What a calibration gave. ``covariance_ok``: the residuals are what the measurement noise explains (chi-square)."""
+    """What a calibration gave. ``covariance_ok``: the residuals are what the measurement noise explains
+    (chi-square).
+    """
 
     rms_px: float
     per_joint_px: dict[str, float]
@@ -207,7 +211,9 @@ class EventMessage(msgspec.Struct, frozen=True):
 
 
 class EventList(msgspec.Struct, frozen=True):
-    """Answer to ``get …/event?from=N``: at most a few hundred; ``next`` is where to go on, ``first`` the oldest kept."""
+    """Answer to ``get …/event?from=N``: at most a few hundred; ``next`` is where to go on, ``first`` the
+    oldest kept.
+    """
 
     boot: str
     first: int
@@ -216,7 +222,9 @@ class EventList(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message itself."""
+    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message
+    itself.
+    """
 
     accepted: bool
     message: str = ""
@@ -248,7 +256,9 @@ def schema(name: str) -> bytes:
 
 
 def encode(message: Any) -> bytes:
-    """A message as JSON. Raises MessageError for a number that is not finite (JSON would turn it into null)."""
+    """A message as JSON. Raises MessageError for a number that is not finite (JSON would turn it into
+    null).
+    """
     tree = msgspec.to_builtins(message)
     require_finite(tree)
     return msgspec.json.encode(tree)
@@ -268,7 +278,8 @@ def require_finite(tree: Any, where: str = "") -> None:
 
 
 def decode(data: bytes, kind: type[_T]) -> _T:
-    """Take a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do not.
+    """Take a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do
+    not.
 
     Raises MessageError: too large, not JSON, a number that is not finite, a field that does not fit.
     """

@@ -1,7 +1,8 @@
-"""The gateway process: zenoh on one side, the servo process on the other; recorder, journal, taught goals, models, fits.
+"""The gateway process: zenoh on one side, the servo process on the other; recorder, journal, taught goals,
+models, fits.
 
-Nothing that the arm waits for runs here; its silence means hold.
-``python -m stereoservo.gateway.process RUNTIME_DIRECTORY PARENT_PID``.
+Nothing that the arm waits for runs here; its silence means hold. ``python -m stereoservo.gateway.process
+RUNTIME_DIRECTORY PARENT_PID``.
 """
 
 from __future__ import annotations
@@ -294,12 +295,18 @@ class Gateway:
             boot=self.boot,
             joints=tuple(
                 JointInfo(
-                    name, kind, float(limits.position_min[i]), float(limits.position_max[i]), float(limits.velocity_max[i])
+                    name,
+                    kind,
+                    float(limits.position_min[i]),
+                    float(limits.position_max[i]),
+                    float(limits.velocity_max[i]),
                 )
                 for i, (name, kind) in enumerate(zip(settings.joint_names, settings.joint_kinds, strict=True))
             ),
             cameras=tuple(
-                CameraInfo(camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids)
+                CameraInfo(
+                    camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids
+                )
                 for camera in settings.cameras
             ),
             laws=LAWS,
@@ -308,17 +315,23 @@ class Gateway:
             model=None
             if model is None
             else ModelInfo(
-                model.epoch, model.stratum, model.marker_ids, model.created,
-                None if model.statistics is None else model.statistics.rms_px, str(self._models.path(model.epoch)),
+                model.epoch,
+                model.stratum,
+                model.marker_ids,
+                model.created,
+                None if model.statistics is None else model.statistics.rms_px,
+                str(self._models.path(model.epoch)),
             ),
-            taught=tuple(TaughtInfo(name, goal.target.model_epoch or 0, goal.created)
-                for name, goal in sorted(self._taught.goals.items())),
+            taught=tuple(
+                TaughtInfo(name, goal.target.model_epoch or 0, goal.created)
+                for name, goal in sorted(self._taught.goals.items())
+            ),
             can_calibrate=settings.trials is not None,
             can_home=settings.home is not None,
             dry_run=plan.dry_run,
             commissioning=plan.commissioning,
             recording=self._recording,
-        )  # fmt: skip
+        )
 
     # -- what the core says ---------------------------------------------------------------------------------
 
@@ -337,9 +350,12 @@ class Gateway:
         elif event.kind == "model" and self._result is not None:
             result, self._result = self._result, None
             self.log.add(
-                "calibrated", message=f"model epoch {result.epoch}: {result.rms_px:.3f} px rms", id=self._job.id,
-                calibration=result, origin="gateway",
-            )  # fmt: skip
+                "calibrated",
+                message=f"model epoch {result.epoch}: {result.rms_px:.3f} px rms",
+                id=self._job.id,
+                calibration=result,
+                origin="gateway",
+            )
         elif (
             event.kind == "warning" and event.message.startswith("model refused") and self._result is not None
         ):
@@ -489,9 +505,14 @@ class Gateway:
         """Say that the daemon is up: ``daemon.json``. Not before the servo process takes requests."""
         plan = self.plan
         info = DaemonInfo(
-            cell=plan.cell.cell.name, endpoint=self.endpoint, boot=self.boot, pid=os.getppid(), cell_path=plan.cell_path,
-            dry_run=plan.dry_run, commissioning=plan.commissioning,
-        )  # fmt: skip
+            cell=plan.cell.cell.name,
+            endpoint=self.endpoint,
+            boot=self.boot,
+            pid=os.getppid(),
+            cell_path=plan.cell_path,
+            dry_run=plan.dry_run,
+            commissioning=plan.commissioning,
+        )
         path = plan.directories.daemon
         temporary = path.with_suffix(".new")
         temporary.write_bytes(encode(info))
@@ -510,9 +531,16 @@ class Gateway:
         self._replies.close()
         self._stop.close()
         declared = [
-            self._alive, self._goal_puts, self._goal_queries, *self._command_queries, self._event_queries,
-            self._state_queries, self._info_queries, self._schema_queries, *self._publishers.all,
-        ]  # fmt: skip
+            self._alive,
+            self._goal_puts,
+            self._goal_queries,
+            *self._command_queries,
+            self._event_queries,
+            self._state_queries,
+            self._info_queries,
+            self._schema_queries,
+            *self._publishers.all,
+        ]
         close_session(self._session, declared)
         self._link.close()
         self._reports.close()

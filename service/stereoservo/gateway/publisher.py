@@ -1,4 +1,6 @@
-"""What the gateway publishes: state, features and numbered events, and the replies, each from where it may block."""
+"""What the gateway publishes: state, features and numbered events, and the replies, each from where it may
+block.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The gateway's side of the servo process: requests and heartbeats there, events, state and step records back."""
+"""The gateway's side of the servo process: requests and heartbeats there, events, state and step records
+back.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""zenoh sessions with the habits that were measured to matter: bounded, local, no discovery, never blocking."""
+"""zenoh sessions with the habits that were measured to matter: bounded, local, no discovery, never
+blocking.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ def endpoint_of(cell: CellFile, socket: Path) -> str:
 
 def _common() -> dict[str, Any]:
     return {
-        # Discovery would announce the arm to every host of the network and bring in peers that no access rule sees.
+        # Discovery would announce the arm to every host of the network and bring in peers that no access rule
+        # sees.
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},  # leaves segments behind and has watchdog drops
@@ -70,7 +73,7 @@ def router_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any
     if zenoh_section.mode == "client":
         if not zenoh_section.endpoints:
             raise SessionError(
-                'zenoh.mode = "client" needs zenoh.endpoints: the router to connect to, e.g. ["tls/router:7447"]'
+                'zenoh.mode = "client" needs zenoh.endpoints: the router to join, e.g. ["tls/router:7447"]'
             )
         return config | _client(list(zenoh_section.endpoints))
     endpoints = list(zenoh_section.endpoints) or [endpoint_of(cell, socket)]
@@ -90,7 +93,8 @@ def check_listen_endpoint(endpoint: str, *, secured: bool) -> None:
     local = host in ("127.0.0.1", "::1", "localhost")
     if protocol not in ("tcp", "tls") or not address.rpartition(":")[2].isdigit():
         raise SessionError(
-            f"zenoh.endpoints: {endpoint!r}; valid are unixsock-stream/PATH, tcp/127.0.0.1:PORT, or tls/HOST:PORT with [zenoh.tls]"
+            f"zenoh.endpoints: {endpoint!r}; valid are unixsock-stream/PATH, tcp/127.0.0.1:PORT, or "
+            f"tls/HOST:PORT with [zenoh.tls]"
         )
     if protocol == "tcp" and not local:
         raise SessionError(
@@ -131,7 +135,8 @@ def open_session(config: dict[str, Any]) -> Any:
 
 
 def close_session(session: Any, declared: list[Any]) -> bool:
-    """Undeclare, then close, in a side thread with a time limit (a hung client would hold ``close`` for 10 s).
+    """Undeclare, then close, in a side thread with a time limit (a hung client would hold ``close`` for 10
+    s).
 
     False where the limit passed; the process may then end without it.
     """

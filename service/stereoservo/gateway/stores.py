@@ -1,4 +1,6 @@
-"""What outlives a run: taught goals, models, the journal. All in the cell's state directory, written whole or not at all."""
+"""What outlives a run: taught goals, models, the journal. All in the cell's state directory, written whole
+or not at all.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Static checks of goals and commands, before the core sees them: everything that can be known without the arm's state."""
+"""Static checks of goals and commands, before the core sees them: everything that can be known without the
+arm's state.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ MIN_MARKERS = 3
 
 @dataclass(frozen=True)
 class GoalContext:
-    """What a goal is checked against. ``model_markers``: markers of the model in use, None where there is none."""
+    """What a goal is checked against. ``model_markers``: markers of the model in use, None where there is
+    none.
+    """
 
     settings: CoreSettings
     taught: tuple[str, ...]
@@ -21,7 +25,9 @@ class GoalContext:
 
 
 def check_goal(goal: Goal, context: GoalContext) -> list[str]:
-    """What is wrong with ``goal``: each problem names the value and what would have been valid; empty when nothing is."""
+    """What is wrong with ``goal``: each problem names the value and what would have been valid; empty when
+    nothing is.
+    """
     target = goal.target
     if isinstance(target, JointTarget):
         return _check_joints(goal, target, context)
@@ -51,21 +57,25 @@ def _check_features(target: FeatureTarget, context: GoalContext) -> list[str]:
         for marker, (u, v) in points.items():
             if marker not in camera.marker_ids:
                 problems.append(
-                    f"{where}.{marker}: the detector of camera {name!r} knows no marker {marker}; it knows: {_list(camera.marker_ids)}"
+                    f"{where}.{marker}: the detector of camera {name!r} knows no marker {marker}; it "
+                    f"knows: {_list(camera.marker_ids)}"
                 )
             elif context.model_markers is not None and marker not in context.model_markers:
                 problems.append(
-                    f"{where}.{marker}: the model has no marker {marker}; it has: {_list(context.model_markers)}"
+                    f"{where}.{marker}: the model has no marker {marker}; it has: "
+                    f"{_list(context.model_markers)}"
                 )
             if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
                 problems.append(
-                    f"{where}.{marker}: pixel ({u:g}, {v:g}) is outside the image; u from -0.5 to {camera.width - 0.5:g}, "
+                    f"{where}.{marker}: pixel ({u:g}, {v:g}) is outside the image; u from -0.5 to "
+                    f"{camera.width - 0.5:g}, "
                     f"v from -0.5 to {camera.height - 0.5:g} are valid"
                 )
             markers.add(marker)
     if not problems and len(markers) < MIN_MARKERS:
         problems.append(
-            f"target.set_points: {len(markers)} marker(s) ({_list(sorted(markers))}); at least {MIN_MARKERS} fix a pose"
+            f"target.set_points: {len(markers)} marker(s) ({_list(sorted(markers))}); at least "
+            f"{MIN_MARKERS} fix a pose"
         )
     return problems
 
@@ -111,7 +121,8 @@ def check_command(command: Command, settings: CoreSettings) -> list[str]:
         limit = float(settings.limits.velocity_max[settings.joint_names.index(name)])
         if abs(velocity) > limit:
             problems.append(
-                f"velocities.{name}: {velocity:g} is above the joint's limit; {-limit:g} to {limit:g} is valid"
+                f"velocities.{name}: {velocity:g} is above the joint's limit; {-limit:g} to {limit:g} "
+                f"is valid"
             )
     return problems
 

@@ -1,4 +1,6 @@
-"""Gathers what the trial motions showed until it can be fitted: ``calibration_sample`` events in, trial data out."""
+"""Gathers what the trial motions showed until it can be fitted: ``calibration_sample`` events in, trial
+data out.
+"""
 
 from __future__ import annotations
 

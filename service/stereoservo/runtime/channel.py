@@ -1,7 +1,9 @@
-"""Messages that must not be lost: a unix SEQPACKET socket, non-blocking on both sides, bounded, record boundaries kept.
+"""Messages that must not be lost: a unix SEQPACKET socket, non-blocking on both sides, bounded, record
+boundaries kept.
 
-A :class:`ChannelServer` accepts any number of peers or, with ``single=True``, keeps only the newest (a restarted gateway
-replaces the one that died). Nothing here blocks; a full socket is reported to the caller, who decides what to drop.
+A :class:`ChannelServer` accepts any number of peers or, with ``single=True``, keeps only the newest (a
+restarted gateway replaces the one that died). Nothing here blocks; a full socket is reported to the
+caller, who decides what to drop.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
-"""What a cell's drivers say of themselves, asked in a process of its own: a driver that crashes takes nothing with it.
+"""What a cell's drivers say of themselves, asked in a process of its own: a driver that crashes takes
+nothing with it.
 
-``python -m stereoservo.runtime.describe CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID JSON_OPTIONS`` writes the
-run plan and compiles the kernels, so that the other processes find them compiled.
+``python -m stereoservo.runtime.describe CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID
+JSON_OPTIONS`` writes the run plan and compiles the kernels, so that the other processes find them
+compiled.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ def describe_cell(
 ) -> tuple[JointDriverDescription, tuple[CameraDescription, ...]]:
     """Descriptions of joint driver and cameras, each camera with its detector's marker ids.
 
-    Raises PluginError, DriverError, CellFileError (a camera that can show no marker, a camera without detector).
+    Raises PluginError, DriverError, CellFileError (a camera that can show no marker, or lacks a detector).
     """
     common = {
         "clock": clock,

@@ -1,4 +1,6 @@
-"""Where a cell keeps things: a runtime directory (sockets, slots, locks; gone with the daemon) and a state directory."""
+"""Where a cell keeps things: a runtime directory (sockets, slots, locks; gone with the daemon) and a state
+directory.
+"""
 
 from __future__ import annotations
 
@@ -106,7 +108,9 @@ class CellDirectories:
 
 
 def runtime_root() -> Path:
-    """``$STEREOSERVO_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/stereoservo``, else ``/tmp/stereoservo-<uid>``."""
+    """``$STEREOSERVO_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/stereoservo``, else
+    ``/tmp/stereoservo-<uid>``.
+    """
     if given := os.environ.get(RUNTIME_VARIABLE):
         return Path(given).absolute()
     if given := os.environ.get("XDG_RUNTIME_DIR"):
@@ -159,7 +163,8 @@ def _private(path: Path, variable: str) -> None:
         raise DirectoryError(f"{path}: is not a directory of user {os.getuid()}; {advice}")
     if found.st_mode & 0o022:
         raise DirectoryError(
-            f"{path}: others may write to it (mode {stat.S_IMODE(found.st_mode):o}); chmod 700 it, or {advice}"
+            f"{path}: others may write to it (mode {stat.S_IMODE(found.st_mode):o}); chmod 700 it, or "
+            f"{advice}"
         )
 
 

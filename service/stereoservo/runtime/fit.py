@@ -1,7 +1,9 @@
-"""The fit process: trial data in, model file out; short-lived and niced, so that the loop does not feel it.
+"""The fit process: trial data in, model file out; short-lived and niced, so that the loop does not feel
+it.
 
-``python -m stereoservo.runtime.fit TRIALS.npz MODEL.json --epoch N`` prints one JSON object a line: ``{"progress": …,
-"message": …}``, and at the end ``{"model": …}`` with the statistics or ``{"error": …}`` with exit code 1.
+``python -m stereoservo.runtime.fit TRIALS.npz MODEL.json --epoch N`` prints one JSON object a line:
+``{"progress": …, "message": …}``, and at the end ``{"model": …}`` with the statistics or ``{"error": …}``
+with exit code 1.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Newest-only hand-over between processes: an mmap'd file with a sequence lock, and the stop slot.
 
-Python cannot fence memory (aarch64 may reorder the stores), so the sequence lock is only the fast path: every record
-carries a CRC-32 over its sequence number and bytes, and a reader believes nothing else. Files are created once, by the
-supervisor or the first writer, and keep their inode for the cell's life, so that a restarted process finds the slot it left.
+Python cannot fence memory (aarch64 may reorder the stores), so the sequence lock is only the fast path:
+every record carries a CRC-32 over its sequence number and bytes, and a reader believes nothing else. Files
+are created once, by the supervisor or the first writer, and keep their inode for the cell's life, so that
+a restarted process finds the slot it left.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ def layout_hash(layout: str) -> int:
 
 
 def create_slot(path: Path, capacity: int, layout: str) -> None:
-    """Make the file of a slot for records of up to ``capacity`` bytes; an existing fitting file stays as it is."""
+    """Make the file of a slot for records of up to ``capacity`` bytes; an existing fitting file stays as
+    it is.
+    """
     size = _HEADER_BYTES + capacity
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -170,8 +173,8 @@ class SlotWriter:
 class SlotReader:
     """One of any number of readers.
 
-    ``torn`` counts reads that met a writer at work and were retried; ``missed`` counts polls that gave up after
-    ``retries`` of them (the record is then taken at the next poll).
+    ``torn`` counts reads that met a writer at work and were retried; ``missed`` counts polls that gave up
+    after ``retries`` of them (the record is then taken at the next poll).
     """
 
     def __init__(self, path: Path, layout: str, *, retries: int = 8) -> None:
@@ -243,8 +246,8 @@ def create_stop_slot(path: Path) -> None:
 class StopSlot:
     """One word that any process may raise and the servo process reads each cycle and acknowledges.
 
-    Two processes that raise it at once both write a fresh word; whichever wins, the reader sees a change. The count is
-    for people to read and may miss one of two simultaneous raises.
+    Two processes that raise it at once both write a fresh word; whichever wins, the reader sees a change.
+    The count is for people to read and may miss one of two simultaneous raises.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,4 +1,6 @@
-"""What ties a process to its parent and to signals: no orphan survives a killed supervisor, no signal is lost."""
+"""What ties a process to its parent and to signals: no orphan survives a killed supervisor, no signal is
+lost.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ _PR_SET_PDEATHSIG = 1
 def die_with_parent(parent: int, how: signal.Signals) -> None:
     """Have the kernel send ``how`` when the parent dies; exits at once where ``parent`` has died already.
 
-    The kernel watches the parent's *thread*, so processes must be spawned from a thread that lives as long as it should.
+    The kernel watches the parent's *thread*, so processes must be spawned from a thread that lives as long
+    as it should.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0) != 0:
@@ -25,7 +28,9 @@ def die_with_parent(parent: int, how: signal.Signals) -> None:
 
 
 class Termination:
-    """SIGTERM and SIGINT as a flag. After the first one the process has ``grace_s`` to end; then SIGALRM kills it."""
+    """SIGTERM and SIGINT as a flag. After the first one the process has ``grace_s`` to end; then SIGALRM
+    kills it.
+    """
 
     def __init__(self, grace_s: float = 5.0) -> None:
         self.signals = 0

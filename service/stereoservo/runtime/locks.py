@@ -1,4 +1,6 @@
-"""One daemon per cell, one per hardware channel: ``flock``, which the kernel releases when its holder dies."""
+"""One daemon per cell, one per hardware channel: ``flock``, which the kernel releases when its holder
+dies.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,9 @@ def holder(path: Path) -> int | None:
 
 
 def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> Path | None:
-    """The lock file of the hardware channel that ``options`` name, None where they name none (a simulation)."""
+    """The lock file of the hardware channel that ``options`` name, None where they name none (a
+    simulation).
+    """
     for key in CHANNEL_OPTIONS:
         value = options.get(key)
         if isinstance(value, str | int) and value != "":

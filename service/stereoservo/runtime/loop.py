@@ -1,7 +1,8 @@
 """The servo loop's time: absolute deadlines on a fixed grid, counted misses, a histogram of lateness.
 
-A relative sleep loses every oversleep for good; here slot k is at ``start + k * period`` whatever happened before. A cycle
-that ran over its slot's end skips the slots that have passed instead of catching up with a burst.
+A relative sleep loses every oversleep for good; here slot k is at ``start + k * period`` whatever happened
+before. A cycle that ran over its slot's end skips the slots that have passed instead of catching up with a
+burst.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ class Histogram:
         self.maximum = max(self.maximum, value)
 
     def quantile(self, fraction: float) -> float:
-        """The value below or at which ``fraction`` of the counted ones lie (upper edge of its bin, at most the maximum)."""
+        """The value below or at which ``fraction`` of the counted ones lie (upper edge of its bin, at most
+        the maximum).
+        """
         if not self.count:
             return 0.0
         wanted = fraction * self.count
@@ -73,7 +76,8 @@ def _upper_edge(index: int) -> int:
 class LoopClock:
     """Wakes at ``start + k * period``. ``now`` and ``sleep`` are injected for virtual time.
 
-    Time spent stopped in a debugger or a suspended machine shows as skipped slots, never as a burst of cycles.
+    Time spent stopped in a debugger or a suspended machine shows as skipped slots, never as a burst of
+    cycles.
     """
 
     def __init__(
@@ -134,9 +138,11 @@ class LoopClock:
 
 
 def prepare_realtime(priority: int) -> list[str]:
-    """Freeze the garbage collector's generations and ask for SCHED_FIFO (``priority`` 0: leave the scheduler alone).
+    """Freeze the garbage collector's generations and ask for SCHED_FIFO (``priority`` 0: leave the
+    scheduler alone).
 
-    Gives warnings, each with the command that cures it; the loop runs without as well, only later at times.
+    Gives warnings, each with the command that cures it; the loop runs without as well, only later at
+    times.
     """
     gc.collect()
     gc.freeze()

@@ -1,4 +1,6 @@
-"""Drivers, detectors and commands found by entry point: imported only when asked for, a broken one listed with its error."""
+"""Drivers, detectors and commands found by entry point: imported only when asked for, a broken one listed
+with its error.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The servo process: joint driver, core, slots and sockets, at a fixed rate.
 
-It holds nothing that could delay the arm: no zenoh, no scipy solver, no images, no log but a line at start and end.
-Whatever ends it, the drives are stopped. ``python -m stereoservo.runtime.servo RUNTIME_DIRECTORY PARENT_PID``.
+It holds nothing that could delay the arm: no zenoh, no scipy solver, no images, no log but a line at start
+and end. Whatever ends it, the drives are stopped. ``python -m stereoservo.runtime.servo RUNTIME_DIRECTORY
+PARENT_PID``.
 """
 
 from __future__ import annotations
@@ -168,7 +169,9 @@ class StepStream:
 
 
 class ServoProcess:
-    """One cycle after the other: read, step, write, tell. Driver and time are given, so that tests can drive it."""
+    """One cycle after the other: read, step, write, tell. Driver and time are given, so that tests can
+    drive it.
+    """
 
     def __init__(
         self,
@@ -364,7 +367,9 @@ class ServoProcess:
         self._cycles += 1
 
     def come_to_rest(self, loop: LoopClock, termination: Termination) -> None:
-        """Let the core brake until its command is zero, at most ``REST_TIMEOUT_S``; a second signal cuts it short."""
+        """Let the core brake until its command is zero, at most ``REST_TIMEOUT_S``; a second signal cuts
+        it short.
+        """
         until = self._clock.now_ns() + int(REST_TIMEOUT_S * 1e9)
         first = True
         while termination.signals < 2 and self._clock.now_ns() < until:

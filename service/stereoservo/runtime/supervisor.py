@@ -1,7 +1,9 @@
-"""The supervisor: starts, watches and restarts the processes of one cell; owns its locks and its runtime directory.
+"""The supervisor: starts, watches and restarts the processes of one cell; owns its locks and its runtime
+directory.
 
-A gateway or vision process that ends is started again after a growing pause. The servo process is never started again:
-when it ends, everything stops. Children die with the supervisor, whatever kills it (the servo process in good order).
+A gateway or vision process that ends is started again after a growing pause. The servo process is never
+started again: when it ends, everything stops. Children die with the supervisor, whatever kills it (the
+servo process in good order).
 """
 
 from __future__ import annotations
@@ -111,7 +113,8 @@ class Supervisor:
             for child in (self.servo, self.gateway):
                 if child.process is not None and (code := child.process.poll()) is not None:
                     raise StartError(
-                        f"the {child.name} process ended at its start (exit code {code}); its message is above"
+                        f"the {child.name} process ended at its start (exit code {code}); its message "
+                        f"is above"
                     )
             if time.monotonic() > until:
                 raise StartError(f"the processes were not ready within {READY_TIMEOUT_S:g} s")
@@ -188,7 +191,8 @@ def child_environment() -> dict[str, str]:
 def prepare(
     cell_path: Path, options: PlanOptions, directories: CellDirectories, termination: Termination
 ) -> RunPlan | None:
-    """Check the cell with its drivers, compile the kernels, lay out the slots; None when asked to end meanwhile.
+    """Check the cell with its drivers, compile the kernels, lay out the slots; None when asked to end
+    meanwhile.
 
     Raises StartError.
     """
@@ -240,7 +244,8 @@ def run_cell(
 ) -> int:
     """Run the daemon of a cell until SIGTERM or SIGINT; gives the signal that ended it.
 
-    Raises CellFileError, DirectoryError, AlreadyRunningError, StartError, ServoDiedError, each after everything stopped.
+    Raises CellFileError, DirectoryError, AlreadyRunningError, StartError, ServoDiedError, each after
+    everything stopped.
     """
     cell = load_cell_file(cell_path)
     directories = cell_directories(cell.cell.name)

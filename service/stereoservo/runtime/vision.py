@@ -154,7 +154,9 @@ def run_pipeline(
     sleep: Callable[[float], None],
     flush: Callable[[], None],
 ) -> None:
-    """Run until ``ended``; every failure is reported once and answered by a reconnect after a growing pause."""
+    """Run until ``ended``; every failure is reported once and answered by a reconnect after a growing
+    pause.
+    """
     pause_s = FIRST_PAUSE_S
     down = False
     while not ended():
@@ -202,9 +204,13 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     section = next(section for section in plan.cell.camera if section.name == camera)
     description = next(description for description in plan.cameras if description.name == camera)
     context = DriverContext(
-        clock=clock, cell=plan.cell.cell.name, runtime_dir=Path(plan.runtime), cell_dir=Path(plan.cell_path).parent,
-        camera=camera, seed=plan.seed,
-    )  # fmt: skip
+        clock=clock,
+        cell=plan.cell.cell.name,
+        runtime_dir=Path(plan.runtime),
+        cell_dir=Path(plan.cell_path).parent,
+        camera=camera,
+        seed=plan.seed,
+    )
     path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
     lock = (
         FileLock(path, f"camera driver {section.driver!r} with these options") if path is not None else None

@@ -1,4 +1,5 @@
-"""Compiles the kernels of the loop into numba's cache, so that a process that starts later finds them compiled.
+"""Compiles the kernels of the loop into numba's cache, so that a process that starts later finds them
+compiled.
 
 A made-up arm with two cameras runs some steps of each law; kernels are compiled by types, not by sizes.
 """
