@@ -70,7 +70,7 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Refuse dots so many standard deviations off their prior; 0: leave it to the core."""
     lopsided: Positive = 0.02
     """Largest odd harmonic of a whole dot's edge; a cut of 0.5 px makes 0.02, of 1 px 0.04."""
-    floor_px: Annotated[float, Meta(ge=0)] = 0.002
+    floor_px: Annotated[float, Meta(ge=0)] = 0.001
     """Systematic standard deviation [px] added to every covariance: sampling of sharp edges (measured
     0.0005-0.003).
     """

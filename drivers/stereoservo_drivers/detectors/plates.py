@@ -51,12 +51,13 @@ def seven_dots(
     *,
     side: float = 0.084,
     radius: float = 0.008,
-    margin: float = 0.010,
+    margin: float = 0.018,
 ) -> DotFace:
     """A face from fractions of its corner square: ``edge_fraction`` along edge 0-1, ``inner`` (x, y) from
     corner 0.
 
-    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots. Ids are ``first_id`` ..
+    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots: a detector judges the noise
+    and the black level there, so leave it ten pixels. Ids are ``first_id`` ..
     ``first_id + 6``.
     """
     fractions = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (edge_fraction, 0.0), *inner])
