@@ -67,7 +67,12 @@ def fundamental_robust(
     parameters.randomGeneratorState = 20010701
     parameters.score = cv2.SCORE_METHOD_MAGSAC
     parameters.threshold = threshold
-    found, mask = cv2.findFundamentalMat(left, right, parameters)
+    try:
+        found, mask = cv2.findFundamentalMat(left, right, parameters)
+    except cv2.error as error:  # its search asserts on some hopeless inputs
+        raise GeometryError(
+            "no_model", f"no fundamental matrix fits the {len(left)} matches: {error}", matches=len(left)
+        ) from error
     if found is None or np.shape(found) != (3, 3) or not np.isfinite(found).all():
         raise GeometryError(
             "no_model", f"no fundamental matrix fits the {len(left)} matches", matches=len(left)

@@ -169,8 +169,8 @@ def _check_algebra(model: CellModel, path: Path | str) -> None:
                 path,
                 f"generators[{j}]",
                 f"joint {model.joint_names[j]!r} is {kind} but "
-                f"‖{law.replace(' = ', ' - ').replace('- -', '+ ')}‖ is "
-                f"{np.linalg.norm(defect):.2e} with ‖Ĥ‖ {size:.2e}; {law} is needed",
+                f"‖{law.replace(' = ', ' - ').replace('- -', '+ ')}‖ is {np.linalg.norm(defect):.2e} with "
+                f"‖Ĥ‖ {size:.2e}; {law} is needed",
             )
     heights = model.marker_points @ model.plane_at_infinity
     if np.abs(heights - 1).max() > ALGEBRA_TOLERANCE:
@@ -185,8 +185,7 @@ def _check_algebra(model: CellModel, path: Path | str) -> None:
             path,
             "projective_to_euclidean",
             f"is {'missing' if model.projective_to_euclidean is None else 'given'} with stratum "
-            f"{model.stratum!r}; "
-            "it is there in the metric stratum, and only there",
+            f"{model.stratum!r}; it is there in the metric stratum, and only there",
         )
 
 

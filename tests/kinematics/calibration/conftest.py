@@ -161,7 +161,7 @@ def gantry():
     return placed(["prismatic"] * 3, links, two_faces(), np.zeros(3), [0.2, 0.15, 0.2], facing)
 
 
-def scara():
+def scara(body=None):
     """R, R, P, R with all axes parallel."""
     links = [translation(0.35, 0, 0.2), translation(0.3, 0, 0), np.eye(4), translation(0, 0, 0.03)]
     ranges = [*np.radians([15, 20]), 0.1, np.radians(40)]
@@ -169,7 +169,7 @@ def scara():
     return placed(
         ["revolute", "revolute", "prismatic", "revolute"],
         links,
-        two_faces(),
+        two_faces() if body is None else body,
         [0.3, 0.5, 0, 0.2],
         ranges,
         facing,

@@ -315,6 +315,16 @@ def test_points_of_one_plane_are_refused(arms, plate):
     assert caught.value.code == "views_degenerate"
 
 
+def test_axis_that_a_flat_target_cannot_show_is_refused(arms, plate):
+    """Parallel axes with a lift: affine at most. The last joint turns the plate in its plane: its axis
+    stays open.
+    """
+    cell = arms["scara"](plate)
+    with pytest.raises(CalibrationError) as caught:
+        fit_model(cell.trials(0.1, np.random.default_rng(23)), epoch=1)
+    assert caught.value.code == "not_identifiable"
+
+
 def test_lens_distortion_is_not_passed_off_as_a_good_fit(arms):
     rng = np.random.default_rng(22)
     cell = arms["rx90"]()

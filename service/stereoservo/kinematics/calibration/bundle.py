@@ -254,9 +254,11 @@ def solve(
 ) -> Solution:
     """Least squares over the minimal charts of ``stratum``, re-centred between ``rounds``.
 
-    ``loss_scale`` [sigmas] for the robust losses. Never raises on a bad fit: look at ``converged`` and
-    ``cost``.
+    ``loss_scale`` [sigmas] for the robust losses. Raises LinAlgError where the start has no finite residuals.
+    Never raises on a bad fit: look at ``converged`` and ``cost``.
     """
+    if not np.isfinite(residuals(rig, data)).all():
+        raise np.linalg.LinAlgError("points at infinity or in a focal plane at the start of a bundle")
     evaluations = 0
     converged = False
     for _ in range(rounds):

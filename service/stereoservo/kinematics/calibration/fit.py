@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.displacements import exp_generator
+from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, residuals, solve
 from stereoservo.kinematics.calibration.report import CalibrationResult, build_result
 from stereoservo.kinematics.calibration.separate import MIN_MARKERS, JointTrial, measurements, separate_joint
@@ -26,6 +27,8 @@ BoolArray = npt.NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 
 
+FLOOR = 1.5
+"""Variance factor up to which a bundle that has not converged walks along an open valley, not towards a fit."""
 MIN_SIGHTINGS = 2
 """Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 
@@ -41,10 +44,23 @@ def fit_model(
     """Fit a cell's model to its trial motions.
 
     ``progress(stage, fraction)`` is called as the work goes on. Raises CalibrationError with the cause where
-    the data do not give a model that fits them; never returns a model that does not.
+    the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
+    Between that and the noise floor the model's ``chi2_ok`` is false and the report's notes say what is
+    known.
     """
-    tell = progress or _silent
     check_trials(trials)
+    try:
+        return _fit(trials, epoch, created, progress or _silent, options)
+    except (GeometryError, np.linalg.LinAlgError) as error:
+        raise CalibrationError(
+            "no_convergence",
+            f"the fit broke down: {error}. Are positions and markers what they are said to be?",
+        ) from error
+
+
+def _fit(
+    trials: TrialData, epoch: int, created: str, tell: Progress, options: FitOptions
+) -> CalibrationResult:
     tell("cameras", 0.0)
     cameras, points, usable = first_views(trials)
     trials, points, usable, left_out = _without_rare_markers(trials, points, usable)
@@ -210,8 +226,8 @@ def _refuse_misfit(
             raise CalibrationError(
                 "too_many_outliers",
                 f"{lost:.0%} of the pixels of joint {name!r}'s trial do not fit the {solution.stratum} "
-                "model; at "
-                f"most {options.max_trial_outliers:.0%} may. Are its positions right, did only it move?",
+                f"model; at most {options.max_trial_outliers:.0%} may. Are its positions right, did only "
+                "it move?",
                 joint=name,
                 share=lost,
                 maximum=options.max_trial_outliers,
@@ -239,8 +255,7 @@ def _refuse_misfit(
         raise CalibrationError(
             "residual_above_floor",
             f"residuals are {factor:.3g} times the stated sigmas; at most {options.max_sigma_factor:g} "
-            "allowed. Worst is "
-            f"joint {worst!r} ({per_joint[worst]:.3g})",
+            f"allowed. Worst is joint {worst!r} ({per_joint[worst]:.3g})",
             sigma_factor=factor,
             maximum=options.max_sigma_factor,
             joints=per_joint,
@@ -255,19 +270,27 @@ def _refuse_open(solution: Solution, notes: tuple[str, ...]) -> None:
         raise CalibrationError(
             "not_identifiable",
             f"the trials determine {rank} of {solution.charts.size} parameters of the {solution.stratum} "
-            f"model{because}; "
-            "markers off one plane, more stops or larger motions are needed",
+            f"model{because}; markers off one plane, more stops or larger motions are needed",
             rank=rank,
             parameters=solution.charts.size,
             notes=notes,
         )
-    if not solution.converged:
+    if solution.converged:
+        return
+    factor = variance_factor(solution)
+    if factor < FLOOR:
         raise CalibrationError(
-            "no_convergence",
-            f"the {solution.stratum} bundle did not converge in {solution.evaluations} "
-            f"evaluations{because}; residual "
-            f"{np.sqrt(variance_factor(solution)):.3g} sigmas",
+            "not_identifiable",
+            f"the {solution.stratum} model fits, but the trials leave a direction of it open{because}; markers "
+            "off one plane, more stops or larger motions are needed",
             stratum=solution.stratum,
-            evaluations=solution.evaluations,
             notes=notes,
         )
+    raise CalibrationError(
+        "no_convergence",
+        f"the {solution.stratum} bundle did not converge in {solution.evaluations} evaluations{because}; "
+        f"residual {np.sqrt(factor):.3g} sigmas",
+        stratum=solution.stratum,
+        evaluations=solution.evaluations,
+        notes=notes,
+    )

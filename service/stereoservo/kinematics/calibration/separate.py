@@ -93,10 +93,8 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
         raise CalibrationError(
             "too_few_stops",
             f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of "
-            f"{int(own.sum())} stops, "
-            f"{lost} show fewer than {MIN_SHOWN} markers that two cameras agree on, and at {strayed} other joints "
-            "strayed by more "
-            f"than {STILL:g}",
+            f"{int(own.sum())} stops, {lost} show fewer than {MIN_SHOWN} markers that two cameras agree "
+            f"on, and at {strayed} other joints strayed by more than {STILL:g}",
             joint=name,
             stops=distinct,
             minimum=MIN_STOPS,
@@ -107,8 +105,7 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
         raise CalibrationError(
             "joint_did_not_move",
             f"joint {name!r}: the stops that show markers span {np.ptp(positions[stops, joint]):.4g} "
-            f"{unit}; at least "
-            f"{MIN_RANGE:g} {unit} is needed",
+            f"{unit}; at least {MIN_RANGE:g} {unit} is needed",
             joint=name,
             range=float(np.ptp(positions[stops, joint])),
             minimum=MIN_RANGE,
@@ -178,8 +175,7 @@ def separate_joint(
             f"joint {name!r}: its trial does not look like a "
             f"{'rotation' if kind == 'revolute' else 'translation'} by the reported positions: typical "
             f"residual {least:.3g} sigmas, at most {MISFIT:g} expected. Is the joint {kind}, are its "
-            "positions "
-            "right, did only it move?",
+            "positions right, did only it move?",
             joint=name,
             residual_sigmas=least,
             maximum=MISFIT,

@@ -102,8 +102,8 @@ class Judge:
         self.notes.append(
             f"the {solution.stratum} constraints cost a chi-square of "
             f"{solution.cost - self.projective.cost:.4g} for "
-            f"{self.projective.charts.size - solution.charts.size} parameters: cameras or joints follow the "
-            "model only nearly (lens distortion, play, positions)"
+            f"{self.projective.charts.size - solution.charts.size} parameters: cameras or joints follow "
+            "the model only nearly (lens distortion, play, positions)"
         )
         return (solution, plane) if certain or self._close(solution) else None
 
@@ -163,10 +163,21 @@ def upgraded(
         )
     for start, plane in _metric_starts(solution.rig, finite, noise, np.ptp(data.offsets, axis=0)):
         # Cameras that are not right yet must not be bent to a chain that is not: settle the chain first.
-        chain = solve(
-            start, data, "metric", cameras=False, loss="soft_l1", rounds=1, max_evaluations=20, tolerance=1e-2
-        )
-        metric = solve(chain.rig, data, "metric", rounds=2, max_evaluations=40)
+        try:
+            chain = solve(
+                start,
+                data,
+                "metric",
+                cameras=False,
+                loss="soft_l1",
+                rounds=1,
+                max_evaluations=20,
+                tolerance=1e-2,
+            )
+            metric = solve(chain.rig, data, "metric", rounds=2, max_evaluations=40)
+        except np.linalg.LinAlgError as error:
+            judge.notes.append(f"no metric start: {error}")
+            continue
         if judge.passes(metric, plane):
             return metric, plane, ()
         if judge.hopeless:
@@ -176,11 +187,12 @@ def upgraded(
         judge.hopeless, judge.reserve = False, []
         for plane in finite:
             try:
-                start = upgrade.affine_rig(solution.rig, plane)
-            except GeometryError as error:
+                affine = solve(
+                    upgrade.affine_rig(solution.rig, plane), data, "affine", rounds=2, max_evaluations=40
+                )
+            except (GeometryError, np.linalg.LinAlgError) as error:
                 judge.notes.append(f"no affine start: {error}")
                 continue
-            affine = solve(start, data, "affine", rounds=2, max_evaluations=40)
             if judge.passes(affine, plane):
                 return affine, plane, tuple(judge.notes)
             if judge.hopeless:

@@ -100,8 +100,8 @@ def _epipolar(
                 raise CalibrationError(
                     "views_degenerate",
                     f"a plane explains what cameras {names} see in common to {rms:.3g} px, with sigmas of "
-                    f"{sigma:.3g} px: their geometry stays open. The markers must not stay in one plane over "
-                    "all trials, and the cameras must stand apart",
+                    f"{sigma:.3g} px: their geometry stays open. The markers must not stay in one plane "
+                    "over all trials, and the cameras must stand apart",
                     rms_px=rms,
                     sigma_px=sigma,
                 ) from error
@@ -116,8 +116,8 @@ def _epipolar(
     raise CalibrationError(
         "views_degenerate",
         f"only {best:.0%} of the matches of cameras {names} fit one epipolar geometry at 16 sigmas "
-        f"({16 * sigma:.3g} px); at least {MIN_AGREEMENT:.0%} must. Did a camera move, or are markers mixed "
-        "up?",
+        f"({16 * sigma:.3g} px); at least {MIN_AGREEMENT:.0%} must. Did a camera move, or are markers "
+        "mixed up?",
         agreement=best,
         minimum=MIN_AGREEMENT,
     )
@@ -128,8 +128,7 @@ def _degenerate(trials: TrialData, k: int, error: GeometryError) -> CalibrationE
     return CalibrationError(
         "views_degenerate",
         f"the views of cameras {names} do not determine their geometry: {error}. The cameras must stand "
-        "apart, and "
-        "the markers must not stay in one plane over all trials",
+        "apart, and the markers must not stay in one plane over all trials",
         cause=error.code,
         cameras=[trials.cameras[0].name, trials.cameras[k].name],
     )
