@@ -39,7 +39,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     start: dict[str, float] = {}
     resume: bool = True
     command_timeout_s: Positive = 0.1
-    encoder: NonNegative = 1e-5
+    encoder: NonNegative = 1e-6
     history: Annotated[int, Meta(ge=64, le=10_000_000)] = CAPACITY
 
 

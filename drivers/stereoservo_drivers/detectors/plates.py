@@ -57,8 +57,8 @@ def seven_dots(
     corner 0.
 
     ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots: a detector judges the noise
-    and the black level there, so leave it ten pixels. Ids are ``first_id`` ..
-    ``first_id + 6``.
+    and the black level there, so leave it ten pixels. Ids are
+    ``first_id`` .. ``first_id + 6``.
     """
     fractions = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (edge_fraction, 0.0), *inner])
     return DotFace(
