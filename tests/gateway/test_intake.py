@@ -41,6 +41,10 @@ class Message:
     def __init__(self, key: str, payload: bytes | None) -> None:
         self.key_expr = key
         self.payload = None if payload is None else Bytes(payload)
+        self.dropped = False
+
+    def drop(self) -> None:
+        self.dropped = True
 
 
 class StubLink:
@@ -167,13 +171,22 @@ def test_commands_carry_their_operator(bench: Bench) -> None:
 
 def test_bad_commands_are_refused_with_the_place(bench: Bench) -> None:
     bench.intake.command_query(Message(KEYS.command("jog", "bob"), b'{"velocities": {"j1": NaN}}'))
-    bench.intake.command_query(Message("stereoservo/v1/demo/command/*/bob", b""))
+    bench.intake.command_query(Message("stereoservo/v1/demo/command/fly/bob", b""))
     bench.intake.command_query(Message(KEYS.command("jog", "bob"), b'{"velocities": {"j1": 99}}'))
     texts = [" ".join(reply.problems) for _, reply in bench.replies.sent]
     assert "NaN is not a JSON number" in texts[0]
     assert "there are: stop, enable" in texts[1]
     assert "-1 to 1 is valid" in texts[2]
     assert bench.link.asked == []
+
+
+def test_a_look_around_with_a_wildcard_commands_nothing(bench: Bench) -> None:
+    for key in ("stereoservo/v1/demo/**", "stereoservo/v1/demo/command/*/bob"):
+        query = Message(key, b"")
+        bench.intake.command_query(query)
+        bench.intake.goal_query(query)
+        assert query.dropped
+    assert (bench.link.asked, bench.replies.sent, bench.kinds()) == ([], [], [])
 
 
 def test_an_unanswered_request_is_answered_at_its_deadline_and_a_late_answer_is_dropped(

@@ -100,6 +100,28 @@ def test_home_jog_and_cli_verbs(client: Client) -> None:
     assert aborted["error"]["code"] == "goal_aborted"  # type: ignore[index]
 
 
+def test_looking_around_with_a_wildcard_reads_everything_and_stops_nothing(client: Client) -> None:
+    found = {}
+    for reply in client.session.get(f"{client.keys.prefix}/**", timeout=2.0):
+        if reply.ok is not None:
+            found[str(reply.ok.key_expr)] = reply.ok.payload.to_bytes()
+    assert set(found) == {client.keys.state, client.keys.info, client.keys.event}
+    client.session.put(f"{client.keys.prefix}/command/*", b"{}")
+    assert client.goal({"j1": client.status().joints["j1"]}).reached(30.0)
+    assert not {"STOPPED", "HELD"} & {reason.code for reason in client.status().reasons}
+
+
+def test_a_put_stops_too(client: Client) -> None:
+    client.session.put(client.keys.stop, b"")
+    eventually("stopped", lambda: "STOPPED" in {reason.code for reason in client.status().reasons})
+    client.resume()
+
+
+def test_schemas_are_served(client: Client) -> None:
+    assert b"set_points" in client.schema("goal")
+    assert b"there are: goal, state" in client.schema("gaol")
+
+
 # -- bad input ----------------------------------------------------------------------------------------------
 
 

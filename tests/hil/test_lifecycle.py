@@ -5,12 +5,21 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from stereoservo.gateway.client import Client, DaemonLostError, EventWatch, NoReplyError, RefusedError
+from stereoservo.gateway.client import (
+    Client,
+    DaemonLostError,
+    EventWatch,
+    FailedError,
+    NoReplyError,
+    RefusedError,
+)
 from stereoservo.gateway.messages import EventMessage
 from stereoservo.gateway.session import SessionError
 from stereoservo.runtime.commands import Goal, JointTarget
@@ -215,6 +224,40 @@ def test_a_recording_replays_bit_for_bit(calibrated: Path, start: Start, roots: 
     assert result.identical is True
     assert result.steps > 500
     assert result.checkpoints >= 1
+
+
+def test_a_live_cell_is_recorded_on_demand(own: Client) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "stereoservo.cli.main", "record", CELL, "--seconds", "0.5", "--json"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    file = Path(json.loads(done.stdout)["file"])
+    assert own.info().recording == ""
+    result = replay(file)
+    assert result.identical is True
+    assert result.steps > 10
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("[camera.options]\nmarker_drop_rate = 1.0\n", r"shows 0 markers .* at the base"),
+        ("[joints.options]\nfaults = { drop_writes_after = 40 }\n", r"j\d"),
+    ],
+)
+def test_a_calibration_that_cannot_succeed_ends_with_its_reason_and_the_arm_at_rest(
+    options: str, message: str, cell_file: Path, start: Start
+) -> None:
+    old = "# [joints.options]" if options.startswith("[joints") else "[servo]"
+    start(changed(cell_file, old, options + old))
+    with Client(CELL) as client:
+        client.enable()
+        with pytest.raises((FailedError, RefusedError), match=message):
+            client.calibrate(timeout_s=60.0)
+        eventually("the arm rests", lambda: at_rest(client))
+        assert client.status().goal == ""
 
 
 def test_a_dry_run_moves_nothing(calibrated: Path, start: Start) -> None:

@@ -44,7 +44,8 @@ from stereoservo.runtime.ports import (
     JointState,
 )
 from stereoservo.runtime.record import decode_step
-from stereoservo.runtime.servo import GATEWAY_SILENCE_S, ServoLinks, ServoProcess
+from stereoservo.runtime.servo import GATEWAY_SILENCE_S, ServoProcess
+from stereoservo.runtime.servo_links import ServoLinks
 from stereoservo.runtime.settings import core_settings
 
 RATE_HZ = 250.0

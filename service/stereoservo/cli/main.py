@@ -32,6 +32,7 @@ COMMANDS: dict[str, str] = {
     "hold": "verbs:hold",
     "resume": "verbs:resume",
     "reset": "verbs:reset",
+    "record": "record:record",
     "replay": "replay:replay",
     "drivers": "drivers:drivers",
     "doctor": "doctor:doctor",

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stereoservo.cli.output import JsonOption, emit, note
+from stereoservo.cli.output import CommandError, JsonOption, emit, note
 from stereoservo.runtime.interprocess import COMMISSIONING_SPEED, RunPlan
 from stereoservo.runtime.supervisor import run_cell
 
@@ -34,6 +34,8 @@ def run(
         note(f"cell {plan.cell.cell.name!r} is up{mode}")
 
     file = record if record in ("", "auto") else str(Path(record).absolute())
+    if Path(file).is_file():
+        raise CommandError("exists", f"{file} exists already; a recording is not written over")
     ended_by = run_cell(
         cell, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready
     )

@@ -7,7 +7,6 @@ from __future__ import annotations
 import getpass
 import os
 import re
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -15,9 +14,17 @@ from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
 import msgspec
-import zenoh
 from zenoh.handlers import RingChannel
 
+from stereoservo.gateway.errors import (
+    ClientError,
+    DaemonLostError,
+    FailedError,
+    NoReplyError,
+    RefusedError,
+    TimedOutError,
+)
+from stereoservo.gateway.following import EventWatch, GoalHandle, GoalResult
 from stereoservo.gateway.keys import KeySpace
 from stereoservo.gateway.messages import (
     ENCODING,
@@ -26,6 +33,7 @@ from stereoservo.gateway.messages import (
     EventList,
     EventMessage,
     FeaturesMessage,
+    Record,
     Reply,
     StateMessage,
     encode,
@@ -55,69 +63,9 @@ from stereoservo.runtime.commands import (
 from stereoservo.runtime.daemon import find_daemon
 
 POLL_S = 0.01
-ALIVE_EVERY_S = 1.0
 DRAIN = 32
-TERMINAL = {
-    "goal_reached": "reached",
-    "goal_aborted": "aborted",
-    "goal_cancelled": "cancelled",
-    "goal_preempted": "preempted",
-}
 
 _T = TypeVar("_T")
-
-
-class ClientError(Exception):
-    """Something that a client asked for did not happen."""
-
-
-class NoReplyError(ClientError):
-    """Nobody answered: the daemon is gone, hangs, or does not let this client ask. Means refused."""
-
-    def __init__(self, key: str, timeout_s: float) -> None:
-        super().__init__(
-            f"no reply on {key} within {timeout_s:g} s: the daemon is gone, hangs, or refuses this client"
-        )
-        self.key = key
-        self.timeout_s = timeout_s
-
-
-class RefusedError(ClientError):
-    """The daemon refused; ``reply`` says why."""
-
-    def __init__(self, what: str, reply: Reply) -> None:
-        why = "; ".join(
-            reply.problems or tuple(reason.hint for reason in reply.reasons if reason.hint != reply.message)
-        )
-        super().__init__(f"{what} refused: {reply.message}" + (f": {why}" if why else ""))
-        self.reply = reply
-
-
-class FailedError(ClientError):
-    """What was accepted ended badly; ``event`` says how."""
-
-    def __init__(self, what: str, event: EventMessage) -> None:
-        super().__init__(f"{what}: {event.kind.replace('_', ' ')}: {event.message}")
-        self.event = event
-
-
-class TimedOutError(ClientError):
-    """What was waited for did not happen in time."""
-
-
-class DaemonLostError(ClientError):
-    """The daemon went away, or another one took its place, while this client waited."""
-
-
-class GoalResult(msgspec.Struct, frozen=True):
-    """How a goal ended."""
-
-    id: str
-    outcome: Literal["reached", "aborted", "cancelled", "preempted"]
-    message: str
-    error_px: float | None
-    reasons: tuple[Any, ...]
-    seconds: float
 
 
 class Client:
@@ -218,6 +166,10 @@ class Client:
     def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
         """Joint velocities for ``lease_s``; call again within it to go on (a dead man's switch)."""
         return self.command("jog", Jog(dict(velocities), lease_s))
+
+    def record(self, on: bool = True) -> Reply:
+        """Begin or end a flight recording; the reply's message is its file on the daemon's host."""
+        return self._ask("record", self.keys.command("record", self.operator), encode(Record(on)))
 
     def cancel(self, goal_id: str) -> Reply:
         """Cancel a goal."""
@@ -389,157 +341,6 @@ class Client:
         self.close()
 
 
-class EventWatch:
-    """Events from now on, in order and without gaps: what a subscription lost is asked for."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self._subscriber = client.session.declare_subscriber(client.keys.event, RingChannel(1024))
-        state = client.status()
-        self._boot = state.boot
-        self._next = client.events(1 << 60).next
-        self._alive = time.monotonic()
-
-    def poll(self) -> list[EventMessage]:
-        """What happened since the last poll. Raises DaemonLostError."""
-        found: list[EventMessage] = []
-        while (sample := self._subscriber.try_recv()) is not None:
-            event = msgspec.json.decode(sample.payload.to_bytes(), type=EventMessage)
-            if event.boot != self._boot:
-                raise DaemonLostError(
-                    f"the gateway of cell {self._client.cell!r} was started anew; ask for the state"
-                )
-            if event.seq > self._next:
-                self._fill(found, event.seq)
-            if event.seq == self._next:
-                found.append(event)
-                self._next += 1
-        if found:
-            self._alive = time.monotonic()
-        elif time.monotonic() - self._alive > ALIVE_EVERY_S:
-            self._check()
-            self._fill(found, 1 << 60)
-        return found
-
-    def _fill(self, found: list[EventMessage], before: int) -> None:
-        while self._next < before:
-            page = self._client.events(self._next)
-            if page.first > self._next:
-                raise DaemonLostError(f"events {self._next} to {page.first - 1} are no longer kept")
-            some = [event for event in page.events if event.seq < before]
-            if not some:
-                return
-            found.extend(some)
-            self._next = some[-1].seq + 1
-
-    def _check(self) -> None:
-        try:
-            boot = self._client.status().boot
-        except NoReplyError as error:
-            raise DaemonLostError(f"the daemon of cell {self._client.cell!r} no longer answers") from error
-        if boot != self._boot:
-            raise DaemonLostError(
-                f"the gateway of cell {self._client.cell!r} was started anew; ask for the state"
-            )
-        self._alive = time.monotonic()
-
-    def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:
-        """Wait for an event. Raises TimedOutError, DaemonLostError."""
-        until = time.monotonic() + timeout_s
-        while True:
-            for event in self.poll():
-                if wanted(event):
-                    return event
-            if time.monotonic() > until:
-                raise TimedOutError(f"{what}: nothing within {timeout_s:g} s")
-            time.sleep(POLL_S)
-
-    def close(self) -> None:
-        """End the subscription. Idempotent."""
-        if self._subscriber is not None:
-            self._subscriber.undeclare()
-            self._subscriber = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class GoalHandle:
-    """A goal that was accepted. As a context manager it cancels the goal when left before its end."""
-
-    def __init__(self, client: Client, goal: Goal, watch: EventWatch) -> None:
-        self.id = goal.id
-        self._client = client
-        self._watch = watch
-        self._started = time.monotonic()
-        self._result: GoalResult | None = None
-        self._ended = threading.Event()
-        if goal.lease_s is not None:
-            self._renewal = threading.Thread(
-                target=self._renew, args=(goal.lease_s / 3.0,), name=f"lease {goal.id}", daemon=True
-            )
-            self._renewal.start()
-
-    def _renew(self, every_s: float) -> None:
-        while not self._ended.wait(every_s):
-            try:
-                self._client.renew(self.id)
-            except zenoh.ZError:  # the session is closed: the lease runs out, as it should
-                return
-
-    def wait(self, timeout_s: float = 600.0) -> GoalResult:
-        """Wait for its terminal event. Raises TimedOutError (the goal goes on), DaemonLostError."""
-        if self._result is None:
-            event = self._watch.wait(
-                lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
-            )
-            self._end()
-            outcome: Any = TERMINAL[event.kind]
-            self._result = GoalResult(
-                self.id,
-                outcome,
-                event.message,
-                event.error_px,
-                event.reasons,
-                time.monotonic() - self._started,
-            )
-        return self._result
-
-    def reached(self, timeout_s: float = 600.0) -> GoalResult:
-        """Like :meth:`wait`, and raises ClientError unless the goal was reached."""
-        result = self.wait(timeout_s)
-        if result.outcome != "reached":
-            raise ClientError(f"goal {self.id} was {result.outcome}: {result.message}")
-        return result
-
-    def cancel(self) -> None:
-        """Cancel it."""
-        self._client.cancel(self.id)
-
-    def abandon(self) -> None:
-        """Stop renewing and watching; the goal goes on until its lease or time limit ends."""
-        self._end()
-
-    def _end(self) -> None:
-        self._ended.set()
-        self._watch.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._result is None and not self._ended.is_set():
-            self._end()
-            self.cancel()
-
-
 def as_target(target: Target | str | Mapping[str, Any]) -> Target:
     """What a target may be short for: a taught goal's name, positions by joint, set-points by camera."""
     if isinstance(target, str):
@@ -559,3 +360,18 @@ def as_target(target: Target | str | Mapping[str, Any]) -> Target:
 def _default_operator() -> str:
     name = re.sub(r"[^A-Za-z0-9_-]", "", getpass.getuser())[:40] or "user"
     return f"{name}-{os.getpid()}"
+
+
+__all__ = [
+    "Client",
+    "ClientError",
+    "DaemonLostError",
+    "EventWatch",
+    "FailedError",
+    "GoalHandle",
+    "GoalResult",
+    "NoReplyError",
+    "RefusedError",
+    "TimedOutError",
+    "as_target",
+]

@@ -39,10 +39,10 @@ class FitProgress(msgspec.Struct, frozen=True):
 class Fit:
     """One running fit. ``poll`` gives its progress; ``result`` its model once it has ended."""
 
-    def __init__(self, trials: TrialData, model_path: Path, epoch: int, scratch: Path) -> None:
+    def __init__(self, trials: TrialData, model_path: Path, epoch: int) -> None:
         self.model_path = model_path
         self.epoch = epoch
-        self._trials_path = scratch / f"trials-{epoch:06d}.npz"
+        self._trials_path = model_path.with_name(f"trials-{epoch:06d}.npz")
         save_trials(trials, self._trials_path)
         self._started = time.monotonic()
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - read when the fit has ended

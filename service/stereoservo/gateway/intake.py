@@ -81,6 +81,9 @@ class Intake:
     def _take(
         self, query: Any, key: str, payload: bytes, work: Callable[[str, bytes], tuple[str, Command]]
     ) -> None:
+        if query is not None and "*" in key:
+            query.drop()  # somebody looks around; goals and commands are addressed
+            return
         operator = ""
         try:
             operator, command = work(key, payload)

@@ -20,6 +20,7 @@ VERBS = (
     "teach",
     "cancel",
     "renew",
+    "record",
 )
 """Commands with an operator; ``stop`` has a key of its own."""
 

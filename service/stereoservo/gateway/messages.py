@@ -33,6 +33,7 @@ MAX_PAYLOAD_BYTES = 65_536
 _T = TypeVar("_T")
 _NOT_FINITE = re.compile(rb"(?<![\w\"])(-?NaN|[+-]?Infinity|-?inf|nan)(?![\w\"])")
 
+
 COMMANDS: dict[str, type[Command]] = {
     "enable": Enable,
     "disable": Disable,
@@ -47,6 +48,12 @@ COMMANDS: dict[str, type[Command]] = {
     "renew": RenewGoal,
 }
 """What the payload of ``command/<verb>/<operator>`` decodes into; the ``command`` tag may be left out."""
+
+
+class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", forbid_unknown_fields=True):
+    """Begin or end a flight recording. The gateway's own business: the core does not hear of it."""
+
+    on: bool = True
 
 
 class MessageError(ValueError):
@@ -243,6 +250,7 @@ SCHEMAS: dict[str, Any] = {
     "features": FeaturesMessage,
     "info": CellInfo,
     "reply": Reply,
+    "command-record": Record,
     **{f"command-{verb}": kind for verb, kind in COMMANDS.items()},
 }
 

@@ -10,9 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 import time
-from collections import deque
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,19 +21,20 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 import stereoservo
-from stereoservo.gateway.fitting import Fit, FitFailedError, calibration_result
+from stereoservo.gateway.calibration import Calibration
 from stereoservo.gateway.intake import Intake
 from stereoservo.gateway.keys import VERBS, InvalidKeyError, KeySpace
 from stereoservo.gateway.messages import (
-    CalibrationResult,
     CameraInfo,
     CellInfo,
     JointInfo,
     MessageError,
     ModelInfo,
+    Record,
     Reply,
     StateMessage,
     TaughtInfo,
+    decode,
     encode,
     schema,
 )
@@ -47,101 +46,40 @@ from stereoservo.gateway.publisher import (
     features_message,
     state_message,
 )
+from stereoservo.gateway.recordings import Recordings
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.session import (
     SessionError,
-    client_config,
     close_session,
     endpoint_of,
     open_session,
     router_config,
 )
+from stereoservo.gateway.stop import StopThread
 from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.validation import GoalContext
-from stereoservo.kinematics.calibration.trials import CalibrationError
-from stereoservo.kinematics.model import CellModel, ModelFileError
-from stereoservo.runtime.calibration_job import CalibrationJob
 from stereoservo.runtime.channel import ChannelServer
 from stereoservo.runtime.commands import LAWS
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.daemon import DaemonInfo
 from stereoservo.runtime.directories import DirectoryError
-from stereoservo.runtime.handover import SlotError, SlotReader, StopSlot
+from stereoservo.runtime.handover import SlotError, SlotReader
 from stereoservo.runtime.interprocess import (
     OBSERVATION_LAYOUT,
     PlanError,
-    RecordedCheckpoint,
-    RecordedStep,
-    RecordingStart,
     RunPlan,
     load_plan,
     observation_decoder,
     report_decoder,
 )
 from stereoservo.runtime.lifeline import Termination, die_with_parent, say
-from stereoservo.runtime.recorder import FlightRecorder
 from stereoservo.runtime.taught import TaughtFileError
 
 STATE_EVERY_S = 0.05
 IDLE_S = 0.003
-STOP_POLL_S = 0.002
-ACKNOWLEDGE_S = 0.1
 SERVO_STALE_S = 0.5
 DRAIN = 32
 EXIT_SETUP = 3
-
-
-class StopThread:
-    """Takes stops and enables on a session of its own, so that no flood on other keys delays them."""
-
-    def __init__(self, endpoint: str, keys: KeySpace, plan: RunPlan, boot: str) -> None:
-        self._session = open_session(client_config(endpoint))
-        self._slot = StopSlot(plan.directories.stop_slot)
-        self._boot = boot
-        self._stops = self._session.declare_queryable(keys.stop, RingChannel(16), complete=True)
-        self._puts = self._session.declare_subscriber(keys.stop, RingChannel(16))
-        self._enables = self._session.declare_queryable(
-            keys.any_command("enable"), RingChannel(16), complete=True
-        )
-        self._replies = ReplyThread()
-        self.enables: deque[Any] = deque(maxlen=16)
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="stop", daemon=True)
-        self._thread.start()
-
-    def _work(self) -> None:
-        while not self._ending.is_set():
-            try:
-                while self._puts.try_recv() is not None:
-                    self._slot.raise_stop()
-                while (query := self._stops.try_recv()) is not None:
-                    self._stop(query)
-                while (query := self._enables.try_recv()) is not None:
-                    self.enables.append(query)
-            except zenoh.ZError:  # closed under our hands at the end
-                return
-            self._ending.wait(STOP_POLL_S)
-
-    def _stop(self, query: Any) -> None:
-        word = self._slot.raise_stop()
-        until = time.monotonic() + ACKNOWLEDGE_S
-        while not self._slot.acknowledged(word) and time.monotonic() < until:
-            time.sleep(0.001)
-        seen = self._slot.acknowledged(word)
-        text = (
-            "the servo process has taken the stop"
-            if seen
-            else "the stop is raised; the servo process has not taken it yet"
-        )
-        self._replies.reply(query, encode(Reply(accepted=seen, message=text, boot=self._boot)))
-
-    def close(self) -> None:
-        """End the thread, close the session."""
-        self._ending.set()
-        self._thread.join(1.0)
-        self._replies.close()
-        close_session(self._session, [self._stops, self._puts, self._enables])
-        self._slot.close()
 
 
 class Gateway:
@@ -155,7 +93,6 @@ class Gateway:
         cell_dir = Path(plan.cell_path).parent
         self._taught = TaughtStore(directories.taught)
         self._models = ModelStore(directories.models)
-        self._model: CellModel | None = None
         self._journal = Journal(directories.journal)
         self.keys = KeySpace(plan.cell.cell.name)
         cameras = tuple(camera.name for camera in plan.cameras)
@@ -163,7 +100,8 @@ class Gateway:
         self.endpoint = endpoint_of(plan.cell, directories.zenoh_socket)
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.log = EventLog(self.boot, self._publish_event)
-        self._link = ServoLink(directories, records=bool(plan.record))
+        self._link = ServoLink(directories)
+        self._link.records = bool(plan.record)
         self._replies = ReplyThread()
         self._intake = Intake(
             self.keys, self._link, self._replies, self.log, self._context, self._taught, self.boot
@@ -177,11 +115,8 @@ class Gateway:
         self._state: StateMessage | None = None
         self._state_heard = 0.0
         self._state_sent = 0.0
-        self._job = CalibrationJob(self.settings)
-        self._fit: Fit | None = None
-        self._result: CalibrationResult | None = None
-        self._recorder: FlightRecorder | None = None
-        self._recording = ""
+        self._calibration = Calibration(self.settings, self._models, self._link, self.log)
+        self._recordings = Recordings(plan, self.log)
         self._handled_path = directories.runtime / "handled"
         self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
         self._greeted = False
@@ -194,8 +129,9 @@ class Gateway:
         self._command_queries = [
             session.declare_queryable(keys.any_command(verb), RingChannel(32))
             for verb in VERBS
-            if verb != "enable"
+            if verb not in ("enable", "record")
         ]
+        self._record_queries = session.declare_queryable(keys.any_command("record"), RingChannel(32))
         self._event_queries = session.declare_queryable(keys.event, RingChannel(32))
         self._state_queries = session.declare_queryable(keys.state, RingChannel(32))
         self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
@@ -207,7 +143,8 @@ class Gateway:
         self._publishers.event.put(payload)
 
     def _context(self) -> GoalContext:
-        markers = None if self._model is None else self._model.marker_ids
+        model = self._calibration.model
+        markers = None if model is None else model.marker_ids
         return GoalContext(self.settings, self._taught.names, markers)
 
     # -- the loop -------------------------------------------------------------------------------------------
@@ -215,9 +152,9 @@ class Gateway:
     def turn(self) -> bool:
         """One pass; whether there was anything to do."""
         self._link.keep()
-        if self._link.connected and not self._greeted:
+        if self._link.connected and self._state is not None and not self._greeted:
             self._greeted = True
-            self._load_model()
+            self._calibration.load(self._state.model_epoch)
         busy = False
         for event in self._link.events():
             busy = True
@@ -227,9 +164,10 @@ class Gateway:
         self._tell_features()
         self._tell_state()
         self._take_reports()
-        self._record()
-        self._follow_fit()
-        if not self._announced and self._greeted and self._state is not None:
+        for item in self._link.steps():
+            self._recordings.take(item)
+        self._calibration.follow()
+        if not self._announced and self._greeted:
             self._announced = True
             self._announce()
         return busy
@@ -240,6 +178,7 @@ class Gateway:
             (self._goal_puts, self._intake.goal_sample),
             (self._goal_queries, self._intake.goal_query),
             *((queryable, self._intake.command_query) for queryable in self._command_queries),
+            (self._record_queries, self._take_record),
             (self._event_queries, self._answer_events),
             (self._state_queries, self._answer_state),
             (self._info_queries, self._answer_info),
@@ -255,29 +194,50 @@ class Gateway:
             self._intake.command_query(self._stop.enables.popleft())
         return busy
 
+    def _take_record(self, query: Any) -> None:
+        key = str(query.key_expr)
+        if "*" in key:
+            query.drop()
+            return
+        try:
+            self.keys.command_of(key)
+            wanted = decode(query.payload.to_bytes() if query.payload is not None else b"{}", Record)
+        except (MessageError, InvalidKeyError) as error:
+            reply = Reply(False, "the message is not valid", problems=(str(error),), boot=self.boot)
+        else:
+            self._link.records = wanted.on
+            if not wanted.on:
+                steps = self._recordings.stop()
+                reply = Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
+            elif self._recordings.running:
+                reply = Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
+            else:
+                reply = Reply(True, "recording begins; its event names the file", boot=self.boot)
+        self._replies.reply(query, encode(reply))
+
     def _answer_events(self, query: Any) -> None:
         given = str(query.parameters)
         number = dict(part.split("=", 1) for part in given.split(";") if "=" in part).get("from", "1")
         if not number.isdigit():
             problem = f"from={number}: a number is valid, 1 to {self.log.last + 1}"
-            self._replies.reply(
-                query, encode(Reply(False, "the query is not valid", problems=(problem,), boot=self.boot))
-            )
+            reply = Reply(False, "the query is not valid", problems=(problem,), boot=self.boot)
+            self._replies.reply(query, encode(reply), self.keys.event)
             return
-        self._replies.reply(query, encode(self.log.since(int(number))))
+        self._replies.reply(query, encode(self.log.since(int(number))), self.keys.event)
 
     def _answer_state(self, query: Any) -> None:
-        if self._state is None:
-            self._replies.reply(
-                query, encode(Reply(False, "the servo process has shown no state yet", boot=self.boot))
-            )
-        else:
-            self._replies.reply(query, encode(self._state))
+        answer: StateMessage | Reply | None = self._state
+        if answer is None:
+            answer = Reply(False, "the servo process has shown no state yet", boot=self.boot)
+        self._replies.reply(query, encode(answer), self.keys.state)
 
     def _answer_info(self, query: Any) -> None:
-        self._replies.reply(query, encode(self.info()))
+        self._replies.reply(query, encode(self.info()), self.keys.info)
 
     def _answer_schema(self, query: Any) -> None:
+        if "*" in str(query.key_expr):
+            query.drop()
+            return
         try:
             payload = schema(self.keys.schema_of(str(query.key_expr)))
         except (MessageError, InvalidKeyError) as error:
@@ -288,7 +248,7 @@ class Gateway:
         """What the cell is."""
         settings, plan = self.settings, self.plan
         limits = settings.limits
-        model = self._model
+        model = self._calibration.model
         return CellInfo(
             cell=settings.cell,
             version=stereoservo.__version__,
@@ -330,13 +290,12 @@ class Gateway:
             can_home=settings.home is not None,
             dry_run=plan.dry_run,
             commissioning=plan.commissioning,
-            recording=self._recording,
+            recording=self._recordings.path if self._recordings.running else "",
         )
 
     # -- what the core says ---------------------------------------------------------------------------------
 
     def _core_event(self, event: Event) -> None:
-        self._job.add(event)
         if event.kind == "reply":
             self._intake.core_reply(event)
         if event.kind in SILENT:
@@ -345,29 +304,15 @@ class Gateway:
         if event.kind == "taught" and fresh:
             self._store_taught(event)
         self.log.add_core(event)
-        if event.kind == "calibration_finished" and fresh:
-            self._start_fit()
-        elif event.kind == "model" and self._result is not None:
-            result, self._result = self._result, None
-            self.log.add(
-                "calibrated",
-                message=f"model epoch {result.epoch}: {result.rms_px:.3f} px rms",
-                id=self._job.id,
-                calibration=result,
-                origin="gateway",
-            )
-        elif (
-            event.kind == "warning" and event.message.startswith("model refused") and self._result is not None
-        ):
-            self._result = None
-            self._calibration_failed(event.message)
+        self._calibration.core_event(event, fresh=fresh)
         if event.kind in ("taught", "calibration_finished"):
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
             self._handled_path.write_text(str(self._handled))
 
     def _store_taught(self, event: Event) -> None:
-        epoch = 0 if self._model is None else self._model.epoch
+        model = self._calibration.model
+        epoch = 0 if model is None else model.epoch
         try:
             self._taught.add(event, epoch, _now())
         except OSError as error:
@@ -377,58 +322,6 @@ class Gateway:
                 name=event.name,
                 origin="gateway",
             )
-
-    # -- models ---------------------------------------------------------------------------------------------
-
-    def _load_model(self) -> None:
-        model, passed = self._models.newest_fitting(self.settings)
-        for text in passed:
-            self.log.add("warning", message=f"model passed over: {text}", origin="gateway")
-        if model is not None and self._link.give_model(model):
-            self._model = model
-
-    def _start_fit(self) -> None:
-        if self._fit is not None:
-            self._fit.cancel()
-        try:
-            epoch = self._models.next_epoch()
-            self._fit = Fit(self._job.trials(), self._models.path(epoch), epoch, self.plan.directories.models)
-        except (CalibrationError, OSError) as error:
-            self._calibration_failed(str(error))
-            return
-        self.log.add(
-            "fit_started", message=f"{self._job.stops} stops", id=self._job.id, progress=0.0, origin="gateway"
-        )
-
-    def _follow_fit(self) -> None:
-        if self._fit is None:
-            return
-        for step in self._fit.poll():
-            self.log.add(
-                "fit_progress",
-                message=step.message,
-                id=self._job.id,
-                progress=step.progress,
-                origin="gateway",
-            )
-        if not self._fit.ended:
-            return
-        fit, self._fit = self._fit, None
-        try:
-            model, seconds = fit.result()
-            result = calibration_result(model, fit.model_path, seconds)
-        except (FitFailedError, ModelFileError) as error:
-            self._calibration_failed(str(error))
-            return
-        if not self._link.give_model(model):
-            self._calibration_failed(
-                f"the servo process does not take the model; it is saved as {fit.model_path}"
-            )
-            return
-        self._model, self._result = model, result
-
-    def _calibration_failed(self, message: str) -> None:
-        self.log.add("calibration_failed", message=message, id=self._job.id, origin="gateway")
 
     # -- telling --------------------------------------------------------------------------------------------
 
@@ -473,32 +366,6 @@ class Gateway:
                     origin=report.origin,
                 )
 
-    def _record(self) -> None:
-        for item in self._link.steps():
-            if isinstance(item, RecordingStart):
-                if self._recorder is not None:
-                    self._recorder.close()
-                path = self._recording_path()
-                self._recorder = FlightRecorder(path, item.settings, item.fingerprint)
-                self._recording = str(path)
-                self.log.add("recording", message=str(path), origin="gateway")
-            elif self._recorder is None:
-                continue
-            elif isinstance(item, RecordedCheckpoint):
-                if item.lost:
-                    self._recorder.gap(item.lost, item.t_ns)
-                self._recorder.checkpoint(item.step, item.state, item.t_ns)
-            else:
-                assert isinstance(item, RecordedStep)
-                self._recorder.step(item.data, item.t_ns)
-
-    def _recording_path(self) -> Path:
-        if self.plan.record != "auto":
-            wanted = Path(self.plan.record)
-            return wanted if not self._recording else wanted.with_stem(f"{wanted.stem}-{os.getpid()}")
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        return self.plan.directories.recordings / f"{self.settings.cell}-{stamp}.mcap"
-
     # -- life -----------------------------------------------------------------------------------------------
 
     def _announce(self) -> None:
@@ -520,12 +387,10 @@ class Gateway:
 
     def close(self) -> None:
         """Finish the recording, end the fit, close the sessions within a time limit."""
-        if self._fit is not None:
-            self._fit.cancel()
-        if self._recorder is not None:
-            for _ in range(20):
-                self._record()
-            self._recorder.close()
+        self._calibration.cancel()
+        for item in self._link.steps(100_000):
+            self._recordings.take(item)
+        self._recordings.stop()
         with suppress(zenoh.ZError):  # telling is good manners, not needed
             self.log.add("daemon_ends", message="the daemon ends", origin="gateway")
         self._replies.close()
@@ -535,6 +400,7 @@ class Gateway:
             self._goal_puts,
             self._goal_queries,
             *self._command_queries,
+            self._record_queries,
             self._event_queries,
             self._state_queries,
             self._info_queries,

@@ -44,9 +44,9 @@ class ReplyThread:
         self._thread = threading.Thread(target=self._work, name="replies", daemon=True)
         self._thread.start()
 
-    def reply(self, query: Any, payload: bytes) -> None:
-        """Answer ``query`` and let it go."""
-        self._queue.put((query, str(query.key_expr), payload))
+    def reply(self, query: Any, payload: bytes, key: str = "") -> None:
+        """Answer ``query`` on ``key`` (default: the query's own, which must then be concrete) and let it go."""
+        self._queue.put((query, key or str(query.key_expr), payload))
 
     def _work(self) -> None:
         while (item := self._queue.get()) is not None:

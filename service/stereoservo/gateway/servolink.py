@@ -31,11 +31,11 @@ RECONNECT_EVERY_S = 0.1
 
 
 class ServoLink:
-    """Connection to the servo process; reconnects by itself, blocks never."""
+    """Connection to the servo process; reconnects by itself, blocks never. ``records``: take step records, too."""
 
-    def __init__(self, directories: CellDirectories, *, records: bool) -> None:
+    def __init__(self, directories: CellDirectories) -> None:
         self._directories = directories
-        self._records = records
+        self.records = False
         self._control: Channel | None = None
         self._steps: Channel | None = None
         self._state = SlotReader(directories.state_slot, STATE_LAYOUT)
@@ -59,8 +59,11 @@ class ServoLink:
                 self._control = _try(self._directories, "control_socket")
                 if self._control is not None:
                     self._control.send(encode(Hello(self._last_event)))
-            if self._records and (self._steps is None or not self._steps.is_open):
+            if self.records and (self._steps is None or not self._steps.is_open):
                 self._steps = _try(self._directories, "steps_socket")
+        if not self.records and self._steps is not None:
+            self._steps.close()
+            self._steps = None
         if self._control is not None and now - self._last_beat >= HEARTBEAT_EVERY_S:
             self._last_beat = now
             self._control.send(encode(Heartbeat()))
@@ -86,11 +89,11 @@ class ServoLink:
             self._last_event = max(self._last_event, found[-1].seq)
         return found
 
-    def steps(self) -> list[FromServoSteps]:
-        """Step records since the last call."""
+    def steps(self, limit: int = 512) -> list[FromServoSteps]:
+        """Step records since the last call, at most ``limit``."""
         if self._steps is None:
             return []
-        return [steps_decoder.decode(data) for data in self._steps.receive(512)]
+        return [steps_decoder.decode(data) for data in self._steps.receive(limit)]
 
     def state(self) -> ServoState | None:
         """The servo process's newest state, if it is new."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections import deque
 from pathlib import Path
 
 import msgspec
@@ -18,27 +17,19 @@ import numpy as np
 
 from stereoservo.runtime import plugins
 from stereoservo.runtime.cellfile import CellFileError
-from stereoservo.runtime.channel import Channel, ChannelServer
+from stereoservo.runtime.channel import Channel
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.commands import Hold, Request
 from stereoservo.runtime.core import ServoCore
-from stereoservo.runtime.cycle import DriverFault, Event, ModelUpdate, StepInputs, StepOutputs
-from stereoservo.runtime.directories import CellDirectories, DirectoryError
-from stereoservo.runtime.handover import SlotError, SlotReader, SlotWriter, StopSlot
+from stereoservo.runtime.cycle import DriverFault, ModelUpdate, StepInputs, StepOutputs
+from stereoservo.runtime.directories import DirectoryError
+from stereoservo.runtime.handover import SlotError
 from stereoservo.runtime.interprocess import (
-    OBSERVATION_LAYOUT,
-    PRIOR_CAPACITY,
-    PRIOR_LAYOUT,
-    STATE_CAPACITY,
-    STATE_LAYOUT,
     Ask,
     Heartbeat,
     Hello,
     NewModel,
     PlanError,
-    RecordedCheckpoint,
-    RecordedStep,
-    RecordingStart,
     RunPlan,
     ServoState,
     encode,
@@ -57,9 +48,7 @@ from stereoservo.runtime.ports import (
     JointDriver,
     JointState,
 )
-from stereoservo.runtime.record import encode_step, fingerprint
-from stereoservo.runtime.settings import CoreSettings
-from stereoservo.runtime.state import encode_state
+from stereoservo.runtime.servo_links import EventOutbox, ServoLinks, StepStream
 from stereoservo.runtime.warmup import warm_up
 
 GATEWAY_SILENCE_S = 0.5
@@ -69,103 +58,8 @@ STATISTICS_EVERY_S = 0.5
 FAULT_READ_EVERY_S = 0.1
 REST_TIMEOUT_S = 1.5
 """How long a shutdown waits for the core to bring the arm to rest before the driver's own stop."""
-CHECKPOINT_EVERY_S = 5.0
-RETAINED_EVENTS = 2048
 CONFIGURE_TRIES = 20
 EXIT_SETUP = 3
-
-
-class ServoLinks:
-    """Sockets and slots of the servo process. Nothing here blocks."""
-
-    def __init__(self, directories: CellDirectories, cameras: tuple[str, ...]) -> None:
-        self._directories = directories
-        self.stop = StopSlot(directories.stop_slot)
-        self.observations = [
-            SlotReader(directories.observation_slot(name), OBSERVATION_LAYOUT) for name in cameras
-        ]
-        self.priors = {
-            name: SlotWriter(directories.prior_slot(name), PRIOR_CAPACITY, PRIOR_LAYOUT) for name in cameras
-        }
-        self.state = SlotWriter(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)
-        self.control = ChannelServer(directories.control_socket, single=True)
-        self.steps = ChannelServer(directories.steps_socket, single=True)
-
-    def close(self) -> None:
-        """Release all; idempotent."""
-        self.control.close()
-        self.steps.close()
-        self.state.close()
-        for writer in self.priors.values():
-            writer.close()
-        for reader in self.observations:
-            reader.close()
-        self.stop.close()
-
-
-class EventOutbox:
-    """Events on their way to the gateway, kept until a later one has pushed them out of a bounded memory."""
-
-    def __init__(self) -> None:
-        self._retained: deque[tuple[int, bytes]] = deque(maxlen=RETAINED_EVENTS)
-        self._sent = 0
-
-    def add(self, events: tuple[Event, ...]) -> None:
-        """Queue events; their numbers ascend."""
-        for event in events:
-            self._retained.append((event.seq, encode(event)))
-
-    def rewind(self, last_known: int) -> None:
-        """The gateway knows events up to ``last_known``; send the later ones (again)."""
-        self._sent = last_known
-
-    def flush(self, peer: Channel) -> None:
-        """Send what is due, as far as the socket takes it."""
-        if not self._retained or self._retained[-1][0] <= self._sent:
-            return
-        for seq, data in self._retained:
-            if seq > self._sent:
-                if not peer.send(data):
-                    return
-                self._sent = seq
-
-
-class StepStream:
-    """Step records and checkpoints to the gateway's recorder; drops and counts where the socket is full."""
-
-    def __init__(self, settings: CoreSettings, rate_hz: float) -> None:
-        self._start = encode(RecordingStart(settings, fingerprint()))
-        self._every = max(1, round(CHECKPOINT_EVERY_S * rate_hz))
-        self._peer: Channel | None = None
-        self._since_checkpoint = 0
-        self._lost = 0
-        self.dropped = 0
-
-    def before(self, server: ChannelServer, core: ServoCore, now_ns: int) -> None:
-        """Take a new peer; send a checkpoint when one is due (start, period, after a gap)."""
-        for peer in server.accept():
-            self._peer = peer if peer.send(self._start) else None
-            self._since_checkpoint, self._lost = self._every, 0
-        if self._peer is None:
-            return
-        if not self._peer.is_open:
-            self._peer = None
-            return
-        if self._since_checkpoint >= self._every or self._lost:
-            record = RecordedCheckpoint(now_ns, core.state.step, encode_state(core.state), self._lost)
-            if self._peer.send(encode(record)):
-                self._since_checkpoint, self._lost = 0, 0
-
-    def after(self, inputs: StepInputs, outputs: StepOutputs) -> None:
-        """Send the step."""
-        if self._peer is None:
-            return
-        self._since_checkpoint += 1
-        if self._lost or not self._peer.send(
-            encode(RecordedStep(inputs.now_ns, encode_step(inputs, outputs)))
-        ):
-            self._lost += 1
-            self.dropped += 1
 
 
 class ServoProcess:
