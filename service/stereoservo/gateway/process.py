@@ -155,11 +155,11 @@ class Gateway:
         if self._link.connected and self._state is not None and not self._greeted:
             self._greeted = True
             self._calibration.load(self._state.model_epoch)
-        busy = False
-        for event in self._link.events():
-            busy = True
+        events = self._link.events()
+        self._take_state()
+        for event in events:
             self._core_event(event)
-        busy |= self._queries()
+        busy = self._queries() or bool(events)
         self._intake.expire()
         self._tell_features()
         self._tell_state()
@@ -338,7 +338,7 @@ class Gateway:
                 continue
             self._publishers.features[observation.camera].put(payload)
 
-    def _tell_state(self) -> None:
+    def _take_state(self) -> None:
         now = time.monotonic()
         state = self._link.state()
         if state is not None:
@@ -346,10 +346,13 @@ class Gateway:
             self._state = state_message(
                 self.plan, self.boot, state, servo_alive=True, last_event=self.log.last
             )
+        elif self._state is not None and self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
+            self._state = msgspec.structs.replace(self._state, servo_alive=False)
+
+    def _tell_state(self) -> None:
+        now = time.monotonic()
         if self._state is None or now - self._state_sent < STATE_EVERY_S:
             return
-        if self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
-            self._state = msgspec.structs.replace(self._state, servo_alive=False)
         self._state_sent = now
         self._publishers.state.put(encode(self._state))
 

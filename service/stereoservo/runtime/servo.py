@@ -237,17 +237,17 @@ class ServoProcess:
         self._moving = outputs.status.source != "hold" or bool(np.any(outputs.status.command))
         for prior in outputs.priors:
             self.links.priors[prior.camera].write(encode(prior))
+        self._tell_state(outputs, loop)  # before its events: who hears an event finds a state no older
         self._outbox.add(outputs.events)
         if self._peer is not None and self._peer.is_open:
             self._outbox.flush(self._peer)
         self._stream.after(inputs, outputs)
-        self._tell_state(outputs, loop)
         return outputs
 
     def _tell_state(self, outputs: StepOutputs, loop: LoopClock) -> None:
         if self._statistics is None or self._cycles % self._statistics_every == 0:
             self._statistics = loop.statistics()
-        if self._cycles % self._state_every == 0:
+        if outputs.events or self._cycles % self._state_every == 0:
             state = ServoState(
                 status=outputs.status,
                 loop=self._statistics,
