@@ -1,5 +1,6 @@
 """zenoh configurations: what listens where, and what is refused."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ from stereoservo.gateway.session import (
     SessionError,
     check_listen_endpoint,
     client_config,
+    endpoint_of,
+    gateway_config,
     open_session,
-    router_config,
+    stop_config,
 )
 from stereoservo.runtime.cellfile import CellFile, check_cell
 
@@ -33,7 +36,7 @@ SOCKET = Path("/tmp/x/zenoh.sock")
 
 
 def test_by_default_the_router_listens_on_a_unix_socket_and_discovers_nobody() -> None:
-    config = router_config(cell(), Path("/"), SOCKET)
+    config = gateway_config(cell(), Path("/"), SOCKET)
     assert config["mode"] == "router"
     assert config["listen"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock"]
     assert config["scouting"]["multicast"]["enabled"] is False
@@ -42,11 +45,9 @@ def test_by_default_the_router_listens_on_a_unix_socket_and_discovers_nobody() -
 
 
 @pytest.mark.parametrize(
-    "config", [router_config(cell(), Path("/"), SOCKET), client_config("tcp/127.0.0.1:1")]
+    "config", [gateway_config(cell(), Path("/"), SOCKET), client_config("tcp/127.0.0.1:1")]
 )
 def test_zenoh_knows_every_key_of_ours(config: dict[str, Any]) -> None:
-    import json
-
     read = zenoh.Config.from_json5(json.dumps(config))
     assert json.loads(read.get_json("transport/link/tx/queue/congestion_control/drop/wait_before_drop")) == 0
     assert json.loads(read.get_json("scouting/multicast/enabled")) is False
@@ -80,10 +81,29 @@ def test_local_endpoints_are_fine(endpoint: str) -> None:
 
 def test_client_mode_needs_a_router_to_connect_to() -> None:
     with pytest.raises(SessionError, match=r"needs zenoh\.endpoints"):
-        router_config(cell(mode="client"), Path("/"), SOCKET)
-    config = router_config(cell(mode="client", endpoints=["tcp/10.0.0.1:7447"]), Path("/"), SOCKET)
+        gateway_config(cell(mode="client"), Path("/"), SOCKET)
+    config = gateway_config(cell(mode="client", endpoints=["tcp/10.0.0.1:7447"]), Path("/"), SOCKET)
     assert config["mode"] == "client"
     assert config["listen"]["endpoints"] == []
+
+
+def test_a_router_with_endpoints_still_listens_on_its_own_socket_for_this_host() -> None:
+    config = gateway_config(cell(endpoints=["tcp/127.0.0.1:7447"]), Path("/"), SOCKET)
+    assert config["listen"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock", "tcp/127.0.0.1:7447"]
+    assert endpoint_of(cell(endpoints=["tcp/127.0.0.1:7447"]), SOCKET) == "unixsock-stream//tmp/x/zenoh.sock"
+
+
+TLS = {"root_ca_certificate": "ca.pem", "listen_private_key": "key.pem", "listen_certificate": "cert.pem"}
+
+
+def test_tls_paths_are_relative_to_the_cell_file_on_either_side() -> None:
+    server = gateway_config(cell(endpoints=["tls/0.0.0.0:7447"], tls=TLS), Path("/etc/cell"), SOCKET)
+    assert server["transport"]["link"]["tls"]["listen_certificate"] == "/etc/cell/cert.pem"
+    assert server["transport"]["link"]["tls"]["enable_mtls"] is True
+    client = stop_config(cell(mode="client", endpoints=["tls/r:7447"], tls=TLS), Path("/etc/cell"), SOCKET)
+    assert client["transport"]["link"]["tls"]["connect_private_key"] == "/etc/cell/key.pem"
+    zenoh.Config.from_json5(json.dumps(server))
+    zenoh.Config.from_json5(json.dumps(client))
 
 
 @pytest.mark.process

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit
-from stereoservo.gateway.session import SessionError, router_config
+from stereoservo.gateway.session import SessionError, gateway_config
 from stereoservo.gateway.stores import ModelStore
 from stereoservo.runtime.cellfile import load_cell_file
 from stereoservo.runtime.describe import PlanOptions, make_plan
@@ -71,7 +71,7 @@ def _daemon(plan: RunPlan, directories: CellDirectories) -> Check:
 
 def _wire(plan: RunPlan, directories: CellDirectories) -> Check:
     try:
-        config = router_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
+        config = gateway_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
     except SessionError as error:
         return Check("zenoh", False, str(error))
     return Check(

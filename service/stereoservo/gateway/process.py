@@ -52,8 +52,9 @@ from stereoservo.gateway.session import (
     SessionError,
     close_session,
     endpoint_of,
+    gateway_config,
     open_session,
-    router_config,
+    stop_config,
 )
 from stereoservo.gateway.stop import StopThread
 from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
@@ -96,7 +97,7 @@ class Gateway:
         self._journal = Journal(directories.journal)
         self.keys = KeySpace(plan.cell.cell.name)
         cameras = tuple(camera.name for camera in plan.cameras)
-        self._session = open_session(router_config(plan.cell, cell_dir, directories.zenoh_socket))
+        self._session = open_session(gateway_config(plan.cell, cell_dir, directories.zenoh_socket))
         self.endpoint = endpoint_of(plan.cell, directories.zenoh_socket)
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.log = EventLog(self.boot, self._publish_event)
@@ -111,7 +112,9 @@ class Gateway:
             SlotReader(directories.observation_slot(name), OBSERVATION_LAYOUT) for name in cameras
         ]
         self._declare()
-        self._stop = StopThread(self.endpoint, self.keys, plan, self.boot)
+        self._stop = StopThread(
+            stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot
+        )
         self._state: StateMessage | None = None
         self._state_heard = 0.0
         self._state_sent = 0.0

@@ -24,8 +24,8 @@ class SessionError(Exception):
 
 
 def endpoint_of(cell: CellFile, socket: Path) -> str:
-    """Where clients of this host reach the cell."""
-    if cell.zenoh.endpoints:
+    """Where clients of this host reach the cell: the unix socket, or the site's router."""
+    if cell.zenoh.mode == "client" and cell.zenoh.endpoints:
         return cell.zenoh.endpoints[0]
     return f"unixsock-stream/{socket}"
 
@@ -55,33 +55,41 @@ def _common() -> dict[str, Any]:
     }
 
 
-def router_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
+def gateway_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
     """The gateway's main session: the router itself, or a client of a site's router.
 
+    A router listens on the unix socket in any case: the gateway's own second session and this host's clients use it.
     Raises SessionError: more than this host may connect, and no TLS is configured.
     """
-    zenoh_section = cell.zenoh
+    section = cell.zenoh
     config = _common()
-    tls = zenoh_section.tls
-    if tls is not None:
+    client = section.mode == "client"
+    if section.tls is not None:
+        side = "connect" if client else "listen"
         config["transport"]["link"]["tls"] = {
-            "root_ca_certificate": str(cell_dir / tls.root_ca_certificate),
-            "listen_private_key": str(cell_dir / tls.listen_private_key),
-            "listen_certificate": str(cell_dir / tls.listen_certificate),
-            "enable_mtls": tls.enable_mtls,
+            "root_ca_certificate": str(cell_dir / section.tls.root_ca_certificate),
+            f"{side}_private_key": str(cell_dir / section.tls.listen_private_key),
+            f"{side}_certificate": str(cell_dir / section.tls.listen_certificate),
+            "enable_mtls": section.tls.enable_mtls,
         }
-    if zenoh_section.mode == "client":
-        if not zenoh_section.endpoints:
+    if client:
+        if not section.endpoints:
             raise SessionError(
                 'zenoh.mode = "client" needs zenoh.endpoints: the router to join, e.g. ["tls/router:7447"]'
             )
-        return config | _client(list(zenoh_section.endpoints))
-    endpoints = list(zenoh_section.endpoints) or [endpoint_of(cell, socket)]
-    if not zenoh_section.endpoints:
-        check_socket_path(socket)
-    for endpoint in endpoints:
-        check_listen_endpoint(endpoint, secured=tls is not None)
+        return config | _client(list(section.endpoints))
+    check_socket_path(socket)
+    for endpoint in section.endpoints:
+        check_listen_endpoint(endpoint, secured=section.tls is not None)
+    endpoints = [f"unixsock-stream/{socket}", *section.endpoints]
     return config | {"mode": "router", "listen": {"endpoints": endpoints}, "connect": {"endpoints": []}}
+
+
+def stop_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
+    """The session for stop and enable: a client of the gateway's own router, or of the site's."""
+    if cell.zenoh.mode == "client":
+        return gateway_config(cell, cell_dir, socket)
+    return client_config(endpoint_of(cell, socket))
 
 
 def check_listen_endpoint(endpoint: str, *, secured: bool) -> None:

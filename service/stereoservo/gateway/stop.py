@@ -13,7 +13,7 @@ from zenoh.handlers import RingChannel
 from stereoservo.gateway.keys import KeySpace
 from stereoservo.gateway.messages import Reply, encode
 from stereoservo.gateway.publisher import ReplyThread
-from stereoservo.gateway.session import client_config, close_session, open_session
+from stereoservo.gateway.session import close_session, open_session
 from stereoservo.runtime.handover import StopSlot
 from stereoservo.runtime.interprocess import RunPlan
 
@@ -24,8 +24,8 @@ ACKNOWLEDGE_S = 0.1
 class StopThread:
     """Takes stops and enables on a session of its own, so that no flood on other keys delays them."""
 
-    def __init__(self, endpoint: str, keys: KeySpace, plan: RunPlan, boot: str) -> None:
-        self._session = open_session(client_config(endpoint))
+    def __init__(self, config: dict[str, Any], keys: KeySpace, plan: RunPlan, boot: str) -> None:
+        self._session = open_session(config)
         self._slot = StopSlot(plan.directories.stop_slot)
         self._boot = boot
         self._key = keys.stop
