@@ -110,3 +110,12 @@ def test_tls_paths_are_relative_to_the_cell_file_on_either_side() -> None:
 def test_nobody_at_the_endpoint_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(SessionError, match=r"cannot connect to unixsock-stream/.*none\.sock"):
         open_session(client_config(f"unixsock-stream/{tmp_path}/none.sock"))
+
+
+def test_a_clients_tls_files_are_looked_for_before_it_connects(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=r"ca\.pem: no such file; a TLS directory holds"):
+        client_config("tls/10.0.0.1:7447", tmp_path)
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        (tmp_path / name).touch()
+    tls = client_config("tls/10.0.0.1:7447", tmp_path)["transport"]["link"]["tls"]
+    assert tls["connect_private_key"] == str(tmp_path / "key.pem")

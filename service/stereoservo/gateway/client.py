@@ -10,6 +10,7 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
@@ -63,6 +64,7 @@ from stereoservo.runtime.commands import (
 from stereoservo.runtime.daemon import find_daemon
 
 POLL_S = 0.01
+TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
 DRAIN = 32
 
 _T = TypeVar("_T")
@@ -72,11 +74,19 @@ class Client:
     """A session with the daemon of one cell.
 
     ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
-    host. Raises NotRunningError, SessionError.
+    host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
+
+    Raises NotRunningError, SessionError.
     """
 
     def __init__(
-        self, cell: str, *, endpoint: str | None = None, operator: str | None = None, timeout_s: float = 2.0
+        self,
+        cell: str,
+        *,
+        endpoint: str | None = None,
+        operator: str | None = None,
+        timeout_s: float = 2.0,
+        tls: Path | None = None,
     ) -> None:
         if endpoint is None:
             info = find_daemon(cell)
@@ -86,7 +96,7 @@ class Client:
         self.keys = KeySpace(cell)
         self._goal_key = self.keys.goal(self.operator)
         self._timeout_s = timeout_s
-        self._session = open_session(client_config(endpoint))
+        self._session = open_session(client_config(endpoint, _tls_directory() if tls is None else tls))
         self._declared: list[Any] = []
         self._closed = False
 
@@ -355,6 +365,11 @@ def as_target(target: Target | str | Mapping[str, Any]) -> Target:
             )
         return JointTarget({str(name): float(value) for name, value in target.items()})
     return target
+
+
+def _tls_directory() -> Path | None:
+    given = os.environ.get(TLS_VARIABLE)
+    return Path(given) if given else None
 
 
 def _default_operator() -> str:

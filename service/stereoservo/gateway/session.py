@@ -126,9 +126,27 @@ def _client(endpoints: list[str]) -> dict[str, Any]:
     }
 
 
-def client_config(endpoint: str) -> dict[str, Any]:
-    """A client of the daemon at ``endpoint``."""
-    return _common() | _client([endpoint])
+def client_config(endpoint: str, tls: Path | None = None) -> dict[str, Any]:
+    """A client of the daemon at ``endpoint``; ``tls``: directory with ``ca.pem``, ``cert.pem`` and ``key.pem``.
+
+    Raises SessionError for a file that is missing.
+    """
+    config = _common()
+    if tls is not None:
+        files = {
+            "root_ca_certificate": tls / "ca.pem",
+            "connect_certificate": tls / "cert.pem",
+            "connect_private_key": tls / "key.pem",
+        }
+        for path in files.values():
+            if not path.is_file():
+                raise SessionError(
+                    f"{path}: no such file; a TLS directory holds ca.pem, cert.pem and key.pem"
+                )
+        config["transport"]["link"]["tls"] = {key: str(path) for key, path in files.items()} | {
+            "enable_mtls": True
+        }
+    return config | _client([endpoint])
 
 
 def open_session(config: dict[str, Any]) -> Any:
