@@ -53,7 +53,7 @@ def scratch() -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
 
 
 @kernel
-def _median(histogram, count):  # type: ignore[no-untyped-def]
+def _median(histogram, count):
     half = (count + 1) // 2
     total = 0
     for level in range(256):
@@ -64,7 +64,7 @@ def _median(histogram, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found):  # type: ignore[no-untyped-def]
+def _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found):
     """Label the bright components of a window; the label of the one nearest to (pu, pv), 0 if there is none.
 
     ``found``: count, sum u, sum v, u_min, u_max, v_min, v_max, level sum of its inner pixels, their count.
@@ -143,7 +143,7 @@ def _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, st
 
 
 @kernel
-def _ring_level(image, dark, u_min, u_max, v_min, v_max):  # type: ignore[no-untyped-def]
+def _ring_level(image, dark, u_min, u_max, v_min, v_max):
     """Median level of the rectangular ring 3 to 4 px outside a bounding box (all inside the image)."""
     histogram = np.zeros(256, np.int32)
     count = 0
@@ -162,7 +162,7 @@ def _ring_level(image, dark, u_min, u_max, v_min, v_max):  # type: ignore[no-unt
 
 
 @kernel
-def _ellipse(image, dark, box, labels, label, found, background, contrast, out):  # type: ignore[no-untyped-def]
+def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
     """Soft area, centre and ellipse matrix into ``out``. False where no ellipse can be had."""
     u0, v0, u1, v1 = box
     lo_u, hi_u = int(found[3]) - 2, int(found[4]) + 2
@@ -174,7 +174,7 @@ def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
         for u in range(lo_u, hi_u + 1):
             if u0 <= u < u1 and v0 <= v < v1:
                 other = labels[v - v0, u - u0]
-                if other != 0 and other != label:
+                if other not in (0, label):
                     continue
             level = int(image[v, u])
             if dark:
@@ -217,21 +217,21 @@ def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
 
 
 @kernel
-def smaller_half_axis(q11, q12, q22):  # type: ignore[no-untyped-def]
+def smaller_half_axis(q11, q12, q22):
     """Smaller half axis [px] of the ellipse dᵀQd = 1."""
     middle = 0.5 * (q11 + q22)
     return 1.0 / np.sqrt(middle + np.sqrt(0.25 * (q11 - q22) ** 2 + q12 * q12))
 
 
 @kernel
-def _reach(q11, q12, q22):  # type: ignore[no-untyped-def]
+def _reach(q11, q12, q22):
     """How far the window extends outside the ellipse [px], where the distance to first order is SKIRT."""
     thin = smaller_half_axis(q11, q12, q22)
     return SKIRT + np.sqrt(SKIRT * SKIRT + thin * thin) - thin
 
 
 @kernel
-def _window_sums(image, dark, background, out, sums, edge):  # type: ignore[no-untyped-def]
+def _window_sums(image, dark, background, out, sums, edge):
     """S (2), J (4), sum T Tᵀ (3) at the centre in ``out``; where ``edge``, the odd harmonics of the edge's
     level.
 
@@ -304,7 +304,29 @@ def _window_sums(image, dark, background, out, sums, edge):  # type: ignore[no-u
 
 
 @kernel
-def _noise(image, dark, background, out):  # type: ignore[no-untyped-def]
+def _crowded(labels, box, label, out):
+    """Whether more than specks (noise on the dot's own edge) of other components come within a pixel of its skirt."""
+    specks = 3
+    u0, v0, u1, v1 = box
+    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
+    far = 4.0 * (SKIRT + 1.0) * (SKIRT + 1.0)
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            other = labels[v - v0, u - u0]
+            if other not in (0, label):
+                x, y = u - out[U], v - out[V]
+                gx = q11 * x + q12 * y
+                gy = q12 * x + q22 * y
+                e = x * gx + y * gy - 1.0
+                if e <= 0.0 or e * e < far * (gx * gx + gy * gy):
+                    specks -= 1
+                    if specks < 0:
+                        return True
+    return False
+
+
+@kernel
+def _noise(image, dark, background, out):
     """Variance of the dot's surroundings about a plane [grey levels squared]; -1 where there is too little
     to see.
 
@@ -375,7 +397,7 @@ def _noise(image, dark, background, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels, stack, out):  # type: ignore[no-untyped-def]
+def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels, stack, out):
     """Measure the dot nearest to (pu, pv) in the window [u0, u1) x [v0, v1) of ``image`` (h, w) uint8.
 
     ``dark``: dots darker than their background. ``out`` (FIELDS,) is written; returns a status, ``OK`` or
@@ -413,6 +435,8 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     if contrast < min_contrast:
         return NO_CONTRAST
     if not _ellipse(image, dark, box, labels, label, found, background, contrast, out):
+        return SHAPE
+    if _crowded(labels, box, label, out):
         return SHAPE
     start_u, start_v = out[U], out[V]
     sums = np.zeros(15)

@@ -19,7 +19,7 @@ CLEAR = 1.6
 
 
 @kernel
-def _solve(A, b):  # type: ignore[no-untyped-def]
+def _solve(A, b):
     """Gaussian elimination with partial pivoting, in place; the solution is in ``b``. False if singular."""
     n = b.size
     for i in range(n):
@@ -47,7 +47,7 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _normal_matrix(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
+def _normal_matrix(pattern, pixels, used, frame, h, A, b):
     """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = middle and scale
     of the pixels.
     """
@@ -72,7 +72,7 @@ def _normal_matrix(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-un
 
 
 @kernel
-def _row(point, axis, target, depth, row):  # type: ignore[no-untyped-def]
+def _row(point, axis, target, depth, row):
     row[:] = 0.0
     row[3 * axis] = point[0] / depth
     row[3 * axis + 1] = point[1] / depth
@@ -82,7 +82,7 @@ def _row(point, axis, target, depth, row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fit(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
+def _fit(pattern, pixels, used, frame, h, A, b):
     """Homography in normalised pixels into ``h`` (8,). False where it is undetermined or depths are not
     positive.
     """
@@ -116,7 +116,7 @@ def _fit(pattern, pixels, used, frame, h, A, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _in_pixels(frame, h, H):  # type: ignore[no-untyped-def]
+def _in_pixels(frame, h, H):
     for j in range(2):
         H[j, 0] = frame[2] * h[3 * j] + frame[j] * h[6]
         H[j, 1] = frame[2] * h[3 * j + 1] + frame[j] * h[7]
@@ -127,7 +127,7 @@ def _in_pixels(frame, h, H):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
+def fit_homography(pattern, pixels, used, H):
     """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,),
     into ``H``.
 
@@ -146,7 +146,7 @@ def fit_homography(pattern, pixels, used, H):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def image_of_circle(H, x, y, radius, out):  # type: ignore[no-untyped-def]
+def image_of_circle(H, x, y, radius, out):
     """The picture of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's
     centre, ellipse area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen
     from in front.
@@ -183,7 +183,7 @@ def image_of_circle(H, x, y, radius, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def misfits(pattern, pixels, used, H, out):  # type: ignore[no-untyped-def]
+def misfits(pattern, pixels, used, H, out):
     """Distances (n,) [px] between pixels and projected pattern; 0 where not used. Returns the largest."""
     worst = 0.0
     for i in range(used.size):
@@ -199,13 +199,14 @@ def misfits(pattern, pixels, used, H, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):  # type: ignore[no-untyped-def]
+def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
     """The dot that fits the others least, -1 where each lies where the others put it.
 
     A dot's distance from the homography of the others, to first order, is |(I - L)⁻¹ e|, e its residual and
     L (2, 2) its leverage; a homography bends to a single bad dot, so that e alone may hide most of its
-    error. It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root of (I - L)⁻¹. Of the dots beyond,
-    the one with the largest studentised residual goes. -2 where the fit is degenerate.
+    error. It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root
+    of (I - L)⁻¹. Of the dots beyond, the one with the largest studentised residual goes. -2 where the fit is
+    degenerate.
     """
     if not _normal_matrix(pattern, pixels, used, frame, h, A, b):
         return -2
@@ -252,7 +253,7 @@ def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):  #
 
 
 @kernel
-def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):  # type: ignore[no-untyped-def]
+def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):
     """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of where the others
     put it.
 
@@ -282,7 +283,7 @@ def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):  # type: 
 
 
 @kernel
-def _turn(a, b, c):  # type: ignore[no-untyped-def]
+def _turn(a, b, c):
     """Twice the signed area of a triangle; positive when clockwise as seen (v down)."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
@@ -297,7 +298,7 @@ def basis_inverse(positions: FloatArray) -> FloatArray:
 
 
 @kernel
-def _hypothesis(p, q, r, s, inverse, H):  # type: ignore[no-untyped-def]
+def _hypothesis(p, q, r, s, inverse, H):
     """Homography of four pattern points (by ``inverse``) to four pixels, H[2, 2] > 0."""
     whole = _turn(p, q, r)
     a, b, c = _turn(s, q, r) / whole, _turn(p, s, r) / whole, _turn(p, q, s) / whole
@@ -315,7 +316,7 @@ def _hypothesis(p, q, r, s, inverse, H):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _promising(pattern, pixels, basis, least, reach, H):  # type: ignore[no-untyped-def]
+def _promising(pattern, pixels, basis, least, reach, H):
     """Whether enough dots outside the basis have something near their place."""
     missing = pattern.shape[0] - least
     for i in range(pattern.shape[0]):
@@ -339,7 +340,7 @@ def _promising(pattern, pixels, basis, least, reach, H):  # type: ignore[no-unty
 
 
 @kernel
-def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: ignore[no-untyped-def]
+def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):
     """Dots nearest to the projected pattern into ``owner`` (n,), -1 where none has the right place and size.
 
     Returns their number; 0 where the homography does not show the pattern from in front.
@@ -370,15 +371,16 @@ def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):  # type: i
 
 
 @kernel
-def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tolerance, owner):  # type: ignore[no-untyped-def]
+def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tolerance, owner):
     """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas``
     (m,) [px²].
 
-    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4) with its ``inverses`` (b,
-    3, 3), pruned by the signs and sizes of its triangles, which the dots' areas foretell. A hypothesis
-    counts when ``least`` dots or more lie within ``tolerance`` [px] of the homography fitted to all of them and are of the right size. ``owner`` (n,) gets the dots' rows,
-    -1 for missing ones. Returns the number found; 0 if none, or if another assignment explains as many dots
-    nearly as well.
+    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4) with its ``inverses``
+    (b, 3, 3), pruned by the signs and sizes of its triangles, which the dots' areas foretell. A hypothesis
+    counts when ``least`` dots or more lie within ``tolerance`` [px] of the homography fitted to all of them
+    and are of the right size; ``reach`` [px] is how far a dot may lie from the homography of the quadruple.
+    ``owner`` (n,) gets the dots' rows, -1 for missing ones. Returns the number found; 0 if none, or if
+    another assignment explains as many dots nearly as well.
     """
     n = pattern.shape[0]
     m = pixels.shape[0]
@@ -465,6 +467,6 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
 def compile_kernels() -> None:
     """Compile what the detector calls, or load it from the cache."""
     compile_for(
-        find_face, given(FLOAT, 2), FLOAT, given(FLOAT, 2), given(FLOAT, 1), given(INT, 2), given(FLOAT, 3), INT, FLOAT, FLOAT,
-        written(INT, 1),
+        find_face, given(FLOAT, 2), FLOAT, given(FLOAT, 2), given(FLOAT, 1), given(INT, 2), given(FLOAT, 3),
+        INT, FLOAT, FLOAT, written(INT, 1),
     )  # fmt: skip

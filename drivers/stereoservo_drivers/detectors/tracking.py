@@ -52,7 +52,7 @@ them.
 
 
 @kernel
-def measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, out, status):  # type: ignore[no-untyped-def]
+def measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, out, status):
     """:func:`measure` in windows (k, 4) about points (k, 2) [px], components of ``least`` (k,) pixels or
     more.
 
@@ -66,7 +66,7 @@ def measure_windows(image, dark, windows, near, min_contrast, least, labels, sta
 
 
 @kernel
-def whole(dot, lopsided):  # type: ignore[no-untyped-def]
+def whole(dot, lopsided):
     """Whether a measurement (FIELDS,) is of a whole dot: not cut, not merged with something else."""
     thin = smaller_half_axis(dot[QXX], dot[QXY], dot[QYY])
     # thin dots suffer from sampling: measured 0.04 at 2 px, 0.13 at 1.4 px
@@ -75,7 +75,7 @@ def whole(dot, lopsided):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _median(values, used):  # type: ignore[no-untyped-def]
+def _median(values, used):
     chosen = np.empty(values.size)
     n = 0
     for i in range(values.size):
@@ -90,7 +90,10 @@ def _median(values, used):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def expect(every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s, predicted, present, shapes, windows, least):  # type: ignore[no-untyped-def]  # fmt: skip
+def expect(
+    every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s,
+    predicted, present, shapes, windows, least,
+):  # fmt: skip
     """Windows for the dots of a prior of ``ids`` (k,), ``pixels``, ``velocities`` (k, 2), ``covariances``
     (k, 2, 2).
 
@@ -126,8 +129,11 @@ def expect(every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s
             shape = shapes[f * n + i]
             if good and not image_of_circle(H, patterns[f, i, 0], patterns[f, i, 1], radii[f], shape):
                 good = False
-            if good and mine[i] and (shape[6] < THINNEST or shape[5] + spread[i] + SHAPE_MARGIN >
-            MAX_HALF_WINDOW):
+            if (
+                good
+                and mine[i]
+                and (shape[6] < THINNEST or shape[5] + spread[i] + SHAPE_MARGIN > MAX_HALF_WINDOW)
+            ):
                 good = False
         for i in range(n):
             if good and mine[i]:
@@ -144,7 +150,7 @@ def expect(every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s
 
 
 @kernel
-def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):  # type: ignore[no-untyped-def]
+def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):
     """What each dot of a face must keep by itself and beside its neighbours, into ``used`` (n,)."""
     n = used.size
     contrasts = np.zeros(n)
@@ -170,7 +176,7 @@ def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):  # 
 
 
 @kernel
-def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, tolerance, dots, used):  # type: ignore[no-untyped-def]
+def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, tolerance, dots, used):
     """Accept what was measured: whole, of the expected size, alike, nearest to its own prediction, fitting
     its face.
 
@@ -195,8 +201,9 @@ def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, 
                     used[i] = False
             count += 1 if used[i] else 0
         count = settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, 4) if count >= 4 else 0
-        if count == 0 or (count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine,
-        FEW_TOLERANCE)):
+        if count == 0 or (
+            count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine, FEW_TOLERANCE)
+        ):
             mine[:] = False
             count = 0
         total += count
@@ -204,7 +211,7 @@ def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, 
 
 
 @kernel
-def agree_with_prior(predicted, dots, used, tolerance):  # type: ignore[no-untyped-def]
+def agree_with_prior(predicted, dots, used, tolerance):
     """Whether dots (n, FIELDS) lie on their predictions (n, 2) up to a similarity, within ``tolerance`` [px].
 
     For faces with too few dots to check one another: a prior may be off, but smoothly.
@@ -241,7 +248,7 @@ def agree_with_prior(predicted, dots, used, tolerance):  # type: ignore[no-untyp
 
 
 @kernel
-def _remove_shift(pattern, radius, raw, used, H, dots):  # type: ignore[no-untyped-def]
+def _remove_shift(pattern, radius, raw, used, H, dots):
     """``dots`` = ``raw`` minus the way from a dot's image to the centre of its ellipse."""
     circle = np.zeros(7)
     for i in range(used.size):
@@ -254,7 +261,7 @@ def _remove_shift(pattern, radius, raw, used, H, dots):  # type: ignore[no-untyp
 
 
 @kernel
-def settle_face(pattern, radius, dots, used, tolerance, least):  # type: ignore[no-untyped-def]
+def settle_face(pattern, radius, dots, used, tolerance, least):
     """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to
     the dots' own.
 
@@ -300,7 +307,8 @@ def compile_kernels() -> None:
     )  # fmt: skip
     compile_for(
         expect, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(FLOAT, 2), given(FLOAT, 2),
-        given(FLOAT, 3), FLOAT, written(FLOAT, 2), written(BOOL, 1), written(FLOAT, 2), written(INT, 2), written(INT, 1),
+        given(FLOAT, 3), FLOAT, written(FLOAT, 2), written(BOOL, 1), written(FLOAT, 2), written(INT, 2),
+        written(INT, 1),
     )  # fmt: skip
     compile_for(
         judge, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(BOOL, 1), given(FLOAT, 2), given(INT, 1),

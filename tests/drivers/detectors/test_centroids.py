@@ -128,6 +128,27 @@ def test_a_straight_cut_shows():
             assert status != centroids.OK or not whole(out, 0.02)
 
 
+@pytest.mark.parametrize("gap", [1.5, 2.0, 2.5, 4.0, 8.0])
+def test_a_neighbour_hides_a_dot_or_leaves_it_alone(gap):
+    """Another dot so many pixels beside a thin one: either refused, or measured as if alone.
+
+    (Nearer twins are one symmetric blob; their area tells.)
+    """
+    rng = np.random.default_rng(10)
+    for _ in range(20):
+        conic, centre = tilted_circle(rng, 5.0, 70.0)
+        thin = np.linalg.eigh(conic[:2, :2])[1][:, 1]
+        beside = np.eye(3)
+        beside[:2, 2] = -thin * (gap + 2 * 5.0 * np.cos(np.radians(70.0)))
+        neighbour = beside.T @ conic @ beside
+        status, out = measure(Scene(size=SIZE, clutter=[conic, neighbour], noise=1.0).render(rng))
+        if status == centroids.OK and whole(out, 0.02):
+            to_either = [np.hypot(*(out[:2] - centre + k * beside[:2, 2])) for k in (0, 1)]
+            assert min(to_either) < 0.06
+        else:
+            assert gap <= 4.0
+
+
 def test_dots_at_the_border_are_refused():
     rng = np.random.default_rng(9)
     for offset in (-6.0, -2.0, 0.0, 3.0, 6.0):

@@ -22,6 +22,14 @@ def wrong(shot, observation):
     return int((np.hypot(*shot.errors(observation).T) > GROSS).sum())
 
 
+def cover(image, pixels):
+    """The image with black squares over these dots."""
+    covered = image.copy()
+    for u, v in np.round(pixels).astype(int):
+        covered[v - 14 : v + 15, u - 14 : u + 15] = 30
+    return covered
+
+
 # Acquisition
 
 
@@ -42,7 +50,7 @@ def identify(detector, seed, n, least_found, **settings):
     [
         (1, 40, 0.99, {"noise": 2.0}),
         (2, 40, 0.97, {"noise": 2.0, "clutter": 9}),
-        (3, 25, 0.97, {"noise": 5.0, "clutter": 4, "tilt": 70.0, "distance": (0.8, 1.5)}),
+        (3, 25, 0.95, {"noise": 5.0, "clutter": 4, "tilt": 70.0, "distance": (0.8, 1.5)}),
         (4, 15, 0.97, {"noise": 3.0, "lens_blur": 1.5, "gradient": 0.5}),
         (5, 15, 0.97, {"noise": 2.0, "wall": 200.0, "gradient": 0.5}),
         # clutter that runs into dots hides them, but makes no others of them
@@ -87,11 +95,8 @@ def test_one_hidden_dot_is_left_out_and_the_others_keep_their_ids(detector, hidd
 def test_a_face_with_fewer_than_six_dots_is_not_acquired(detector, hidden):
     rng = np.random.default_rng(30)
     shot = random_shot(rng, distance=(0.8, 1.3), tilt=45.0, noise=2.0)
-    image = shot.frame.image.copy()
-    for dot in hidden:
-        u, v = np.round(shot.truth[dot]).astype(int)
-        image[v - 14 : v + 15, u - 14 : u + 15] = 30
-    assert detector.detect(as_frame(image), None).ids.tolist() == list(range(7, 14))
+    frame = as_frame(cover(shot.frame.image, shot.truth[list(hidden)]))
+    assert detector.detect(frame, None).ids.tolist() == list(range(7, 14))
 
 
 def test_mirrored_and_negative_pictures_show_nothing(detector):
@@ -188,15 +193,17 @@ def test_tracking_and_acquisition_measure_the_same(detector):
 
 
 def test_priors_are_moved_to_the_frame(detector):
-    """At 600 px/s and 40 ms the prior is 24 px behind; uncorrected it would track other dots or none."""
-    shot = random_shot(np.random.default_rng(16), noise=2.0, clutter=6)
+    """At 600 px/s and 40 ms the prior is 24 px behind. Two dots of each face are hidden, so that only a
+    track can be found.
+    """
+    shot = random_shot(np.random.default_rng(16), noise=2.0, distance=(0.8, 1.3), tilt=45.0)
+    frame = as_frame(cover(shot.frame.image, shot.truth[[5, 6, 12, 13]]))
     velocities = np.tile([480.0, -360.0], (14, 1))
-    prior = shot.prior(
-        -0.04 * velocities[0], velocities=velocities, t_ns=shot.frame.t_shutter_ns - 40_000_000
-    )
-    found = make_detector(min_dots=1).detect(shot.frame, prior)
-    assert found.ids.tolist() == IDS.tolist()
+    behind = {"velocities": velocities, "t_ns": shot.frame.t_shutter_ns - 40_000_000}
+    found = detector.detect(frame, shot.prior(-0.04 * velocities[0], **behind))
+    assert found.ids.tolist() == [0, 1, 2, 3, 4, 7, 8, 9, 10, 11]
     assert wrong(shot, found) == 0
+    assert len(detector.detect(frame, shot.prior(-0.04 * velocities[0])).ids) == 0
 
 
 @pytest.mark.parametrize("age_s", [-1.0, 0.3, 100.0])
@@ -272,11 +279,8 @@ def test_four_dots_of_a_face_go_with_the_prior_three_do_not(detector):
     rng = np.random.default_rng(21)
     shot = random_shot(rng, distance=(0.8, 1.3), tilt=45.0, noise=2.0)
     for hidden, expected in (((1, 5, 6), [0, 2, 3, 4]), ((1, 3, 5, 6), [])):
-        image = shot.frame.image.copy()
-        for dot in hidden:
-            u, v = np.round(shot.truth[dot]).astype(int)
-            image[v - 14 : v + 15, u - 14 : u + 15] = 30
-        observation = detector.detect(as_frame(image), shot.prior((0.4, 0.4)))
+        frame = as_frame(cover(shot.frame.image, shot.truth[list(hidden)]))
+        observation = detector.detect(frame, shot.prior((0.4, 0.4)))
         assert observation.ids.tolist() == expected + list(range(7, 14))
         assert wrong(shot, observation) == 0
 
