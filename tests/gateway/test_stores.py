@@ -14,7 +14,15 @@ from stereoservo.runtime.warmup import _model, _settings
 
 
 def taught_event(name: str) -> Event:
-    sample = Sample("left", np.array([2, 5]), np.array([[1.5, 2.5], [3.0, 4.0]]), np.zeros((2, 2, 2)), 20)
+    sample = Sample(
+        "left",
+        np.array([2, 5]),
+        np.array([[1.5, 2.5], [3.0, 4.0]]),
+        np.zeros((2, 2, 2)),
+        20,
+        np.full(2, 20.0),
+        np.zeros(2),
+    )
     return Event(1, 1, "taught", name=name, joints=np.arange(6.0), samples=(sample,))
 
 

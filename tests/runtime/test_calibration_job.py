@@ -24,7 +24,10 @@ def sample(camera: str, ids: list[int], offset: float = 0.0) -> Sample:
     k = len(ids)
     pixels = np.arange(2.0 * k).reshape(k, 2) + offset
     covariances = np.tile(np.diag([0.03, 0.01]), (k, 1, 1))
-    return Sample(camera, np.array(ids, dtype=np.int64), pixels, covariances, 5)
+    count = len(ids)
+    return Sample(
+        camera, np.array(ids, dtype=np.int64), pixels, covariances, 5, np.full(count, 5.0), np.zeros(count)
+    )
 
 
 def stop(seq: int, trial: int, *samples: Sample, goal: str = "a") -> Event:

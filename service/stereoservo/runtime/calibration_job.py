@@ -8,7 +8,7 @@ import numpy as np
 
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialCamera, TrialData
 from stereoservo.runtime.cycle import Event
-from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.settings import CameraSettings, CoreSettings
 
 
 class CalibrationJob:
@@ -51,6 +51,7 @@ class CalibrationJob:
         pixels = np.full((*shape, 2), np.nan)
         sigmas = np.full(shape, np.nan)
         images = 0
+        factors = {camera.name: self._noise_factor(camera) for camera in settings.cameras}
         for s, event in enumerate(self._stops):
             for sample in event.samples:
                 images += sample.frames
@@ -59,7 +60,9 @@ class CalibrationJob:
                 ):
                     where = row[sample.camera], s, column[int(marker)]
                     pixels[where] = pixel
-                    sigmas[where] = np.sqrt(0.5 * np.trace(covariance))
+                    systematic = settings.cameras[where[0]].systematic_px ** 2
+                    noise = 0.5 * np.trace(covariance) - systematic
+                    sigmas[where] = np.sqrt(factors[sample.camera] * noise + systematic)
         return TrialData(
             joint_names=settings.joint_names,
             joint_kinds=settings.joint_kinds,
@@ -73,6 +76,22 @@ class CalibrationJob:
             sigmas=sigmas,
             images=images,
         )
+
+    def _noise_factor(self, camera: CameraSettings) -> float:
+        """Variance of the pixels over the frames of a stop, over what the detector states, pooled over all stops.
+
+        1 where single frames were taken or the detector states no noise.
+        """
+        measured = stated = 0.0
+        for event in self._stops:
+            for sample in event.samples:
+                if sample.camera != camera.name:
+                    continue
+                freedom = sample.sights - 1.0
+                noise = 0.5 * np.trace(sample.covariances, axis1=1, axis2=2) - camera.systematic_px**2
+                measured += float((freedom * sample.scatter).sum())
+                stated += float((freedom * noise * sample.sights).sum())
+        return measured / stated if stated > 0.0 and measured > 0.0 else 1.0
 
 
 def _joints(event: Event) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

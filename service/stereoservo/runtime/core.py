@@ -132,7 +132,9 @@ class ServoCore:
             state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
         if state.history.count == 0:
             return np.zeros_like(state.command)
-        newest: FloatArray = state.history.positions[(state.history.count - 1) % len(state.history.t_ns)].copy()
+        newest: FloatArray = state.history.positions[
+            (state.history.count - 1) % len(state.history.t_ns)
+        ].copy()
         return newest
 
     def _follow_driver(self, inputs: StepInputs, emit: Any) -> None:

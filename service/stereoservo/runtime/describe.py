@@ -15,6 +15,7 @@ from pathlib import Path
 import msgspec
 
 from stereoservo.runtime import plugins
+from stereoservo.runtime.cameras import describe_camera, make_camera
 from stereoservo.runtime.cellfile import CellFile, CellFileError, load_cell_file
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.interprocess import RunPlan, save_plan
@@ -26,7 +27,6 @@ from stereoservo.runtime.ports import (
     DriverError,
     JointDriverDescription,
 )
-from stereoservo.runtime.vision import make_camera
 from stereoservo.runtime.warmup import warm_up
 
 EXIT_INVALID = 2
@@ -69,30 +69,7 @@ def describe_cell(
     cameras = []
     for section in cell.camera:
         driver, detector = make_camera(section, DriverContext(**common, camera=section.name))  # type: ignore[arg-type]
-        description = driver.describe()
-        ids = description.marker_ids
-        if detector is not None:
-            if description.delivers == "observations":
-                raise CellFileError(
-                    cell_path,
-                    "camera.detector",
-                    f"camera {section.name!r} delivers observations; leave the detector out",
-                )
-            ids = detector.describe().marker_ids
-        elif description.delivers == "frames":
-            known = ", ".join(plugins.names(plugins.DETECTORS)) or "none installed"
-            raise CellFileError(
-                cell_path,
-                "camera.detector",
-                f"camera {section.name!r} delivers frames and needs a detector; there are: {known}",
-            )
-        if not ids:
-            raise CellFileError(
-                cell_path,
-                "camera",
-                f"camera {section.name!r} can report no marker; check its detector's options",
-            )
-        cameras.append(msgspec.structs.replace(description, name=section.name, marker_ids=ids))
+        cameras.append(describe_camera(section, driver, detector, cell_path))
     return joints, tuple(cameras)
 
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import msgspec
-
 from stereoservo.runtime import plugins
+from stereoservo.runtime.cameras import describe_camera, make_camera
 from stereoservo.runtime.cellfile import CellFile
 from stereoservo.runtime.clock import VirtualClock
 from stereoservo.runtime.commands import Command, Request
@@ -71,16 +70,10 @@ class LockstepCell:
         self.detectors: list[Detector | None] = []
         descriptions: list[CameraDescription] = []
         for section in cell.camera:
-            context = self._driver_context(section.name)
-            camera = plugins.load(plugins.CAMERA_DRIVERS, section.driver)(section.options, context)
-            detector = None
-            if section.detector:
-                detector = plugins.load(plugins.DETECTORS, section.detector)(
-                    section.detector_options, context
-                )
+            camera, detector = make_camera(section, self._driver_context(section.name))
             self.cameras.append(camera)
             self.detectors.append(detector)
-            descriptions.append(described(camera, detector))
+            descriptions.append(describe_camera(section, camera, detector))
         self.descriptions = tuple(descriptions)
         self.settings: CoreSettings = core_settings(cell, self.joints.describe(), self.descriptions)
         self.core = ServoCore(self.settings)
@@ -241,11 +234,3 @@ class LockstepCell:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def described(camera: CameraDriver, detector: Detector | None) -> CameraDescription:
-    """A camera's description with the marker ids of its detector."""
-    description = camera.describe()
-    if detector is None:
-        return description
-    return msgspec.structs.replace(description, marker_ids=detector.describe().marker_ids)

@@ -97,6 +97,9 @@ def measurement_buffers(settings: CoreSettings) -> dict[str, Any]:
     return {
         "counts": np.zeros((c, m)),
         "sums": np.zeros((c, m, 2)),
+        "first": np.zeros((c, m, 2)),
+        "deviation_sums": np.zeros((c, m, 2)),
+        "square_sums": np.zeros((c, m)),
         "covariance_sums": np.zeros((c, m, 2, 2)),
         "frames": np.zeros(c, dtype=np.int64),
     }

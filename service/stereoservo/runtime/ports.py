@@ -77,13 +77,19 @@ class CameraDescription(msgspec.Struct, frozen=True):
     delivers: Literal["frames", "observations"]
     call_budget_us: float
     marker_ids: tuple[int, ...] = ()
+    systematic_px: float = 0.0
 
 
 class DetectorDescription(msgspec.Struct, frozen=True):
-    """Which marker ids a detector can report."""
+    """Which marker ids a detector can report.
+
+    ``systematic_px``: standard deviation [px] of its errors that do not average out over frames of a scene at rest
+    (sampling, rounding to grey levels); contained in the covariances that it states.
+    """
 
     detector: str
     marker_ids: tuple[int, ...]
+    systematic_px: float = 0.0
 
 
 class JointState(msgspec.Struct, frozen=True, eq=False):

@@ -17,7 +17,7 @@ from stereoservo.runtime.ports import (
 
 
 class CameraSettings(msgspec.Struct, frozen=True):
-    """A camera as the core sees it: size [px], rate [Hz], the marker ids its detector can report."""
+    """A camera as the core sees it: size [px], rate [Hz], its detector's marker ids and systematic error [px]."""
 
     name: str
     width: int
@@ -25,6 +25,7 @@ class CameraSettings(msgspec.Struct, frozen=True):
     rate_hz: float
     mount: Mount
     marker_ids: tuple[int, ...]
+    systematic_px: float = 0.0
 
 
 class LimitSettings(msgspec.Struct, frozen=True, eq=False):
@@ -111,7 +112,7 @@ def core_settings(
     camera_settings = tuple(
         CameraSettings(
             description.name, description.width, description.height, description.rate_hz, section.mount,
-            tuple(sorted(description.marker_ids)),
+            tuple(sorted(description.marker_ids)), description.systematic_px,
         )
         for section, description in zip(cell.camera, cameras, strict=True)
     )  # fmt: skip

@@ -115,6 +115,12 @@ class Trials(msgspec.Struct, tag="trials", eq=False):
     """Sights of each marker in each camera at this stop, (c, m)."""
     sums: FloatArray
     """(c, m, 2)"""
+    first: FloatArray
+    """Pixels at the first sight (c, m, 2), against which the scatter is taken."""
+    deviation_sums: FloatArray
+    """(c, m, 2)"""
+    square_sums: FloatArray
+    """(c, m)"""
     covariance_sums: FloatArray
     """(c, m, 2, 2)"""
     frames: IntArray
@@ -125,7 +131,7 @@ class Trials(msgspec.Struct, tag="trials", eq=False):
     """Range really visited, by joint."""
     stops: IntArray
     """Stops recorded, by joint."""
-    joint_steps: int = 0
+    joint_frames: int = 0
     lost_ns: int = 0
     base_done: bool = False
 
@@ -139,6 +145,9 @@ class Teaching(msgspec.Struct, eq=False):
     started_ns: int
     counts: FloatArray
     sums: FloatArray
+    first: FloatArray
+    deviation_sums: FloatArray
+    square_sums: FloatArray
     covariance_sums: FloatArray
     frames: IntArray
 

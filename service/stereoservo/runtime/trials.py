@@ -11,6 +11,7 @@ import numpy as np
 
 from stereoservo.control.reasons import Reason
 from stereoservo.runtime.averaging import add_observation, averages
+from stereoservo.runtime.estimate import joints_at
 from stereoservo.runtime.motion import ARRIVED, Motion, Present, arrived, measurement_buffers, towards
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.settings import CoreSettings, TrialSettings
@@ -57,9 +58,12 @@ def trials_step(trials: Trials, present: Present) -> Motion:
             _enter(trials, "collect", present)
         return Motion(zero)
     for observation in present.observations:
-        add_observation(trials, present.settings, observation, settings.frames, trials.phase_ns)
-    trials.joint_sum += present.q
-    trials.joint_steps += 1
+        at_shutter = joints_at(present.state.history, observation.t_shutter_ns)
+        if at_shutter is None:
+            continue
+        if add_observation(trials, present.settings, observation, settings.frames, trials.phase_ns):
+            trials.joint_sum += at_shutter
+            trials.joint_frames += 1
     waited_s = (present.now_ns - trials.phase_ns) * 1e-9
     if bool((trials.frames >= settings.frames).all()) or waited_s > settings.wait_s:
         return _stop_done(trials, present, settings)
@@ -75,7 +79,7 @@ def _enter(trials: Trials, phase: str, present: Present) -> None:
         for name, value in measurement_buffers(present.settings).items():
             setattr(trials, name, value)
         trials.joint_sum = np.zeros_like(present.q)
-        trials.joint_steps = 0
+        trials.joint_frames = 0
 
 
 def _move(trials: Trials, present: Present, settings: TrialSettings) -> Motion:
@@ -143,7 +147,7 @@ def _stop_done(trials: Trials, present: Present, settings: TrialSettings) -> Mot
                 ),
             )  # fmt: skip
         return _back_off(trials, present, settings, "at the stop")
-    mean = trials.joint_sum / max(trials.joint_steps, 1)
+    mean = trials.joint_sum / max(trials.joint_frames, 1)
     present.emit(
         "calibration_sample", id=trials.id, joints=mean, samples=samples, trial=trials.joint,
         progress=_progress(trials, settings, present.settings),

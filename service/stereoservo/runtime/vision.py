@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from stereoservo.runtime import plugins
-from stereoservo.runtime.cellfile import CameraSection
+from stereoservo.runtime.cameras import make_camera
 from stereoservo.runtime.channel import Channel, ChannelError
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.handover import SlotError, SlotReader, SlotWriter
@@ -186,15 +186,6 @@ def run_pipeline(
             flush()
             sleep(min(0.05, pause_s))
         pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
-
-
-def make_camera(section: CameraSection, context: DriverContext) -> tuple[CameraDriver, Detector | None]:
-    """Driver and detector of a camera, constructed and not connected. Raises PluginError, DriverError."""
-    driver: CameraDriver = plugins.load(plugins.CAMERA_DRIVERS, section.driver)(section.options, context)
-    detector: Detector | None = None
-    if section.detector:
-        detector = plugins.load(plugins.DETECTORS, section.detector)(section.detector_options, context)
-    return driver, detector
 
 
 def run(plan: RunPlan, camera: str, termination: Termination) -> None:
