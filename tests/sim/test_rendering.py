@@ -53,8 +53,8 @@ def test_an_ellipse_has_its_area_and_its_centre(u, v, long, ratio, angle):
     assert image.min() >= 0
     assert image.max() <= 1 + 1e-6
     assert image.sum() == pytest.approx(np.pi * long**2 * ratio, rel=5e-3)
-    if long * ratio > 3:  # smaller ones are undersampled by the pixels themselves
-        assert np.abs(centroid(image) - [u, v]).max() < 0.005
+    # What remains is the pixels' own undersampling, which falls with the size of the shape.
+    assert np.abs(centroid(image) - [u, v]).max() < 0.05 / (long * ratio)
 
 
 @settings(max_examples=60, deadline=None)
