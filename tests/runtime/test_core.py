@@ -176,6 +176,15 @@ def test_goal_without_renewal_of_its_lease_is_aborted_and_the_arm_rests(bench: A
     assert np.abs(bench.run(1.0).command).max() == 0.0
 
 
+def test_joint_goal_without_renewal_of_its_lease_is_aborted_too(bench: Any) -> None:
+    bench.ready()
+    target = JointTarget({"j1": float(bench.q[0] + 2.0)})
+    assert bench.reply(RunGoal(Goal("0000000b", target, lease_s=0.5))).accepted
+    event = bench.until(ended, 1.0)
+    assert (event.kind, event.reasons[0].code) == ("goal_aborted", "LEASE_EXPIRED")
+    assert np.abs(bench.run(1.0).command).max() == 0.0
+
+
 def test_jog_stops_when_the_dead_mans_lease_runs_out(bench: Any) -> None:
     bench.ready()
     assert bench.reply(Jog({"j1": 0.2}, lease_s=0.3)).accepted

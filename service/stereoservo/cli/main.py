@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import sys
 import traceback
@@ -16,6 +17,8 @@ from typer.models import CommandInfo
 import stereoservo
 from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
 from stereoservo.runtime import plugins
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads cost more than they give here
 
 COMMANDS: dict[str, str] = {
     "run": "run:run",
@@ -61,7 +64,9 @@ class LazyGroup(TyperGroup):
         try:
             function = _load(cmd_name)
         except plugins.PluginError as error:
-            function = _broken(error)
+            return _command(
+                cmd_name, _broken(error), {"allow_extra_args": True, "ignore_unknown_options": True}
+            )
         return _command(cmd_name, function)
 
 
@@ -74,17 +79,19 @@ def _load(name: str) -> Any:
 
 
 def _broken(error: plugins.PluginError) -> Any:
-    def broken(json: bool = typer.Option(False, "--json")) -> None:
-        raise CommandError("plugin", str(error))
+    def broken(ctx: typer.Context, json: bool = typer.Option(False, "--json")) -> None:
+        raise CommandError("plugin", str(error), arguments=ctx.args)
 
     broken.__doc__ = f"(broken) {error}"
     return broken
 
 
-def _command(name: str, function: Any) -> Any:
+def _command(name: str, function: Any, context_settings: dict[Any, Any] | None = None) -> Any:
     """A typer command of one function."""
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
-    single.registered_commands.append(CommandInfo(name=name, callback=function))
+    single.registered_commands.append(
+        CommandInfo(name=name, callback=function, context_settings=context_settings)
+    )
     command = get_command(single)
     command.name = name
     return command

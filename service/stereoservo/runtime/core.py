@@ -315,22 +315,12 @@ class ServoCore:
                 intake.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
             return rest
         source = state.source
-        if (
-            isinstance(source, Servoing)
-            and source.goal.lease_s is not None
-            and present.now_ns > source.lease_until_ns
-        ):
-            reason = Reason(
-                "LEASE_EXPIRED",
-                "hold",
-                "",
-                source.goal.lease_s,
-                source.goal.lease_s,
-                "s",
-                "the client did not renew its lease: is it alive?",
-            )
-            intake.end_source(present, "goal_aborted", (reason,), reason.hint)
-            return rest
+        if isinstance(source, Servoing | JointMove) and source.lease_s is not None:
+            if present.now_ns > source.lease_until_ns:
+                hint = "the client did not renew its lease: is it alive?"
+                reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
+                intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+                return rest
         if state.held or state.stopped:
             return rest
         if isinstance(source, Jogging):

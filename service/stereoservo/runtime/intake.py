@@ -210,7 +210,10 @@ def _check_goal(goal: Goal, present: Present) -> Source:
         for name, position in target.positions.items():
             wanted[_joint(name, present)] = position
         _inside_limits(wanted, present)
-        return _move(goal.id, wanted, goal.speed_scale, present, goal.time_limit_s)
+        move = _move(goal.id, wanted, goal.speed_scale, present, goal.time_limit_s)
+        move.lease_s = goal.lease_s
+        move.lease_until_ns = present.now_ns + int((goal.lease_s or 0.0) * 1e9)
+        return move
     if isinstance(target, TaughtTarget):
         raise Refusal(
             "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
@@ -279,9 +282,9 @@ def next_goal(present: Present) -> None:
 
 def _renew(command: RenewGoal, present: Present) -> str:
     source = present.state.source
-    if isinstance(source, Servoing) and source.goal.id == command.id:
-        if source.goal.lease_s is not None:
-            source.lease_until_ns = present.now_ns + int(source.goal.lease_s * 1e9)
+    if isinstance(source, Servoing | JointMove) and goal_of(source) == command.id:
+        if source.lease_s is not None:
+            source.lease_until_ns = present.now_ns + int(source.lease_s * 1e9)
         return "renewed"
     if goal_of(source) == command.id or any(goal.id == command.id for goal in present.state.queue):
         return "renewed"

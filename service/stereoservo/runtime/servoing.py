@@ -57,6 +57,7 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         hold_frames=goal.hold_frames or settings.hold_frames,
         time_limit_s=goal.time_limit_s or settings.time_limit_s,
         started_ns=present.now_ns,
+        lease_s=goal.lease_s,
         lease_until_ns=present.now_ns + int(lease_s * 1e9),
         set_points=set_points,
         wanted=wanted,

@@ -68,6 +68,8 @@ class JointMove(msgspec.Struct, tag="joints", eq=False):
     speed_scale: float
     started_ns: int
     time_limit_s: float
+    lease_s: float | None = None
+    lease_until_ns: int = 0
     settled: int = 0
 
 
@@ -86,6 +88,7 @@ class Servoing(msgspec.Struct, tag="law", eq=False):
     hold_frames: int
     time_limit_s: float
     started_ns: int
+    lease_s: float | None
     lease_until_ns: int
     set_points: FloatArray
     wanted: FloatArray
