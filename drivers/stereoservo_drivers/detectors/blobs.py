@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo_drivers.detectors.centroids import FIELDS, LOPSIDED, MAX_WINDOW, OK
-from stereoservo_drivers.detectors.tracking import measure_windows, whole
+from stereoservo_drivers.detectors.centroids import FIELDS, LOPSIDED, MAX_WINDOW, OK, measure_windows
+from stereoservo_drivers.detectors.tracking import whole
 
 SHRINK_FROM = 240
 """Least side of an image [px] that is searched, not measured, at half its size: a third of the time, half

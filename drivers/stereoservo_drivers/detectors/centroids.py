@@ -23,13 +23,23 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo_drivers.detectors.compilation import kernel
+from stereoservo_drivers.detectors.compilation import (
+    BOOL,
+    FLOAT,
+    IMAGE,
+    INT,
+    INT32,
+    compile_for,
+    given,
+    kernel,
+    written,
+)
 
 SKIRT = 2.2
 """Distance to the ellipse, to first order, up to which a pixel outside counts [px] (in truth up to 2.8 at 4
 px radius).
 """
-RING = 3
+RING = 2
 """Width of the surroundings outside the skirt [px] that give background and noise."""
 MARGIN = 4
 """Pixels needed between a dot's half-contrast outline and the border of the image."""
@@ -365,35 +375,41 @@ def _noise(image, dark, background, out):
     if count < 24:
         return -1.0
     limit = 4.0 * 1.4826 * _median(histogram, count) + 2.0
-    n = si = sx = sy = sxx = sxy = syy = sxi = syi = sii = 0.0
-    for k in range(count):
-        x, y, level = ring[k, 0], ring[k, 1], ring[k, 2]
-        if abs(level) > limit:
-            continue
-        n += 1.0
-        si += level
-        sx += x
-        sy += y
-        sxx += x * x
-        sxy += x * y
-        syy += y * y
-        sxi += x * level
-        syi += y * level
-        sii += level * level
-    if n < 12.0:
-        return -1.0
-    sxx -= sx * sx / n
-    sxy -= sx * sy / n
-    syy -= sy * sy / n
-    sxi -= sx * si / n
-    syi -= sy * si / n
-    sii -= si * si / n
-    d = sxx * syy - sxy * sxy
-    if d <= 0.0:
-        return -1.0
-    a = (syy * sxi - sxy * syi) / d
-    b = (sxx * syi - sxy * sxi) / d
-    return max(sii - a * sxi - b * syi, 0.0) / (n - 3.0)
+    level0 = slope_x = slope_y = variance = 0.0
+    for _ in range(2):
+        n = si = sx = sy = sxx = sxy = syy = sxi = syi = sii = 0.0
+        for k in range(count):
+            x, y, level = ring[k, 0], ring[k, 1], ring[k, 2]
+            if abs(level - level0 - slope_x * x - slope_y * y) > limit:
+                continue
+            n += 1.0
+            si += level
+            sx += x
+            sy += y
+            sxx += x * x
+            sxy += x * y
+            syy += y * y
+            sxi += x * level
+            syi += y * level
+            sii += level * level
+        if n < 12.0:
+            return -1.0
+        sxx -= sx * sx / n
+        sxy -= sx * sy / n
+        syy -= sy * sy / n
+        sxi -= sx * si / n
+        syi -= sy * si / n
+        sii -= si * si / n
+        d = sxx * syy - sxy * sxy
+        if d <= 0.0:
+            return -1.0
+        slope_x = (syy * sxi - sxy * syi) / d
+        slope_y = (sxx * syi - sxy * sxi) / d
+        level0 = (si - slope_x * sx - slope_y * sy) / n
+        variance = max(sii - slope_x * sxi - slope_y * syi, 0.0) / (n - 3.0)
+        limit = 3.0 * np.sqrt(variance) + 0.5
+    # what lies within three standard deviations of a Gaussian has 0.973 of its variance
+    return variance / 0.973 if variance > 1.0 else variance
 
 
 @kernel
@@ -470,3 +486,25 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     out[LOPSIDED] = 2.0 * np.sqrt(odd) / (sums[9] * contrast)
     out[LOPSIDED_NOISE] = 2.0 * np.sqrt(2.0 * sums[14]) / (sums[9] * contrast)
     return OK
+
+
+@kernel
+def measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, out, status):
+    """:func:`measure` in windows (k, 4) about points (k, 2) [px], components of ``least`` (k,) pixels or
+    more.
+
+    Writes ``out`` (k, FIELDS) and ``status`` (k,); empty windows are skipped with ``BORDER``.
+    """
+    for k in range(windows.shape[0]):
+        u0, v0, u1, v1 = windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3]
+        status[k] = measure(
+            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, least[k], labels, stack, out[k]
+        )
+
+
+def compile_kernels() -> None:
+    """Compile what the detector calls, or load it from the cache."""
+    compile_for(
+        measure_windows, IMAGE, BOOL, given(INT, 2), given(FLOAT, 2), INT, given(INT, 1), written(INT32, 2),
+        written(INT32, 1), written(FLOAT, 2), written(INT, 1),
+    )  # fmt: skip

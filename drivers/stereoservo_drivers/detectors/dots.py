@@ -24,12 +24,21 @@ from stereoservo.runtime.ports import (
     ImageArray,
     Prior,
 )
-from stereoservo_drivers.detectors import patterns, tracking
+from stereoservo_drivers.detectors import centroids, patterns, tracking
 from stereoservo_drivers.detectors.blobs import find_spots
-from stereoservo_drivers.detectors.centroids import AREA, CXX, CXY, CYY, FIELDS, NOISE, scratch
+from stereoservo_drivers.detectors.centroids import (
+    AREA,
+    CXX,
+    CXY,
+    CYY,
+    FIELDS,
+    NOISE,
+    measure_windows,
+    scratch,
+)
 from stereoservo_drivers.detectors.patterns import basis_inverse, find_face
 from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY
-from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, measure_windows, settle_face
+from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, settle_face
 
 QUANTISATION = 1.0 / 12.0
 """Least noise variance [grey levels squared]: rounding to whole levels."""
@@ -71,8 +80,10 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lopsided: Positive = 0.02
     """Largest odd harmonic of a whole dot's edge; a cut of 0.5 px makes 0.02, of 1 px 0.04."""
     floor_px: Annotated[float, Meta(ge=0)] = 0.001
-    """Systematic standard deviation [px] added to every covariance: sampling of sharp edges (measured
-    0.0005-0.003).
+    """Systematic standard deviation [px], part of every covariance: sampling of sharp edges and rounding to grey
+    levels. The default is what residuals of calibrations have beyond the scatter of frames at 2 grey levels of
+    noise (tests/sim/test_demo.py holds the pooled chi-square); noise-free images, whose rounding nothing
+    dithers, have 0.0013.
     """
     max_spots: Annotated[int, Meta(ge=7, le=100)] = 48
     """Dot-like spots that acquisition looks at, the roundest first."""
@@ -119,6 +130,7 @@ class DotDetector:
         self._patterns = _patterns(self.options)
         self._dark = self.options.polarity == "dark"
         self._labels, self._stack = scratch()
+        centroids.compile_kernels()
         patterns.compile_kernels()
         tracking.compile_kernels()
         self._size = self.options.image_size
@@ -130,7 +142,7 @@ class DotDetector:
 
     def describe(self) -> DetectorDescription:
         """The marker ids of all faces."""
-        return DetectorDescription(detector="dots", marker_ids=self._ids)
+        return DetectorDescription("dots", self._ids, self.options.floor_px)
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """Dots of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
@@ -181,8 +193,8 @@ class DotDetector:
         ids = np.ascontiguousarray(prior.ids, np.int64)
         expect(
             self._every_id, self._positions, self._radii, ids, np.ascontiguousarray(prior.pixels, np.float64),
-            np.ascontiguousarray(prior.velocities, np.float64), covariances, dt_s, predicted, present, shapes, windows,
-            least,
+            np.ascontiguousarray(prior.velocities, np.float64), covariances, dt_s, predicted, present, shapes,
+            windows, least,
         )  # fmt: skip
         measure_windows(
             image, self._dark, windows, predicted, options.min_contrast, least, self._labels, self._stack,
@@ -260,7 +272,7 @@ def noise_variances(measured: FloatArray) -> FloatArray:
     """Noise variance of each dot's surroundings (k,) from the measured ones (k,), -1 where there is none
     [levels²].
 
-    One picture has one noise: each gets the median over all dots, which is steadier (a dot's own: 15 % standard deviation),
+    One picture has one noise: each gets the median over all dots, which is steadier (a dot's own: 15 %),
     unless its own surroundings are more than twice as restless.
     """
     known = measured[measured >= 0.0]

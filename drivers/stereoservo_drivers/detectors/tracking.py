@@ -21,15 +21,12 @@ from stereoservo_drivers.detectors.centroids import (
     QXX,
     QXY,
     QYY,
-    measure,
     smaller_half_axis,
 )
 from stereoservo_drivers.detectors.compilation import (
     BOOL,
     FLOAT,
-    IMAGE,
     INT,
-    INT32,
     compile_for,
     given,
     kernel,
@@ -49,20 +46,6 @@ SHAPE = 7
 """Columns of an expected dot, as :func:`~stereoservo_drivers.detectors.patterns.image_of_circle` writes
 them.
 """
-
-
-@kernel
-def measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, out, status):
-    """:func:`measure` in windows (k, 4) about points (k, 2) [px], components of ``least`` (k,) pixels or
-    more.
-
-    Writes ``out`` (k, FIELDS) and ``status`` (k,); empty windows are skipped with ``BORDER``.
-    """
-    for k in range(windows.shape[0]):
-        u0, v0, u1, v1 = windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3]
-        status[k] = measure(
-            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, least[k], labels, stack, out[k]
-        )
 
 
 @kernel
@@ -301,10 +284,6 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
 
 def compile_kernels() -> None:
     """Compile what the detector calls, or load it from the cache."""
-    compile_for(
-        measure_windows, IMAGE, BOOL, given(INT, 2), given(FLOAT, 2), INT, given(INT, 1), written(INT32, 2),
-        written(INT32, 1), written(FLOAT, 2), written(INT, 1),
-    )  # fmt: skip
     compile_for(
         expect, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(FLOAT, 2), given(FLOAT, 2),
         given(FLOAT, 3), FLOAT, written(FLOAT, 2), written(BOOL, 1), written(FLOAT, 2), written(INT, 2),
