@@ -58,7 +58,7 @@ class PybulletCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=Tr
 
     noise: NonNegative = 2.0
     blur: NonNegative = 0.7
-    background: Literal["arm", "plain"] = "arm"
+    background: Literal["arm", "plain", "pybullet"] = "arm"
 
 
 class PybulletCameraDriver(SimulatedCamera):

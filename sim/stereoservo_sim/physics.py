@@ -47,6 +47,14 @@ def import_pybullet() -> Any:
     return pybullet
 
 
+def load_robot(bullet: Any, client: int, robot: Robot) -> int:
+    """Load an arm into a simulation; its body number."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{robot.name}.urdf"
+        path.write_text(urdf(robot))
+        return int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+
+
 class PybulletPlant:
     """The arm as rigid bodies under gravity. Drives follow their set-points by position and velocity, so
     nothing sags.
@@ -64,7 +72,7 @@ class PybulletPlant:
         self._velocity_gains = [1.0] * self._count
         self._bullet.setTimeStep(step_s, physicsClientId=self._client)
         self._bullet.setGravity(0, 0, -9.81, physicsClientId=self._client)
-        self._arm = self._load(robot)
+        self._arm = load_robot(self._bullet, self._client, robot)
         self._joints = list(range(self._count))
         for joint in self._joints:
             self._bullet.changeDynamics(
@@ -83,12 +91,6 @@ class PybulletPlant:
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         self.positions = positions.copy()
         self.velocities = np.zeros(self._count)
-
-    def _load(self, robot: Robot) -> int:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"{robot.name}.urdf"
-            path.write_text(urdf(robot))
-            return int(self._bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=self._client))
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Move on by ``h`` [s], one step of the engine, towards set-points (n,), (n,)."""

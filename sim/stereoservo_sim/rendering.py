@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo_sim.backdrop import PybulletBackdrop
 from stereoservo_sim.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.rig import PinholeCamera, project
 from stereoservo_sim.robots import shape_segments
@@ -31,7 +32,8 @@ _NOISE_MARGIN = 64
 class RenderSettings:
     """``blur_px``: sigma of the lens blur; ``noise_grey``: sigma of the sensor noise [grey levels].
 
-    ``background``: ``arm`` draws a room and the arm, ``plain`` an even grey.
+    ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm anew for every
+    frame; ``plain`` is an even grey.
     """
 
     blur_px: float = 0.7
@@ -47,6 +49,7 @@ class Renderer:
         self.camera = camera
         self.settings = settings
         self._room = _room(camera) if settings.background == "arm" else _plain(camera)
+        self._backdrop = PybulletBackdrop(cell.robot, camera) if settings.background == "pybullet" else None
         shape = (camera.height + _NOISE_MARGIN, camera.width + _NOISE_MARGIN)
         field = np.random.default_rng(20010101).standard_normal(shape) * settings.noise_grey
         self._noise = field.astype(np.float32)
@@ -57,6 +60,9 @@ class Renderer:
         if self.settings.background == "arm":
             background = self._room.copy()
             front = self._draw_arm(background, q)
+        elif self._backdrop is not None:
+            background = self._backdrop.image(q)
+            front = self._draw_arm(background.copy(), q)  # only what stands before the body is drawn again
         image = background.astype(np.float32)
         region = draw_body(image, self.cell, self.camera, q)
         for polygon, level in front:

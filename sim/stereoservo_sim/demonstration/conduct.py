@@ -62,6 +62,7 @@ def conduct_lockstep(cell_path: Path, out: Path, seed: int, stage: Stage) -> Dem
     """One process, virtual time, deterministic given the seed."""
     cell = load_cell_file(cell_path)
     recording = out / "flight.mcap"
+    recording.unlink(missing_ok=True)  # of an earlier demonstration
     with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
         history = JointHistory.in_memory(len(cell.safety.limit), capacity=1 << 16)
         with LockstepCell(
@@ -97,6 +98,7 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
     """Real processes: a daemon in directories of its own, and a client over zenoh."""
     cell = load_cell_file(cell_path)
     recording = out / "flight.mcap"
+    recording.unlink(missing_ok=True)  # of an earlier demonstration
     with tempfile.TemporaryDirectory(prefix="stereoservo-") as scratch:
         os.environ[RUNTIME_VARIABLE] = str(Path(scratch) / "run")
         os.environ[STATE_VARIABLE] = str(Path(scratch) / "state")
