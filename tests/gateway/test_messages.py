@@ -115,3 +115,34 @@ def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> 
     assert "lease_s" in schema("goal").decode()
     with pytest.raises(MessageError, match=r"no schema 'gaol'; there are: goal"):
         schema("gaol")
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"law": "image"}, "law: Invalid enum value 'image'; valid: stereo, cartesian3"),
+        ({"gain": -1}, "gain: Expected `float` > 0.0, got -1"),
+        ({"zz": 1}, "unknown field `zz`; known: id, target, law"),
+        (
+            {"target": {"kind": "points"}},
+            "target.kind: Invalid value 'points'; valid: features, taught, joints",
+        ),
+        (
+            {"target": {"kind": "features", "set_points": {"left": {"abc": [1, 2]}}}},
+            "a key of target.set_points",
+        ),
+    ],
+)
+def test_a_refusal_names_the_value_and_what_would_have_been_valid(change: dict[str, Any], text: str) -> None:
+    tree = {"id": "0" * 8, "target": {"kind": "taught", "name": "park"}} | change
+    with pytest.raises(MessageError) as refused:
+        decode(msgspec.json.encode(tree), Goal)
+    assert text in str(refused.value)
+
+
+def test_an_integer_that_no_later_stage_can_carry_is_refused() -> None:
+    payload = b'{"id": "00000000", "target": {"kind": "features", "set_points": {}, "model_epoch": 1%s}}' % (
+        b"0" * 30
+    )
+    with pytest.raises(MessageError, match="out of range"):
+        decode(payload, Goal)

@@ -56,6 +56,19 @@ def test_events_are_numbered_and_can_be_read_from_any_number(client: Client) -> 
     assert [event.seq for event in later.events] == [page.next - 1]
 
 
+@pytest.mark.parametrize("number", ["abc", "-1", "²", "9" * 5000])
+def test_a_number_that_is_none_is_refused_and_the_gateway_lives(client: Client, number: str) -> None:
+    boot = client.status().boot
+    reply = decode(client._get(f"{client.keys.event}?from={number}"), Reply)
+    assert not reply.accepted
+    assert "a number is valid" in reply.problems[0]
+    features = b'{"kind": "features", "set_points": {"left": {"0": [1, 1]}}, "model_epoch": %s}'
+    payload = b'{"id": "00000000", "target": ' + features + b"}"
+    reply = decode(client._get(client.keys.goal("x"), payload % (b"9" * 30)), Reply)
+    assert not reply.accepted
+    assert client.status().boot == boot
+
+
 def test_watch_shows_state_events_and_features(client: Client) -> None:
     seen = set()
     stream = client.watch(features=True)

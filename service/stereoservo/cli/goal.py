@@ -21,8 +21,11 @@ from stereoservo.cli.output import (
     pairs,
 )
 from stereoservo.gateway.client import Client, ClientError, GoalHandle
-from stereoservo.gateway.messages import decode
+from stereoservo.gateway.messages import decode, encode
 from stereoservo.runtime.commands import FeatureTarget, Goal, JointTarget, Target, TaughtTarget
+
+WAITING_LEASE_S = 2.0
+"""Who waits for a goal stands behind it: when that process dies, the arm stops."""
 
 
 def goal(
@@ -44,7 +47,11 @@ def goal(
     hold_frames: Annotated[int | None, typer.Option(help="Frames for which the tolerance must hold.")] = None,
     speed_scale: Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")] = 1.0,
     lease: Annotated[
-        float | None, typer.Option(help="Abort when this client is silent for so long [s].")
+        float | None,
+        typer.Option(
+            help=f"Abort when this client is silent for so long [s] (default: {WAITING_LEASE_S:g} while it waits, "
+            f"none with --no-wait)."
+        ),
     ] = None,
     time_limit: Annotated[float | None, typer.Option(help="Abort after so long [s].")] = None,
     queue: Annotated[bool, typer.Option("--queue", help="After the active goal, not instead of it.")] = False,
@@ -72,8 +79,11 @@ def goal(
             "mode": "queue" if queue else "preempt",
         }
         wanted = decode(
-            msgspec.json.encode({key: value for key, value in tree.items() if value is not None}), Goal
+            encode({key: value for key, value in tree.items() if value is not None}),
+            Goal,  # NaN is refused, not dropped
         )
+    if wait and wanted.lease_s is None:
+        wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         if check or wanted.check:
             reply = client.check(wanted)

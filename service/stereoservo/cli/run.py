@@ -24,7 +24,9 @@ def run(
     record: Annotated[
         str, typer.Option("--record", metavar="FILE", help="Record the flight; 'auto' names the file itself.")
     ] = "",
-    seed: Annotated[int, typer.Option("--seed", help="Seed for simulated drivers.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Seed for simulated drivers.", min=0, max=(1 << 63) - 1)
+    ] = 0,
     json: JsonOption = False,
 ) -> None:
     """Run a cell until SIGTERM or Ctrl-C; either ends it with the arm stopped."""
@@ -34,7 +36,7 @@ def run(
         note(f"cell {plan.cell.cell.name!r} is up{mode}")
 
     file = record if record in ("", "auto") else str(Path(record).absolute())
-    if Path(file).is_file():
+    if file not in ("", "auto") and Path(file).exists():
         raise CommandError("exists", f"{file} exists already; a recording is not written over")
     ended_by = run_cell(
         cell, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready

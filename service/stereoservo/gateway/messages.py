@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import msgspec
 
@@ -24,6 +24,7 @@ from stereoservo.runtime.commands import (
     RenewGoal,
     Reset,
     Resume,
+    Target,
     Teach,
 )
 
@@ -294,17 +295,67 @@ def decode(data: bytes, kind: type[_T]) -> _T:
     if len(data) > MAX_PAYLOAD_BYTES:
         raise MessageError(f"payload of {len(data)} bytes; at most {MAX_PAYLOAD_BYTES} are taken")
     try:
-        return msgspec.json.decode(data, type=kind)
+        found = msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
-        text, _, where = str(error).partition(" - at `")
-        place = where.rstrip("`").removeprefix("$").lstrip(".")
-        raise MessageError(f"{place}: {text}" if place else text) from error
+        raise MessageError(_misfit(str(error), data, kind)) from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         if match := _NOT_FINITE.search(data):
             raise MessageError(
                 f"{match[0].decode()} is not a JSON number; finite numbers are valid"
             ) from error
         raise MessageError(f"payload is not JSON: {error}") from error
+    _require_bounded(msgspec.to_builtins(found, str_keys=True))
+    return found
+
+
+def _misfit(error: str, data: bytes, kind: Any) -> str:
+    """A validation error with its place, the value that was given, and the words that would have been valid."""
+    text, _, where = error.partition(" - at `")
+    if where.startswith("key` in `"):
+        return f"a key of {where.removeprefix('key` in `$.').rstrip('`')}: {text}"
+    place = where.rstrip("`").removeprefix("$").lstrip(".")
+    if not place:
+        known = getattr(kind, "__struct_fields__", ()) if "unknown field" in text else ()
+        return text + (f"; known: {', '.join(known)}" if known else "")
+    try:
+        value: Any = msgspec.json.decode(data)
+    except msgspec.MsgspecError:  # a number too large for any type, say; the place alone is told
+        return f"{place}: {text}"
+    for part in place.split("."):
+        value = value.get(part) if isinstance(value, dict) and "[" not in part else None
+    given = (
+        "" if value is None or isinstance(value, dict | list) or repr(value) in text else f", got {value!r}"
+    )
+    words = _WORDS.get(place, ()) if text.startswith("Invalid ") else ()
+    return f"{place}: {text}{given}" + (f"; valid: {', '.join(words)}" if words else "")
+
+
+_WORDS: dict[str, tuple[str, ...]] = {
+    **{
+        field.name: tuple(
+            word
+            for part in get_args(field.type)
+            for word in get_args(part) or (part,)
+            if isinstance(word, str)
+        )
+        for field in msgspec.structs.fields(Goal)
+    },
+    "target.kind": tuple(str(target.__struct_config__.tag) for target in get_args(Target)),
+}
+"""What a field of a goal may say, where its words are few."""
+
+
+def _require_bounded(tree: Any) -> None:
+    """Raises MessageError for an integer that does not fit 64 bits: no later stage could carry it."""
+    if isinstance(tree, int):
+        if not -(1 << 63) <= tree < 1 << 63:
+            raise MessageError(f"integer {tree} is out of range; -2^63 to 2^63 - 1 are valid")
+    elif isinstance(tree, dict):
+        for value in tree.values():
+            _require_bounded(value)
+    elif isinstance(tree, list | tuple):
+        for value in tree:
+            _require_bounded(value)
 
 
 def decode_command(verb: str, data: bytes) -> Command:

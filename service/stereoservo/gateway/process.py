@@ -221,8 +221,8 @@ class Gateway:
     def _answer_events(self, query: Any) -> None:
         given = str(query.parameters)
         number = dict(part.split("=", 1) for part in given.split(";") if "=" in part).get("from", "1")
-        if not number.isdigit():
-            problem = f"from={number}: a number is valid, 1 to {self.log.last + 1}"
+        if not (number.isascii() and number.isdigit() and len(number) < 20):
+            problem = f"from={number[:40]}: a number is valid, 1 to {self.log.last + 1}"
             reply = Reply(False, "the query is not valid", problems=(problem,), boot=self.boot)
             self._replies.reply(query, encode(reply), self.keys.event)
             return
