@@ -1,4 +1,4 @@
-"""The arm before its background as pybullet renders it: slow, so refreshed seldom; the marker layer is drawn over it."""
+"""The arm before its background as pybullet renders it: slow, so refreshed seldom; the markers are drawn over it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BRIGHTNESS = 0.6  # of what pybullet's lamp gives
 
 
 class PybulletBackdrop:
-    """Grey images of the arm by pybullet's own renderer (about 15 ms), kept until the arm has moved and time has passed."""
+    """Grey images of the arm by pybullet's own renderer, kept until the arm has moved and time has passed."""
 
     def __init__(self, robot: Robot, camera: PinholeCamera) -> None:
         self._bullet = import_pybullet()

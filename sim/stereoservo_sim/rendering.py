@@ -8,16 +8,19 @@ by up to half a pixel, and even antialiased ones by hundredths.)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo_sim.backdrop import PybulletBackdrop
 from stereoservo_sim.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.rig import PinholeCamera, project
 from stereoservo_sim.robots import shape_segments
 from stereoservo_sim.world import SimulatedCell
+
+if TYPE_CHECKING:
+    from stereoservo_sim.backdrop import PybulletBackdrop
 
 FloatArray = npt.NDArray[np.float64]
 ImageArray = npt.NDArray[np.uint8]
@@ -32,8 +35,8 @@ _NOISE_MARGIN = 64
 class RenderSettings:
     """``blur_px``: sigma of the lens blur; ``noise_grey``: sigma of the sensor noise [grey levels].
 
-    ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm anew for every
-    frame; ``plain`` is an even grey.
+    ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm anew for
+    every frame; ``plain`` is an even grey.
     """
 
     blur_px: float = 0.7
@@ -49,7 +52,7 @@ class Renderer:
         self.camera = camera
         self.settings = settings
         self._room = _room(camera) if settings.background == "arm" else _plain(camera)
-        self._backdrop = PybulletBackdrop(cell.robot, camera) if settings.background == "pybullet" else None
+        self._backdrop = _backdrop(cell, camera) if settings.background == "pybullet" else None
         shape = (camera.height + _NOISE_MARGIN, camera.width + _NOISE_MARGIN)
         field = np.random.default_rng(20010101).standard_normal(shape) * settings.noise_grey
         self._noise = field.astype(np.float32)
@@ -100,6 +103,12 @@ class Renderer:
         height, width = image.shape
         noise = self._noise[down : down + height, right : right + width]
         return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def _backdrop(cell: SimulatedCell, camera: PinholeCamera) -> PybulletBackdrop:
+    from stereoservo_sim.backdrop import PybulletBackdrop  # pybullet is loaded only where it is asked for
+
+    return PybulletBackdrop(cell.robot, camera)
 
 
 def draw_body(

@@ -1,4 +1,4 @@
-"""ServoCore: one step from inputs to a joint velocity. Pure given its state: no clock, no I/O, no random number (DESIGN 2)."""
+"""ServoCore: one step from inputs to a joint velocity. Pure given its state: no clock, no I/O, no random number."""
 
 from __future__ import annotations
 
@@ -260,7 +260,8 @@ class ServoCore:
             slow = self.settings.cameras[int(teaching.frames.argmin())].name
             present.emit(
                 "warning", request=teaching.request, accepted=False, name=teaching.name,
-                message=f"teaching {teaching.name!r} failed: camera {slow} gave {int(teaching.frames.min())} of {teaching.frames_wanted} frames in {TEACH_TIMEOUT_S:.0f} s",
+                message=f"teaching {teaching.name!r} failed: camera {slow} gave {int(teaching.frames.min())} of "
+                f"{teaching.frames_wanted} frames in {TEACH_TIMEOUT_S:.0f} s",
             )  # fmt: skip
 
     def _watch_following(self, present: Present) -> None:
@@ -315,12 +316,11 @@ class ServoCore:
                 intake.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
             return rest
         source = state.source
-        if isinstance(source, Servoing | JointMove) and source.lease_s is not None:
-            if present.now_ns > source.lease_until_ns:
-                hint = "the client did not renew its lease: is it alive?"
-                reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
-                intake.end_source(present, "goal_aborted", (reason,), reason.hint)
-                return rest
+        if isinstance(source, Servoing | JointMove) and source.lease_expired(present.now_ns):
+            hint = "the client did not renew its lease: is it alive?"
+            reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
+            intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+            return rest
         if state.held or state.stopped:
             return rest
         if isinstance(source, Jogging):

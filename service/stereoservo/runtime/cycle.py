@@ -91,8 +91,8 @@ EventKind = Literal[
 class Sample(msgspec.Struct, frozen=True, eq=False):
     """Markers averaged at rest in one camera: ``ids`` (k,), ``pixels`` (k, 2), ``covariances`` (k, 2, 2) of the mean.
 
-    The covariances are the detector's: its noise over the number of sights, plus its systematic part. ``sights`` (k,) and
-    ``scatter`` (k,) [px²], the variance of a coordinate over these sights, tell how far its noise is as stated.
+    The covariances are the detector's: its noise over the number of sights, plus its systematic part. ``sights`` (k,)
+    and ``scatter`` (k,) [px²], the variance of a coordinate over these sights, tell how far its noise is as stated.
     """
 
     camera: str

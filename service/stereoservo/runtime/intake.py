@@ -39,7 +39,7 @@ QUEUE_LENGTH = 16
 HOME_SPEED = 0.5
 
 
-class Refusal(Exception):
+class RefusalError(Exception):
     """The core will not do what was asked; carries the reason."""
 
     def __init__(
@@ -89,7 +89,7 @@ def answer(request: Request, present: Present) -> None:
     """Carry out one request and emit its reply."""
     try:
         message = _carry_out(request, request.command, present)
-    except Refusal as refusal:
+    except RefusalError as refusal:
         present.emit(
             "reply",
             request=request.request,
@@ -124,7 +124,7 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
         return "the arm is stopped and its drives go off"
     if isinstance(command, Reset):
         if state.lifecycle != Lifecycle.FAULT:
-            raise Refusal("NOT_IN_FAULT", f"the cell is {state.lifecycle}; there is nothing to reset")
+            raise RefusalError("NOT_IN_FAULT", f"the cell is {state.lifecycle}; there is nothing to reset")
         state.fault = []  # latched until here; a cause that is still there latches it again
         state.driver_request = "reset"
         return "resetting"
@@ -153,11 +153,11 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
     _preempt(present, type(command).__name__.lower())
     if isinstance(command, Home):
         if present.settings.home is None:
-            raise Refusal("NO_HOME", "the cell file states neither [joints] home nor [calibration] base")
+            raise RefusalError("NO_HOME", "the cell file states neither [joints] home nor [calibration] base")
         state.source = _move(command.id, present.settings.home, HOME_SPEED * command.speed_scale, present)
         return "moving home"
     if present.settings.trials is None:
-        raise Refusal("NO_TRIALS", "the cell file has no [calibration] section")
+        raise RefusalError("NO_TRIALS", "the cell file has no [calibration] section")
     state.source = start_trials(command.id, present.q, present.now_ns, present.settings)
     present.emit("calibration_progress", id=command.id, progress=0.0, message="trial motions begin")
     return "calibrating"
@@ -166,14 +166,14 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
 def _enable(present: Present) -> str:
     state = present.state
     if state.lifecycle == Lifecycle.FAULT:
-        raise Refusal(
+        raise RefusalError(
             "IN_FAULT",
             "the cell is in fault: "
             + "; ".join(r.hint for r in state.fault)
             + ". Clear the cause, then reset",
         )
     if state.lifecycle == Lifecycle.UNCONFIGURED:
-        raise Refusal("NOT_CONFIGURED", "the joint driver is not configured yet")
+        raise RefusalError("NOT_CONFIGURED", "the joint driver is not configured yet")
     state.held = state.stopped = False
     if state.lifecycle == Lifecycle.INACTIVE:
         state.driver_request = "activate"
@@ -184,14 +184,15 @@ def _enable(present: Present) -> str:
 def _may_move(present: Present) -> None:
     state = present.state
     if state.lifecycle != Lifecycle.ACTIVE:
-        raise Refusal(
+        raise RefusalError(
             "NOT_ACTIVE",
-            f"the cell is {state.lifecycle}; {'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first",
+            f"the cell is {state.lifecycle}; "
+            f"{'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first",
         )
     if state.stopped:
-        raise Refusal("STOPPED", "the cell was stopped; resume it first")
+        raise RefusalError("STOPPED", "the cell was stopped; resume it first")
     if state.held:
-        raise Refusal("HELD", "the cell is held; resume it first")
+        raise RefusalError("HELD", "the cell is held; resume it first")
 
 
 def _preempt(present: Present, by: str) -> None:
@@ -210,12 +211,9 @@ def _check_goal(goal: Goal, present: Present) -> Source:
         for name, position in target.positions.items():
             wanted[_joint(name, present)] = position
         _inside_limits(wanted, present)
-        move = _move(goal.id, wanted, goal.speed_scale, present, goal.time_limit_s)
-        move.lease_s = goal.lease_s
-        move.lease_until_ns = present.now_ns + int((goal.lease_s or 0.0) * 1e9)
-        return move
+        return _move(goal.id, wanted, goal.speed_scale, present, goal.time_limit_s, goal.lease_s)
     if isinstance(target, TaughtTarget):
-        raise Refusal(
+        raise RefusalError(
             "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
         )
     return _feature_goal(goal, target, present)
@@ -224,21 +222,23 @@ def _check_goal(goal: Goal, present: Present) -> Source:
 def _feature_goal(goal: Goal, target: FeatureTarget, present: Present) -> Servoing:
     state = present.state
     if state.model is None or present.arrays is None or state.readiness == ModelReadiness.NONE:
-        raise Refusal("NO_MODEL", "the cell has no model yet: calibrate first")
+        raise RefusalError("NO_MODEL", "the cell has no model yet: calibrate first")
     if state.readiness == ModelReadiness.SUSPECT:
-        raise Refusal(
+        raise RefusalError(
             "MODEL_SUSPECT",
             "the model no longer explains the images: check the cameras and the markers, then calibrate",
         )
     if target.model_epoch is not None and target.model_epoch != state.model.epoch:
-        raise Refusal(
-            "OTHER_MODEL", f"the goal was taught with model epoch {target.model_epoch}; the cell has epoch {state.model.epoch}: teach it again",
+        raise RefusalError(
+            "OTHER_MODEL",
+            f"the goal was taught with model epoch {target.model_epoch}; the cell has epoch {state.model.epoch}: "
+            "teach it again",
             value=float(target.model_epoch), threshold=float(state.model.epoch),
         )  # fmt: skip
     try:
         return start_servoing(goal, target, present)
     except ValueError as error:
-        raise Refusal("GOAL_UNUSABLE", str(error)) from error
+        raise RefusalError("GOAL_UNUSABLE", str(error)) from error
 
 
 def _run_goal(goal: Goal, present: Present) -> str:
@@ -248,7 +248,7 @@ def _run_goal(goal: Goal, present: Present) -> str:
         return "already accepted"  # a client's retry
     if goal.mode == "queue" and goal_of(state.source):
         if len(state.queue) >= QUEUE_LENGTH:
-            raise Refusal(
+            raise RefusalError(
                 "QUEUE_FULL",
                 f"{QUEUE_LENGTH} goals are queued",
                 value=float(len(state.queue)),
@@ -276,19 +276,18 @@ def next_goal(present: Present) -> None:
         goal = state.queue.pop(0)
         try:
             begin(_check_goal(goal, present), present)
-        except Refusal as refusal:
+        except RefusalError as refusal:
             present.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=(refusal.reason,))
 
 
 def _renew(command: RenewGoal, present: Present) -> str:
     source = present.state.source
     if isinstance(source, Servoing | JointMove) and goal_of(source) == command.id:
-        if source.lease_s is not None:
-            source.lease_until_ns = present.now_ns + int(source.lease_s * 1e9)
+        source.renew_lease(present.now_ns)
         return "renewed"
     if goal_of(source) == command.id or any(goal.id == command.id for goal in present.state.queue):
         return "renewed"
-    raise Refusal(
+    raise RefusalError(
         "NO_SUCH_GOAL",
         f"goal {command.id} is not active; active: {goal_of(source) or 'none'}",
         subject=command.id,
@@ -302,7 +301,7 @@ def _cancel(command: CancelGoal, present: Present) -> str:
         return "cancelled"
     kept = [goal for goal in state.queue if goal.id != command.id]
     if len(kept) == len(state.queue):
-        raise Refusal(
+        raise RefusalError(
             "NO_SUCH_GOAL",
             f"goal {command.id} is neither active nor queued; active: {goal_of(state.source) or 'none'}",
             subject=command.id,
@@ -315,15 +314,15 @@ def _cancel(command: CancelGoal, present: Present) -> str:
 def _teach(command: Teach, request: Request, present: Present) -> str:
     state = present.state
     if state.model is None:
-        raise Refusal(
+        raise RefusalError(
             "NO_MODEL", "the cell has no model yet: calibrate first, so that the goal can carry its epoch"
         )
     if state.teaching is not None:
-        raise Refusal(
+        raise RefusalError(
             "TEACHING", f"goal {state.teaching.name!r} is still being taught", subject=state.teaching.name
         )
     if bool((np.abs(state.command) > 1e-3).any()):
-        raise Refusal(
+        raise RefusalError(
             "MOVING",
             "the arm moves; a goal is taught at rest",
             value=float(np.abs(state.command).max()),
@@ -339,7 +338,7 @@ def _teach(command: Teach, request: Request, present: Present) -> str:
 def _joint(name: str, present: Present) -> int:
     names = present.settings.joint_names
     if name not in names:
-        raise Refusal("NO_SUCH_JOINT", f"no joint {name!r}; joints: {', '.join(names)}", subject=name)
+        raise RefusalError("NO_SUCH_JOINT", f"no joint {name!r}; joints: {', '.join(names)}", subject=name)
     return names.index(name)
 
 
@@ -351,23 +350,39 @@ def _inside_limits(target: FloatArray, present: Present) -> None:
             limits.position_max[i] - limits.position_margin,
         )
         if not low <= target[i] <= high and target[i] != present.q[i]:
-            raise Refusal(
-                "JOINT_LIMIT", f"joint {name}: {target[i]:.4f} is outside {low:.4f} … {high:.4f} (limits less the margin)",
-                subject=name, value=float(target[i]), threshold=float(high if target[i] > high else low), unit="rad or m",
+            raise RefusalError(
+                "JOINT_LIMIT",
+                f"joint {name}: {target[i]:.4f} is outside {low:.4f} … {high:.4f} (limits less the margin)",
+                subject=name, value=float(target[i]), threshold=float(high if target[i] > high else low),
+                unit="rad or m",
             )  # fmt: skip
 
 
 def _move(
-    goal_id: str, target: FloatArray, speed_scale: float, present: Present, time_limit_s: float | None = None
+    goal_id: str,
+    target: FloatArray,
+    speed_scale: float,
+    present: Present,
+    time_limit_s: float | None = None,
+    lease_s: float | None = None,
 ) -> JointMove:
-    limit = present.settings.time_limit_s if time_limit_s is None else time_limit_s
-    return JointMove(goal_id, np.array(target), speed_scale, present.now_ns, limit)
+    move = JointMove(
+        id=goal_id,
+        target=np.array(target),
+        speed_scale=speed_scale,
+        started_ns=present.now_ns,
+        time_limit_s=present.settings.time_limit_s if time_limit_s is None else time_limit_s,
+        lease_s=lease_s,
+        lease_until_ns=0,
+    )
+    move.renew_lease(present.now_ns)
+    return move
 
 
 def _jog(command: Jog, present: Present) -> str:
     state = present.state
     if not isinstance(state.source, Holding | Jogging):
-        raise Refusal(
+        raise RefusalError(
             "BUSY",
             f"a goal is active ({goal_of(state.source)}): cancel it before jogging",
             subject=goal_of(state.source),
@@ -375,7 +390,7 @@ def _jog(command: Jog, present: Present) -> str:
     velocity = np.zeros_like(present.q)
     for name, speed in command.velocities.items():
         if not math.isfinite(speed):
-            raise Refusal(
+            raise RefusalError(
                 "NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name
             )
         velocity[_joint(name, present)] = speed

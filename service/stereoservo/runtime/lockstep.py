@@ -35,7 +35,7 @@ from stereoservo.runtime.settings import CoreSettings, core_settings
 from stereoservo.runtime.state import encode_state
 
 
-class LockstepTimeout(Exception):
+class LockstepTimeoutError(Exception):
     """What was waited for did not happen in the given virtual time; carries the last status."""
 
     def __init__(self, message: str, status: Status | None) -> None:
@@ -206,7 +206,7 @@ class LockstepCell:
             self.step()
 
     def wait_for(self, wanted: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
-        """Step until an event with number > ``since`` fits. Raises LockstepTimeout."""
+        """Step until an event with number > ``since`` fits. Raises LockstepTimeoutError."""
         seen = 0
         for _ in range(round(timeout_s * 1e9 / self.period_ns) + 1):
             for event in self.events[seen:]:
@@ -214,7 +214,7 @@ class LockstepCell:
                     return event
             seen = len(self.events)
             self.step()
-        raise LockstepTimeout(f"nothing of what was waited for within {timeout_s} s", self.status)
+        raise LockstepTimeoutError(f"nothing of what was waited for within {timeout_s} s", self.status)
 
     def close(self) -> None:
         """Stop the arm and release everything."""

@@ -28,7 +28,7 @@ TERMINAL = frozenset({"goal_reached", "goal_aborted", "goal_cancelled", "goal_pr
 CALIBRATION_TIMEOUT_S = 1800.0
 
 
-class LockstepRefusal(Exception):
+class LockstepRefusalError(Exception):
     """The cell refused, or a goal did not end as hoped; carries the event."""
 
     def __init__(self, event: Event) -> None:
@@ -49,17 +49,17 @@ class LockstepOperator:
     def _submit(self, command: Command) -> Event:
         reply = self.cell.submit(command)
         if not reply.accepted:
-            raise LockstepRefusal(reply)
+            raise LockstepRefusalError(reply)
         return reply
 
     def enable(self) -> None:
-        """Enable, and wait until the arm may move. Raises LockstepRefusal, LockstepTimeout."""
+        """Enable, and wait until the arm may move. Raises LockstepRefusalError, LockstepTimeoutError."""
         since = self.cell.events[-1].seq if self.cell.events else 0
         self._submit(Enable())
         self.cell.wait_for(lambda e: e.kind == "lifecycle" and e.name == Lifecycle.ACTIVE, 5.0, since - 1)
 
     def calibrate(self, progress: Callable[[str, float], None] | None = None) -> CellModel:
-        """Trial motions, fit in this process, model into the core. Raises LockstepRefusal, CalibrationError."""
+        """Trial motions, fit in this process, model into the core. Raises LockstepRefusalError, CalibrationError."""
         first = len(self.cell.events)
         goal_id = str(next(self._ids))
         self._submit(Calibrate(goal_id))
@@ -68,7 +68,7 @@ class LockstepOperator:
             CALIBRATION_TIMEOUT_S, self.cell.events[first].seq - 1,
         )  # fmt: skip
         if end.kind == "calibration_aborted":
-            raise LockstepRefusal(end)
+            raise LockstepRefusalError(end)
         job = CalibrationJob(self.cell.settings)
         for event in self.cell.events[first:]:
             job.add(event)
@@ -80,27 +80,27 @@ class LockstepOperator:
         return model
 
     def teach(self, name: str, frames: int = 20) -> Event:
-        """Store what the cameras see now as goal ``name``. Raises LockstepRefusal."""
+        """Store what the cameras see now as goal ``name``. Raises LockstepRefusalError."""
         reply = self._submit(Teach(name, frames))
         event = self.cell.wait_for(
             lambda e: e.name == name and e.kind in ("taught", "warning"), 30.0, reply.seq
         )
         if event.kind != "taught":
-            raise LockstepRefusal(event)
+            raise LockstepRefusalError(event)
         self.taught[name] = feature_target(event, self._epoch)
         return event
 
     def goal(
         self, target: FeatureTarget | JointTarget | str, *, timeout_s: float = 120.0, **options: object
     ) -> Event:
-        """Run a goal (a taught one by its name) to its terminal event. Raises LockstepRefusal when it is refused."""
+        """Run a goal (a taught one by its name) to its end. Raises LockstepRefusalError when it is refused."""
         resolved = self.taught[target] if isinstance(target, str) else target
         goal = Goal(str(next(self._ids)), resolved, **options)  # type: ignore[arg-type]
         reply = self._submit(RunGoal(goal))
         return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, reply.seq)
 
     def home(self) -> Event:
-        """Move home. Raises LockstepRefusal."""
+        """Move home. Raises LockstepRefusalError."""
         goal_id = str(next(self._ids))
         reply = self._submit(Home(goal_id))
         return self.cell.wait_for(lambda e: e.id == goal_id and e.kind in TERMINAL, 120.0, reply.seq)

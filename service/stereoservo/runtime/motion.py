@@ -82,7 +82,8 @@ def joint_move(move: JointMove, present: Present) -> Motion:
         name = present.settings.joint_names[worst]
         reason = Reason(
             "TIME_LIMIT", "hold", name, elapsed_s, move.time_limit_s, "s",
-            f"joint {name} is {abs(move.target[worst] - present.q[worst]):.4f} from its target: is it blocked or at a limit?",
+            f"joint {name} is {abs(move.target[worst] - present.q[worst]):.4f} from its target: is it blocked, or at "
+            "a limit?",
         )  # fmt: skip
         present.emit("goal_aborted", id=move.id, message="joint move not finished in time", reasons=(reason,))
         return Motion(np.zeros_like(present.q), finished=True)

@@ -33,7 +33,7 @@ class RecordingError(Exception):
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """``identical`` is None where the fingerprints differ; ``max_relative_error`` of the joint velocities then counts."""
+    """``identical`` is None where the fingerprints differ; ``max_relative_error`` of the velocities counts then."""
 
     identical: bool | None
     steps: int

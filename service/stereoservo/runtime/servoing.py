@@ -36,10 +36,9 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
     target_points, ok = triangulate(arrays.matrices, set_points, wanted, 5)
     known = np.asarray(ok, dtype=bool) & seen_by_all
     target_points = np.where(known[:, None], with_unit_height(target_points, arrays.plane_at_infinity), 0.0)
-    if int((wanted.sum(axis=0) > 0).sum()) < MIN_MARKERS:
-        raise ValueError(
-            f"the goal shows {int((wanted.sum(axis=0) > 0).sum())} markers; at least {MIN_MARKERS} are needed to fix a pose"
-        )
+    shown = int((wanted.sum(axis=0) > 0).sum())
+    if shown < MIN_MARKERS:
+        raise ValueError(f"the goal shows {shown} markers; at least {MIN_MARKERS} are needed to fix a pose")
     face: IntArray = np.zeros(3, np.int64)
     centre = np.zeros(4)
     pose_known = law == "cartesian3" or int(known.sum()) >= MIN_MARKERS
@@ -47,8 +46,7 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         face = _face(set_points, known, arrays)
         target_points = _goal_points(present, arrays, target_points, known, face, set_points, wanted)
         centre = target_points[known].sum(axis=0) / float(known.sum())
-    lease_s = goal.lease_s if goal.lease_s is not None else 0.0
-    return Servoing(
+    source = Servoing(
         goal=goal,
         law=law,
         points=goal.points or settings.points,
@@ -58,7 +56,7 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         time_limit_s=goal.time_limit_s or settings.time_limit_s,
         started_ns=present.now_ns,
         lease_s=goal.lease_s,
-        lease_until_ns=present.now_ns + int(lease_s * 1e9),
+        lease_until_ns=0,
         set_points=set_points,
         wanted=wanted,
         target_points=target_points,
@@ -68,6 +66,8 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
         face=face,
         last_frames=sum(e.frames for e in present.state.cameras),
     )
+    source.renew_lease(present.now_ns)
+    return source
 
 
 def _set_points(
@@ -149,7 +149,8 @@ def servo_step(source: Servoing, present: Present) -> Motion:
     if source.moved_s > source.time_limit_s:
         reason = Reason(
             "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
-            "no error was measured" if error_px is None else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
+            "no error was measured" if error_px is None
+            else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
         )  # fmt: skip
         present.emit(
             "goal_aborted",
@@ -193,7 +194,8 @@ def _stereo(
     much farther than either.
     """
     prediction, pixels = present.prediction, present.pixels
-    assert prediction is not None and pixels is not None
+    assert prediction is not None
+    assert pixels is not None
     points = _points(source, present, arrays)
     jacobian = image_jacobian(prediction.operators, arrays.matrices, points)
     if source.pose_known:
@@ -215,7 +217,9 @@ def _stereo(
 
 
 def _points(source: Servoing, present: Present, arrays: ModelArrays) -> FloatArray:
-    assert present.prediction is not None and present.pixels is not None and present.weights is not None
+    assert present.prediction is not None
+    assert present.pixels is not None
+    assert present.weights is not None
     return points_now(
         arrays,
         present.q,

@@ -60,7 +60,22 @@ class Jogging(msgspec.Struct, tag="jog", eq=False):
     until_ns: int
 
 
-class JointMove(msgspec.Struct, tag="joints", eq=False):
+class Leased(msgspec.Struct, eq=False):
+    """A goal whose client must renew its lease, where it has one."""
+
+    lease_s: float | None
+    lease_until_ns: int
+
+    def lease_expired(self, now_ns: int) -> bool:
+        """Whether the client was silent for too long."""
+        return self.lease_s is not None and now_ns > self.lease_until_ns
+
+    def renew_lease(self, now_ns: int) -> None:
+        """The client spoke."""
+        self.lease_until_ns = now_ns + int((self.lease_s or 0.0) * 1e9)
+
+
+class JointMove(Leased, tag="joints", eq=False, kw_only=True):
     """A straight line in joint space to ``target`` (n,)."""
 
     id: str
@@ -68,16 +83,14 @@ class JointMove(msgspec.Struct, tag="joints", eq=False):
     speed_scale: float
     started_ns: int
     time_limit_s: float
-    lease_s: float | None = None
-    lease_until_ns: int = 0
     settled: int = 0
 
 
-class Servoing(msgspec.Struct, tag="law", eq=False):
+class Servoing(Leased, tag="law", eq=False, kw_only=True):
     """A law drives the arm to set-points.
 
-    ``set_points`` (c, m, 2) [px] with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the goal, where
-    ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): indices of three that span it.
+    ``set_points`` (c, m, 2) [px] with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the goal,
+    where ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): three that span it.
     """
 
     goal: Goal
@@ -88,8 +101,6 @@ class Servoing(msgspec.Struct, tag="law", eq=False):
     hold_frames: int
     time_limit_s: float
     started_ns: int
-    lease_s: float | None
-    lease_until_ns: int
     set_points: FloatArray
     wanted: FloatArray
     target_points: FloatArray

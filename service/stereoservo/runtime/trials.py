@@ -1,4 +1,4 @@
-"""The calibration programme as a motion source: each joint alone, stop after stop, backing off when markers leave a view.
+"""The calibration programme as a motion source: each joint alone, stop after stop.
 
 From the base, joint l goes in equal steps to one side, then to the other (thesis 5.4.1, fig. 5.13); equal steps let all
 pairs of neighbouring stops determine one homography. At a stop the pixels are averaged at rest. A step that loses the
@@ -113,7 +113,8 @@ def _too_slow(trials: Trials, present: Present) -> Reason | None:
         name = present.settings.joint_names[joint]
         return Reason(
             "STOP_NOT_REACHED", "hold", name, float(present.q[joint]), float(trials.target[joint]), "rad or m",
-            f"joint {name} did not reach its stop within {limit_s:.0f} s (tolerance {ARRIVED}): a limit, a keep-out, or a blocked joint",
+            f"joint {name} did not reach its stop within {limit_s:.0f} s (tolerance {ARRIVED}): a limit, a keep-out, "
+            "or a blocked joint",
         )  # fmt: skip
     return None
 
@@ -141,7 +142,8 @@ def _stop_done(trials: Trials, present: Present, settings: TrialSettings) -> Mot
             return _abort(
                 trials, present,
                 Reason(
-                    "MARKERS_NOT_SEEN", "hold", poorest.camera, float(poorest.ids.size), float(settings.min_markers), "markers",
+                    "MARKERS_NOT_SEEN", "hold", poorest.camera, float(poorest.ids.size), float(settings.min_markers),
+                    "markers",
                     f"camera {poorest.camera} shows {poorest.ids.size} markers in {poorest.frames} frames at the base: "
                     "check light, focus, and that the base configuration shows the marker body to every camera",
                 ),
@@ -230,7 +232,8 @@ def _too_little(trials: Trials, present: Present, settings: TrialSettings) -> Re
     return Reason(
         "TRIAL_TOO_SMALL", "hold", name, visited, settings.min_range, "rad or m",
         f"joint {name} was seen at {stops} stops over {visited:.3f}; at least {MIN_STOPS} stops over "
-        f"{settings.min_range} are needed: change calibration.base so that the markers stay in view, or raise calibration.range.{name}",
+        f"{settings.min_range} are needed: change calibration.base so that the markers stay in view, or raise "
+        f"calibration.range.{name}",
     )  # fmt: skip
 
 

@@ -26,8 +26,8 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     flight = read_flight(demonstration.recording)
     goals = [
         judge_goal(
-            goal.name, goal.law, demonstration.outcomes[goal.name], flight, demonstration.truth_t, demonstration.truth_q,
-            demo_cell(),
+            goal.name, goal.law, demonstration.outcomes[goal.name], flight, demonstration.truth_t,
+            demonstration.truth_q, demo_cell(),
         )
         for goal in GOALS
     ]  # fmt: skip
