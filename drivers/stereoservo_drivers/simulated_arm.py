@@ -86,6 +86,7 @@ class SimulatedArm:
             pacing="clock",
             command_timeout_s=self._options.command_timeout_s,
             call_budget_us=self.call_budget_us,
+            home=tuple(self._start.tolist()),
         )
 
     def configure(self) -> None:

@@ -344,13 +344,32 @@ def test_dry_run_expects_no_motion(benches: Any) -> None:
     assert bench.run(1.0).status.lifecycle == "active"
 
 
-def test_trial_motions_without_markers_name_the_camera(bench: Any) -> None:
+@pytest.mark.parametrize(("silent", "code"), [(True, "CAMERA_SILENT"), (False, "MARKERS_NOT_SEEN")])
+def test_trial_motions_without_markers_name_the_camera(bench: Any, silent: bool, code: str) -> None:
     bench.run(0.1)
     bench.step(Enable())
-    bench.cameras_on[1] = False
     bench.reply(Calibrate("00000011"))
+    if silent:
+        bench.cameras_on[1] = False
+    else:
+        bench.marker_mask[:] = False
     event = bench.until(lambda e: e.kind == "calibration_aborted", 120.0)
-    assert (event.reasons[0].code, event.reasons[0].subject) == ("MARKERS_NOT_SEEN", "right")
+    assert event.reasons[0].code == code
+    assert event.reasons[0].subject in (("right",) if silent else ("left", "right"))
+    assert np.abs(bench.run(1.0).command).max() == 0.0
+
+
+def test_trial_motions_wait_for_a_camera_that_is_still_starting(bench: Any) -> None:
+    bench.cameras_on[1] = False
+    bench.run(0.1)
+    bench.step(Enable())
+    bench.reply(Calibrate("00000011"))
+    bench.run(20.0)
+    assert not [
+        e for e in bench.events if e.kind.startswith("calibration_") and e.kind != "calibration_progress"
+    ]
+    bench.cameras_on[1] = True
+    assert bench.until(lambda e: e.kind == "calibration_sample", 5.0).trial == -1
 
 
 def test_trial_motions_back_off_when_markers_leave_the_view(bench: Any) -> None:

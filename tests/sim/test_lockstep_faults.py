@@ -34,7 +34,8 @@ def fake_cell() -> CellFile:
             "servo": {"tolerance_px": 0.2, "hold_frames": 5},
             "safety": {
                 "limit": [
-                    {"joint": n, "min": -2.7, "max": 2.7, "velocity": 1.0, "acceleration": 4.0} for n in NAMES
+                    {"joint": n, "min": -m, "max": m, "velocity": 1.0, "acceleration": 4.0}
+                    for n, m in zip(NAMES, (2.7, 2.3, 2.4, 4.7, 1.8, 4.7), strict=True)
                 ]
             },
             "calibration": {

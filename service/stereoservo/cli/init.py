@@ -95,8 +95,8 @@ def _text(
         lines += [
             "[[safety.limit]]",
             f'joint = "{joint.name}"',
-            f"min = {joint.position_min!r}",
-            f"max = {joint.position_max!r}",
+            f"min = {round(joint.position_min, 4)!r}",
+            f"max = {round(joint.position_max, 4)!r}",
             f"velocity = {joint.velocity_max!r}",
             f"acceleration = {joint.acceleration_max!r}",
             "",
@@ -111,7 +111,8 @@ def _text(
         "",
         "[calibration.base]",
     ]
-    lines += [f"{joint.name} = {_base(joint.position_min, joint.position_max)!r}" for joint in joints.joints]
+    base = joints.home or [_base(joint.position_min, joint.position_max) for joint in joints.joints]
+    lines += [f"{joint.name} = {round(q, 4)!r}" for joint, q in zip(joints.joints, base, strict=True)]
     lines += ["", "[calibration.range]"]
     lines += [f"{joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints]
     return "\n".join(lines) + "\n"

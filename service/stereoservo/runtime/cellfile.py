@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from stereoservo.runtime.commands import LAWS, LawName, Name, PointSource
 from stereoservo.runtime.ports import Mount
 
 SCHEMA = 1
+LARGEST = 1e9
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -161,11 +163,14 @@ def load_cell_file(path: Path) -> CellFile:
         tree = tomllib.loads(text.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CellFileError(path, "", f"is not TOML: {error}") from error
+    except RecursionError as error:
+        raise CellFileError(path, "", "is nested too deeply; a cell file has three levels") from error
     return check_cell(tree, path)
 
 
 def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
     """Decode a parsed cell file strictly. Raises CellFileError."""
+    _check_numbers(tree, "", path)
     if tree.get("schema") != SCHEMA:
         raise CellFileError(path, "schema", f"is {tree.get('schema')!r}; this version reads {SCHEMA}")
     try:
@@ -182,6 +187,22 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
             raise CellFileError(path, "camera.name", f"{name!r} is used twice; camera names must differ")
     _check_limits(cell, path)
     return cell
+
+
+def _check_numbers(value: Any, key: str, path: Path | str) -> None:
+    """No number may be infinite, NaN or too large to carry: an infinite time-out is a time-out switched off."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _check_numbers(item, f"{key}.{name}" if key else str(name), path)
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            _check_numbers(item, f"{key}[{k}]", path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise CellFileError(path, key, f"is {value}; a finite number is needed")
+    elif isinstance(value, float) and abs(value) > LARGEST:
+        raise CellFileError(path, key, f"is {value}; numbers up to {LARGEST:g} are valid")
+    elif isinstance(value, int) and abs(value) >= 2**63:
+        raise CellFileError(path, key, "is an integer of more than 63 bits")
 
 
 def _check_limits(cell: CellFile, path: Path | str) -> None:
@@ -205,15 +226,40 @@ def _check_limits(cell: CellFile, path: Path | str) -> None:
     if cell.calibration is not None:
         sections += [("calibration.base", dict(cell.calibration.base))]
         sections += [("calibration.range", dict(cell.calibration.range))]
-    sections += [(f"safety.keep_out {k.name!r}", dict(k.ranges)) for k in cell.safety.keep_out]
+    for box in cell.safety.keep_out:
+        if not box.ranges:
+            raise CellFileError(path, f"safety.keep_out {box.name!r}", "bounds no joint; give ranges of some")
+        sections.append((f"safety.keep_out {box.name!r}", dict(box.ranges)))
     for key, values in sections:
-        for joint in values:
+        for joint, value in values.items():
             if joint not in seen:
                 raise CellFileError(
                     path,
                     key,
                     f"joint {joint!r} has no [[safety.limit]]; joints with limits: {', '.join(seen) or 'none'}",
                 )
+            _check_value(key, joint, value, cell, path)
+
+
+def _check_value(key: str, joint: str, value: Any, cell: CellFile, path: Path | str) -> None:
+    """One value for a joint against its limits: a configuration, a range of trial motion, a side of a keep-out."""
+    limit = next(limit for limit in cell.safety.limit if limit.joint == joint)
+    margin = cell.safety.position_margin
+    low, high = limit.min + margin, limit.max - margin
+    if key in ("joints.home", "calibration.base") and not low <= value <= high:
+        raise CellFileError(
+            path,
+            f"{key}.{joint}",
+            f"is {value:g}; {low:g} to {high:g} is valid (its limits less the margin; in rad?)",
+        )
+    if key == "calibration.range" and value > limit.max - limit.min:
+        raise CellFileError(
+            path,
+            f"{key}.{joint}",
+            f"is {value:g}; at most {limit.max - limit.min:g}, all that its limits leave (in rad?)",
+        )
+    if isinstance(value, tuple) and not value[0] < value[1]:
+        raise CellFileError(path, f"{key}.{joint}", f"is {list(value)}; the first must be below the second")
 
 
 def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str = "<cell>") -> None:

@@ -12,8 +12,10 @@ import msgspec
 from msgspec import Meta
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-GoalId = Annotated[str, Meta(pattern=r"^[0-9a-fA-F-]{8,36}$")]
+GoalId = Annotated[str, Meta(pattern=r"^[0-9a-fA-F]{8}[0-9a-fA-F-]{0,28}$")]
 Positive = Annotated[float, Meta(gt=0)]
+Gain = Annotated[float, Meta(gt=0, le=50)]
+Pixels = Annotated[float, Meta(gt=0, le=1000)]
 Fraction = Annotated[float, Meta(gt=0, le=1)]
 
 LAWS = ("stereo", "cartesian3")
@@ -27,7 +29,7 @@ class FeatureTarget(
     """Set-points: for each camera, marker id -> (u, v) [px]. ``model_epoch``: None, or refuse another model."""
 
     set_points: dict[str, dict[int, tuple[float, float]]]
-    model_epoch: int | None = None
+    model_epoch: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
 
 
 class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", forbid_unknown_fields=True):
@@ -56,8 +58,8 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     target: Target
     law: LawName | None = None
     points: PointSource | None = None
-    gain: Positive | None = None
-    tolerance_px: Positive | None = None
+    gain: Gain | None = None
+    tolerance_px: Pixels | None = None
     hold_frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None
     speed_scale: Fraction = 1.0
     lease_s: Annotated[float, Meta(ge=0.3, le=3600)] | None = None

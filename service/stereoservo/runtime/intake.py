@@ -144,6 +144,10 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
         return _teach(command, request, present)
     if isinstance(command, RunGoal) and command.goal.check:
         _check_goal(command.goal, present)
+        try:
+            _may_move(present)
+        except RefusalError as error:
+            return f"the goal would be accepted, but now {error}"
         return "the goal would be accepted"
     _may_move(present)
     if isinstance(command, Jog):

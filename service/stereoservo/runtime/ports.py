@@ -56,7 +56,10 @@ class JointSpec(msgspec.Struct, frozen=True):
 
 
 class JointDriverDescription(msgspec.Struct, frozen=True):
-    """What a joint driver drives, readable before it is connected."""
+    """What a joint driver drives, readable before it is connected.
+
+    ``home``: a configuration in which the arm may well stand (in joint order; empty: the driver knows none).
+    """
 
     driver: str
     joints: tuple[JointSpec, ...]
@@ -64,6 +67,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     pacing: Pacing
     command_timeout_s: float
     call_budget_us: float
+    home: tuple[float, ...] = ()
 
 
 class CameraDescription(msgspec.Struct, frozen=True):

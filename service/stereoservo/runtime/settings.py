@@ -15,6 +15,8 @@ from stereoservo.runtime.ports import (
     Mount,
 )
 
+SLACK = 1e-3  # of a cell's limits beyond the drive's, for rounding [rad or m]
+
 
 class CameraSettings(msgspec.Struct, frozen=True):
     """A camera as the core sees it: size [px], rate [Hz], its detector's marker ids and systematic error [px]."""
@@ -102,12 +104,13 @@ def core_settings(
     check_joints(cell, names)
     limits = {limit.joint: limit for limit in cell.safety.limit}
     for spec in joints.joints:
-        if limits[spec.name].min >= spec.position_max or limits[spec.name].max <= spec.position_min:
+        limit = limits[spec.name]
+        if limit.min < spec.position_min - SLACK or limit.max > spec.position_max + SLACK:
             raise CellFileError(
                 cell.cell.name,
                 "safety.limit",
-                f"joint {spec.name!r}: range {limits[spec.name].min}…{limits[spec.name].max} lies outside the "
-                f"drive's {spec.position_min}…{spec.position_max} (are the limits in rad?)",
+                f"joint {spec.name!r}: {limit.min:g} to {limit.max:g} is wider than the drive's "
+                f"{spec.position_min:.4f} to {spec.position_max:.4f} (are the limits in rad?)",
             )
     camera_settings = tuple(
         CameraSettings(

@@ -18,6 +18,7 @@ from stereoservo.runtime.settings import CoreSettings, TrialSettings
 from stereoservo.runtime.state import Trials
 
 MIN_STOPS = 4  # of one joint, the base among them
+FIRST_FRAME_S = 120.0  # a camera that has never delivered may still be starting
 LOST_S = 0.4  # markers missing for so long in motion: back off
 
 
@@ -65,7 +66,9 @@ def trials_step(trials: Trials, present: Present) -> Motion:
             trials.joint_sum += at_shutter
             trials.joint_frames += 1
     waited_s = (present.now_ns - trials.phase_ns) * 1e-9
-    if bool((trials.frames >= settings.frames).all()) or waited_s > settings.wait_s:
+    silent = min(estimate.last_seq for estimate in present.state.cameras) < 0
+    limit_s = max(settings.wait_s, FIRST_FRAME_S) if silent else settings.wait_s
+    if bool((trials.frames >= settings.frames).all()) or waited_s > limit_s:
         return _stop_done(trials, present, settings)
     return Motion(zero)
 
@@ -138,6 +141,12 @@ def _stop_done(trials: Trials, present: Present, settings: TrialSettings) -> Mot
     samples = averages(trials, present.settings)
     poorest = min(samples, key=lambda sample: sample.ids.size)
     if poorest.ids.size < settings.min_markers or poorest.frames < max(1, settings.frames // 2):
+        if trials.k == 0 and poorest.frames == 0:
+            hint = f"camera {poorest.camera} delivers no frames: is it connected? See the daemon's log"
+            reason = Reason(
+                "CAMERA_SILENT", "hold", poorest.camera, 0.0, float(settings.frames), "frames", hint
+            )
+            return _abort(trials, present, reason)
         if trials.k == 0:
             return _abort(
                 trials, present,

@@ -31,7 +31,9 @@ def demo(
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="One process on a virtual clock: deterministic given the seed.")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated noise.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the simulated noise.")
+    ] = 0,
     out: Annotated[
         Path, typer.Option("--out", help="Directory for report, recording and model (made where missing).")
     ] = Path("stereoservo-demo"),
@@ -54,14 +56,9 @@ def demo(
     else:
         _print(result)
     if not result["converged"]:
-        failed = [
-            f"{goal['name']} ({goal['outcome']})" for goal in result["goals"] if goal["outcome"] != "reached"
-        ]
         if json:
             raise SystemExit(1)
-        raise DemoFailedError(
-            f"goals not reached well enough: {', '.join(failed) or 'see the table'}; report: {result['report']}"
-        )
+        raise DemoFailedError(f"{'; '.join(result['problems'])}; report: {result['report']}")
 
 
 @contextmanager

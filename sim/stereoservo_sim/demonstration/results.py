@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -38,7 +39,8 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     )
     model = demonstration.calibrated.model
     return {
-        "converged": good_calibration(model) and all(good_goal(goal) for goal in goals),
+        "converged": not (found := problems(model, goals)),
+        "problems": found,
         "goals": [_row(goal) for goal in goals],
         "calibration": _calibration(model, demonstration.calibrated.seconds),
         "loop": _loop(demonstration),
@@ -57,18 +59,25 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     }
 
 
-def good_goal(goal: Judgement) -> bool:
-    """Whether a goal was reached, and truly."""
-    return (
-        goal.outcome == "reached"
-        and goal.final_error_px <= MAX_ERROR_PX
-        and goal.final_error_mm <= MAX_ERROR_MM
-    )
-
-
-def good_calibration(model: CellModel) -> bool:
-    """Whether the residual is what the measurement noise explains: two-sided chi-square at 99.9 %."""
-    return model.statistics is not None and model.statistics.chi2_ok
+def problems(model: CellModel, goals: Sequence[Judgement]) -> list[str]:
+    """What keeps a demonstration from having converged: the residual's chi-square at 99.9 %, goals, errors."""
+    found = []
+    statistics = model.statistics
+    if statistics is None or not statistics.chi2_ok:
+        values = (
+            ""
+            if statistics is None
+            else f" (chi-square {statistics.chi2:.0f}, {statistics.degrees_of_freedom} expected)"
+        )
+        found.append(f"the calibration's residual is not what the measurement noise explains{values}")
+    for goal in goals:
+        if goal.outcome != "reached":
+            found.append(f"goal {goal.name}: {goal.outcome}")
+        if goal.final_error_px > MAX_ERROR_PX:
+            found.append(f"goal {goal.name}: {goal.final_error_px:.3f} px off, {MAX_ERROR_PX} px allowed")
+        if goal.final_error_mm > MAX_ERROR_MM:
+            found.append(f"goal {goal.name}: {goal.final_error_mm:.3f} mm off, {MAX_ERROR_MM} mm allowed")
+    return found
 
 
 def _row(goal: Judgement) -> dict[str, Any]:

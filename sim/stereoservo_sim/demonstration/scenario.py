@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from stereoservo.kinematics.model import CellModel
+from stereoservo_sim.world import DEMO_GOALS
 
 TEACH_FRAMES = 20
 REST_S = 0.4  # after a move, before the cameras are believed
@@ -17,19 +16,14 @@ JUDGE_S = 1.2  # rest after a goal, of which one second is judged
 
 @dataclass(frozen=True)
 class ShownGoal:
-    """A goal of the demonstration: where the arm stands when it is shown [deg], and the law that reaches it again."""
+    """A goal of the demonstration, one of ``world.DEMO_GOALS``, and the law that reaches it again."""
 
     name: str
-    joints_deg: tuple[float, ...]
     law: str
 
 
-GOALS = (
-    ShownGoal("near", (9.0, -86.0, -19.0, -19.0, 69.0, -5.0), "stereo"),
-    ShownGoal("turned", (0.0, -63.0, -18.0, -25.0, 43.0, 97.0), "cartesian3"),
-    ShownGoal("rolled", (4.0, -83.0, -29.0, -24.0, 53.0, -90.0), "cartesian3"),
-)
-"""From home: about 45, 85 and 105 degrees of rotation and 0.2 to 0.3 m."""
+GOALS = (ShownGoal("near", "stereo"), ShownGoal("roll", "cartesian3"), ShownGoal("far", "cartesian3"))
+"""From home: 29, 132 and 94 degrees of rotation, 0.12, 0.13 and 0.37 m."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +66,7 @@ def perform(
     tell(f"calibrated in {calibrated.seconds:.0f} s{rms}")
     for goal in GOALS:
         tell(f"showing goal {goal.name!r}")
-        operator.move(dict(zip(joint_names, np.deg2rad(goal.joints_deg).tolist(), strict=True)))
+        operator.move(dict(zip(joint_names, DEMO_GOALS[goal.name].tolist(), strict=True)))
         operator.rest(REST_S)
         operator.teach(goal.name, TEACH_FRAMES)
     outcomes = {}

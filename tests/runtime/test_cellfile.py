@@ -1,0 +1,108 @@
+"""Bad cell files are refused with the key, the value and what would have been valid; the file keeps its bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stereoservo.runtime.cellfile import CellFileError, load_cell_file
+from stereoservo.runtime.ports import CameraDescription, JointDriverDescription, JointSpec
+from stereoservo.runtime.settings import core_settings
+
+GOOD = """
+schema = 1
+[cell]
+name = "test"
+[joints]
+driver = "fake"
+[[camera]]
+name = "left"
+driver = "fake"
+[safety]
+[[safety.limit]]
+joint = "j1"
+min = -1.0
+max = 1.0
+velocity = 0.5
+acceleration = 2.0
+[calibration]
+base = { j1 = 0.1 }
+range = { j1 = 0.3 }
+"""
+DRIVE = JointDriverDescription(
+    "fake", (JointSpec("j1", "revolute", -2.0, 2.0, 1.0, 4.0),), 250.0, "clock", 0.1, 100.0
+)
+CAMERA = CameraDescription("fake", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2, 3))
+
+
+def settings(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(text)
+    try:
+        core_settings(load_cell_file(path), DRIVE, (CAMERA,))
+    finally:
+        assert path.read_text() == text
+
+
+def test_good_cell_file_loads(tmp_path: Path) -> None:
+    settings(tmp_path, GOOD)
+
+
+CASES = {
+    "unknown key": ("velocity = 0.5", "velocity = 0.5\nspeed = 1.0", ["speed", "acceleration"]),
+    "unknown section": ("[calibration]", "[extra]\na = 1\n[calibration]", ["extra", "zenoh"]),
+    "other schema": ("schema = 1", "schema = 2", ["schema", "2", "1"]),
+    "wrong type": ("velocity = 0.5", 'velocity = "fast"', ["velocity", "fast"]),
+    "negative": ("velocity = 0.5", "velocity = -0.5", ["velocity", "-0.5"]),
+    "infinite": ("velocity = 0.5", "velocity = inf", ["velocity", "inf", "finite"]),
+    "not a number": ("j1 = 0.1", "j1 = nan", ["calibration.base.j1", "nan"]),
+    "huge": ("acceleration = 2.0", "acceleration = 1e300", ["acceleration", "1e+300"]),
+    "huge integer": (
+        "schema = 1",
+        "schema = 1\n[servo]\nhold_frames = 100000000000000000000000000",
+        ["hold_frames"],
+    ),
+    "swapped limits": ("min = -1.0", "min = 3.0", ["j1", "3.0"]),
+    "degrees": ("max = 1.0", "max = 160.0", ["j1", "160", "rad"]),
+    "base outside": ("j1 = 0.1", "j1 = 1.5", ["calibration.base.j1", "1.5", "0.99"]),
+    "range too large": ("j1 = 0.3", "j1 = 30.0", ["calibration.range.j1", "30"]),
+    "other joint": ("j1 = 0.1", "j7 = 0.1", ["j7", "j1"]),
+    "joint without limits": ('joint = "j1"', 'joint = "j2"', ["j1", "j2"]),
+    "camera twice": ("[safety]", '[[camera]]\nname = "left"\ndriver = "fake"\n[safety]', ["left", "twice"]),
+    "empty keep-out": (
+        "[calibration]",
+        '[[safety.keep_out]]\nname = "a"\nranges = {}\n[calibration]',
+        ["a", "bounds"],
+    ),
+    "reversed keep-out": (
+        "[calibration]",
+        '[[safety.keep_out]]\nname = "a"\nranges = { j1 = [0.5, -0.5] }\n[calibration]',
+        ["0.5", "below"],
+    ),
+    "unknown law": ("schema = 1", 'schema = 1\n[servo]\nlaw = "magic"', ["magic"]),
+    "not TOML": ("schema = 1", "schema = = 1", ["TOML"]),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bad_cell_file_is_refused(tmp_path: Path, name: str) -> None:
+    old, new, words = CASES[name]
+    assert old in GOOD
+    with pytest.raises(CellFileError) as caught:
+        settings(tmp_path, GOOD.replace(old, new, 1))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CellFileError, match="cannot be read"):
+        load_cell_file(tmp_path / "missing.toml")
+    with pytest.raises(CellFileError, match="cannot be read"):
+        load_cell_file(tmp_path)
+    (tmp_path / "binary.toml").write_bytes(bytes(range(256)))
+    with pytest.raises(CellFileError, match="TOML"):
+        load_cell_file(tmp_path / "binary.toml")
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
+    with pytest.raises(CellFileError):
+        load_cell_file(tmp_path / "deep.toml")
