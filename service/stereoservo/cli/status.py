@@ -32,7 +32,10 @@ def describe(state: StateMessage) -> str:
     if state.goal:
         error = "" if state.error_px is None else f", error {state.error_px:.3f} px"
         lines.append(f"  goal    {state.goal} ({state.law or 'joints'}){error}")
-    lines += [f"  {reason.level:7} {reason.code} {reason.subject}: {reason.hint}" for reason in state.reasons]
+    lines += [
+        f"  {reason.level:7} {' '.join(filter(None, (reason.code, reason.subject)))}: {reason.hint}"
+        for reason in state.reasons
+    ]
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)
