@@ -208,14 +208,15 @@ class Client:
         tolerance_px: float | None = None,
         hold_frames: int | None = None,
         speed_scale: float = 1.0,
-        lease_s: float | None = None,
+        lease_s: float | None = 5.0,
         time_limit_s: float | None = None,
         mode: Literal["preempt", "queue"] = "preempt",
     ) -> GoalHandle:
         """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by
         camera.
 
-        A lease is renewed by a thread of this client until the goal has ended or the client is closed.
+        The lease is renewed by a thread of this client until the goal has ended or the client is closed: a client that
+        dies stops the arm. ``lease_s=None``: the goal goes on without the client.
         Raises RefusedError with every problem, NoReplyError.
         """
         goal = Goal(
