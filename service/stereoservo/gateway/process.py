@@ -78,6 +78,7 @@ from stereoservo.runtime.taught import TaughtFileError
 
 STATE_EVERY_S = 0.05
 IDLE_S = 0.003
+LAST_TURNS = 100
 SERVO_STALE_S = 0.5
 DRAIN = 32
 EXIT_SETUP = 3
@@ -430,6 +431,11 @@ def run(plan: RunPlan, termination: Termination) -> None:
         while not termination.asked:
             if not gateway.turn():
                 time.sleep(IDLE_S)
+        for _ in range(
+            LAST_TURNS
+        ):  # what the servo process said last, that it stopped above all, is still told
+            if not gateway.turn():
+                break
     finally:
         gateway.close()
 
