@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from stereoservo.runtime.cycle import Sample
-from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray
+from stereoservo.runtime.ports import CameraObservation
 from stereoservo.runtime.settings import CoreSettings
-
-
-class Sums(Protocol):
-    """Where sights are summed: ``Trials`` and ``Teaching``."""
-
-    counts: FloatArray
-    sums: FloatArray
-    first: FloatArray
-    deviation_sums: FloatArray
-    square_sums: FloatArray
-    covariance_sums: FloatArray
-    frames: IntArray
+from stereoservo.runtime.state import Sums
 
 
 def add_observation(

@@ -202,7 +202,7 @@ class ServoCore:
             if camera is None or observation.seq <= state.cameras[camera].last_seq:
                 continue
             estimate = state.cameras[camera]
-            estimate.last_seq, estimate.last_shutter_ns = observation.seq, observation.t_shutter_ns
+            estimate.last_seq = observation.seq
             estimate.last_visible = int(observation.ids.size)
             fresh.append(observation)
             at_shutter = joints_at(state.history, observation.t_shutter_ns)

@@ -37,7 +37,6 @@ class CameraEstimate(msgspec.Struct, eq=False):
     sigma: FloatArray
     seen_ns: IntArray
     last_seq: int = -1
-    last_shutter_ns: int = 0
     last_visible: int = 0
     accepted_ns: int = 0
     """Shutter time of the last frame with three or more accepted markers."""
@@ -113,20 +112,11 @@ class Servoing(Leased, tag="law", eq=False, kw_only=True):
     last_frames: int = 0
 
 
-class Trials(msgspec.Struct, tag="trials", eq=False):
-    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base."""
+class Sums(msgspec.Struct, eq=False, kw_only=True):
+    """Sights of the markers, summed up while the arm rests; see ``averaging``."""
 
-    id: str
-    joint: int
-    side: int
-    k: int
-    phase: Literal["move", "settle", "collect", "return", "finish"]
-    target: FloatArray
-    phase_ns: int
-    start: FloatArray
-    """Measured positions when the current move began."""
     counts: FloatArray
-    """Sights of each marker in each camera at this stop, (c, m)."""
+    """Sights of each marker in each camera, (c, m)."""
     sums: FloatArray
     """(c, m, 2)"""
     first: FloatArray
@@ -138,7 +128,21 @@ class Trials(msgspec.Struct, tag="trials", eq=False):
     covariance_sums: FloatArray
     """(c, m, 2, 2)"""
     frames: IntArray
-    """Frames taken at this stop, by camera."""
+    """Frames taken, by camera."""
+
+
+class Trials(Sums, tag="trials", eq=False):
+    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base."""
+
+    id: str
+    joint: int
+    side: int
+    k: int
+    phase: Literal["move", "settle", "collect", "return", "finish"]
+    target: FloatArray
+    phase_ns: int
+    start: FloatArray
+    """Measured positions when the current move began."""
     joint_sum: FloatArray
     lowest: FloatArray
     highest: FloatArray
@@ -147,23 +151,15 @@ class Trials(msgspec.Struct, tag="trials", eq=False):
     """Stops recorded, by joint."""
     joint_frames: int = 0
     lost_ns: int = 0
-    base_done: bool = False
 
 
-class Teaching(msgspec.Struct, eq=False):
+class Teaching(Sums, eq=False):
     """Averaging of a goal that is being shown."""
 
     name: str
     request: int
     frames_wanted: int
     started_ns: int
-    counts: FloatArray
-    sums: FloatArray
-    first: FloatArray
-    deviation_sums: FloatArray
-    square_sums: FloatArray
-    covariance_sums: FloatArray
-    frames: IntArray
 
 
 Source = Holding | Jogging | JointMove | Servoing | Trials

@@ -167,8 +167,6 @@ def _stop_done(trials: Trials, present: Present, settings: TrialSettings) -> Mot
         trials.stops[trials.joint] += 1
         trials.lowest = np.minimum(trials.lowest, mean)
         trials.highest = np.maximum(trials.highest, mean)
-    else:
-        trials.base_done = True
     return _next(trials, present, settings)
 
 
