@@ -171,3 +171,25 @@ def test_the_loops_kinematics_load_no_scipy_and_no_opencv():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_cameras_on_the_tip_see_the_inverse_motion(seed):
+    kinds = ("revolute", "prismatic", "revolute", "revolute")
+    rng, arm, H, _ = random_arm(seed, kinds)
+    zero, q = rng.uniform(-1, 1, (2, len(kinds)))
+    back = np.linalg.inv(H)
+    # What stands still before a camera on the tip moves by the inverse of the tip's own displacement.
+    base_to_tip = arm.pose(zero)
+    seen = np.linalg.inv(arm.pose(q)) @ base_to_tip
+    twists = -np.linalg.inv(base_to_tip) @ arm.twists(zero) @ base_to_tip
+    chain = ProjectiveChain(kinds, H @ twists @ back, zero, tip_first=True)
+    np.testing.assert_allclose(chain.displacement(q), H @ seen @ back, atol=1e-9)
+    point = H @ np.append(rng.uniform(-1, 1, 3), 1.0)
+    slope = chain.point_jacobian_zero_reference(q, point[None])[0]
+    for j in range(len(kinds)):
+        step = np.zeros(len(kinds))
+        step[j] = 1e-6
+        difference = (chain.displacement(q + step) - chain.displacement(q - step)) @ point / 2e-6
+        np.testing.assert_allclose(slope[:, j], difference, atol=1e-7 * max(1.0, np.abs(slope).max()))

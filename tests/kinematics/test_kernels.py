@@ -63,6 +63,10 @@ def test_forward_kinematics_is_the_references(seed, kinds):
     kernels.chain_forward_into(chain.generators, chain.kind_codes, chain.zero, q, again, operators_again)
     assert again.tobytes() == H.tobytes()
     assert operators_again.tobytes() == operators.tobytes()
+    turned = ProjectiveChain(chain.kinds, chain.generators, chain.zero, tip_first=True)
+    H, operators = kernels.chain_forward(chain.generators, chain.kind_codes, chain.zero, q, True)
+    assert np.abs(H - turned.displacement(q)).max() < 1e-10
+    assert np.abs(operators - turned.operators_at(q)).max() < 1e-10
 
 
 @given(seeds, st.integers(1, 3), st.integers(0, 9))

@@ -48,7 +48,7 @@ def make_model(seed=0, **fields):
         generators=np.array([rotation_generator(rng), np.outer(p - a * (a @ p) / (a @ a), a)]),
         cameras=(
             CameraModel("left", rng.normal(size=(3, 4)), 640, 480),
-            CameraModel("right", rng.normal(size=(3, 4)), 800, 600),
+            CameraModel("right", rng.normal(size=(3, 4)), 800, 600, np.array([-0.1, 398.0, 301.0, 400.0])),
         ),
         marker_ids=(3, 1, 4, 15, 9),
         marker_points=points / (points @ plane)[:, None],
@@ -73,6 +73,7 @@ def same(one, two):
         elif field.name == "cameras":
             for x, y in zip(a, b, strict=True):
                 assert x.matrix.tobytes() == y.matrix.tobytes()
+                assert x.lens.tobytes() == y.lens.tobytes()
                 assert (x.name, x.width, x.height) == (y.name, y.width, y.height)
         elif field.name == "statistics" and a is not None:
             assert msgspec.structs.asdict(a) == msgspec.structs.asdict(b)
@@ -120,7 +121,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("key", "words", "fields"),
     [
-        ("schema", "is 9; this version reads 1", {"schema": 9}),
+        ("schema", f"is 9; this version reads {MODEL_SCHEMA}", {"schema": 9}),
         ("epoch", "-1", {"epoch": -1}),
         ("joint_kinds", "has 1 entries", {"joint_kinds": ("revolute",)}),
         ("joint_names", "'a' stands twice", {"joint_names": ("a", "a")}),
@@ -158,7 +159,7 @@ def test_prismatic_generator_must_be_nilpotent():
 @pytest.mark.parametrize(
     ("change", "key", "words"),
     [
-        (lambda t: t.update(schema=2), "schema", "is 2"),
+        (lambda t: t.update(schema=3), "schema", "is 3"),
         (lambda t: t.pop("schema"), "schema", "is None"),
         (lambda t: t.pop("zero"), "", "zero"),
         (lambda t: t.update(epoch="four"), "epoch", "int"),
@@ -196,3 +197,16 @@ def test_a_newer_reader_tolerates_new_fields():
     tree = json.loads(encode_model(make_model(0)))
     tree["colour"] = "blue"
     same(decode_model(json.dumps(tree).encode()), make_model(0))
+
+
+def test_a_file_of_the_first_schema_is_read_as_pinholes_that_stand_still():
+    tree = json.loads(encode_model(make_model()))
+    tree["schema"] = 1
+    del tree["mount"]
+    for camera in tree["cameras"]:
+        del camera["lens"]
+    model = decode_model(json.dumps(tree).encode())
+    assert model.schema == MODEL_SCHEMA
+    assert model.mount == "eye_to_hand"
+    assert not model.tip_first
+    assert [camera.lens[0] for camera in model.cameras] == [0.0, 0.0]

@@ -32,13 +32,17 @@ class ProjectiveChain:
     """``H(q) = exp((q₁−z₁)Ĥ₁)…exp((qₙ−zₙ)Ĥₙ)``, base first (5.18).
 
     ``kinds``: ``"revolute"`` [rad] or ``"prismatic"`` [m] for each joint. ``generators`` (n, 4, 4) at the
-    zero. ``zero`` (n,): the configuration at which H is the identity. Raises ChainError on shapes or kinds
+    zero. ``zero`` (n,): the configuration at which H is the identity. ``tip_first``: cameras ride on the tip and
+    the markers stand still (eye-in-hand), so that the joint next to them, the base's, acts first:
+    ``H(q) = exp((qₙ−zₙ)Ĥₙ)…exp((q₁−z₁)Ĥ₁)``, joints still counted from the base, signs inside the generators.
+    Raises ChainError on shapes or kinds
     that do not fit.
     """
 
     kinds: tuple[str, ...]
     generators: FloatArray
     zero: FloatArray
+    tip_first: bool = False
 
     def __post_init__(self) -> None:
         generators = np.ascontiguousarray(self.generators, dtype=np.float64)
@@ -71,13 +75,21 @@ class ProjectiveChain:
         """``(n,)`` as the kernels take them: 0 revolute, 1 prismatic."""
         return np.array([KIND_CODES[kind] for kind in self.kinds], dtype=np.uint8)
 
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Joints in the order of the product's factors, the one farthest from the markers first."""
+        joints = range(self.joints)
+        return tuple(reversed(joints)) if self.tip_first else tuple(joints)
+
     def partial_displacements(self, q: FloatArray) -> FloatArray:
-        """``H̄_j = exp(·Ĥ₁)…exp(·Ĥ_j)`` for j = 0…n, ``(n + 1, 4, 4)`` (5.20); the first is the identity."""
+        """Products of the first 0…n factors in the chain's ``order``, ``(n + 1, 4, 4)`` (5.20); the first is
+        the identity, the last ``H(q)``.
+        """
         steps = self._steps(q)
         partial = np.empty((self.joints + 1, 4, 4))
         partial[0] = np.eye(4)
-        for j in range(self.joints):
-            partial[j + 1] = partial[j] @ exp_generator(self.kinds[j], self.generators[j], steps[j])
+        for i, j in enumerate(self.order):
+            partial[i + 1] = partial[i] @ exp_generator(self.kinds[j], self.generators[j], steps[j])
         return partial
 
     def displacement(self, q: FloatArray) -> FloatArray:
@@ -88,8 +100,10 @@ class ProjectiveChain:
         """``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4): the joints' generators where the arm is now
         (5.21).
         """
+        order = list(self.order)
         partial = self.partial_displacements(q)[:-1]
-        operators: FloatArray = partial @ self.generators @ np.linalg.inv(partial)
+        operators = np.empty_like(self.generators)
+        operators[order] = partial @ self.generators[order] @ np.linalg.inv(partial)
         return operators
 
     def point_jacobian(self, q: FloatArray, M_now: FloatArray) -> FloatArray:
@@ -105,7 +119,9 @@ class ProjectiveChain:
         """The same arm with its zero at ``Q`` (n,): generators become ``Ĥ_j|_Q`` (5.22). Points must move
         with ``H(Q)``.
         """
-        return ProjectiveChain(self.kinds, self.operators_at(Q), np.array(Q, dtype=np.float64))
+        return ProjectiveChain(
+            self.kinds, self.operators_at(Q), np.array(Q, dtype=np.float64), self.tip_first
+        )
 
     def image_jacobian(self, Ps: FloatArray, q: FloatArray, M_now: FloatArray) -> FloatArray:
         """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3,

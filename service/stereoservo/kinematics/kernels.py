@@ -60,8 +60,9 @@ def chain_forward_into(
     q: FloatArray,
     H: FloatArray,
     operators: FloatArray,
+    tip_first: bool = False,
 ) -> None:
-    """``H(q)`` into (4, 4) and ``Ĥ_j|_Q`` into (n, 4, 4) (5.18, 5.21)."""
+    """``H(q)`` into (4, 4) and ``Ĥ_j|_Q`` into (n, 4, 4) (5.18, 5.21); ``tip_first`` as in `ProjectiveChain`."""
     n = q.shape[0]
     inverse = np.empty((4, 4))
     first = np.empty((4, 4))
@@ -70,7 +71,8 @@ def chain_forward_into(
         for k in range(4):
             H[i, k] = 1.0 if i == k else 0.0
             inverse[i, k] = H[i, k]
-    for j in range(n):
+    for nth in range(n):
+        j = n - 1 - nth if tip_first else nth
         G = generators[j]
         # With O = H̄ Ĥ H̄⁻¹ at hand, exp(sĤ) moves through: H̄ exp(sĤ) = exp(sO) H̄ = H̄ + sin s H̄Ĥ + (1 −
         # cos s) H̄Ĥ².
@@ -102,12 +104,12 @@ def chain_forward_into(
 
 @kernel
 def chain_forward(
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray
+    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, tip_first: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """``H(q)`` (4, 4) and the operators ``Ĥ_j|_Q`` (n, 4, 4) of a chain at ``q`` (n,) (5.18, 5.21)."""
     H = np.empty((4, 4))
     operators = np.empty((q.shape[0], 4, 4))
-    chain_forward_into(generators, kinds, zero, q, H, operators)
+    chain_forward_into(generators, kinds, zero, q, H, operators, tip_first)
     return H, operators
 
 

@@ -13,18 +13,30 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
-MODEL_SCHEMA = 1
+MODEL_SCHEMA = 2
+READABLE_SCHEMAS = (1, 2)
+"""Schema 1 knew neither lenses nor mounts: pinholes that stand still."""
 
 Stratum = Literal["projective", "affine", "metric"]
+Mount = Literal["eye_to_hand", "eye_in_hand"]
+
+
+def pinhole() -> FloatArray:
+    """The lens (4,) of a camera without distortion (`stereoservo.geometry.distortion`)."""
+    return np.array([0.0, 0.0, 0.0, 1.0])
 
 
 class CameraModel(msgspec.Struct, frozen=True, eq=False):
-    """A camera in the model's projective frame: ``matrix`` (3, 4) maps points to pixels; image size [px]."""
+    """A camera in the model's projective frame: ``matrix`` (3, 4) maps points to ideal pixels; image size [px].
+
+    ``lens`` (4,): radial distortion ``(k, cu, cv, r0)`` from ideal to raw pixels, see `geometry.distortion`.
+    """
 
     name: str
     matrix: FloatArray
     width: int
     height: int
+    lens: FloatArray = msgspec.field(default_factory=pinhole)
 
 
 class JointStatistics(msgspec.Struct, frozen=True):
@@ -60,7 +72,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     ``generators`` (n, 4, 4): joint operators at ``zero`` (n,), revolute ones with eigenvalues (0, 0, i, -i),
     prismatic ones nilpotent (5.18). ``marker_points`` (m, 4): markers at the zero, orbital heights such that
     ``plane_at_infinity @ M == 1``. ``projective_to_euclidean`` (4, 4): H_PE up to one global scale, where the
-    stratum is ``metric``. ``epoch`` is unique for each model a cell ever had.
+    stratum is ``metric``. ``mount``: of all its cameras; eye-in-hand chains
+    are ``tip_first``. ``epoch`` is unique for each model a cell ever had.
 
     Stratum ``projective``: the plane at infinity is not identifiable (all axes parallel, say);
     ``plane_at_infinity`` is then the least singular vector of (5.59): joints keep the heights ``a @ M`` that
@@ -82,6 +95,12 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     statistics: FitStatistics | None
     created: str = ""
     source: str = ""
+    mount: Mount = "eye_to_hand"
+
+    @property
+    def tip_first(self) -> bool:
+        """The order of the chain's factors: see `kinematics.chain.ProjectiveChain`."""
+        return self.mount == "eye_in_hand"
 
 
 class ModelFileError(Exception):
@@ -138,6 +157,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         ("marker_points", model.marker_points, (m, 4)),
         ("plane_at_infinity", model.plane_at_infinity, (4,)),
         *((f"cameras[{i}].matrix", camera.matrix, (3, 4)) for i, camera in enumerate(model.cameras)),
+        *((f"cameras[{i}].lens", camera.lens, (4,)) for i, camera in enumerate(model.cameras)),
     ]
     if model.projective_to_euclidean is not None:
         arrays.append(("projective_to_euclidean", model.projective_to_euclidean, (4, 4)))
@@ -153,6 +173,12 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
                 path,
                 f"cameras[{i}]",
                 f"{camera.name!r}: image size {camera.width}x{camera.height} px is not positive",
+            )
+        if camera.lens[3] <= 0:
+            raise ModelFileError(
+                path,
+                f"cameras[{i}].lens",
+                f"{camera.name!r}: reference radius {camera.lens[3]:g} px is not positive",
             )
     _check_algebra(model, path)
 
@@ -218,8 +244,10 @@ def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
         raise ModelFileError(path, "", f"is not JSON: {error}") from error
     if not isinstance(tree, dict):
         raise ModelFileError(path, "", f"holds a {type(tree).__name__}; a JSON object is needed")
-    if tree.get("schema") != MODEL_SCHEMA:
-        raise ModelFileError(path, "schema", f"is {tree.get('schema')!r}; this version reads {MODEL_SCHEMA}")
+    if tree.get("schema") not in READABLE_SCHEMAS:
+        known = " and ".join(str(schema) for schema in READABLE_SCHEMAS)
+        raise ModelFileError(path, "schema", f"is {tree.get('schema')!r}; this version reads {known}")
+    tree["schema"] = MODEL_SCHEMA
     try:
         model = msgspec.convert(tree, CellModel, dec_hook=_decode_array)
     except (msgspec.ValidationError, TypeError) as error:

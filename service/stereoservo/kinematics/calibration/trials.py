@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.kinematics.model import write_atomically
+from stereoservo.kinematics.model import Mount, write_atomically
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -45,11 +45,15 @@ def finite_rows(array: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 class TrialCamera(msgspec.Struct, frozen=True):
-    """A camera of the trials and its image size [px]."""
+    """A camera of the trials and its image size [px].
+
+    ``mount``: ``eye_to_hand`` where it stands and the arm carries the markers, ``eye_in_hand`` the other way round.
+    """
 
     name: str
     width: int
     height: int
+    mount: Mount = "eye_to_hand"
 
 
 class TrialData(msgspec.Struct, frozen=True, eq=False):

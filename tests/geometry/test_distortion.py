@@ -1,0 +1,74 @@
+"""Lens distortion against OpenCV, its own inverse and finite differences."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereoservo.geometry.distortion import (
+    distort,
+    distortion_jacobian,
+    lens_jacobian,
+    straight_lens,
+    undistort,
+)
+
+WIDTH, HEIGHT = 640, 480
+
+
+def grid(step=40):
+    u, v = np.meshgrid(np.arange(0, WIDTH, step), np.arange(0, HEIGHT, step))
+    return np.stack([u, v], axis=-1).astype(float)
+
+
+def test_a_straight_lens_changes_nothing():
+    lens = straight_lens(WIDTH, HEIGHT)
+    np.testing.assert_array_equal(distort(lens, grid()), grid())
+    np.testing.assert_array_equal(undistort(lens, grid()), grid())
+    np.testing.assert_allclose(lens[1:3], [319.5, 239.5])
+
+
+@pytest.mark.parametrize("k1", [-0.3, 0.2])
+def test_it_is_the_model_of_opencv_with_k1_alone(k1):
+    f, centre = 800.0, np.array([330.0, 236.0])
+    K = np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1]])
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (200, 2)), np.ones(200)])
+    raw, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array([k1, 0, 0, 0.0]))
+    lens = np.array([k1 * (0.5 * WIDTH / f) ** 2, *centre, 0.5 * WIDTH])
+    ideal = points[:, :2] * f + centre
+    np.testing.assert_allclose(distort(lens, ideal), raw[:, 0], atol=1e-9)
+
+
+@given(k=st.floats(-0.06, 0.5), cu=st.floats(280, 360), cv=st.floats(200, 280))
+def test_undistort_is_the_inverse(k, cu, cv):
+    lens = np.array([k, cu, cv, 320.0])
+    np.testing.assert_allclose(undistort(lens, distort(lens, grid())), grid(), atol=1e-9)
+    np.testing.assert_allclose(distort(lens, undistort(lens, grid())), grid(), atol=1e-9)
+
+
+def test_beyond_the_fold_there_is_nothing():
+    lens = np.array([-0.3, 320.0, 240.0, 320.0])
+    edge = 320.0 * np.sqrt(1 / 0.9)
+    assert np.isfinite(distort(lens, np.array([320 + 0.99 * edge, 240]))).all()
+    assert np.isnan(distort(lens, np.array([320 + 1.01 * edge, 240]))).all()
+    raw_edge = edge * 2 / 3
+    assert np.isfinite(undistort(lens, np.array([320 + 0.99 * raw_edge, 240]))).all()
+    assert np.isnan(undistort(lens, np.array([320 + 1.01 * raw_edge, 240]))).all()
+
+
+@pytest.mark.parametrize("k", [-0.1, 0.0, 0.3])
+def test_jacobians_by_finite_differences(k):
+    lens = np.array([k, 310.0, 250.0, 320.0])
+    pixels = grid(97).reshape(-1, 2)
+    for i in range(2):
+        step = np.zeros(2)
+        step[i] = 1e-4
+        slope = (distort(lens, pixels + step) - distort(lens, pixels - step)) / 2e-4
+        np.testing.assert_allclose(distortion_jacobian(lens, pixels)[..., i], slope, atol=1e-7)
+    for i, size in enumerate((1e-6, 1e-4, 1e-4)):
+        step = np.zeros(4)
+        step[i] = size
+        slope = (distort(lens + step, pixels) - distort(lens - step, pixels)) / (2 * size)
+        np.testing.assert_allclose(lens_jacobian(lens, pixels)[..., i], slope, rtol=1e-6, atol=1e-6)
