@@ -25,9 +25,11 @@ def test_pixels_are_those_of_opencv():
     q = cell.home + 0.1
     pixels = cell.pixels(q[None])
     for K, pose, seen in zip(cell.intrinsics, cell.poses, pixels[:, 0], strict=True):
-        points = (np.hstack([cell.body, np.ones((14, 1))]) @ (pose @ cell.flange(q)).T)[:, :3]
+        body = np.hstack([cell.body, np.ones((14, 1))])
+        points = np.ascontiguousarray((body @ (pose @ cell.flange(q)).T)[:, :3])
         expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array([-0.3, 0, 0, 0.0]))
-        assert np.abs(seen - expected[:, 0]).max() < 1.0
+        # OpenCV's lens is round in normalised coordinates, ours in pixels: alike to fx/fy = 1.006.
+        assert np.abs(seen - expected[:, 0]).max() < 0.1
     one = synthetic.rx90()
     plain = cell.with_k1(0.0).pixels(q[None])
     np.testing.assert_allclose(plain, one.pixels(q[None]))
