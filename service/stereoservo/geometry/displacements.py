@@ -141,7 +141,16 @@ def log_rotation(H: FloatArray) -> tuple[FloatArray, float]:
     odd = (H - inverse) / (2.0 * np.sin(theta))
     if theta < 0.75 * np.pi:
         return nearest_rotation_generator(odd), theta
-    even = 0.5 * (H + inverse) - np.eye(4)  # (1 − cos θ) Ĥ², of rank two
+    return generator_between(odd, 0.5 * (H + inverse) - np.eye(4)), theta
+
+
+def generator_between(odd: FloatArray, even: FloatArray) -> FloatArray:
+    """The generator ``Ĥ`` (4, 4) near ``odd`` (4, 4) between the eigenspaces of ``even`` ~ ``Ĥ²`` (4, 4), of
+    rank two.
+
+    For rotations by nearly π, whose even part is accurate where the odd one is small. Raises GeometryError
+    (``half_turn``) where the odd part is lost in noise.
+    """
     U, _, Vt = np.linalg.svd(even)
     columns, rows = U[:, :2], Vt[:2]
     # Ĥ = C J R with R C invertible; restrict the odd part to the plane, where it is a 2x2 with J² = −1.
@@ -151,10 +160,10 @@ def log_rotation(H: FloatArray) -> tuple[FloatArray, float]:
     determinant = float(np.linalg.det(plane))
     if not determinant > 0:
         raise GeometryError(
-            "half_turn", f"the rotation is {theta!r} rad; its sense is lost in noise", theta=theta
+            "half_turn", "the rotation is half a turn within its noise, which hides its sense"
         )
     G: FloatArray = columns @ (plane / np.sqrt(determinant)) @ metric @ rows
-    return G, theta
+    return G
 
 
 def rotation_generator(H: FloatArray) -> FloatArray:
