@@ -73,7 +73,7 @@ def line_of_planes(a1: FloatArray, a2: FloatArray) -> FloatArray:
 
 
 def _complement(x: FloatArray, y: FloatArray, what: str) -> FloatArray:
-    pair = _unit_rows(np.stack([x, y]))
+    pair = unit_rows(np.stack([x, y]))
     _, singular, rows = np.linalg.svd(pair)
     if not singular[1] > RANK_TOLERANCE:
         raise GeometryError(
@@ -84,7 +84,7 @@ def _complement(x: FloatArray, y: FloatArray, what: str) -> FloatArray:
     return np.ascontiguousarray(rows[2:])
 
 
-def _unit_rows(rows: FloatArray) -> FloatArray:
+def unit_rows(rows: FloatArray) -> FloatArray:
     rows = np.asarray(rows, dtype=np.float64)
     if not np.isfinite(rows).all():
         raise GeometryError("not_finite", f"homogeneous vectors must be finite, got {rows.tolist()}")
@@ -99,18 +99,18 @@ def incidence_residual(plane: FloatArray, points: FloatArray) -> FloatArray:
     """Signed sine ``(n,)`` between plane ``(4,)`` and points ``(n, 4)`` as unit 4-vectors: 0 where they
     are incident.
     """
-    residual: FloatArray = _unit_rows(points) @ _unit_rows(plane)
+    residual: FloatArray = unit_rows(points) @ unit_rows(plane)
     return residual
 
 
 def collinearity_residual(points: FloatArray) -> float:
     """Third singular value of unit-norm points ``(n, 4)``, n >= 3: 0 where they lie on one line."""
-    return float(np.linalg.svd(_unit_rows(points), compute_uv=False)[2])
+    return float(np.linalg.svd(unit_rows(points), compute_uv=False)[2])
 
 
 def coplanarity_residual(points: FloatArray) -> float:
     """Fourth singular value of unit-norm points ``(n, 4)``, n >= 4: 0 where they lie on one plane."""
-    return float(np.linalg.svd(_unit_rows(points), compute_uv=False)[3])
+    return float(np.linalg.svd(unit_rows(points), compute_uv=False)[3])
 
 
 def crossing_of_diagonals(A1: FloatArray, A2: FloatArray, A3: FloatArray, A4: FloatArray) -> FloatArray:
@@ -122,7 +122,7 @@ def crossing_of_diagonals(A1: FloatArray, A2: FloatArray, A3: FloatArray, A4: Fl
     cross.
     """
     corners = np.stack([A1, A3, A2, A4]).astype(np.float64)
-    norms = np.linalg.norm(_unit_rows(corners) * np.linalg.norm(corners, axis=1, keepdims=True), axis=1)
+    norms = np.linalg.norm(unit_rows(corners) * np.linalg.norm(corners, axis=1, keepdims=True), axis=1)
     _, singular, rows = np.linalg.svd((corners / norms[:, None] * np.array([[1.0], [1.0], [-1.0], [-1.0]])).T)
     if not singular[2] > 1e-9 * singular[0]:
         raise GeometryError(
@@ -162,7 +162,7 @@ def whitener(points: FloatArray) -> FloatArray:
 
     Raises GeometryError where the points are coplanar.
     """
-    unit = _unit_rows(points)
+    unit = unit_rows(points)
     values, vectors = np.linalg.eigh(unit.T @ unit / len(unit))
     if not values[0] > 1e-14 * values[3]:
         raise GeometryError(
@@ -170,3 +170,21 @@ def whitener(points: FloatArray) -> FloatArray:
         )
     W: FloatArray = (vectors / np.sqrt(values)).T
     return W
+
+
+def move_points(H: FloatArray, M: FloatArray) -> FloatArray:
+    """``H M`` (..., 4) of points ``(..., 4)`` under a map ``H`` (4, 4): heights are kept as H makes them."""
+    moved: FloatArray = np.asarray(M, dtype=np.float64) @ H.T
+    return moved
+
+
+def move_planes(H: FloatArray, a: FloatArray) -> FloatArray:
+    """``H⁻ᵀ a`` (..., 4) of planes ``(..., 4)`` under the map ``H`` (4, 4) of the points (2.68)."""
+    moved: FloatArray = np.asarray(a, dtype=np.float64) @ np.linalg.inv(H)
+    return moved
+
+
+def move_cameras(H: FloatArray, Ps: FloatArray) -> FloatArray:
+    """``P H⁻¹`` (..., 3, 4) of cameras ``(..., 3, 4)`` under the map ``H`` (4, 4) of the points (2.14-2.16)."""
+    moved: FloatArray = np.asarray(Ps, dtype=np.float64) @ np.linalg.inv(H)
+    return moved
