@@ -1,0 +1,413 @@
+"""Maximum likelihood of projective translations that share the plane at infinity (thesis 3.2.3, (3.40)).
+
+Six parameters for one motion, 3 + 3n for n: of the plane ``h`` the largest entry stands still (its scale is
+no parameter), and the entry of each ``k`` beside it follows from ``hᵀk = 0`` (3.39 with errata). Points are
+given, or free and eliminated by the Schur complement (variable projection). Pixels are ideal ones [px], NaN
+where missing. Everything runs in coordinates whitened over the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray, whitener
+
+BoolArray = npt.NDArray[np.bool_]
+
+MAX_ITERATIONS = 60
+COST_TOLERANCE = 1e-10
+"""Relative decrease of the cost below which the fit has converged."""
+UNDETERMINED = 1e-11
+"""Relative eigenvalue of the scaled information matrix below which a direction counts as not determined."""
+
+
+@dataclass(frozen=True, eq=False)
+class TranslationFit:
+    """Translations ``H_s = I + k_s hᵀ`` of least squared reprojection error.
+
+    ``plane`` (4,) h, of unit norm, the points on its positive side; ``plane_covariance`` (4, 4), of rank
+    three, ``C h = 0``, at the stated noise; ``directions`` (n, 4) k_s with ``hᵀk = 0``; ``points`` (m, 4) at
+    rest, NaN where not estimated, depth 1 in the first camera; ``cost`` the sum of squares over the stated
+    variances; ``freedom`` measurements less parameters; ``evaluations`` of the model.
+    """
+
+    plane: FloatArray
+    plane_covariance: FloatArray
+    directions: FloatArray
+    points: FloatArray
+    cost: float
+    freedom: int
+    evaluations: int
+
+    @property
+    def homographies(self) -> FloatArray:
+        """``H_s`` (n, 4, 4), normalised: rest to the n-th stop."""
+        return np.asarray(np.eye(4) + self.directions[:, :, None] * self.plane, dtype=np.float64)
+
+    @property
+    def variance_factor(self) -> float:
+        """Estimated over stated variance of the pixels; 1 where the model and the stated noise are right."""
+        return self.cost / max(1, self.freedom)
+
+    def agrees(self, tail: float = 1e-3) -> bool:
+        """Whether the cost is one that the stated noise exceeds with a probability above ``tail``."""
+        return bool(self.cost <= chi2_distribution.isf(tail, max(1, self.freedom)))
+
+
+Motion = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Parameters (q,) to displacements (s, 4, 4) and their derivatives (s, q, 4, 4)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Pixels (s, c, m, 2), 0 where missing, and weights (s, c, m) [1/px], 0 where missing, of s stops."""
+
+    cameras: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+
+    @property
+    def measurements(self) -> int:
+        """Number of pixel coordinates."""
+        return 2 * int((self.weights > 0).sum())
+
+
+def read_images(Ps: FloatArray, pixels: FloatArray, sigma: FloatArray | float) -> Images:
+    """Pixels ``(s, c, m, 2)`` [px], NaN where missing, of cameras ``(c, 3, 4)`` with noise ``sigma``, a number or
+    (s, c, m) [px]. Raises GeometryError for shapes that do not fit or a sigma that is not positive.
+    """
+    Ps, pixels = np.asarray(Ps, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
+    if Ps.ndim != 3 or Ps.shape[1:] != (3, 4) or pixels.ndim != 4 or pixels.shape[1::2] != (len(Ps), 2):
+        raise GeometryError(
+            "shape",
+            f"cameras {Ps.shape} and pixels {pixels.shape} do not fit; (c, 3, 4) and (stops, c, points, 2) are needed",
+            cameras=Ps.shape,
+            pixels=pixels.shape,
+        )
+    seen: BoolArray = np.asarray(np.isfinite(pixels).all(axis=3))
+    noise = np.broadcast_to(np.asarray(sigma, dtype=np.float64), seen.shape)
+    if not (noise[seen] > 0).all():
+        raise GeometryError("shape", "sigma must be positive wherever a pixel is given", sigma=np.min(noise))
+    weights = np.where(seen, 1.0 / np.where(seen, noise, 1.0), 0.0)
+    return Images(Ps, np.where(seen[..., None], pixels, 0.0), weights)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedPlane:
+    """The minimal chart (3 + 3n,) of n translations about one plane (3.39 with errata): entry ``at`` of h stays
+    ``pivot``, the entry ``at`` of each k follows from ``hᵀk = 0``.
+    """
+
+    at: int
+    pivot: float
+    motions: int
+
+    @property
+    def others(self) -> list[int]:
+        """The three entries of h and of each k that are parameters."""
+        return [j for j in range(4) if j != self.at]
+
+    def vectors(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``h`` (4,) and ``k`` (n, 4) of parameters ``x``."""
+        h, k = np.empty(4), np.empty((self.motions, 4))
+        h[self.at], h[self.others] = self.pivot, x[:3]
+        k[:, self.others] = x[3:].reshape(self.motions, 3)
+        k[:, self.at] = -(k[:, self.others] @ h[self.others]) / self.pivot
+        return h, k
+
+    def displacements(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``I + k hᵀ`` (n, 4, 4) and its derivatives (n, 3 + 3n, 4, 4)."""
+        h, k = self.vectors(x)
+        p, each = self.at, np.arange(self.motions)
+        slopes = np.zeros((self.motions, len(x), 4, 4))
+        for a, j in enumerate(self.others):
+            slopes[:, a, :, j] = k
+            slopes[:, a, p, :] -= k[:, j, None] * h / self.pivot
+            slopes[each, 3 + 3 * each + a, j] = h
+            slopes[each, 3 + 3 * each + a, p] = -h[j] / self.pivot * h
+        return np.eye(4) + k[:, :, None] * h, slopes
+
+
+def shared_plane(plane: FloatArray, directions: FloatArray) -> tuple[SharedPlane, FloatArray]:
+    """The chart about a start ``plane`` (4,), ``directions`` (n, 4), and the start's parameters (3 + 3n,)."""
+    size = float(np.linalg.norm(plane))
+    h = plane / size
+    at = int(np.argmax(np.abs(h)))
+    chart = SharedPlane(at, float(h[at]), len(directions))
+    return chart, np.concatenate([h[chart.others], (directions[:, chart.others] * size).ravel()])
+
+
+def homography_motion(Hs: FloatArray) -> tuple[Motion, FloatArray]:
+    """Fifteen parameters for each of the homographies ``(n, 4, 4)``, and the map from them."""
+    n = len(Hs)
+    charts = np.stack([np.linalg.svd(H.reshape(1, 16))[2][1:] for H in Hs]).reshape(n, 15, 4, 4)
+    slopes = np.zeros((n, 15 * n, 4, 4))
+    for s in range(n):
+        slopes[s, 15 * s : 15 * s + 15] = charts[s]
+
+    def motion(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return Hs + np.einsum("sq,sqij->sij", x.reshape(n, 15), charts), slopes
+
+    return motion, np.zeros(15 * n)
+
+
+def with_rest(motion: Motion) -> Motion:
+    """The same with the rest pose, the identity, as the first stop."""
+
+    def moved(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        H, slopes = motion(x)
+        zero = np.zeros((1, *slopes.shape[1:]))
+        return np.concatenate([np.eye(4)[None], H]), np.concatenate([zero, slopes])
+
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """Residuals (m, r), derivatives in the motion (m, r, q) and in each point's own chart (m, r, 3)."""
+
+    residuals: FloatArray
+    motion: FloatArray
+    points: FloatArray
+
+
+def point_charts(M: FloatArray) -> FloatArray:
+    """Orthonormal complements (m, 4, 3) of points (m, 4): their three freedoms, the scale left out."""
+    return np.asarray(np.linalg.svd(M[:, None, :])[2][:, 1:].transpose(0, 2, 1), dtype=np.float64)
+
+
+def linearise(
+    images: Images, H: FloatArray, slopes: FloatArray, M: FloatArray, charts: FloatArray
+) -> Linearisation:
+    """Residuals and derivatives at displacements ``H`` (s, 4, 4) and points ``M`` (m, 4) or (s, m, 4)."""
+    M = np.broadcast_to(M, (len(H), *M.shape[-2:]))
+    moved = M @ H.transpose(0, 2, 1)
+    m = np.einsum("cij,snj->scni", images.cameras, moved)
+    depth = np.where(images.weights > 0, m[..., 2], 1.0)
+    predicted = m[..., :2] / depth[..., None]
+    residuals = (predicted - images.pixels) * images.weights[..., None]
+    scale = (images.weights / depth)[..., None, None]
+    P = images.cameras[None, :, None]
+    rows = (P[..., :2, :] - predicted[..., None] * P[..., 2:, :]) * scale
+    by_motion = rows @ np.einsum("sqij,snj->snqi", slopes, M).transpose(0, 1, 3, 2)[:, None]
+    by_points = rows @ H[:, None, None] @ charts
+    n = M.shape[1]
+
+    def per_point(values: FloatArray) -> FloatArray:
+        return values.transpose(2, 0, 1, 3, *range(4, values.ndim)).reshape(n, -1, *values.shape[4:])
+
+    return Linearisation(per_point(residuals), per_point(by_motion), per_point(by_points))
+
+
+def without_points(at: Linearisation) -> tuple[FloatArray, FloatArray]:
+    """Residuals (m, r) and motion derivatives (m, r, q) projected off what the points can absorb."""
+    Q = np.linalg.qr(at.points)[0]
+    residuals = at.residuals - (Q @ (Q.transpose(0, 2, 1) @ at.residuals[..., None]))[..., 0]
+    return residuals, at.motion - Q @ (Q.transpose(0, 2, 1) @ at.motion)
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Parameters (q,), points (m, 4), cost, information (q, q) of the parameters, model evaluations."""
+
+    x: FloatArray
+    points: FloatArray
+    cost: float
+    information: FloatArray
+    evaluations: int
+
+
+def minimise(images: Images, motion: Motion, x: FloatArray, M: FloatArray, free_points: bool) -> Minimum:
+    """Levenberg-Marquardt from ``x`` (q,) and points ``M`` (m, 4), or fixed ones (s, m, 4).
+
+    Raises GeometryError where the start itself gives no finite residual, or no convergence is reached.
+    """
+    charts = point_charts(M) if free_points else np.zeros((M.shape[-2], 4, 3))
+    at = linearise(images, *motion(x), M, charts)
+    cost = float((at.residuals**2).sum())
+    if not np.isfinite(cost):
+        raise GeometryError("degenerate", "the start of the fit puts points into a camera's focal plane")
+    damping, evaluations = 1e-6, 1
+    while evaluations < MAX_ITERATIONS:
+        r, J = without_points(at) if free_points else (at.residuals, at.motion)
+        information = np.einsum("nrp,nrq->pq", J, J, optimize=True)
+        gradient = np.einsum("nrp,nr->p", J, r)
+        step = _damped_step(information, gradient, damping)
+        M_new = M
+        if free_points:
+            remaining = at.residuals + at.motion @ step
+            pseudo = np.linalg.pinv(at.points)
+            M_new = M - np.einsum("nij,njr,nr->ni", charts, pseudo, remaining)
+            M_new = M_new / np.linalg.norm(M_new, axis=1, keepdims=True)
+        charts_new = point_charts(M_new) if free_points else charts
+        new = linearise(images, *motion(x + step), M_new, charts_new)
+        evaluations += 1
+        cost_new = float((new.residuals**2).sum())
+        if np.isfinite(cost_new) and cost_new <= cost:
+            done = cost - cost_new <= COST_TOLERANCE * (cost + 1e-12 * images.measurements)
+            x, M, charts, at, cost = x + step, M_new, charts_new, new, cost_new
+            damping = max(damping / 10.0, 1e-12)
+        else:
+            # At the minimum rounding decides which cost is the lower one.
+            done = abs(float(gradient @ step)) <= COST_TOLERANCE * (cost + 1e-12 * images.measurements)
+            damping *= 10.0
+        if done:
+            J = without_points(at)[1] if free_points else at.motion
+            information = np.einsum("nrp,nrq->pq", J, J, optimize=True)
+            return Minimum(x, M, cost, information, evaluations)
+    raise GeometryError(
+        "no_model",
+        f"no convergence in {MAX_ITERATIONS} evaluations; the cost stands at {cost:.4g} for "
+        f"{images.measurements} pixel coordinates",
+        cost=cost,
+        measurements=images.measurements,
+    )
+
+
+def _damped_step(information: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(size, size) + damping * np.eye(len(size))
+    return np.asarray(-np.linalg.lstsq(scaled, gradient / size, rcond=1e-15)[0] / size, dtype=np.float64)
+
+
+def covariance_of(information: FloatArray, what: str) -> FloatArray:
+    """Inverse of an information matrix (q, q). Raises GeometryError where the data leave a direction open."""
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    if not values[0] > UNDETERMINED * values[-1]:
+        raise GeometryError(
+            "degenerate",
+            f"the images leave {what} undetermined (information {values[0]:.3g} to {values[-1]:.3g}); "
+            "more points off one plane, or motions in other directions, are needed",
+            information=values.tolist(),
+        )
+    root = vectors / np.sqrt(values) / size[:, None]
+    return np.asarray(root @ root.T, dtype=np.float64)
+
+
+def refine_translations(
+    Ps: FloatArray,
+    pixels: FloatArray,
+    points: FloatArray,
+    plane: FloatArray,
+    directions: FloatArray,
+    sigma: FloatArray | float,
+    *,
+    points_covariance: FloatArray | None = None,
+) -> TranslationFit:
+    """Translations of least reprojection error with points given a priori (3.40).
+
+    Cameras ``Ps`` (c, 3, 4); ``pixels`` (n, c, m, 2) [px] after each of the n motions; ``points`` (m, 4) before
+    them, or (n, m, 4) before each one; start ``plane`` (4,), ``directions`` (n, 4). Points are taken for exact:
+    the covariance holds the pixels' noise alone, unless ``points_covariance`` (m, 4, 4) of common points says
+    theirs, which is then carried over to first order. Raises GeometryError for shapes that do not fit, a plane
+    that the data do not determine, no convergence.
+    """
+    images = read_images(Ps, pixels, sigma)
+    common = points[None] if points.ndim == 2 else points
+    if common.ndim != 3 or common.shape[1:] != (pixels.shape[2], 4) or len(common) not in (1, len(pixels)):
+        raise GeometryError(
+            "shape",
+            f"points {points.shape} do not fit pixels {pixels.shape}; (m, 4) or (n, m, 4)",
+            points=points.shape,
+        )
+    _check_start(plane, directions, len(pixels))
+    known: BoolArray = np.asarray(np.isfinite(common).all(axis=(0, 2)))
+    images = _only(images, known)
+    if points_covariance is not None and points.ndim != 2:
+        raise GeometryError("shape", "points_covariance needs points (m, 4) common to all motions")
+    W = whitener(common[:, known].reshape(-1, 4))
+    size = np.linalg.norm(common[:, known] @ W.T, axis=2, keepdims=True)
+    M = common[:, known] @ W.T / size
+    seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)
+    chart, x = shared_plane(np.asarray(np.linalg.solve(W.T, plane), dtype=np.float64), directions @ W.T)
+    best = minimise(seen, chart.displacements, x, M[0] if len(M) == 1 else M, free_points=False)
+    covariance = covariance_of(best.information, "the plane at infinity")
+    if points_covariance is not None:
+        whole = np.broadcast_to(np.eye(4), (M.shape[1], 4, 4))
+        at = linearise(seen, *chart.displacements(best.x), M[0], whole)
+        lever = np.einsum("nrq,nrj->nqj", at.motion, at.points)
+        noise = W @ points_covariance[known] @ W.T / size[0, :, :, None] ** 2
+        covariance = covariance + covariance @ np.einsum("npi,nij,nqj->pq", lever, noise, lever) @ covariance
+    freedom = images.measurements - len(x)
+    return _answer(best, chart, covariance, W, common[0], freedom)
+
+
+def bundle_translations(
+    Ps: FloatArray,
+    pixels: FloatArray,
+    points: FloatArray,
+    plane: FloatArray,
+    directions: FloatArray,
+    sigma: FloatArray | float,
+) -> TranslationFit:
+    """Translations and points of least reprojection error over all stops (3.40 with free points).
+
+    ``pixels`` (n + 1, c, m, 2) [px], the stop at rest first; start ``points`` (m, 4) at rest, NaN where a point
+    is to be left out, ``plane`` (4,), ``directions`` (n, 4) from rest to each stop. Raises GeometryError as
+    `refine_translations` does.
+    """
+    images = read_images(Ps, pixels, sigma)
+    if points.shape != (pixels.shape[2], 4):
+        raise GeometryError(
+            "shape", f"points {points.shape}; {(pixels.shape[2], 4)} are needed", points=points.shape
+        )
+    _check_start(plane, directions, len(pixels) - 1)
+    known = np.isfinite(points).all(axis=1) & ((images.weights > 0).sum(axis=(0, 1)) >= 2)
+    images = _only(images, known)
+    W = whitener(points[known])
+    M = points[known] @ W.T
+    M = M / np.linalg.norm(M, axis=1, keepdims=True)
+    seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)
+    chart, x = shared_plane(np.asarray(np.linalg.solve(W.T, plane), dtype=np.float64), directions @ W.T)
+    best = minimise(seen, with_rest(chart.displacements), x, M, free_points=True)
+    covariance = covariance_of(best.information, "the plane at infinity")
+    estimated = np.full(points.shape, np.nan)
+    estimated[known] = best.points @ np.linalg.inv(W).T
+    estimated = estimated / (estimated @ images.cameras[0, 2])[:, None]
+    freedom = images.measurements - len(x) - 3 * int(known.sum())
+    return _answer(best, chart, covariance, W, estimated, freedom)
+
+
+def _check_start(plane: FloatArray, directions: FloatArray, n: int) -> None:
+    if n < 1 or np.shape(plane) != (4,) or np.shape(directions) != (n, 4):
+        raise GeometryError(
+            "shape",
+            f"plane {np.shape(plane)} and directions {np.shape(directions)} do not fit {n} motions; (4,) and (n, 4) "
+            "with n >= 1 are needed",
+            motions=n,
+        )
+
+
+def _only(images: Images, known: BoolArray) -> Images:
+    if int(known.sum()) < 4:
+        raise GeometryError(
+            "too_few", f"{int(known.sum())} points are known; 4 are needed", points=int(known.sum())
+        )
+    return Images(images.cameras, images.pixels[:, :, known], images.weights[:, :, known])
+
+
+def _answer(
+    best: Minimum, chart: SharedPlane, covariance: FloatArray, W: FloatArray, points: FloatArray, freedom: int
+) -> TranslationFit:
+    """The fit in the caller's frame: ``h = Wᵀ h_w`` of unit norm, the points on its positive side."""
+    h_white, k_white = chart.vectors(best.x)
+    h = W.T @ h_white
+    size = float(np.linalg.norm(h)) * (1.0 if np.nansum(np.sign(points @ h)) >= 0 else -1.0)
+    unit = h / size
+    tangent = (np.eye(4) - np.outer(unit, unit)) @ W.T[:, chart.others] / size
+    return TranslationFit(
+        unit,
+        np.asarray(tangent @ covariance[:3, :3] @ tangent.T, dtype=np.float64),
+        np.asarray(np.linalg.solve(W, k_white.T).T * size, dtype=np.float64),
+        points,
+        best.cost,
+        freedom,
+        best.evaluations,
+    )

@@ -1,0 +1,261 @@
+"""Projective translations: Jordan frames, and direction and plane at infinity from homographies (thesis 3).
+
+A projective translation is ``H = I + k hᵀ`` with ``hᵀk = 0``: ``k`` (4,) the direction of translation at
+infinity, ``h`` (4,) the plane at infinity (3.13, 3.14). Exponential, logarithm and generators stand in
+`displacements`; the fits to pixels in `translation_fit`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.cameras import check_views
+from stereoservo.geometry.displacements import conjugate, nearest_translation_generator
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray, whitener
+
+NILPOTENT_TOLERANCE = 1e-8
+"""``|Ĥ²| / |Ĥ|²`` above which a matrix is no generator of a translation."""
+
+
+@dataclass(frozen=True, eq=False)
+class JordanFrame:
+    """A frame in which a projective translation is the unit translation along z: ``H = S⁻¹ J S`` (3.5).
+
+    ``planes`` (4, 4): rows ``h₁..h₄`` of S; ``points`` (4, 4): rows ``k₁..k₄``, the columns of S⁻¹
+    (3.15). ``k₃`` is the direction of translation, ``h₄`` the plane at infinity; ``k₁``, ``k₂`` other
+    directions, ``k₄`` a finite point; ``h₁``, ``h₂`` planes along the translation, ``h₃`` one across it.
+    """
+
+    planes: FloatArray
+    points: FloatArray
+
+    @property
+    def direction(self) -> FloatArray:
+        """``k₃`` (4,)."""
+        k: FloatArray = self.points[2]
+        return k
+
+    @property
+    def plane_at_infinity(self) -> FloatArray:
+        """``h₄`` (4,)."""
+        h: FloatArray = self.planes[3]
+        return h
+
+    @property
+    def fixed_points(self) -> FloatArray:
+        """``k₁, k₂, k₃`` (3, 4): they span the plane at infinity, fixed point by point (3.9)."""
+        return self.points[:3]
+
+    @property
+    def fixed_planes(self) -> FloatArray:
+        """``h₁, h₂, h₄`` (3, 4): they span the planes along the translation, which meet in ``k₃`` (3.10)."""
+        return self.planes[[0, 1, 3]]
+
+    def changed(self, C: FloatArray) -> JordanFrame:
+        """The frame ``C S`` of the same translation (3.7), ``C`` (4, 4) of `jordan_commutator`."""
+        return _frame_of(np.asarray(C, dtype=np.float64) @ self.planes)
+
+
+JORDAN_TRANSLATION = np.eye(4) + np.outer(np.eye(4)[2], np.eye(4)[3])
+"""``J_T`` (3.4): the unit translation along z."""
+
+
+def split_generator(G: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``(k, h)`` with ``Ĥ = k hᵀ``, ``|h| = 1`` (3.14), of a translation's generator ``G`` (4, 4).
+
+    The sign is free: ``(−k, −h)`` is the same generator. Raises GeometryError where G is not nilpotent of
+    rank one (``Ĥ² = 0``, 3.24).
+    """
+    G = np.asarray(G, dtype=np.float64)
+    if G.shape != (4, 4) or not np.isfinite(G).all():
+        raise GeometryError(
+            "shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape
+        )
+    U, singular, Vt = np.linalg.svd(G)
+    square = float(np.linalg.norm(G @ G))
+    size = float(singular[0])
+    if not (size > 0 and square <= NILPOTENT_TOLERANCE * size**2 and singular[1] <= 1e-6 * size):
+        raise GeometryError(
+            "degenerate",
+            f"singular values {singular.tolist()}, |G²| {square:.3g}; a translation's generator has rank one "
+            "and square zero",
+            singular=singular.tolist(),
+            square=square,
+        )
+    return U[:, 0] * size, Vt[0]
+
+
+def jordan_frame(G: FloatArray) -> JordanFrame:
+    """One Jordan frame of the translation ``exp(Ĥ) = I + Ĥ``, ``G`` (4, 4) = ``τĤ`` (3.5, 3.8).
+
+    All others are ``frame.changed(jordan_commutator(...))``. Raises GeometryError where G is no generator
+    of a translation.
+    """
+    k, h = split_generator(G)
+    k = k - h * (h @ k)
+    across = np.linalg.svd(np.stack([k, h]))[2][2:]
+    return _frame_of(np.vstack([across, k / (k @ k), h]))
+
+
+def _frame_of(S: FloatArray) -> JordanFrame:
+    points = np.asarray(np.linalg.inv(S).T, dtype=np.float64)
+    return JordanFrame(S, points)
+
+
+def jordan_commutator(parameters: npt.ArrayLike) -> FloatArray:
+    """``C_T`` (4, 4) of its ten parameters ``(μ, c11, c12, c14, c21, c22, c24, c31, c32, c34)`` (3.6).
+
+    It commutes with ``J_T``. Raises GeometryError for parameters that make it singular.
+    """
+    p = np.asarray(parameters, dtype=np.float64)
+    if p.shape != (10,):
+        raise GeometryError("shape", f"parameters have shape {p.shape}; (10,) is needed", shape=p.shape)
+    C = np.eye(4)
+    C[:3, [0, 1, 3]] = p[1:].reshape(3, 3)
+    minor = float(p[1] * p[5] - p[2] * p[4])
+    if not (np.isfinite(p).all() and p[0] != 0 and abs(minor) > 1e-12):
+        raise GeometryError(
+            "degenerate", f"mu is {p[0]}, c11 c22 - c12 c21 is {minor:.3g}; neither may be zero", minor=minor
+        )
+    return np.asarray(p[0] * C, dtype=np.float64)
+
+
+def raw_generator(H: FloatArray) -> FloatArray:
+    """``H / γ − I`` with ``γ = tr H / 4`` (3.2, 3.22): the generator of a measured homography ``(4, 4)``, as
+    it is.
+
+    Of rank one only as far as H is a translation. Raises GeometryError where the trace is zero to rounding.
+    """
+    H = np.asarray(H, dtype=np.float64)
+    if H.shape != (4, 4) or not np.isfinite(H).all():
+        raise GeometryError(
+            "shape", f"a homography is a finite (4, 4) matrix, got {H.tolist()}", shape=H.shape
+        )
+    gamma = float(np.trace(H)) / 4.0
+    if not abs(gamma) > 1e-9 * float(np.linalg.norm(H)):
+        raise GeometryError(
+            "degenerate",
+            f"the trace is {4 * gamma:.3g}; a translation's is four times its scale",
+            trace=gamma,
+        )
+    return np.asarray(H / gamma - np.eye(4), dtype=np.float64)
+
+
+TRACE_FREE = np.linalg.svd(np.eye(4).reshape(1, 16))[2][1:].reshape(15, 4, 4)
+"""Orthonormal basis of the matrices without trace, among them every generator."""
+
+
+def translation_homography(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> FloatArray:
+    """``H = I + G``, ``tr G = 0``, from points before and pixels after a motion near a translation, linear.
+
+    Each pixel gives two equations ``(u P₃ − P₁)(M + G M) = 0``, which weigh errors where they arise, in the images;
+    divided by the depth before the motion. Cameras (c, 3, 4), points (m, 4) of any scale, pixels (c, m, 2) [px],
+    NaN where missing. Raises GeometryError for fewer than 15 equations or points that leave G undetermined.
+    """
+    values, w = check_views(Ps, pixels, None)
+    known = np.isfinite(M).all(axis=1)
+    values, w, M = values[:, known], w[:, known], M[known]
+    measured = 2 * int((w > 0).sum())
+    if measured < 15:
+        raise GeometryError(
+            "too_few",
+            f"{measured} pixel coordinates of known points; 15 unknowns need as many",
+            measured=measured,
+        )
+    W = whitener(M)
+    X = M @ W.T
+    P = Ps @ np.linalg.inv(W)
+    depth = np.einsum("cj,nj->cn", P[:, 2], X)
+    scale = np.divide(w, depth, out=np.zeros_like(w), where=depth != 0)
+    rows = (P[:, None, :2, :] - values[..., None] * P[:, None, 2:, :]) * scale[..., None, None]
+    system = np.einsum("cnai,qij,nj->cnaq", rows, TRACE_FREE, X, optimize=True).reshape(-1, 15)
+    x, _, rank, singular = np.linalg.lstsq(system, -np.einsum("cnai,ni->cna", rows, X).ravel(), rcond=1e-10)
+    if rank < 15:
+        raise GeometryError(
+            "degenerate", "the points do not determine a homography (coplanar?)", singular=singular.tolist()
+        )
+    back = np.asarray(np.linalg.inv(W), dtype=np.float64)
+    return conjugate(back, np.eye(4) + np.tensordot(x, TRACE_FREE, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class TranslationSVD:
+    """What the singular value decomposition of one homography says (3.36).
+
+    ``direction`` (4,) and ``plane`` (4,), both of unit norm; ``generator`` (4, 4), the nilpotent nearest to
+    the measured one; ``singular`` (4,) descending.
+    """
+
+    direction: FloatArray
+    plane: FloatArray
+    generator: FloatArray
+    singular: FloatArray
+
+    @property
+    def conditioning(self) -> float:
+        """``σ₁/σ₂``: large where the homography is a translation (3.36); infinite for an exact one."""
+        return float(self.singular[0] / self.singular[1]) if self.singular[1] > 0 else float("inf")
+
+
+def translation_from_homography(H: FloatArray, frame: FloatArray | None = None) -> TranslationSVD:
+    """Direction and plane at infinity of one homography ``H`` (4, 4) by SVD (3.32-3.34, 3.36).
+
+    ``frame`` W (4, 4): norms are taken in the coordinates ``W M``, best those of `homogeneous.whitener` of
+    the points, so that no coordinate of the projective frame weighs more than the points do; default the
+    given coordinates, as in the thesis. Singular values are those of that frame. Raises GeometryError for
+    the identity and a homography without trace.
+    """
+    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
+    G = conjugate(W, raw_generator(H))
+    U, singular, Vt = np.linalg.svd(G)
+    back = np.asarray(np.linalg.inv(W), dtype=np.float64)
+    k, h = back @ U[:, 0], W.T @ Vt[0]
+    generator = conjugate(back, nearest_translation_generator(G))
+    return TranslationSVD(k / np.linalg.norm(k), h / np.linalg.norm(h), generator, singular)
+
+
+def plane_at_infinity_from_stack(
+    Hs: Sequence[FloatArray] | FloatArray, frame: FloatArray | None = None
+) -> FloatArray:
+    """Plane at infinity ``(4,)``, unit norm, of homographies ``(n, 4, 4)`` of any directions (3.37).
+
+    ``frame`` as in `translation_from_homography`. Raises GeometryError for an empty stack.
+    """
+    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
+    stack = np.concatenate([conjugate(W, raw_generator(H)) for H in _some(Hs)])
+    plane = W.T @ np.linalg.svd(stack)[2][0]
+    return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
+
+
+def direction_from_stack(
+    Hs: Sequence[FloatArray] | FloatArray, frame: FloatArray | None = None
+) -> FloatArray:
+    """Direction ``(4,)``, unit norm, common to homographies ``(n, 4, 4)`` of parallel translations (3.38).
+
+    ``frame`` as in `translation_from_homography`. Raises GeometryError for an empty stack.
+    """
+    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
+    stack = np.concatenate([conjugate(W, raw_generator(H)).T for H in _some(Hs)])
+    direction = np.linalg.solve(W, np.linalg.svd(stack)[2][0])
+    return np.asarray(direction / np.linalg.norm(direction), dtype=np.float64)
+
+
+def direction_given_plane(H: FloatArray, plane: FloatArray, frame: FloatArray | None = None) -> FloatArray:
+    """``k`` (4,) with ``I + k hᵀ`` nearest to the homography ``H`` (4, 4), and ``hᵀk = 0``, for the plane
+    at infinity ``h`` (4,) as scaled.
+    """
+    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
+    h = np.linalg.solve(W.T, plane)
+    k = conjugate(W, raw_generator(H)) @ h / (h @ h)
+    return np.asarray(np.linalg.solve(W, k - h * (h @ k) / (h @ h)), dtype=np.float64)
+
+
+def _some(Hs: Sequence[FloatArray] | FloatArray) -> Sequence[FloatArray] | FloatArray:
+    if len(Hs) == 0:
+        raise GeometryError("too_few", "no homography is given; at least one is needed", homographies=0)
+    return Hs
