@@ -11,6 +11,7 @@ from stereoservo.kinematics.calibration.strata import FitOptions
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import check_model
+from stereoservo_sim import synthetic
 
 
 def changed(data, /, **fields):
@@ -19,7 +20,7 @@ def changed(data, /, **fields):
 
 def model_pixels(model, positions):
     """Pixels (c, s, m, 2) that a model predicts, by the reference chain."""
-    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
+    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, tip_first=model.tip_first)
     points = np.array([model.marker_points @ chain.partial_displacements(q)[-1].T for q in positions])
     images = np.einsum("cij,smj->csmi", np.array([camera.matrix for camera in model.cameras]), points)
     return images[..., :2] / images[..., 2:]
@@ -158,6 +159,53 @@ def test_three_cameras(arms):
     assert result.model.statistics.parameters == 81 + 11
     assert_at_the_floor(result, 0.1)
     assert error_rms(result.model, cell, cell.held_out(rng, 20)) < 0.04
+
+
+def carrying_the_cameras(cell):
+    """The same arm with the rig on its flange before markers that stand still."""
+    return synthetic.placed(
+        cell.kinds,
+        cell.links,
+        2.0 * synthetic.two_faces(),
+        cell.home,
+        0.4 * cell.ranges,
+        synthetic.rotation("x", 160) @ synthetic.rotation("y", 20),
+        distance=1.6,
+        mount="eye_in_hand",
+    )
+
+
+@pytest.mark.parametrize("name", ["pan_tilt", "rx90"])
+def test_cameras_on_the_tip(arms, name):
+    """The model counts its joints from the base and predicts through the chain with the tip first."""
+    rng = np.random.default_rng(24)
+    cell = arms[name]() if name == "pan_tilt" else carrying_the_cameras(arms[name]())
+    positions, index = cell.stops(9)
+    free = cell.held_out(rng, 6)
+    trials = cell.trials(0.1, rng, positions=(np.vstack([positions, free]), np.append(index, [-1] * 6)))
+    result = fit_model(trials, epoch=1)
+    model = result.model
+    assert model.mount == "eye_in_hand"
+    assert model.stratum == "metric"
+    assert model.joint_names == cell.joint_names
+    assert [joint.name for joint in model.statistics.joints] == list(cell.joint_names)
+    assert [joint.range for joint in model.statistics.joints] == pytest.approx(2 * cell.ranges)
+    assert np.array_equal(model.zero, np.median(trials.positions, axis=0))
+    assert_at_the_floor(result, 0.1)
+    held_out = cell.held_out(rng, 40)
+    assert error_rms(model, cell, held_out) < 0.05
+    blind = msgspec.structs.replace(model, mount="eye_to_hand")
+    assert error_rms(blind, cell, held_out) > 0.15  # the order of the factors does matter
+
+
+def test_mixed_mounts_are_refused(arms):
+    trials = arms["rx90"]().trials(0.1, np.random.default_rng(25), stops=4)
+    left, right = trials.cameras
+    mixed = (left, msgspec.structs.replace(right, mount="eye_in_hand"))
+    with pytest.raises(CalibrationError, match="each on their own") as caught:
+        fit_model(changed(trials, cameras=mixed), epoch=1)
+    assert caught.value.code == "mixed_mounts"
+    assert caught.value.data["mounts"] == {"cam0": "eye_to_hand", "cam1": "eye_in_hand"}
 
 
 def test_missing_pixels_and_outliers(arms):

@@ -20,7 +20,7 @@ from stereoservo.kinematics.calibration.statistics import degrees_of_freedom, ra
 from stereoservo.kinematics.calibration.strata import DEFAULTS, FitOptions, upgraded
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, check_trials
 from stereoservo.kinematics.calibration.views import first_views
-from stereoservo.kinematics.model import Stratum
+from stereoservo.kinematics.model import Mount, Stratum, check_model
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -49,8 +49,11 @@ def fit_model(
     known.
     """
     check_trials(trials)
+    mount = common_mount(trials)
+    chain = trials if mount == "eye_to_hand" else _reversed_trials(trials)
     try:
-        return _fit(trials, epoch, created, progress or _silent, options)
+        result = _fit(chain, epoch, created, progress or _silent, options)
+        return result if mount == "eye_to_hand" else _restored(result)
     except (GeometryError, np.linalg.LinAlgError) as error:
         raise CalibrationError(
             "no_convergence",
@@ -104,6 +107,53 @@ def _fit(
     )
     tell("done", 1.0)
     return result
+
+
+def common_mount(trials: TrialData) -> Mount:
+    """How all cameras of the trials are mounted. Raises CalibrationError (``mixed_mounts``)."""
+    mounts = {camera.name: camera.mount for camera in trials.cameras}
+    if len(set(mounts.values())) > 1:
+        told = ", ".join(f"{name!r} {mount}" for name, mount in mounts.items())
+        raise CalibrationError(
+            "mixed_mounts",
+            f"the cameras are mounted differently: {told}. One model needs cameras that see one motion: "
+            "calibrate those that stand and those on the tip each on their own",
+            mounts=mounts,
+        )
+    return trials.cameras[0].mount
+
+
+def _reversed_trials(trials: TrialData) -> TrialData:
+    """Trials with the joints counted from the other end: from cameras on the tip, the base's joint is the
+    last before the markers.
+    """
+    last = len(trials.joint_names) - 1
+    return msgspec.structs.replace(
+        trials,
+        joint_names=trials.joint_names[::-1],
+        joint_kinds=trials.joint_kinds[::-1],
+        positions=trials.positions[:, ::-1],
+        trials=np.where(trials.trials >= 0, last - trials.trials, trials.trials),
+    )
+
+
+def _restored(result: CalibrationResult) -> CalibrationResult:
+    """The result of reversed trials with its joints base first again, mounted eye-in-hand."""
+    model = result.model
+    statistics = model.statistics
+    if statistics is not None:
+        statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])
+    model = msgspec.structs.replace(
+        model,
+        joint_names=model.joint_names[::-1],
+        joint_kinds=model.joint_kinds[::-1],
+        zero=model.zero[::-1].copy(),
+        generators=model.generators[::-1].copy(),
+        statistics=statistics,
+        mount="eye_in_hand",
+    )
+    check_model(model)
+    return msgspec.structs.replace(result, model=model)
 
 
 def _silent(stage: str, fraction: float) -> None:

@@ -28,7 +28,7 @@ class CalibrationError(Exception):
         code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
             ``too_few_stops``,
             ``joint_did_not_move``, ``joint_without_effect``, ``joint_kind``, ``views_degenerate``,
-            ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``.
+            ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``.
         data: the values the message speaks of.
     """
 
