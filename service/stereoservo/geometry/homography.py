@@ -1,5 +1,5 @@
 """4x4 homographies between projective point sets: from a basis, linear from many points, refined in the
-images.
+images (thesis 2.2). :mod:`stereoservo.geometry.incidences` has those from lines and planes.
 """
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from stereoservo.geometry.cameras import check_views
+from stereoservo.geometry.cameras import check_views, project_many, projection_jacobian_many
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray, whitener
 
@@ -69,22 +69,61 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
     if not singular[14] > 1e-9 * singular[0]:
         raise GeometryError("degenerate", "the points do not determine a homography (four of five coplanar?)")
     H: FloatArray = np.linalg.solve(W_B, v[15].reshape(4, 4)) @ W_A
-    determinant = abs(float(np.linalg.det(H / np.linalg.norm(H))))
-    if not determinant > 1e-20:
-        raise GeometryError("degenerate", "the homography is singular", determinant=determinant)
-    H = H / (np.linalg.norm(H) * determinant**0.25)
+    H = unit_determinant(H, "the homography")
     agreement = (np.sign(((A @ H.T) * B).sum(axis=1))).sum()
     return -H if agreement < 0 else H
 
 
+def unit_determinant(H: FloatArray, what: str) -> FloatArray:
+    """``H`` (4, 4) scaled to ``|det H| = 1``. Raises GeometryError where it is singular."""
+    size = float(np.linalg.norm(H))
+    determinant = abs(float(np.linalg.det(H / size)))
+    if not determinant > 1e-20:
+        raise GeometryError("degenerate", f"{what} is singular", determinant=determinant)
+    scaled: FloatArray = H / (size * determinant**0.25)
+    return scaled
+
+
+def _image_jacobian(Ps: FloatArray, H: FloatArray, M: FloatArray) -> FloatArray:
+    """Derivative ``(n, 2c, 16)`` of the pixels of ``H M`` in the entries of ``H`` (4, 4), row by row (2.83)."""
+    m = np.einsum("cij,nj->cni", Ps @ H, M)
+    u = m[..., :2] / m[..., 2:]
+    rows = (Ps[:, None, :2, :] - u[..., None] * Ps[:, None, 2:, :]) / m[..., 2, None, None]
+    full = rows[..., :, None] * M[None, :, None, None, :]
+    jacobian: FloatArray = full.transpose(1, 0, 2, 3, 4).reshape(len(M), 2 * len(Ps), 16)
+    return jacobian
+
+
+def _whitening(
+    Ps: FloatArray, H: FloatArray, M: FloatArray, weights: FloatArray, M_covariance: FloatArray | None
+) -> FloatArray:
+    """``(n, 2c, 2c)``: pixel differences of each point into uncorrelated ones of unit size, 0 where not seen.
+
+    ``weights`` (c, n) [1/px]. The points' own covariance, if given, is carried into the images to first order.
+    """
+    w = np.repeat(weights.T, 2, axis=1)
+    if M_covariance is None:
+        return w[:, :, None] * np.eye(w.shape[1])
+    J = projection_jacobian_many(Ps @ H, M).transpose(1, 0, 2, 3).reshape(len(M), -1, 4) * w[..., None]
+    spread = np.linalg.cholesky(np.eye(w.shape[1]) + J @ M_covariance @ J.transpose(0, 2, 1))
+    whitening: FloatArray = np.linalg.inv(spread) * w[:, None, :]
+    return whitening
+
+
 def homography_refine(
-    H: FloatArray, Ps: FloatArray, M_from: FloatArray, pixels_to: FloatArray, sigma: FloatArray | float = 1.0
+    H: FloatArray,
+    Ps: FloatArray,
+    M_from: FloatArray,
+    pixels_to: FloatArray,
+    sigma: FloatArray | float = 1.0,
+    M_covariance: FloatArray | None = None,
 ) -> FloatArray:
     """``H`` (4, 4) of least reprojection error of ``P_c H M``, 15 parameters; ``det H`` of its sign and
     size 1.
 
     Cameras ``(c, 3, 4)``, points ``(n, 4)``, target pixels ``(c, n, 2)`` [px], NaN where missing; ``sigma``
-    (c, n) or a number [px]. Raises GeometryError for shapes that do not fit or fewer than 15 coordinates.
+    (c, n) or a number [px]. ``M_covariance`` (n, 4, 4): the points' own, which adds to that of the pixels to
+    first order. Raises GeometryError for shapes that do not fit or fewer than 15 coordinates.
     """
     pixels, weights = check_views(
         Ps, pixels_to, np.broadcast_to(1.0 / np.asarray(sigma), pixels_to.shape[:2])
@@ -94,38 +133,64 @@ def homography_refine(
         raise GeometryError(
             "too_few", f"{measured} pixel coordinates; 15 parameters need as many", measured=measured
         )
-    start = np.asarray(H, dtype=np.float64) / np.linalg.norm(H)
-    W = whitener(M_from)
-    X = M_from @ W.T
-    base = (start @ np.linalg.inv(W)).ravel()
-    size = float(np.linalg.norm(base))
-    chart = np.linalg.svd(base[None])[2][1:].T * size
+    result = np.asarray(H, dtype=np.float64)
+    # The weights follow the solution where the points' covariance enters them: twice is enough, it is small.
+    for _ in range(1 if M_covariance is None else 2):
+        whitening = _whitening(Ps, result, M_from, weights, M_covariance)
+        result = _least_squares(result, Ps, M_from, pixels, whitening)
+    return result
 
-    def images(z: FloatArray) -> FloatArray:
-        m: FloatArray = np.einsum("cij,nj->cni", Ps @ (base + chart @ z).reshape(4, 4), X)
-        return m
+
+def _least_squares(
+    H: FloatArray, Ps: FloatArray, M: FloatArray, pixels: FloatArray, whitening: FloatArray
+) -> FloatArray:
+    """``H`` (4, 4) of least whitened pixel differences from a start, moved across its own direction."""
+    W = whitener(M)
+    X = M @ W.T
+    base = (H / np.linalg.norm(H) @ np.linalg.inv(W)).ravel()
+    chart = np.linalg.svd(base[None])[2][1:].T * float(np.linalg.norm(base))
 
     def residuals(z: FloatArray) -> FloatArray:
-        m = images(z)
-        result: FloatArray = ((m[..., :2] / m[..., 2:] - pixels) * weights[..., None]).ravel()
-        return result
+        u = project_many(Ps @ (base + chart @ z).reshape(4, 4), X)
+        difference = (u - pixels).transpose(1, 0, 2).reshape(len(X), -1)
+        whitened: FloatArray = np.einsum("nij,nj->ni", whitening, difference).ravel()
+        return whitened
 
     def jacobian(z: FloatArray) -> FloatArray:
-        m = images(z)
-        u = m[..., :2] / m[..., 2:]
-        rows = (Ps[:, None, :2, :] - u[..., None] * Ps[:, None, 2:, :]) * (weights / m[..., 2])[
-            ..., None, None
-        ]
-        full = (rows[..., :, None] * X[None, :, None, None, :]).reshape(-1, 16)
-        product: FloatArray = full @ chart
+        full = whitening @ _image_jacobian(Ps, (base + chart @ z).reshape(4, 4), X)
+        product: FloatArray = full.reshape(-1, 16) @ chart
         return product
 
     fit = least_squares(
         residuals, np.zeros(15), jac=jacobian, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
-    refined = (base + chart @ fit.x).reshape(4, 4) @ W
-    determinant = abs(float(np.linalg.det(refined / np.linalg.norm(refined))))
-    if not determinant > 1e-20:
-        raise GeometryError("degenerate", "the refined homography is singular", determinant=determinant)
-    result: FloatArray = refined / (np.linalg.norm(refined) * determinant**0.25)
-    return result
+    return unit_determinant((base + chart @ fit.x).reshape(4, 4) @ W, "the refined homography")
+
+
+def homography_covariance(
+    H: FloatArray,
+    Ps: FloatArray,
+    M_from: FloatArray,
+    pixels_to: FloatArray,
+    sigma: FloatArray | float = 1.0,
+    M_covariance: FloatArray | None = None,
+) -> FloatArray:
+    """First-order covariance ``(16, 16)`` of the entries of a refined ``H`` (4, 4) at ``|det H| = 1``, row by row.
+
+    Arguments as for `homography_refine`; of rank 15. Raises GeometryError where the images leave H undetermined.
+    """
+    _, weights = check_views(Ps, pixels_to, np.broadcast_to(1.0 / np.asarray(sigma), pixels_to.shape[:2]))
+    H = unit_determinant(H, "the homography")
+    # Steps that keep the determinant: tr(H⁻¹ dH) = 0.
+    chart = np.linalg.svd(np.linalg.inv(H).T.reshape(1, 16))[2][1:].T
+    J = _whitening(Ps, H, M_from, weights, M_covariance) @ _image_jacobian(Ps, H, M_from)
+    _, singular, rows = np.linalg.svd(J.reshape(-1, 16) @ chart, full_matrices=False)
+    if len(singular) < 15 or not singular[14] > 1e-10 * singular[0]:
+        raise GeometryError(
+            "degenerate",
+            "the images do not determine the homography (four of five points coplanar?)",
+            singular=singular,
+        )
+    spread = chart @ (rows.T / singular)
+    covariance: FloatArray = spread @ spread.T
+    return covariance

@@ -1,0 +1,262 @@
+"""Homographies of space from any mix of point, line and plane constraints, linear and in pixels (thesis 2.6.2)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from stereoservo.geometry.cameras import project_many, triangulation_covariance
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homography import unit_determinant
+from stereoservo.geometry.lines import image_lines
+from stereoservo.geometry.subspaces import TOLERANCE, basis, dual
+
+PRIMITIVES = {1: "point", 2: "line", 3: "plane"}
+
+RANK = 1e-12
+"""Rank tolerance inside one primitive, whose independence `Incidence` has checked already."""
+
+UNDETERMINED = 0.3
+"""Standard deviation of a homography, relative to its norm, above which it counts as not determined."""
+
+
+@dataclass(frozen=True)
+class Incidence:
+    """A constraint on a homography: what ``first`` spans shall, once moved, lie in what ``second`` spans (2.77).
+
+    ``first`` (K, 4) points in the first frame, ``second`` (K', 4) points in the second one: 1 a point, 2 a line,
+    3 a plane; K = K' makes them coincide. The reverse, K > K', is not linear in H: give it to the inverse map.
+    ``images``: what c cameras saw of ``second``, NaN where missing: pixels (c, 2) of a point, segments (c, 2, 2)
+    of a line [px]. Points of ``first`` are then compared there: for a line give the ends that matter.
+    """
+
+    first: FloatArray
+    second: FloatArray
+    images: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("first", "second"):
+            points = np.atleast_2d(np.asarray(getattr(self, name), dtype=np.float64))
+            rank = len(basis(points)) if points.shape[1:] == (4,) and len(points) else 0
+            if not 1 <= rank <= 3:
+                raise GeometryError(
+                    "shape",
+                    f"the {name} primitive has shape {points.shape} and rank {rank}; "
+                    "one to three independent points (k, 4) are needed",
+                    shape=points.shape,
+                    rank=rank,
+                )
+            object.__setattr__(self, name, points if rank == len(points) else basis(points))
+        if len(self.first) > len(self.second):
+            raise GeometryError(
+                "shape",
+                f"a {PRIMITIVES[len(self.first)]} cannot lie in a {PRIMITIVES[len(self.second)]}; "
+                "constrain the inverse homography, or exchange the two",
+                first=len(self.first),
+                second=len(self.second),
+            )
+        if self.images is not None and (
+            len(self.second) == 3 or np.shape(self.images)[1:] != ((2,) if len(self.second) == 1 else (2, 2))
+        ):
+            raise GeometryError(
+                "shape",
+                f"images of a {PRIMITIVES[len(self.second)]} have shape {np.shape(self.images)}; "
+                "pixels (c, 2) of a point or segments (c, 2, 2) of a line are needed",
+                images=np.shape(self.images),
+            )
+
+    @property
+    def equations(self) -> int:
+        """Number K (4 - K') of linear equations (2.84)."""
+        return len(self.first) * (4 - len(self.second))
+
+    def __str__(self) -> str:
+        relation = "onto" if len(self.first) == len(self.second) else "in"
+        return f"{PRIMITIVES[len(self.first)]} {relation} {PRIMITIVES[len(self.second)]}"
+
+
+def homography_from_incidences(incidences: Sequence[Incidence], tolerance: float = TOLERANCE) -> FloatArray:
+    """``H`` (4, 4) from any mix of point, line and plane constraints, linear (2.84-2.87); ``|det H| = 1``.
+
+    Each element of ``[[b]] H [[A]] = 0`` is one equation; whitened as in `homography_from_points`, with which it
+    agrees to rounding on points. The sign keeps the heights of points onto points; without such it makes the
+    largest entry positive. Five points, five lines or five planes in general position determine H, four lines
+    with their two transversals do not. Raises GeometryError for fewer than 15 equations, and with the dimension
+    of the family left where they do not determine H (singular values below ``tolerance``).
+    """
+    equations = sum(incidence.equations for incidence in incidences)
+    kinds = (
+        ", ".join(f"{count} x {kind}" for kind, count in Counter(map(str, incidences)).items()) or "nothing"
+    )
+    if equations < 15:
+        raise GeometryError(
+            "too_few",
+            f"{kinds}: {equations} equations; a 4x4 homography needs at least 15",
+            equations=equations,
+            kinds=kinds,
+        )
+    W_A = _span_whitener([incidence.first for incidence in incidences], "first")
+    W_B = _span_whitener([incidence.second for incidence in incidences], "second")
+    rows = []
+    for incidence in incidences:
+        planes = dual(incidence.second @ W_B.T, RANK)
+        rows.append(np.einsum("li,kj->lkij", planes, basis(incidence.first @ W_A.T, RANK)).reshape(-1, 16))
+    _, singular, v = np.linalg.svd(np.concatenate(rows))
+    family = int((singular[:15] <= tolerance * singular[0]).sum())
+    if family:
+        raise GeometryError(
+            "degenerate",
+            f"{kinds}: they leave a family of homographies with {family} free parameter(s); add constraints, or "
+            "move them into general position",
+            family=family,
+            singular=singular,
+            kinds=kinds,
+        )
+    H = v[15].reshape(4, 4)
+    determinant = abs(float(np.linalg.det(H)))
+    if not determinant > 1e-12:
+        raise GeometryError(
+            "degenerate",
+            f"{kinds}: only a singular map meets them (determinant {determinant:.3g} at unit norm)",
+            determinant=determinant,
+            kinds=kinds,
+        )
+    H = unit_determinant(np.linalg.solve(W_B, H) @ W_A, "the homography")
+    pairs = [(i.first[0], i.second[0]) for i in incidences if len(i.second) == 1]
+    agreement = (
+        sum(float(np.sign(second @ H @ first)) for first, second in pairs) or H.flat[np.abs(H).argmax()]
+    )
+    return -H if agreement < 0 else H
+
+
+def _span_whitener(subspaces: Sequence[FloatArray], name: str) -> FloatArray:
+    """``W`` (4, 4) that gives the projectors onto the spans unit sum: `whitener` for subspaces of any dimension."""
+    bases = np.concatenate([basis(points, RANK) for points in subspaces])
+    values, vectors = np.linalg.eigh(bases.T @ bases / len(subspaces))
+    if not values[0] > 1e-14 * values[3]:
+        raise GeometryError(
+            "degenerate", f"the {name} primitives lie in one plane; spatial ones are needed", moments=values
+        )
+    W: FloatArray = (vectors / np.sqrt(values)).T
+    return W
+
+
+def homography_refine_incidences(
+    H: FloatArray, incidences: Sequence[Incidence], Ps: FloatArray, sigma: float = 1.0
+) -> FloatArray:
+    """``H`` (4, 4) that meets point, line and plane constraints with least squared pixel errors, ``|det H| = 1``.
+
+    The renormalised form of (2.86): in cameras ``Ps`` (c, 3, 4) of the second frame, a moved point is compared to
+    a target's pixels, or by its distance to a target line's segments, scaled by its own current depth. A target
+    without ``images`` (all planes) is compared by the least displacement of the moved point's pixels, ``sigma``
+    [px] each, that brings it into the target, to first order. ``H`` is a start (`homography_from_incidences`).
+
+    Raises GeometryError for fewer than 15 pixel errors, images of other cameras, and an undetermined H.
+    """
+    Ps = np.asarray(Ps, dtype=np.float64)
+    points = np.concatenate([incidence.first for incidence in incidences])
+    targets = _PixelTargets.of(incidences, len(Ps))
+    if targets.count < 15:
+        raise GeometryError(
+            "too_few", f"{targets.count} pixel errors; 15 parameters need as many", measured=targets.count
+        )
+    W = _span_whitener([incidence.first for incidence in incidences], "first")
+    X = points @ W.T
+    base = (np.asarray(H, dtype=np.float64) / np.linalg.norm(H) @ np.linalg.inv(W)).ravel()
+    chart = np.linalg.svd(base[None])[2][1:].T * float(np.linalg.norm(base))
+
+    def residuals(z: FloatArray) -> FloatArray:
+        return targets.errors(X @ (base + chart @ z).reshape(4, 4).T, Ps, sigma)
+
+    fit = least_squares(
+        residuals, np.zeros(15), jac="3-point", method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=5000
+    )
+    singular = np.linalg.svd(np.asarray(fit.jac, dtype=np.float64), compute_uv=False)
+    uncertainty = 1.0 / max(float(singular[14]), 1e-300)
+    if uncertainty > UNDETERMINED:
+        raise GeometryError(
+            "degenerate",
+            f"the images do not determine the homography: {sigma:.3g} px of noise leave it uncertain by "
+            f"{uncertainty:.3g} of its norm, {UNDETERMINED} is allowed; add constraints in general position",
+            uncertainty=uncertainty,
+            singular=singular,
+        )
+    return unit_determinant((base + chart @ fit.x).reshape(4, 4) @ W, "the refined homography")
+
+
+@dataclass(frozen=True)
+class _PixelTargets:
+    """Flat lists of what moved points are compared to: index of the point, of the camera, and the target."""
+
+    pixel_at: tuple[list[int], list[int]]
+    pixels: FloatArray
+    line_at: tuple[list[int], list[int]]
+    lines: FloatArray
+    plane_at: dict[int, list[int]]
+    planes: dict[int, FloatArray]
+
+    @classmethod
+    def of(cls, incidences: Sequence[Incidence], cameras: int) -> _PixelTargets:
+        pixel_at: tuple[list[int], list[int]] = ([], [])
+        line_at: tuple[list[int], list[int]] = ([], [])
+        pixels: list[FloatArray] = []
+        lines: list[FloatArray] = []
+        plane_at: dict[int, list[int]] = {}
+        planes: dict[int, list[FloatArray]] = {}
+        index = 0
+        for incidence in incidences:
+            own = range(index, index + len(incidence.first))
+            index += len(incidence.first)
+            if incidence.images is None:
+                rows = dual(incidence.second)
+                plane_at.setdefault(len(rows), []).extend(own)
+                planes.setdefault(len(rows), []).extend(rows for _ in own)
+                continue
+            images = np.asarray(incidence.images, dtype=np.float64)
+            if len(images) != cameras:
+                raise GeometryError(
+                    "shape",
+                    f"a target has images of {len(images)} cameras, not of {cameras}",
+                    images=len(images),
+                )
+            at, values, targets = (
+                (pixel_at, pixels, images)
+                if len(incidence.second) == 1
+                else (line_at, lines, image_lines(images))
+            )
+            for c in np.flatnonzero(np.isfinite(targets).all(axis=1)).tolist():
+                for k in own:
+                    at[0].append(c)
+                    at[1].append(k)
+                    values.append(targets[c])
+        return cls(
+            pixel_at,
+            np.reshape(pixels, (-1, 2)),
+            line_at,
+            np.reshape(lines, (-1, 3)),
+            plane_at,
+            {size: np.stack(rows) for size, rows in planes.items()},
+        )
+
+    @property
+    def count(self) -> int:
+        return self.pixels.size + len(self.lines) + sum(size * len(at) for size, at in self.plane_at.items())
+
+    def errors(self, moved: FloatArray, Ps: FloatArray, sigma: float) -> FloatArray:
+        """All errors in units of ``sigma`` [px] for moved points ``(p, 4)``."""
+        u = project_many(Ps, moved)
+        parts = [(u[self.pixel_at] - self.pixels).ravel() / sigma]
+        on_line = u[self.line_at]
+        parts.append(((on_line * self.lines[:, :2]).sum(axis=1) + self.lines[:, 2]) / sigma)
+        for size, at in self.plane_at.items():
+            X = moved[at] / (moved[at] @ Ps[0, 2])[:, None]
+            B = self.planes[size]
+            spread = B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
+            offset = np.einsum("nij,nj->ni", B, X)
+            parts.append(np.linalg.solve(np.linalg.cholesky(spread), offset[..., None]).ravel())
+        return np.concatenate(parts)
