@@ -1,0 +1,378 @@
+"""Joint angles measured by the cameras; homing; encoder zeros (thesis 4.5.4, (4.45)).
+
+No initial guess is asked for: the search starts all over joint space, and every configuration that the pixels
+leave possible is told. Angles of revolute joints are told modulo 2π, nearest the middle of their limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import qmc
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.joint_sights import (
+    JointAnglesError,
+    JointProblem,
+    SeenChain,
+    joint_problem,
+    points_seen,
+)
+
+BoolArray = npt.NDArray[np.bool_]
+
+STARTS = 512
+"""Starts of a global search; up to ``GRID`` a joint where that is fewer."""
+GRID = 16
+RAY_STEPS = 25
+"""Steps by rays, before those by pixels."""
+PIXEL_STEPS = 60
+LONGEST_STEP = 0.5
+"""Largest change of a joint in one step [rad or m]."""
+AMBIGUOUS = 25.0
+"""Chi-square by which another configuration may fit worse and still count as possible."""
+MAX_SIGMA_FACTOR = 3.0
+"""Residual [stated sigmas, rms] above which the pixels are not those of this chain and these points."""
+MISFIT_TAIL = 1e-6
+"""Probability below which a cost is not put down to chance."""
+LARGEST_DEVIATION = 0.1
+"""Standard deviation [rad or m] above which a joint counts as not observable."""
+
+Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray, BoolArray]]
+
+
+@dataclass(frozen=True, eq=False)
+class JointAngles:
+    """Joints ``q`` (n,) [rad or m] of least image error, with ``covariance`` (n, n) at the stated noise.
+
+    ``cost``: sum of squares over the stated variances, with ``freedom`` measurements less joints.
+    """
+
+    q: FloatArray
+    covariance: FloatArray
+    cost: float
+    freedom: int
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Standard deviations (n,) [rad or m]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=np.float64)
+
+
+def measured_joints(
+    problem: JointProblem,
+    *,
+    limits: FloatArray | None = None,
+    start: FloatArray | None = None,
+    largest_deviation: float = LARGEST_DEVIATION,
+) -> tuple[JointAngles, ...]:
+    """Every configuration that the pixels of ``problem`` leave possible, the best first.
+
+    ``limits`` (n, 2) [rad or m] confine the search; without them revolute joints may stand anywhere, prismatic ones
+    need theirs. ``start`` (n,) looks only near a configuration. Raises JointAnglesError: ``limits``, ``too_few``
+    (fewer coordinates than joints), ``no_agreement`` (no configuration explains the pixels), ``outside_limits``,
+    ``not_observable`` with the joints whose deviation exceeds ``largest_deviation`` [rad or m].
+    """
+    seen = problem.seen
+    n = seen.chain.joints
+    if problem.measurements < n:
+        raise JointAnglesError(
+            "too_few",
+            f"{problem.measurements} pixel coordinates for {n} joints; more points or cameras are needed",
+            measurements=problem.measurements,
+            joints=seen.joint_names,
+        )
+    bounds = _bounds(seen, limits, local=start is not None)
+    q = _starts(bounds) if start is None else np.asarray(start, dtype=np.float64).reshape(1, n)
+    if start is None:
+        q = _descent(problem.linearise_rays, q, RAY_STEPS)[0]
+        q = _distinct(q, seen)
+    q, costs, front = _descent(problem.linearise, q, PIXEL_STEPS)
+    q = _wrapped(q, bounds, seen)
+    q, costs = q[front], costs[front]
+    if not len(q):
+        raise JointAnglesError(
+            "no_agreement", "no configuration puts the points before the cameras that see them", cost=None
+        )
+    best = float(costs.min())
+    freedom = max(0, problem.freedom)
+    factor = max(1.0, best / max(1, freedom))
+    ceiling = MAX_SIGMA_FACTOR**2 * (float(chi2_distribution.isf(MISFIT_TAIL, freedom)) if freedom else 1e-3)
+    if best > ceiling:
+        raise JointAnglesError(
+            "no_agreement",
+            f"no configuration explains the pixels: the residual is {np.sqrt(factor):.3g} times the stated noise, at "
+            f"most {MAX_SIGMA_FACTOR:g} is believed. Are these the points, the cameras, the chain?",
+            sigma_factor=float(np.sqrt(factor)),
+            maximum=MAX_SIGMA_FACTOR,
+        )
+    possible = np.flatnonzero(costs - best <= AMBIGUOUS * factor)
+    ordered = possible[np.argsort(costs[possible], kind="stable")]
+    _refuse_open(problem, q[ordered[0]], largest_deviation)
+    found: list[JointAngles] = []
+    for i in ordered:
+        information = _information(problem, q[i])
+        if any(_same(q[i] - other.q, float(costs[i]) - other.cost, information, seen) for other in found):
+            continue
+        covariance: FloatArray = np.asarray(
+            np.linalg.pinv(information, rcond=1e-13, hermitian=True), dtype=np.float64
+        )
+        found.append(JointAngles(q[i], covariance, float(costs[i]), freedom))
+    inside = tuple(a for a in found if _inside(a, bounds))
+    if not inside:
+        raise JointAnglesError(
+            "outside_limits",
+            f"the pixels say {np.round(found[0].q, 4).tolist()}, outside of the limits {bounds.tolist()}",
+            q=found[0].q.tolist(),
+            limits=bounds.tolist(),
+        )
+    return inside
+
+
+@dataclass(frozen=True, eq=False)
+class Homing:
+    """The way home: ``displacement`` (n,) = home less current joints [rad or m], with ``covariance`` (n, n) that holds
+    the noise of both images; ``current`` as measured. Other ways that the image leaves possible: ``alternatives``.
+    """
+
+    displacement: FloatArray
+    covariance: FloatArray
+    current: JointAngles
+    alternatives: tuple[JointAngles, ...]
+
+
+def homing_problem(
+    seen: SeenChain,
+    home: FloatArray,
+    home_pixels: FloatArray,
+    pixels: FloatArray,
+    sigma: FloatArray | float,
+) -> JointProblem:
+    """The problem (4.45) of pixels (c, m, 2) [px], one point or more, of what stood at ``home_pixels`` (c, m, 2) in
+    the configuration ``home`` (n,).
+
+    The points are reconstructed from the home images, and weigh by their covariance from there on. Raises
+    JointAnglesError where no point is seen by two cameras at home.
+    """
+    points, covariance = points_seen(seen, home, home_pixels, sigma)
+    if not np.isfinite(points).all(axis=1).any():
+        raise JointAnglesError("too_few", "no point is seen by two cameras in the home image; one is needed")
+    return joint_problem(seen, points, pixels, sigma, point_covariance=covariance)
+
+
+def way_home(
+    problem: JointProblem,
+    home: FloatArray,
+    *,
+    limits: FloatArray | None = None,
+    start: FloatArray | None = None,
+    largest_deviation: float = LARGEST_DEVIATION,
+) -> Homing:
+    """The joint displacement back to ``home`` (n,) of a `homing_problem`, from anywhere.
+
+    Raises JointAnglesError as `measured_joints` does.
+    """
+    found = measured_joints(problem, limits=limits, start=start, largest_deviation=largest_deviation)
+    return Homing(home - found[0].q, found[0].covariance, found[0], found[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroReset:
+    """``offset`` (n,) [rad or m] to add to the encoders so that they read what the cameras see, ``deviations`` (n,) and
+    ``covariance`` (n, n) of it; ``cost``, ``freedom``; ``alternatives`` that the images leave possible.
+    """
+
+    offset: FloatArray
+    deviations: FloatArray
+    covariance: FloatArray
+    cost: float
+    freedom: int
+    alternatives: tuple[FloatArray, ...]
+
+
+def joint_zeros(
+    seen: SeenChain,
+    points: FloatArray,
+    pixels: FloatArray,
+    sigma: FloatArray | float,
+    encoders: FloatArray,
+    *,
+    limits: FloatArray | None = None,
+    point_covariance: FloatArray | None = None,
+    largest_deviation: float = LARGEST_DEVIATION,
+) -> ZeroReset:
+    """Offsets of the joints' zeros from raw ``pixels`` (k, c, m, 2) [px] at readings ``encoders`` (k, n) [rad or m].
+
+    One stop will do where it shows enough; more stops add up. ``limits`` (n, 2) are those of the offsets, default a
+    full turn and, for prismatic joints, 1 m to either side. Raises JointAnglesError as `measured_joints` does:
+    ``not_observable`` names the joints on which the images say nothing.
+    """
+    kinds = seen.chain.kinds
+    default = np.array([[-np.pi, np.pi] if kind == "revolute" else [-1.0, 1.0] for kind in kinds])
+    problem = joint_problem(
+        seen,
+        points,
+        pixels,
+        sigma,
+        offsets=np.atleast_2d(encoders),
+        point_covariance=point_covariance,
+    )
+    found = measured_joints(
+        problem, limits=default if limits is None else limits, largest_deviation=largest_deviation
+    )
+    best = found[0]
+    return ZeroReset(
+        best.q,
+        best.deviations,
+        best.covariance,
+        best.cost,
+        best.freedom,
+        tuple(other.q for other in found[1:]),
+    )
+
+
+def sensitivity(
+    problem: JointProblem, changed: JointProblem, opposite: JointProblem, q: FloatArray
+) -> FloatArray:
+    """Change (n,) of the measured joints, at ``q`` (n,), by half the difference of two calibrations.
+
+    First order: ``-(JᵀJ)⁻¹ Jᵀ (r₊ - r₋)/2``; with the calibration's covariance as columns of a root, the sum of
+    their outer squares is what the calibration adds to the joints' covariance.
+    """
+    _, slope, _ = problem.linearise(q[None])
+    plus, minus = (p.linearise(q[None])[0][0] for p in (changed, opposite))
+    return np.asarray(-np.linalg.lstsq(slope[0], 0.5 * (plus - minus), rcond=None)[0], dtype=np.float64)
+
+
+def _bounds(seen: SeenChain, limits: FloatArray | None, *, local: bool) -> FloatArray:
+    """Limits (n, 2), a full turn about the zero where none are given."""
+    n = seen.chain.joints
+    if limits is not None:
+        bounds = np.asarray(limits, dtype=np.float64)
+        if bounds.shape != (n, 2) or not (bounds[:, 0] < bounds[:, 1]).all():
+            raise JointAnglesError(
+                "limits",
+                f"limits {bounds.tolist()}; {n} pairs are needed, the lower first",
+                limits=bounds.tolist(),
+            )
+        return bounds
+    free = [
+        name for name, kind in zip(seen.joint_names, seen.chain.kinds, strict=True) if kind == "prismatic"
+    ]
+    if free and not local:
+        raise JointAnglesError(
+            "limits", f"prismatic joints {free} need limits for a search without a start", joints=free
+        )
+    return np.array(
+        [
+            [z - np.pi, z + np.pi] if kind == "revolute" else [-np.inf, np.inf]
+            for z, kind in zip(seen.chain.zero, seen.chain.kinds, strict=True)
+        ]
+    )
+
+
+def _starts(bounds: FloatArray) -> FloatArray:
+    """A grid, or an even sequence, over the limits (n, 2): (s, n)."""
+    n = len(bounds)
+    per_joint = min(GRID, int(STARTS ** (1.0 / n) + 1e-9))
+    if per_joint >= 8:
+        cells = (np.arange(per_joint) + 0.5) / per_joint
+        unit = np.stack(np.meshgrid(*[cells] * n, indexing="ij"), axis=-1).reshape(-1, n)
+    else:
+        unit = qmc.Sobol(n, scramble=False).random(STARTS)
+    return np.asarray(bounds[:, 0] + unit * np.ptp(bounds, axis=1), dtype=np.float64)
+
+
+def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Levenberg-Marquardt of all tries ``q`` (s, n) at once: where they end, costs (s,), in front (s,)."""
+    q = q.copy()
+    error, slope, front = linearise(q)
+    cost = (error**2).sum(axis=1)
+    damping = np.full(len(q), 1e-3)
+    active = np.arange(len(q))
+    identity = np.eye(q.shape[1])
+    for _ in range(steps):
+        normal = slope[active].swapaxes(-1, -2) @ slope[active]
+        size = np.sqrt(np.einsum("sii->si", normal))
+        size = np.where(size > 0.0, size, 1.0)
+        scaled = normal / (size[:, :, None] * size[:, None, :]) + damping[active, None, None] * identity
+        gradient = np.einsum("srn,sr->sn", slope[active], error[active])
+        step = -np.linalg.solve(scaled, (gradient / size)[..., None])[..., 0] / size
+        length = np.abs(step).max(axis=1)
+        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(length, 1e-300))[:, None]
+        new_error, new_slope, new_front = linearise(q[active] + step)
+        new_cost = (new_error**2).sum(axis=1)
+        better = new_cost <= cost[active]
+        won = active[better]
+        gain = cost[won] - new_cost[better]
+        q[won] += step[better]
+        error[won], slope[won], front[won] = new_error[better], new_slope[better], new_front[better]
+        settled = np.zeros(len(active), dtype=bool)
+        settled[better] = gain <= 1e-12 * (new_cost[better] + 1e-18)
+        settled |= np.abs(step).max(axis=1) < 1e-12
+        cost[won] = new_cost[better]
+        damping[active] *= np.where(better, 0.1, 10.0)
+        damping[active] = np.clip(damping[active], 1e-14, 1e12)
+        active = active[~settled]
+        if not len(active):
+            break
+    return q, cost, front
+
+
+def _distinct(q: FloatArray, seen: SeenChain) -> FloatArray:
+    """One of each group of tries (s, n) that came together within a hundredth."""
+    turn = np.array([2.0 * np.pi if kind == "revolute" else np.inf for kind in seen.chain.kinds])
+    folded = np.where(np.isfinite(turn), np.mod(q, turn), q)
+    _, first = np.unique(np.round(folded / 0.01).astype(np.int64), axis=0, return_index=True)
+    return q[np.sort(first)]
+
+
+def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
+    """Revolute angles (s, n) within half a turn of the middle of their limits."""
+    revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
+    middle = np.where(revolute, bounds.mean(axis=1), 0.0)
+    turned = middle + np.mod(q - middle + np.pi, 2.0 * np.pi) - np.pi
+    return np.where(revolute, turned, q)
+
+
+def _information(problem: JointProblem, q: FloatArray) -> FloatArray:
+    slope = problem.linearise(q[None])[1][0]
+    return np.asarray(slope.T @ slope, dtype=np.float64)
+
+
+def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
+    """Raise where the pixels leave a joint's position open at ``q`` (n,)."""
+    slope = problem.linearise(q[None])[1][0]
+    _, singular, rows = np.linalg.svd(slope, full_matrices=True)
+    padded = np.zeros(len(q))
+    padded[: len(singular)] = singular
+    padded = np.maximum(padded, max(1e-12 * float(padded[0]), 1e-300))
+    deviations = np.sqrt(((rows.T / padded) ** 2).sum(axis=1))
+    open_joints = [name for name, d in zip(problem.seen.joint_names, deviations, strict=True) if d > largest]
+    if open_joints:
+        raise JointAnglesError(
+            "not_observable",
+            f"the images do not tell joint(s) {', '.join(open_joints)}: standard deviation above {largest:g}. More "
+            "points, points farther from their axes, or another stop are needed",
+            joints=open_joints,
+            deviations=[float(d) if d < 1e6 else None for d in deviations],
+            maximum=largest,
+        )
+
+
+def _same(apart: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
+    """Whether two ends of a search, ``apart`` (n,) and ``worse`` in cost, are one configuration: within a tenth of a
+    deviation, or in one basin, where the cost grows as the square of the distance.
+    """
+    revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
+    apart = np.where(revolute, np.mod(apart + np.pi, 2.0 * np.pi) - np.pi, apart)
+    return bool(np.abs(apart).max() < 1e-6 or apart @ information @ apart < 1e-2 + 4.0 * worse)
+
+
+def _inside(angles: JointAngles, bounds: FloatArray) -> bool:
+    slack = 1e-6 + 5.0 * angles.deviations
+    return bool(((angles.q >= bounds[:, 0] - slack) & (angles.q <= bounds[:, 1] + slack)).all())
