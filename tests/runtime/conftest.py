@@ -1,4 +1,7 @@
-"""A Euclidean arm and stereo pair, conjugated into a random projective frame: the core's independent truth."""
+"""A Euclidean arm and stereo pair, conjugated into a random projective frame: the core's independent truth.
+
+The pair stands before the arm that carries the markers, or rides on it before markers that stand; its lenses may bend.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics
+from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics, Mount
 from stereoservo.runtime.commands import Command, Request
 from stereoservo.runtime.core import ServoCore
 from stereoservo.runtime.cycle import Event, ModelUpdate, StepInputs, StepOutputs
@@ -40,10 +44,10 @@ def link(a: float, alpha_deg: float, d: float, theta: float) -> np.ndarray:
     )
 
 
-def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+def look_at(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1.0)) -> np.ndarray:
     """Camera pose (4, 4), z towards the target, y downwards."""
     z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0, 0, 1.0])
+    x = np.cross(z, up)
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :4] = np.column_stack([x, np.cross(z, x), z, eye])
@@ -52,15 +56,23 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Truth:
-    """Arm, cameras and markers in metres, and the same in the projective frame."""
+    """Arm, cameras and markers in metres, and the same in the projective frame.
+
+    ``markers`` (m, 4) as they are at ``BASE``, in the frame of the cameras (2, 3, 4).
+    """
 
     model: CellModel
     cameras: np.ndarray
     generators: np.ndarray
     markers: np.ndarray
+    lens: np.ndarray
+    mount: Mount = "eye_to_hand"
 
     def points(self, q: np.ndarray) -> np.ndarray:
         """Markers (m, 3) [m] at ``q``."""
+        if self.mount == "eye_in_hand":
+            standing = flange_at(BASE) @ self.markers.T
+            return (np.linalg.inv(flange_at(q)) @ standing).T[:, :3]
         from scipy.linalg import expm
 
         H = np.eye(4)
@@ -69,13 +81,21 @@ class Truth:
         return (H @ self.markers.T).T[:, :3]
 
     def pixels(self, q: np.ndarray) -> np.ndarray:
-        """(2, m, 2) exact pixels at ``q``."""
+        """(2, m, 2) exact raw pixels at ``q``."""
         homogeneous = np.column_stack([self.points(q), np.ones(len(self.markers))])
         image = np.einsum("cij,mj->cmi", self.cameras, homogeneous)
-        return image[..., :2] / image[..., 2:]
+        return distort(self.lens, image[..., :2] / image[..., 2:])
 
 
-def make_truth(seed: int) -> Truth:
+def flange_at(q: np.ndarray) -> np.ndarray:
+    """Pose (4, 4) of the flange in the arm's base."""
+    pose = np.eye(4)
+    for (a, alpha, d), theta in zip(ROWS, q, strict=True):
+        pose = pose @ link(a, alpha, d, theta)
+    return pose
+
+
+def make_truth(seed: int, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Truth:
     rng = np.random.default_rng(seed)
     frames = [np.eye(4)]
     for (a, alpha, d), theta in zip(ROWS, BASE, strict=True):
@@ -97,6 +117,20 @@ def make_truth(seed: int) -> Truth:
             for s in (-1, 1)
         ]
     )
+    if (
+        mount == "eye_in_hand"
+    ):  # everything in the flange's frame; the pair looks along its axis, bodies stand there
+        generators = np.array([-np.linalg.inv(flange) @ G @ flange for G in generators])
+        middle = np.array([0.02, 0.01, 1.0])
+        markers = np.column_stack([middle + body * (1, -1, -1) + (0, 0, 0.06), np.ones(len(body))])
+        K[0, 0] = K[1, 1] = 500
+        cameras = np.array(
+            [
+                K @ np.linalg.inv(look_at(np.array([0.03, s * 0.1, 0.05]), middle, (1.0, 0, 0)))[:3]
+                for s in (-1, 1)
+            ]
+        )
+    lens = np.array([k1 * 320**2 / K[0, 0] ** 2, 320.0, 240.0, 320.0])
     H = np.eye(4) + 0.3 * rng.standard_normal((4, 4))  # projective -> Euclidean
     inverse = np.linalg.inv(H)
     plane = np.array([0, 0, 0, 1.0]) @ H
@@ -106,17 +140,19 @@ def make_truth(seed: int) -> Truth:
     model = CellModel(
         schema=MODEL_SCHEMA, epoch=7, joint_names=NAMES, joint_kinds=("revolute",) * 6, zero=BASE.copy(),
         generators=np.array([inverse @ G @ H for G in generators]),
-        cameras=tuple(CameraModel(n, P @ H, 640, 480) for n, P in zip(("left", "right"), cameras, strict=True)),
+        cameras=tuple(
+            CameraModel(n, P @ H, 640, 480, lens) for n, P in zip(("left", "right"), cameras, strict=True)
+        ),
         marker_ids=tuple(range(len(body))), marker_points=points, plane_at_infinity=plane, stratum="metric",
-        projective_to_euclidean=H, statistics=statistics,
+        projective_to_euclidean=H, statistics=statistics, mount=mount,
     )  # fmt: skip
-    return Truth(model, cameras, generators, markers)
+    return Truth(model, cameras, generators, markers, lens, mount)
 
 
-def make_settings() -> CoreSettings:
+def make_settings(mount: Mount = "eye_to_hand") -> CoreSettings:
     return CoreSettings(
         cell="test", joint_names=NAMES, joint_kinds=("revolute",) * 6,
-        cameras=tuple(CameraSettings(n, 640, 480, 25.0, "eye_to_hand", tuple(range(8))) for n in ("left", "right")),
+        cameras=tuple(CameraSettings(n, 640, 480, 25.0, mount, tuple(range(8))) for n in ("left", "right")),
         limits=LimitSettings(
             np.full(6, -3.0), np.full(6, 3.0), np.full(6, 1.0), np.full(6, 4.0), 0.01, np.zeros((0, 6, 2)), (),
             0.5, 0.1, 1.0,
@@ -250,8 +286,7 @@ def benches() -> Callable[..., Bench]:
     return make_bench
 
 
-def make_bench(seed: int, noise_px: float = 0.0) -> Bench:
-    settings = make_settings()
-    return Bench(
-        make_truth(seed), settings, ServoCore(settings), np.random.default_rng(seed), BASE.copy(), noise_px
-    )
+def make_bench(seed: int, noise_px: float = 0.0, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Bench:
+    settings = make_settings(mount)
+    truth = make_truth(seed, k1, mount)
+    return Bench(truth, settings, ServoCore(settings), np.random.default_rng(seed), BASE.copy(), noise_px)

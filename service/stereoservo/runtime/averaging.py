@@ -1,4 +1,7 @@
-"""Averages of what the cameras see while the arm rests: for calibration stops and for taught goals."""
+"""Averages of what the cameras see while the arm rests: for calibration stops and for taught goals.
+
+Pixels here are raw: no model is needed, and what is kept stays true when the lens becomes better known.
+"""
 
 from __future__ import annotations
 

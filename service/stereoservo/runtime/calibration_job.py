@@ -67,7 +67,8 @@ class CalibrationJob:
             joint_names=settings.joint_names,
             joint_kinds=settings.joint_kinds,
             cameras=tuple(
-                TrialCamera(camera.name, camera.width, camera.height) for camera in settings.cameras
+                TrialCamera(camera.name, camera.width, camera.height, camera.mount)
+                for camera in settings.cameras
             ),
             marker_ids=markers,
             positions=np.array([_joints(event) for event in self._stops]),

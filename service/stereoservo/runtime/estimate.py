@@ -1,5 +1,8 @@
 """Where the markers are now: kinematic prediction (8.35), corrected by what each camera saw at its own stamp.
 
+Cameras speak in raw pixels. Here they become ideal ones, in which everything behind is linear in homogeneous
+coordinates; priors leave in raw pixels again.
+
 The innovation of a marker is observed minus predicted pixel at the frame's shutter time, with the joints interpolated
 from a short history; no trigger is needed. It is gated statistically, filtered, and carried to the present by the
 kinematics, so that between frames, and through a dropped camera, the prediction carries the loop.
@@ -9,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from stereoservo.control.kernels import damped_least_squares
@@ -22,6 +26,7 @@ from stereoservo.kinematics.kernels import (
     transform_points,
     triangulate,
 )
+from stereoservo.kinematics.lens_kernel import distort_expected, undistort_sights
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
 from stereoservo.runtime.settings import CoreSettings
@@ -43,7 +48,9 @@ class ModelArrays:
     generators: FloatArray
     kinds: np.ndarray[tuple[int], np.dtype[np.uint8]]
     zero: FloatArray
+    tip_first: bool
     matrices: FloatArray
+    lenses: FloatArray
     marker_points: FloatArray
     plane_at_infinity: FloatArray
     camera_centres: FloatArray
@@ -61,6 +68,12 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         )
     if model.joint_kinds != settings.joint_kinds:
         raise ValueError(f"model has joint kinds {model.joint_kinds}; the cell has {settings.joint_kinds}")
+    if any(camera.mount != model.mount for camera in settings.cameras):
+        mounts = ", ".join(f"{camera.name} {camera.mount}" for camera in settings.cameras)
+        raise ValueError(
+            f"model was learnt with cameras mounted {model.mount}; the cell's are {mounts}: calibrate again, or "
+            "correct camera.mount in the cell file"
+        )
     by_name = {camera.name: camera for camera in model.cameras}
     for camera in settings.cameras:
         known = by_name.get(camera.name)
@@ -79,7 +92,9 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
         zero=np.ascontiguousarray(model.zero, dtype=np.float64),
+        tip_first=model.tip_first,
         matrices=matrices,
+        lenses=np.array([by_name[camera.name].lens for camera in settings.cameras], dtype=np.float64),
         marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),
         plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
         camera_centres=with_unit_height(centres, model.plane_at_infinity),
@@ -117,7 +132,7 @@ def _product(A: FloatArray, B: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Markers by kinematics alone at one configuration: operators at it (5.21), points, pixels, image Jacobian."""
+    """Markers by kinematics alone at one configuration: operators there (5.21), points, ideal pixels, their Jacobian."""
 
     operators: FloatArray
     points: FloatArray
@@ -125,9 +140,17 @@ class Prediction:
     jacobian: FloatArray
 
 
+def chain_at(arrays: ModelArrays, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``H(q)`` (4, 4) of the markers and the operators at ``q`` (n, 4, 4) (5.18, 5.21), however cameras are mounted."""
+    found: tuple[FloatArray, FloatArray] = chain_forward(
+        arrays.generators, arrays.kinds, arrays.zero, np.ascontiguousarray(q), arrays.tip_first
+    )
+    return found
+
+
 def predict(arrays: ModelArrays, q: FloatArray) -> Prediction:
     """Bring the projective kinematics to ``q`` (5.21) and predict every marker in every camera (8.35)."""
-    H, operators = chain_forward(arrays.generators, arrays.kinds, arrays.zero, np.ascontiguousarray(q))
+    H, operators = chain_at(arrays, q)
     points = transform_points(H, arrays.marker_points)
     pixels, _ = project_points(arrays.matrices, points)
     return Prediction(operators, points, pixels, image_jacobian(operators, arrays.matrices, points))
@@ -164,6 +187,21 @@ def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
     return None
 
 
+def ideal_observation(arrays: ModelArrays, camera: int, observation: CameraObservation) -> CameraObservation:
+    """An observation in ideal pixels; sights that the camera's lens cannot have made are left out."""
+    lens = arrays.lenses[camera]
+    if lens[0] == 0.0:
+        return observation
+    pixels, covariances, seen = undistort_sights(
+        lens,
+        np.array(observation.pixels, dtype=np.float64),
+        np.array(observation.covariances, dtype=np.float64),
+    )
+    return msgspec.structs.replace(
+        observation, ids=observation.ids[seen], pixels=pixels[seen], covariances=covariances[seen]
+    )
+
+
 def accept_observation(
     estimate: CameraEstimate,
     camera: int,
@@ -173,11 +211,12 @@ def accept_observation(
     arrays: ModelArrays,
     settings: CoreSettings,
 ) -> None:
-    """Gate one camera's observation against the prediction at its stamp and fold it into the estimate.
+    """Gate one camera's observation (raw pixels) against the prediction at its stamp and fold it into the estimate.
 
     ``q``, ``speed`` (n,): joints at the shutter time. The gate is chi-square-like on the deviation from the filtered
     innovation, with the sigmas of detector, model and timing.
     """
+    observation = ideal_observation(arrays, camera, observation)
     prediction = predict(arrays, q)
     accepted = rejected = 0
     squares = 0.0
@@ -257,7 +296,7 @@ def points_now(
     Predicted points are those of the joints plus correction. A marker that fewer than two cameras see cannot be
     triangulated: its predicted point stands in.
     """
-    corrected = chain_forward(arrays.generators, arrays.kinds, arrays.zero, q + correction)[0]
+    corrected = chain_at(arrays, q + correction)[0]
     points: FloatArray = transform_points(corrected, arrays.marker_points)
     if source == "triangulated":
         found, ok = triangulate(arrays.matrices, pixels, weights, 3)
@@ -275,7 +314,7 @@ def priors(
     arrays: ModelArrays, settings: CoreSettings, prediction: Prediction, cameras: list[CameraEstimate],
     velocities: FloatArray, now_ns: int,
 ) -> tuple[Prior, ...]:  # fmt: skip
-    """One prior a camera for the detectors' windows; covariance from model and motion, never fed back."""
+    """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back."""
     ids: IntArray = np.array(arrays.marker_ids, dtype=np.int64)
     found = []
     for camera, estimate in enumerate(cameras):
@@ -285,5 +324,22 @@ def priors(
         covariance = np.zeros((ids.size, 2, 2))
         covariance[:, 0, 0] = covariance[:, 1, 1] = sigma * sigma
         pixels = prediction.pixels[camera] + np.where(fresh[:, None], estimate.innovation, 0.0)
-        found.append(Prior(settings.cameras[camera].name, now_ns, ids, pixels, speed, covariance))
+        prior = Prior(settings.cameras[camera].name, now_ns, ids, pixels, speed, covariance)
+        found.append(_raw_prior(prior, arrays.lenses[camera]))
     return tuple(found)
+
+
+def _raw_prior(prior: Prior, lens: FloatArray) -> Prior:
+    """A prior as the camera's lens shows it; markers beyond its fold are left out."""
+    if lens[0] == 0.0:
+        return prior
+    pixels, velocities, covariances, seen = distort_expected(
+        lens, prior.pixels, prior.velocities, prior.covariances
+    )
+    return msgspec.structs.replace(
+        prior,
+        ids=prior.ids[seen],
+        pixels=pixels[seen],
+        velocities=velocities[seen],
+        covariances=covariances[seen],
+    )

@@ -37,6 +37,7 @@ class Present:
     prediction: Prediction | None = None
     weights: FloatArray | None = None
     pixels: FloatArray | None = None
+    """Ideal pixels."""
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from itertools import combinations
+from math import isfinite
 
 import numpy as np
 
 from stereoservo.control.cartesian3 import cartesian3_reasons
 from stereoservo.control.kernels import cartesian3_step, stereo_step
 from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.kernels import chain_forward, image_jacobian, transform_points, triangulate
+from stereoservo.kinematics.kernels import image_jacobian, transform_points, triangulate
+from stereoservo.kinematics.lens_kernel import undistort_pixel
 from stereoservo.runtime.commands import FeatureTarget, Goal
-from stereoservo.runtime.estimate import ModelArrays, points_now, with_unit_height
+from stereoservo.runtime.estimate import ModelArrays, chain_at, points_now, with_unit_height
 from stereoservo.runtime.goal_pose import goal_pose
 from stereoservo.runtime.motion import Motion, Present
 from stereoservo.runtime.ports import FloatArray, IntArray
@@ -73,7 +75,10 @@ def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servo
 def _set_points(
     target: FeatureTarget, present: Present, arrays: ModelArrays
 ) -> tuple[FloatArray, FloatArray]:
-    """(c, m, 2) set-points and (c, m) wanted. Raises ValueError on a camera, marker or pixel that cannot be."""
+    """(c, m, 2) set-points as ideal pixels and (c, m) wanted, of a target in raw ones.
+
+    Raises ValueError on a camera, marker or pixel that cannot be.
+    """
     settings = present.settings
     c, m = len(settings.cameras), len(arrays.marker_ids)
     names = [camera.name for camera in settings.cameras]
@@ -92,7 +97,14 @@ def _set_points(
                 raise ValueError(
                     f"camera {name!r}, marker {marker}: ({u}, {v}) lies outside its {size.width}x{size.height} image"
                 )
-            set_points[camera, i] = (u, v)
+            ideal = (
+                undistort_pixel(arrays.lenses[camera], u, v) if arrays.lenses[camera, 0] != 0.0 else (u, v)
+            )
+            if not isfinite(ideal[0] + ideal[1]):
+                raise ValueError(
+                    f"camera {name!r}, marker {marker}: ({u}, {v}) lies where the camera's lens images nothing"
+                )
+            set_points[camera, i] = ideal
             wanted[camera, i] = 1.0
     return set_points, wanted
 
@@ -122,9 +134,7 @@ def _goal_points(
     """The goal's pose as marker points. Raises ValueError where no displacement of the body explains the set-points."""
     prediction = present.prediction
     assert prediction is not None
-    points = transform_points(
-        chain_forward(arrays.generators, arrays.kinds, arrays.zero, present.q)[0], arrays.marker_points
-    )
+    points = transform_points(chain_at(arrays, present.q)[0], arrays.marker_points)
     pose = goal_pose(arrays, prediction.operators, points, targets, known, face, set_points, wanted)
     if not pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
         raise ValueError(

@@ -18,7 +18,7 @@ class TaughtFileError(Exception):
 
 
 class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One taught goal: set-points by camera and marker [px], joints at that moment, wall time of teaching."""
+    """One taught goal: set-points by camera and marker (raw pixels), joints at that moment, wall time of teaching."""
 
     target: FeatureTarget
     joints: tuple[float, ...] = ()

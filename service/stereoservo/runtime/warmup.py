@@ -1,13 +1,15 @@
 """Compiles the kernels of the loop into numba's cache, so that a process that starts later finds them
 compiled.
 
-A made-up arm with two cameras runs some steps of each law; kernels are compiled by types, not by sizes.
+A made-up arm with two cameras runs some steps of each law; kernels are compiled by types, not by sizes. The
+cameras' lenses bend, so that the lens's kernels run too.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
 from stereoservo.runtime.commands import Command, FeatureTarget, Goal, LawName, PointSource, Request, RunGoal
 from stereoservo.runtime.core import ServoCore
@@ -20,12 +22,15 @@ JOINTS = tuple(f"j{k}" for k in range(1, 7))
 CAMERAS = ("left", "right")
 MARKERS = tuple(range(6))
 PERIOD_NS = 4_000_000
+LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
 
 def warm_up() -> None:
     """Run each law on the made-up cell."""
     model = _model()
-    pixels = np.stack([_project(camera.matrix, model.marker_points) for camera in model.cameras])
+    pixels = np.stack(
+        [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
+    )
     law: LawName
     points: PointSource
     for law, points in (("stereo", "triangulated"), ("stereo", "predicted"), ("cartesian3", "predicted")):
@@ -101,7 +106,10 @@ def _model() -> CellModel:
         joint_kinds=("revolute",) * 6,
         zero=np.zeros(6),
         generators=generators,
-        cameras=(CameraModel("left", left, WIDTH, HEIGHT), CameraModel("right", right, WIDTH, HEIGHT)),
+        cameras=(
+            CameraModel("left", left, WIDTH, HEIGHT, LENS),
+            CameraModel("right", right, WIDTH, HEIGHT, LENS),
+        ),
         marker_ids=MARKERS,
         marker_points=markers,
         plane_at_infinity=np.array([0.0, 0.0, 0.0, 1.0]),
