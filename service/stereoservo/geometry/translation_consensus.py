@@ -16,7 +16,7 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.geometry.cameras import triangulate
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, whitener
+from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.geometry.translation_fit import (
     Images,
     TranslationFit,
@@ -29,9 +29,10 @@ from stereoservo.geometry.translation_fit import (
 )
 from stereoservo.geometry.translations import (
     TranslationSVD,
+    Weighting,
     direction_given_plane,
+    image_weighting,
     plane_at_infinity_from_stack,
-    split_generator,
     translation_from_homography,
     translation_homography,
 )
@@ -107,26 +108,26 @@ def estimate_translations(
             "too_few", "no motion is given; the stop at rest and one more are needed", motions=n
         )
     rest = triangulate(Ps, pixels[0], noise[0])
-    W = whitener(rest[np.isfinite(rest).all(axis=1)])
+    weighting = image_weighting(Ps, rest)
     if not reject:
         Hs = np.stack([translation_homography(Ps, rest, p) for p in pixels[1:]])
-        fit = _joint(Ps, pixels, noise, rest, Hs, W, np.ones(n, dtype=bool))
+        fit = _joint(Ps, pixels, noise, rest, Hs, weighting, np.ones(n, dtype=bool))
         blank = MotionJudgement("", np.nan, np.nan, np.nan, np.nan)
         return TranslationEstimate(fit, np.ones(n, dtype=bool), (blank,) * n, Hs)
-    singles = [_judge_alone(images, pixels, noise, rest, W, s) for s in range(1, n + 1)]
+    singles = [_judge_alone(images, pixels, noise, rest, weighting, s) for s in range(1, n + 1)]
     Hs = np.stack([np.full((4, 4), np.nan) if m.homography is None else m.homography for m in singles])
     used = _largest_agreement(singles)
     for _ in range(ROUNDS):
         _require_majority(used, singles)
-        fit = _joint(Ps, pixels, noise, rest, Hs, W, used)
-        z, C = _height_one(W, rest, fit.plane, fit.plane_covariance)
+        fit = _joint(Ps, pixels, noise, rest, Hs, weighting, used)
+        z, C = _height_one(weighting.right, rest, fit.plane, fit.plane_covariance)
         distances = np.array([_distance(m, z, C) for m in singles])
         again = distances <= chi2_distribution.isf(TAIL, 3)
         if np.array_equal(again, used):
             break
         used = again
     else:
-        fit = _joint(Ps, pixels, noise, rest, Hs, W, used)
+        fit = _joint(Ps, pixels, noise, rest, Hs, weighting, used)
     return TranslationEstimate(fit, used, _verdicts(singles, used, distances), Hs)
 
 
@@ -136,22 +137,27 @@ def _joint(
     noise: FloatArray,
     rest: FloatArray,
     Hs: FloatArray,
-    W: FloatArray,
+    weighting: Weighting,
     used: BoolArray,
 ) -> TranslationFit:
     """The bundle over the motions used, from their linear stack (3.37)."""
-    plane = plane_at_infinity_from_stack(Hs[used], W)
-    directions = np.stack([direction_given_plane(H, plane, W) for H in Hs[used]])
+    plane = plane_at_infinity_from_stack(Hs[used], weighting)
+    directions = np.stack([direction_given_plane(H, plane, weighting) for H in Hs[used]])
     stops = np.concatenate([[True], used])
     return bundle_translations(Ps, pixels[stops], rest, plane, directions, noise[stops])
 
 
 def _judge_alone(
-    images: Images, pixels: FloatArray, noise: FloatArray, rest: FloatArray, W: FloatArray, stop: int
+    images: Images,
+    pixels: FloatArray,
+    noise: FloatArray,
+    rest: FloatArray,
+    weighting: Weighting,
+    stop: int,
 ) -> _Single:
     """Rest and one stop: does a homography fit, is it a translation, and with which plane at infinity?"""
     nan = float("nan")
-    Ps, pair = images.cameras, [0, stop]
+    Ps, pair, W = images.cameras, [0, stop], weighting.right
     try:
         start = translation_homography(Ps, rest, pixels[stop])
     except GeometryError:
@@ -167,17 +173,18 @@ def _judge_alone(
     except GeometryError:
         return _Single(start, None, None, MotionJudgement("points", nan, nan, nan, nan))
     H, slopes = motion(best.x)
-    svd = translation_from_homography(H[0])
-    least = svd.singular[0] / _second_singular_noise(H[0], slopes[0], covariance)
-    back = np.asarray(np.linalg.inv(W), dtype=np.float64)
-    refined = conjugate(back, H[0])
+    back = np.linalg.inv(W)
+    refined = conjugate(np.asarray(back, dtype=np.float64), H[0])
+    svd = translation_from_homography(refined, weighting)
+    least = svd.singular[0] / _second_singular_noise(weighting.left @ back, H[0], slopes[0], covariance)
     freedom = white.measurements - 15 - 3 * int(both.sum())
     if best.cost > chi2_distribution.isf(TAIL, max(1, freedom)):
         return _Single(refined, None, None, MotionJudgement("points", svd.conditioning, least, nan, nan))
     try:
-        fit = _alone(Ps, pixels[pair][:, :, both], noise[pair][:, :, both], rest[both], svd, W)
-    except GeometryError:
-        return _Single(refined, None, None, MotionJudgement("no_motion", svd.conditioning, least, nan, nan))
+        fit = _alone(Ps, pixels[pair][:, :, both], noise[pair][:, :, both], rest[both], svd)
+    except GeometryError as error:
+        why: Reason = "not_a_translation" if error.code == "no_model" else "no_motion"
+        return _Single(refined, None, None, MotionJudgement(why, svd.conditioning, least, nan, nan))
     excess = fit.cost - best.cost
     reason: Reason = ""
     if excess > chi2_distribution.isf(TAIL, 9):
@@ -187,31 +194,29 @@ def _judge_alone(
     judgement = MotionJudgement(reason, svd.conditioning, least, excess, nan)
     if reason:
         return _Single(refined, None, None, judgement)
-    plane, spread = _height_one(W, rest, fit.plane, fit.plane_covariance)
+    plane, spread = _height_one(weighting.right, rest, fit.plane, fit.plane_covariance)
     return _Single(refined, plane, spread, judgement)
 
 
 def _alone(
-    Ps: FloatArray,
-    pixels: FloatArray,
-    noise: FloatArray,
-    rest: FloatArray,
-    svd: TranslationSVD,
-    W: FloatArray,
+    Ps: FloatArray, pixels: FloatArray, noise: FloatArray, rest: FloatArray, svd: TranslationSVD
 ) -> TranslationFit:
-    """The bundle of one motion, from the decomposition of its homography in whitened coordinates."""
-    k, h = split_generator(svd.generator)
-    direction = np.asarray(np.linalg.solve(W, k), dtype=np.float64)
-    return bundle_translations(Ps, pixels, rest, W.T @ h, direction[None], noise)
+    """The bundle of one motion, from the decomposition of its homography."""
+    direction = (svd.generator @ svd.plane)[None]
+    return bundle_translations(Ps, pixels, rest, svd.plane, direction, noise)
 
 
-def _second_singular_noise(H: FloatArray, slopes: FloatArray, covariance: FloatArray) -> float:
+def _second_singular_noise(
+    left: FloatArray, H: FloatArray, slopes: FloatArray, covariance: FloatArray
+) -> float:
     """What ``σ₂`` of the generator of a true translation exceeds with probability `TAIL`, from the homography's
-    covariance (15, 15): by Weyl at most the norm of the error, whose square is nearly a scaled chi-square.
+    covariance (15, 15), G weighted by ``left``: by Weyl at most the norm of the
+    error, whose square is nearly a scaled chi-square.
     """
     gamma = float(np.trace(H)) / 4.0
     traces = np.trace(slopes, axis1=1, axis2=2)
-    errors = (slopes / gamma - traces[:, None, None] * H / (4.0 * gamma**2)).reshape(len(slopes), 16)
+    errors = left @ (slopes / gamma - traces[:, None, None] * H / (4.0 * gamma**2))
+    errors = errors.reshape(len(slopes), 16)
     C = errors.T @ covariance @ errors
     mean, spread = float(np.trace(C)), float((C * C).sum())
     freedom = mean**2 / spread

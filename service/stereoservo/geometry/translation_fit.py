@@ -197,10 +197,10 @@ def linearise(
     rows = (P[..., :2, :] - predicted[..., None] * P[..., 2:, :]) * scale
     by_motion = rows @ np.einsum("sqij,snj->snqi", slopes, M).transpose(0, 1, 3, 2)[:, None]
     by_points = rows @ H[:, None, None] @ charts
-    n = M.shape[1]
+    n, rows_each = M.shape[1], 2 * images.weights[..., 0].size
 
     def per_point(values: FloatArray) -> FloatArray:
-        return values.transpose(2, 0, 1, 3, *range(4, values.ndim)).reshape(n, -1, *values.shape[4:])
+        return values.transpose(2, 0, 1, 3, *range(4, values.ndim)).reshape(n, rows_each, *values.shape[4:])
 
     return Linearisation(per_point(residuals), per_point(by_motion), per_point(by_points))
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.geometry.cameras import check_views
-from stereoservo.geometry.displacements import conjugate, nearest_translation_generator
+from stereoservo.geometry.cameras import check_views, projection_jacobian_many
+from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray, whitener
 
@@ -184,11 +184,68 @@ def translation_homography(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
 
 
 @dataclass(frozen=True, eq=False)
+class Weighting:
+    """Coordinates in which the norm of a generator G is taken: ``left G right⁻¹``, both (4, 4).
+
+    The rank-one matrix nearest to a measured one depends on them. Identities are the thesis's choice: the
+    projective frame as it is.
+    """
+
+    left: FloatArray
+    right: FloatArray
+
+    def weighted(self, H: FloatArray) -> FloatArray:
+        """``left (H/γ − I) right⁻¹`` (4, 4)."""
+        return np.asarray(self.left @ raw_generator(H) @ np.linalg.inv(self.right), dtype=np.float64)
+
+    def plane(self, row: FloatArray) -> FloatArray:
+        """Plane (4,) of unit norm of a weighted row."""
+        h = self.right.T @ row
+        return np.asarray(h / np.linalg.norm(h), dtype=np.float64)
+
+    def point(self, column: FloatArray) -> FloatArray:
+        """Direction (4,) of unit norm of a weighted column."""
+        k = np.linalg.solve(self.left, column)
+        return np.asarray(k / np.linalg.norm(k), dtype=np.float64)
+
+    def onto(self, plane: FloatArray, point: FloatArray) -> FloatArray:
+        """The point (..., 4) nearest to ``point`` (..., 4) on a plane (4,), in weighted columns."""
+        normal = np.linalg.solve(self.left.T @ self.left, plane)
+        nearest: FloatArray = point - (point @ plane)[..., None] * normal / (plane @ normal)
+        return nearest
+
+
+UNWEIGHTED = Weighting(np.eye(4), np.eye(4))
+
+
+def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
+    """The weighting in which the norm of G is, to first order, the rms motion of points M (m, 4) in the images of
+    cameras (c, 3, 4) [px], as far as a product of one matrix a side can be.
+
+    Raises GeometryError for coplanar points, and points or cameras that leave a direction out of the images.
+    """
+    M = M[np.isfinite(M).all(axis=1)]
+    right = whitener(M)
+    unit = M / np.linalg.norm(M @ right.T, axis=1, keepdims=True)
+    rows = projection_jacobian_many(Ps, unit)
+    moments = np.einsum("cnai,cnaj->ij", rows, rows) / len(unit)
+    values, vectors = np.linalg.eigh(moments)
+    if not values[0] > 1e-14 * values[3]:
+        raise GeometryError(
+            "degenerate",
+            f"the images leave a direction of motion out (moments {values.tolist()}); two cameras with a baseline "
+            "and points off one line of sight are needed",
+            moments=values.tolist(),
+        )
+    return Weighting(np.asarray((vectors * np.sqrt(values)).T, dtype=np.float64), right)
+
+
+@dataclass(frozen=True, eq=False)
 class TranslationSVD:
     """What the singular value decomposition of one homography says (3.36).
 
-    ``direction`` (4,) and ``plane`` (4,), both of unit norm; ``generator`` (4, 4), the nilpotent nearest to
-    the measured one; ``singular`` (4,) descending.
+    ``direction`` (4,) and ``plane`` (4,), both of unit norm; ``generator`` (4, 4), the nilpotent of that plane
+    nearest to the measured one; ``singular`` (4,) descending, in px with `image_weighting`.
     """
 
     direction: FloatArray
@@ -202,57 +259,49 @@ class TranslationSVD:
         return float(self.singular[0] / self.singular[1]) if self.singular[1] > 0 else float("inf")
 
 
-def translation_from_homography(H: FloatArray, frame: FloatArray | None = None) -> TranslationSVD:
+def translation_from_homography(H: FloatArray, weighting: Weighting = UNWEIGHTED) -> TranslationSVD:
     """Direction and plane at infinity of one homography ``H`` (4, 4) by SVD (3.32-3.34, 3.36).
 
-    ``frame`` W (4, 4): norms are taken in the coordinates ``W M``, best those of `homogeneous.whitener` of
-    the points, so that no coordinate of the projective frame weighs more than the points do; default the
-    given coordinates, as in the thesis. Singular values are those of that frame. Raises GeometryError for
-    the identity and a homography without trace.
+    Raises GeometryError for the identity and for a homography without trace.
     """
-    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
-    G = conjugate(W, raw_generator(H))
+    G = weighting.weighted(H)
     U, singular, Vt = np.linalg.svd(G)
-    back = np.asarray(np.linalg.inv(W), dtype=np.float64)
-    k, h = back @ U[:, 0], W.T @ Vt[0]
-    generator = conjugate(back, nearest_translation_generator(G))
-    return TranslationSVD(k / np.linalg.norm(k), h / np.linalg.norm(h), generator, singular)
+    if not singular[0] > 1e-14:
+        raise GeometryError("degenerate", "the homography is the identity; a translation is needed")
+    h = weighting.plane(Vt[0])
+    k = direction_given_plane(H, h, weighting)
+    return TranslationSVD(weighting.point(U[:, 0]), h, np.outer(k, h), singular)
 
 
 def plane_at_infinity_from_stack(
-    Hs: Sequence[FloatArray] | FloatArray, frame: FloatArray | None = None
+    Hs: Sequence[FloatArray] | FloatArray, weighting: Weighting = UNWEIGHTED
 ) -> FloatArray:
     """Plane at infinity ``(4,)``, unit norm, of homographies ``(n, 4, 4)`` of any directions (3.37).
 
-    ``frame`` as in `translation_from_homography`. Raises GeometryError for an empty stack.
+    Raises GeometryError for an empty stack and for a homography without trace.
     """
-    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
-    stack = np.concatenate([conjugate(W, raw_generator(H)) for H in _some(Hs)])
-    plane = W.T @ np.linalg.svd(stack)[2][0]
-    return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
+    stack = np.concatenate([weighting.weighted(H) for H in _some(Hs)])
+    return weighting.plane(np.linalg.svd(stack)[2][0])
 
 
 def direction_from_stack(
-    Hs: Sequence[FloatArray] | FloatArray, frame: FloatArray | None = None
+    Hs: Sequence[FloatArray] | FloatArray, weighting: Weighting = UNWEIGHTED
 ) -> FloatArray:
     """Direction ``(4,)``, unit norm, common to homographies ``(n, 4, 4)`` of parallel translations (3.38).
 
-    ``frame`` as in `translation_from_homography`. Raises GeometryError for an empty stack.
+    Raises GeometryError for an empty stack and for a homography without trace.
     """
-    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
-    stack = np.concatenate([conjugate(W, raw_generator(H)).T for H in _some(Hs)])
-    direction = np.linalg.solve(W, np.linalg.svd(stack)[2][0])
-    return np.asarray(direction / np.linalg.norm(direction), dtype=np.float64)
+    stack = np.concatenate([weighting.weighted(H).T for H in _some(Hs)])
+    return weighting.point(np.linalg.svd(stack)[2][0])
 
 
-def direction_given_plane(H: FloatArray, plane: FloatArray, frame: FloatArray | None = None) -> FloatArray:
+def direction_given_plane(H: FloatArray, plane: FloatArray, weighting: Weighting = UNWEIGHTED) -> FloatArray:
     """``k`` (4,) with ``I + k hᵀ`` nearest to the homography ``H`` (4, 4), and ``hᵀk = 0``, for the plane
-    at infinity ``h`` (4,) as scaled.
+    at infinity ``h`` (4,) as scaled. Raises GeometryError for a homography without trace.
     """
-    W = np.eye(4) if frame is None else np.asarray(frame, dtype=np.float64)
-    h = np.linalg.solve(W.T, plane)
-    k = conjugate(W, raw_generator(H)) @ h / (h @ h)
-    return np.asarray(np.linalg.solve(W, k - h * (h @ k) / (h @ h)), dtype=np.float64)
+    row = np.linalg.solve(weighting.right.T, plane)
+    k = np.linalg.solve(weighting.left, weighting.weighted(H) @ row / (row @ row))
+    return weighting.onto(plane, np.asarray(k, dtype=np.float64))
 
 
 def _some(Hs: Sequence[FloatArray] | FloatArray) -> Sequence[FloatArray] | FloatArray:

@@ -32,6 +32,7 @@ class Options:
     data: Path | None
     hand_tag: int | None
     table_tags: str | None
+    seeds: int | None = None
 
 
 @dataclass(frozen=True)
@@ -97,12 +98,99 @@ def show_real_franka(answer: dict[str, Any], console: Console) -> None:
         console.print(f"wrote {path}")
 
 
+def run_gripper_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``gripper`` from its options; 20 seeds by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.gripper import draw_gripper, run_gripper
+
+    answer = run_gripper(seeds=options.seeds or 20, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_gripper, options.plot)
+
+
+def run_grid_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``grid`` from its options; 20 seeds by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.grid import draw_grid, run_grid
+
+    answer = run_grid(seeds=options.seeds or 20, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_grid, options.plot)
+
+
+def run_house_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``house`` from its options; 50 seeds by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.house import draw_house, run_house
+
+    answer = run_house(seeds=options.seeds or 50, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_house, options.plot)
+
+
+def _with_plots(
+    answer: dict[str, Any], draw: Callable[[dict[str, Any], Path], list[Path]], folder: Path | None
+) -> dict[str, Any]:
+    """The answer with the pictures written, where any are asked for."""
+    if folder is not None:
+        answer["plots"] = [str(path) for path in draw(answer, folder)]
+    return answer
+
+
+def show_rows(answer: dict[str, Any], console: Console) -> None:
+    """The rows as a table, a spread as its median and the 16th to 84th percentile; then the thesis's values."""
+    rows = answer["rows"]
+    names = list(rows[0])
+    table = Table(title=f"{answer['experiment']}: {answer['seeds']} seeds", title_justify="left")
+    for name in names:
+        table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
+    for row in rows:
+        table.add_row(*(_cell(row[name]) for name in names))
+    console.print(table)
+    for item in answer.get("beside_thesis", []):
+        console.print(
+            "beside the thesis: " + ", ".join(f"{key} {_cell(value)}" for key, value in item.items())
+        )
+    console.print(f"thesis: {json.dumps(answer['thesis'])}")
+    for assumption in answer.get("assumptions", []):
+        console.print(f"assumed: {assumption}")
+    for path in answer.get("plots", []):
+        console.print(f"wrote {path}")
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, dict):
+        return (
+            "-"
+            if value["median"] is None
+            else f"{value['median']:.4g} ({value['p16']:.4g} to {value['p84']:.4g})"
+        )
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "-" if value is None else str(value)
+
+
 EXPERIMENTS: dict[str, Experiment] = {
     "real-franka": Experiment(
         "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
         frozenset({"data", "hand_tag", "table_tags"}),
         run_real_franka_command,
         show_real_franka,
+    ),
+    "gripper": Experiment(
+        "fig. 3.5: affine calibration from small translations of a gripper, over noise and number of motions",
+        frozenset({"seeds"}),
+        run_gripper_command,
+        show_rows,
+    ),
+    "grid": Experiment(
+        "fig. 3.6: affine calibration before a grid, single motions beside cumulative estimates",
+        frozenset({"seeds"}),
+        run_grid_command,
+        show_rows,
+    ),
+    "house": Experiment(
+        "fig. 3.7: affine calibration from interest points of an unknown object, judged on the grid",
+        frozenset({"seeds"}),
+        run_house_command,
+        show_rows,
     ),
 }
 """By the name given on the command line."""
@@ -121,14 +209,17 @@ def reproduce(
         typer.Option(help="real-franka: ids of tags lying on the table, by commas [default: 0,2,3]."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Simulated experiments: how many repetitions.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option(help="Write pictures into this folder.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Run an experiment again and print our figures beside those to compare with."""
     try:
         chosen = _find(experiment)
-        options = Options(seed, plot, data, hand_tag, table_tags)
-        for name in ("data", "hand_tag", "table_tags"):
+        options = Options(seed, plot, data, hand_tag, table_tags, seeds)
+        for name in ("data", "hand_tag", "table_tags", "seeds"):
             if getattr(options, name) is not None and name not in chosen.takes:
                 raise ExperimentError("option", f"{experiment} does not take --{name.replace('_', '-')}")
         with _progress_bar() as progress:
