@@ -118,7 +118,7 @@ def test_robust_loss_shrugs_off_outliers(arms):
     wrong = rng.random(len(data.pixels)) < 0.05
     data.pixels[wrong] += rng.uniform(-30, 30, (int(wrong.sum()), 2))
     rig = euclidean_rig(cell)
-    plain = solve(rig, data, "metric", rounds=1)
-    robust = solve(rig, data, "metric", loss="cauchy", loss_scale=2.0, rounds=1)
+    plain = solve(rig, data, "metric")
+    robust = solve(rig, data, "metric", loss="cauchy", loss_scale=2.0)
     errors = [np.sqrt(np.mean((predicted(fit.rig, data) - exact) ** 2)) for fit in (plain, robust)]
     assert errors[1] < 0.05 < errors[0]

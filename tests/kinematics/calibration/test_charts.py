@@ -11,7 +11,7 @@ from stereoservo.kinematics.calibration.charts import (
     camera_basis,
     conjugation,
     generator_basis,
-    point_basis,
+    point_bases,
 )
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -109,5 +109,5 @@ def test_right_camera_has_no_gauge(stratum, gauge):
 
 def test_point_basis_leaves_out_the_scale():
     M = np.array([0.3, -0.2, 1.0, 0.7])
-    assert np.abs(point_basis(M, "projective") @ M).max() < 1e-14
-    assert np.array_equal(point_basis(M, "metric"), np.eye(4)[:3])
+    assert np.abs(point_bases(M[None], "projective")[0] @ M).max() < 1e-14
+    assert np.array_equal(point_bases(M[None], "metric")[0], np.eye(4)[:3])

@@ -1,4 +1,4 @@
-"""Minimal charts around generators, cameras and points, without the gauge freedoms of each stratum (thesis
+"""Minimal charts around generators, cameras, lenses and points, without the gauge freedoms of each stratum (thesis
 4.4, 5.4.2).
 
 A generator keeps its spectrum when it is conjugated, so its neighbours are ``T Ĥ₀ T⁻¹`` with ``T`` from the
@@ -23,6 +23,8 @@ from stereoservo.kinematics.model import Stratum
 
 FloatArray = npt.NDArray[np.float64]
 Kind = Literal["revolute", "prismatic"]
+LensModel = Literal["none", "radial", "radial_centre"]
+"""What of the lenses is free: nothing, one radial parameter a camera, or that and its centre."""
 
 CHART_SIZE: dict[tuple[Stratum, Kind], int] = {
     ("projective", "revolute"): 10,
@@ -114,10 +116,15 @@ def camera_basis(
     return rows[len(fixed) :].reshape(-1, 3, 4)
 
 
-def point_basis(point: FloatArray, stratum: Stratum) -> FloatArray:
-    """Directions (3, 4) of a point (4,): all but its scale, or the three finite coordinates of affine
+def lens_basis(model: LensModel) -> FloatArray:
+    """Directions (p, 4) of a lens (k, cu, cv, r0): none, ``k``, or ``k`` and the centre."""
+    return np.eye(4)[: {"none": 0, "radial": 1, "radial_centre": 3}[model]]
+
+
+def point_bases(points: FloatArray, stratum: Stratum) -> FloatArray:
+    """Directions (m, 3, 4) of points (m, 4): all but their scale, or the three finite coordinates of affine
     strata.
     """
     if stratum != "projective":
-        return np.eye(4)[:3]
-    return np.linalg.svd(point[None, :])[2][1:]
+        return np.tile(np.eye(4)[:3], (len(points), 1, 1))
+    return np.asarray(np.linalg.svd(points[:, None, :])[2][:, 1:])

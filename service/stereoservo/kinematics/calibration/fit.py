@@ -76,11 +76,9 @@ def _fit(
     rig = linked_rig(trials, cameras, separate, zero)
     every = measurements(trials, trials.visible, trials.positions - zero)
     clean = every.select(usable[every.camera, every.stop, every.marker])
-    linked = solve(
-        rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, rounds=1, tolerance=1e-4
-    )
+    linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     tell("rigid bundle", 0.6)
-    robust = solve(linked.rig, clean, "projective", loss="soft_l1", loss_scale=2.0, rounds=1, tolerance=1e-4)
+    robust = solve(linked.rig, clean, "projective", loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.
     solution, inliers = settled(robust.rig, every, "projective", options, tolerance=1e-6)

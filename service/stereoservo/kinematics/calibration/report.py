@@ -113,7 +113,7 @@ def build_result(
         chi2=solution.cost,
         degrees_of_freedom=freedom,
         chi2_ok=chi2_within(solution.cost, freedom),
-        measurements=len(solution.residuals),
+        measurements=solution.rows,
         parameters=solution.charts.size,
         outliers=int((~inliers).sum()),
         joints=tuple(_joint_statistics(trials, j, squares, data) for j in range(len(trials.joint_names))),

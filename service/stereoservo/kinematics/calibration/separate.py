@@ -159,7 +159,6 @@ def separate_joint(
             cameras=False,
             loss="soft_l1",
             loss_scale=3.0,
-            rounds=2,
             max_evaluations=40,
         )
         # The median of a chi-square with two degrees of freedom is ln 4.

@@ -20,6 +20,21 @@ from stereoservo.kinematics.calibration.upgrade import twist_between
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+
+MAX_PAIRS = 150
+"""Pairs of stops that a start looks at: plenty for a start, and its cost stays linear in the stops."""
+
+
+def spread_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
+    """First and second stops of the pairs where ``apart`` (k, k) holds, at most ``MAX_PAIRS``, evenly spread."""
+    first, second = np.nonzero(apart)
+    if len(first) <= MAX_PAIRS:
+        return first, second
+    # Multiples of the golden section spread evenly over the list and meet all steps between stops alike.
+    chosen = np.unique((np.arange(MAX_PAIRS) * 0.6180339887498949 % 1.0 * len(first)).astype(np.int64))
+    return first[chosen], second[chosen]
 
 
 def linear_generator(
@@ -31,7 +46,7 @@ def linear_generator(
     sigmas: FloatArray,
     angles: FloatArray,
 ) -> FloatArray | None:
-    """Generator (4, 4) by linear least squares over all ordered pairs of stops, then the nearest exact one.
+    """Generator (4, 4) by linear least squares over ordered pairs of stops, then the nearest exact one.
 
     A revolute joint takes a point ``M_k`` of stop k to ``M_k + sin Δ Ĥ M_k + (1 - cos Δ) Ĥ² M_k`` at stop l
     (4.27), linear in ``Ĥ`` and ``Ĥ²`` taken as unknowns of their own; seen in pixels of stop l, the heights
@@ -40,7 +55,7 @@ def linear_generator(
     ``angles`` (k,). None where nothing like a rotation comes out.
     """
     span = float(np.ptp(angles))
-    first, second = np.nonzero(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
+    first, second = spread_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
     valid = finite_rows(points)
     pair, marker = np.nonzero(valid[first] & valid[second])
     here, there = first[pair], second[pair]
@@ -93,7 +108,7 @@ def nominal_generator(
     with np.errstate(divide="ignore", invalid="ignore"):
         euclidean = points @ upgrade.T / points[..., 3:]
     valid = finite_rows(euclidean)
-    first, second = np.nonzero(angles[None, :] - angles[:, None] > 0.5 * np.ptp(angles))
+    first, second = spread_pairs(angles[None, :] - angles[:, None] > 0.5 * np.ptp(angles))
     best, least = None, np.inf
     for k, n in zip(first, second, strict=True):
         both = valid[k] & valid[n]
@@ -124,7 +139,11 @@ def _robust_least_squares(system: FloatArray, right: FloatArray, rounds: int = 8
     solution = np.zeros(system.shape[1])
     for _ in range(rounds):
         scaled = system / scale * weights[:, None]
-        solution = np.linalg.lstsq(scaled, right * weights, rcond=1e-12)[0] / scale
+        before, solution = solution, np.linalg.lstsq(scaled, right * weights, rcond=1e-12)[0] / scale
+        if float(np.linalg.norm((solution - before) * scale)) < 1e-4 * float(
+            np.linalg.norm(solution * scale)
+        ):
+            break
         error = np.abs(system @ solution - right)
         typical = float(np.median(error))
         if typical <= 0.0:

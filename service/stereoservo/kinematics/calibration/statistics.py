@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.kinematics.calibration.bundle import Measurements, Solution, jacobian
+from stereoservo.kinematics.calibration.bundle import Measurements, Solution
+from stereoservo.kinematics.calibration.normal_equations import leverages
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -19,8 +20,8 @@ not known.
 
 
 def degrees_of_freedom(solution: Solution) -> int:
-    """Measurements minus parameters net of gauge."""
-    return len(solution.residuals) - solution.charts.size
+    """Measurements, lens priors among them, minus parameters net of gauge."""
+    return solution.rows - solution.charts.size
 
 
 def variance_factor(solution: Solution) -> float:
@@ -37,10 +38,7 @@ def chi2_within(chi2: float, freedom: int) -> bool:
 
 def rank_of(solution: Solution) -> int:
     """How many parameter directions the data determine."""
-    size = np.linalg.norm(solution.jacobian, axis=0)
-    if solution.jacobian.shape[0] < solution.jacobian.shape[1] or not (size > 0).all():
-        return int((size > 0).sum()) if solution.jacobian.shape[0] >= solution.jacobian.shape[1] else 0
-    values = np.linalg.svd(np.linalg.qr(solution.jacobian / size, mode="r"), compute_uv=False)
+    values = np.linalg.svd(solution.triangle / solution.sizes, compute_uv=False)
     return int((values > RANK_TOLERANCE * values[0]).sum())
 
 
@@ -48,10 +46,7 @@ def covariance_root(solution: Solution) -> FloatArray:
     """``R⁻¹`` (p, p) with ``R⁻¹ R⁻ᵀ = (Jᵀ J)⁻¹``: the parameters' covariance at the stated sigmas, as a
     root.
     """
-    size = np.linalg.norm(solution.jacobian, axis=0)
-    triangle = np.linalg.qr(solution.jacobian / size, mode="r")
-    root: FloatArray = np.linalg.inv(triangle) / size[:, None]
-    return root
+    return np.asarray(np.linalg.inv(solution.triangle / solution.sizes) / solution.sizes[:, None])
 
 
 def prediction_deviations(solution: Solution, offsets: FloatArray) -> FloatArray:
@@ -64,25 +59,20 @@ def prediction_deviations(solution: Solution, offsets: FloatArray) -> FloatArray
     camera, stop, marker = (index.ravel() for index in np.indices((c, s, m)))
     k = len(camera)
     grid = Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
-    slopes = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), grid) @ covariance_root(
-        solution
-    )
-    variances = (slopes.reshape(k, 2, -1) ** 2).sum(axis=(1, 2)) / 2 * max(1.0, variance_factor(solution))
-    result: FloatArray = np.sqrt(variances).reshape(c, s, m)
-    return result
+    variances = leverages(solution.rig, solution.charts, grid, covariance_root(solution)) / 2
+    return np.sqrt(variances * max(1.0, variance_factor(solution))).reshape(c, s, m)
 
 
 def generator_noise(solution: Solution) -> FloatArray:
     """Standard deviation (n,) of the entries of each generator, rms, from the bundle's covariance."""
-    scale = np.linalg.norm(solution.jacobian, axis=0)
-    scale[scale == 0] = 1.0
-    information = solution.jacobian.T @ solution.jacobian / np.outer(scale, scale)
+    p = solution.charts.size
     # Directions that the data leave open get a large finite variance instead of none.
-    covariance = np.linalg.inv(information + 1e-13 * np.eye(len(scale))) / np.outer(scale, scale)
+    unit = solution.triangle / solution.sizes
+    bounded = np.linalg.qr(np.vstack([unit, np.sqrt(1e-13) * np.eye(p)]), mode="r")
+    root = np.linalg.inv(bounded) / solution.sizes[:, None]
     at, result = 0, []
     for generator, basis in zip(solution.rig.generators, solution.charts.generators, strict=True):
-        p = len(basis)
-        changes = (basis @ generator - generator @ basis).reshape(p, 16)
-        result.append(np.einsum("pa,pq,qa->", changes, covariance[at : at + p, at : at + p], changes) / 16)
-        at += p
+        changes = (basis @ generator - generator @ basis).reshape(len(basis), 16)
+        result.append(((changes.T @ root[at : at + len(basis)]) ** 2).sum() / 16)
+        at += len(basis)
     return np.sqrt(np.array(result) * max(1.0, variance_factor(solution)))

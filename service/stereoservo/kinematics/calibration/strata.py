@@ -122,7 +122,7 @@ class Judge:
         depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
         spreads = {"depths are": float(depths.max())}
         if solution.stratum == "metric":
-            at = sum(len(basis) for basis in solution.charts.generators)
+            at = solution.charts.start(1)
             scale = np.array([solution.charts.cameras[0][k, i, i] for k, i in ((0, 0), (3, 1))])
             focal = deviations[[at, at + 3]] * scale / np.abs(np.diag(solution.rig.cameras[0][:2, :2]))
             spreads["the focal length is"] = float(focal.max())
@@ -170,11 +170,10 @@ def upgraded(
                 "metric",
                 cameras=False,
                 loss="soft_l1",
-                rounds=1,
                 max_evaluations=20,
                 tolerance=1e-2,
             )
-            metric = solve(chain.rig, data, "metric", rounds=2, max_evaluations=40)
+            metric = solve(chain.rig, data, "metric", max_evaluations=40)
         except np.linalg.LinAlgError as error:
             judge.notes.append(f"no metric start: {error}")
             continue
@@ -187,9 +186,7 @@ def upgraded(
         judge.hopeless, judge.reserve = False, []
         for plane in finite:
             try:
-                affine = solve(
-                    upgrade.affine_rig(solution.rig, plane), data, "affine", rounds=2, max_evaluations=40
-                )
+                affine = solve(upgrade.affine_rig(solution.rig, plane), data, "affine", max_evaluations=40)
             except (GeometryError, np.linalg.LinAlgError) as error:
                 judge.notes.append(f"no affine start: {error}")
                 continue

@@ -94,7 +94,9 @@ def _transformed(rig: Rig, plane: FloatArray, intrinsics: FloatArray) -> Rig:
     upgrade[3] = plane
     back = np.linalg.inv(upgrade)
     points = rig.points @ upgrade.T
-    return Rig(rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:])
+    return Rig(
+        rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:], rig.lenses
+    )
 
 
 def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:

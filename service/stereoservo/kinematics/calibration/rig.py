@@ -1,0 +1,201 @@
+"""The model under estimation (5.53, 5.55-5.57): generators, cameras, lenses and markers in any stratum, and the
+pixels that it predicts.
+
+Angles are exact; pixels carry the noise, raw ones, behind the lens. All quantities are moved along the minimal
+charts of :mod:`stereoservo.kinematics.calibration.charts`, so that the Jacobian has full rank where the data
+identify the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.calibration.charts import (
+    Kind,
+    LensModel,
+    camera_basis,
+    conjugation,
+    exponentials,
+    generator_basis,
+    lens_basis,
+    point_bases,
+)
+from stereoservo.kinematics.model import Stratum, pinhole
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4) to ideal pixels, ``points`` (m, 4)
+    at joint offset 0, ``lenses`` (c, 4) from ideal to raw pixels; empty ones stand for pinholes.
+    """
+
+    kinds: tuple[Kind, ...]
+    generators: FloatArray
+    cameras: FloatArray
+    points: FloatArray
+    lenses: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    def __post_init__(self) -> None:
+        if not len(self.lenses):
+            object.__setattr__(self, "lenses", np.tile(pinhole(), (len(self.cameras), 1)))
+
+
+@dataclass(frozen=True)
+class LensPriors:
+    """What is known of the lenses beforehand: ``mean`` (c, 3) of (k, cu, cv) and ``information`` (c, 3, 3), the
+    inverse of its covariance, zero where nothing is known.
+    """
+
+    mean: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Raw pixels in a flat list: camera, stop and marker of each (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px].
+
+    ``offsets`` (s, n): joint positions of each stop minus the zero. ``lens_priors`` count as measurements of
+    those lenses that are free.
+    """
+
+    offsets: FloatArray
+    camera: IntArray
+    stop: IntArray
+    marker: IntArray
+    pixels: FloatArray
+    sigmas: FloatArray
+    lens_priors: LensPriors | None = None
+
+    def select(self, keep: npt.NDArray[np.bool_] | IntArray) -> Measurements:
+        """The measurements where ``keep`` (k,) holds, or those of the indices ``keep``."""
+        return replace(
+            self,
+            camera=self.camera[keep],
+            stop=self.stop[keep],
+            marker=self.marker[keep],
+            pixels=self.pixels[keep],
+            sigmas=self.sigmas[keep],
+        )
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Directions of each part; an empty basis (0, ...) keeps the part fixed. Parameters stand in this order."""
+
+    generators: tuple[FloatArray, ...]
+    cameras: tuple[FloatArray, ...]
+    lenses: tuple[FloatArray, ...]
+    points: tuple[FloatArray, ...]
+
+    @property
+    def parts(self) -> tuple[tuple[FloatArray, ...], ...]:
+        """The four parts in the order of their parameters."""
+        return self.generators, self.cameras, self.lenses, self.points
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(len(basis) for part in self.parts for basis in part)
+
+    def start(self, part: int) -> int:
+        """Index of the first parameter of a part: 0 generators, 1 cameras, 2 lenses, 3 points."""
+        return sum(len(basis) for bases in self.parts[:part] for basis in bases)
+
+
+def full_charts(
+    rig: Rig, stratum: Stratum, *, cameras: bool = True, points: bool = True, lenses: LensModel = "none"
+) -> Charts:
+    """Minimal charts around ``rig``; cameras or points may be kept fixed, ``lenses`` says what of them is free.
+
+    With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
+    loses the remaining gauge, further ones are free.
+    """
+    none = np.zeros((0, 3, 4))
+    matrices: tuple[FloatArray, ...] = tuple(none for _ in rig.cameras)
+    if cameras:
+        left = camera_basis(rig.cameras[0], "left_metric", stratum) if stratum == "metric" else none
+        matrices = (
+            left,
+            *(
+                camera_basis(matrix, "right" if c == 0 else "other", stratum)
+                for c, matrix in enumerate(rig.cameras[1:])
+            ),
+        )
+    return Charts(
+        tuple(generator_basis(h, kind, stratum) for h, kind in zip(rig.generators, rig.kinds, strict=True)),
+        matrices,
+        tuple(lens_basis(lenses) for _ in rig.lenses),
+        tuple(point_bases(rig.points, stratum) if points else np.zeros((len(rig.points), 0, 4))),
+    )
+
+
+def moved(rig: Rig, charts: Charts, x: FloatArray) -> Rig:
+    """The rig at chart coordinates ``x``."""
+    at = 0
+    generators: list[FloatArray] = []
+    for generator, basis in zip(rig.generators, charts.generators, strict=True):
+        frame, _ = conjugation(basis, x[at : at + len(basis)])
+        generators.append(frame @ generator @ np.linalg.inv(frame))
+        at += len(basis)
+    linear = []
+    for part, bases in (
+        (rig.cameras, charts.cameras),
+        (rig.lenses, charts.lenses),
+        (rig.points, charts.points),
+    ):
+        values = part.copy()
+        for value, basis in zip(values, bases, strict=True):
+            if len(basis):
+                value += (x[at : at + len(basis)] @ basis.reshape(len(basis), -1)).reshape(value.shape)
+                at += len(basis)
+        linear.append(values)
+    cameras, lenses, points = linear
+    return Rig(rig.kinds, np.array(generators), cameras, points, lenses)
+
+
+def partial_products(rig: Rig, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``E_1 … E_j`` and ``E_{j+1} … E_n``, both (n + 1, s, 4, 4), j = 0 … n, at ``offsets`` (s, n) (5.18)."""
+    steps = exponentials(rig.generators, rig.kinds, offsets)
+    s, n = offsets.shape
+    before = np.empty((n + 1, s, 4, 4))
+    after = np.empty((n + 1, s, 4, 4))
+    before[0] = after[n] = np.eye(4)
+    for j in range(n):
+        before[j + 1] = before[j] @ steps[:, j]
+        after[n - 1 - j] = steps[:, n - 1 - j] @ after[n - j]
+    return before, after
+
+
+def displacements(rig: Rig, offsets: FloatArray) -> FloatArray:
+    """``E_1 … E_n`` (s, 4, 4) at ``offsets`` (s, n) (5.18)."""
+    steps = exponentials(rig.generators, rig.kinds, offsets)
+    product: FloatArray = steps[:, 0]
+    for j in range(1, steps.shape[1]):
+        product = product @ steps[:, j]
+    return product
+
+
+def predicted(rig: Rig, data: Measurements) -> FloatArray:
+    """Raw pixels (k, 2) of the rig for each measurement (5.56)."""
+    world = rig.points @ displacements(rig, data.offsets).transpose(0, 2, 1)
+    pixels = np.empty((len(data.camera), 2))
+    for c, (matrix, lens) in enumerate(zip(rig.cameras, rig.lenses, strict=True)):
+        mine = np.flatnonzero(data.camera == c)
+        images = world[data.stop[mine], data.marker[mine]] @ matrix.T
+        ideal = images[:, :2] / images[:, 2:]
+        pixels[mine] = ideal if lens[0] == 0.0 else distort(lens, ideal)
+    return pixels
+
+
+def residuals(rig: Rig, data: Measurements) -> FloatArray:
+    """Weighted residuals (2 k,): prediction minus measurement in sigmas, u and v of each measurement
+    together; without those of lens priors.
+    """
+    return ((predicted(rig, data) - data.pixels) / data.sigmas[:, None]).ravel()
