@@ -103,11 +103,27 @@ class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     speed_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
 
 
+class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``calibration.spread``: at each stop of the joints before ``joint``, that joint visits several positions.
+
+    A flat plate so becomes a body in space: 4 dots at 4 positions are 16 points (thesis fig. 5.16). The positions are
+    ``base ± range``, equally apart; ``range`` [rad or m] defaults to ``calibration.range`` of that joint, or 0.6 rad,
+    0.2 m.
+    """
+
+    joint: str
+    positions: Annotated[int, Meta(ge=2, le=12)] = 4
+    range: Positive | None = None
+
+
 class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``."""
+    """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``.
+
+    A joint without a range goes outwards as far as the markers stay in every view, up to 0.6 rad or 0.2 m.
+    """
 
     base: dict[str, float]
-    range: dict[str, Positive]
+    range: dict[str, Positive] = {}
     stops: Annotated[int, Meta(ge=4, le=200)] = 9
     frames: Annotated[int, Meta(ge=1, le=200)] = 5
     settle_s: NonNegative = 0.15
@@ -118,6 +134,7 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Smallest motion of a joint [rad or m] that can be used."""
     wait_s: Positive = 2.0
     """How long to wait at a stop for enough frames before backing off."""
+    spread: SpreadSection | None = None
 
 
 class TlsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -185,6 +202,14 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
     for name in names:
         if names.count(name) > 1:
             raise CellFileError(path, "camera.name", f"{name!r} is used twice; camera names must differ")
+    mounts = {camera.mount for camera in cell.camera}
+    if len(mounts) > 1:
+        raise CellFileError(
+            path,
+            "camera.mount",
+            f"{', '.join(f'{camera.name!r} is {camera.mount}' for camera in cell.camera)}; all cameras of a cell are "
+            "mounted alike: mount them so, or take those that stand and those on the arm as cells of their own",
+        )
     _check_limits(cell, path)
     return cell
 
@@ -226,6 +251,9 @@ def _check_limits(cell: CellFile, path: Path | str) -> None:
     if cell.calibration is not None:
         sections += [("calibration.base", dict(cell.calibration.base))]
         sections += [("calibration.range", dict(cell.calibration.range))]
+        if cell.calibration.spread is not None:
+            joint = cell.calibration.spread.joint
+            sections += [("calibration.spread.joint", {joint: joint})]
     for box in cell.safety.keep_out:
         if not box.ranges:
             raise CellFileError(path, f"safety.keep_out {box.name!r}", "bounds no joint; give ranges of some")
@@ -281,17 +309,13 @@ def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str 
                 f"no joint {name!r} in driver {cell.joints.driver!r}; its joints: {', '.join(joint_names)}",
             )
     if cell.calibration is not None:
-        for key, values in (
-            ("calibration.base", cell.calibration.base),
-            ("calibration.range", cell.calibration.range),
-        ):
-            missing = [name for name in joint_names if name not in values]
-            if missing:
-                raise CellFileError(
-                    path,
-                    key,
-                    f"missing for joint(s) {', '.join(missing)}; all of {', '.join(joint_names)} are needed",
-                )
+        missing = [name for name in joint_names if name not in cell.calibration.base]
+        if missing:
+            raise CellFileError(
+                path,
+                "calibration.base",
+                f"missing for joint(s) {', '.join(missing)}; all of {', '.join(joint_names)} are needed",
+            )
 
 
 def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
@@ -309,7 +333,8 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
     sections: dict[str, type[msgspec.Struct]] = {
         "": CellFile, "cell": CellSection, "joints": JointsSection, "camera": CameraSection, "servo": ServoSection,
         "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
-        "calibration": CalibrationSection, "zenoh": ZenohSection, "zenoh.tls": TlsSection,
+        "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
+        "zenoh.tls": TlsSection,
     }  # fmt: skip
     section = sections.get(".".join(part.split("[")[0] for part in key.split(".")))
     if section is None:

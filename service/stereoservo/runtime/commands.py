@@ -16,6 +16,7 @@ GoalId = Annotated[str, Meta(pattern=r"^[0-9a-fA-F]{8}[0-9a-fA-F-]{0,28}$")]
 Positive = Annotated[float, Meta(gt=0)]
 Gain = Annotated[float, Meta(gt=0, le=50)]
 Pixels = Annotated[float, Meta(gt=0, le=1000)]
+Lease = Annotated[float, Meta(ge=0.3, le=3600)]
 Fraction = Annotated[float, Meta(gt=0, le=1)]
 
 LAWS = ("stereo", "cartesian3")
@@ -26,7 +27,7 @@ PointSource = Literal["triangulated", "predicted"]
 class FeatureTarget(
     msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True
 ):
-    """Set-points: for each camera, marker id -> (u, v) [px]. ``model_epoch``: None, or refuse another model."""
+    """Set-points: for each camera, marker id -> (u, v), raw pixels. ``model_epoch``: None, or refuse another model."""
 
     set_points: dict[str, dict[int, tuple[float, float]]]
     model_epoch: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
@@ -62,7 +63,7 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerance_px: Pixels | None = None
     hold_frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None
     speed_scale: Fraction = 1.0
-    lease_s: Annotated[float, Meta(ge=0.3, le=3600)] | None = None
+    lease_s: Lease | None = None
     time_limit_s: Positive | None = None
     mode: Literal["preempt", "queue"] = "preempt"
     check: bool = False
@@ -118,14 +119,21 @@ class Home(msgspec.Struct, frozen=True, tag="home", tag_field="command", forbid_
 
     id: GoalId
     speed_scale: Fraction = 1.0
+    lease_s: Lease | None = None
 
 
 class Calibrate(
     msgspec.Struct, frozen=True, tag="calibrate", tag_field="command", forbid_unknown_fields=True
 ):
-    """Run the trial motions of the cell file and fit a model."""
+    """Run the trial motions of the cell file and fit a model.
+
+    ``check``: run the short check motion instead, and say whether the model still holds. ``lease_s``: the motion ends
+    when no renewal arrives for so long (None: no lease); the fit that follows it needs no client.
+    """
 
     id: GoalId
+    check: bool = False
+    lease_s: Lease | None = None
 
 
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbid_unknown_fields=True):

@@ -11,6 +11,7 @@ from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult,
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime import following, intake
 from stereoservo.runtime.averaging import add_observation, averages
+from stereoservo.runtime.check import check_step
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
     SUSPECT_FRAMES,
@@ -31,12 +32,14 @@ from stereoservo.runtime.ports import CameraObservation, FloatArray
 from stereoservo.runtime.servoing import servo_step
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import (
+    Checking,
     CoreState,
     Holding,
     Jogging,
     JointMove,
     Servoing,
     Trials,
+    Visiting,
     camera_estimate,
     initial_state,
 )
@@ -316,7 +319,7 @@ class ServoCore:
                 intake.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
             return rest
         source = state.source
-        if isinstance(source, Servoing | JointMove) and source.lease_expired(present.now_ns):
+        if isinstance(source, Servoing | JointMove | Visiting) and source.lease_expired(present.now_ns):
             hint = "the client did not renew its lease: is it alive?"
             reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
             intake.end_source(present, "goal_aborted", (reason,), reason.hint)
@@ -332,6 +335,8 @@ class ServoCore:
             return joint_move(source, present)
         if isinstance(source, Trials):
             return trials_step(source, present)
+        if isinstance(source, Checking):
+            return check_step(source, present)
         if isinstance(source, Servoing):
             return servo_step(source, present)
         return rest
@@ -386,7 +391,10 @@ class ServoCore:
         state = self.state
         reasons = self._reasons(motion, safety)
         source = state.source
-        names = {Holding: "hold", Jogging: "jog", JointMove: "joints", Servoing: "law", Trials: "calibrate"}
+        names = {
+            Holding: "hold", Jogging: "jog", JointMove: "joints", Servoing: "law", Trials: "calibrate",
+            Checking: "check",
+        }  # fmt: skip
         return Status(
             t_ns=inputs.now_ns,
             step=state.step,

@@ -83,6 +83,7 @@ EventKind = Literal[
     "calibration_sample",
     "calibration_finished",
     "calibration_aborted",
+    "check_finished",
     "taught",
     "warning",
 ]

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from stereoservo.control.reasons import Reason
+from stereoservo.runtime.check import start_check
 from stereoservo.runtime.commands import (
     Calibrate,
     CancelGoal,
@@ -32,7 +33,7 @@ from stereoservo.runtime.cycle import Lifecycle, ModelReadiness
 from stereoservo.runtime.motion import Present, measurement_buffers
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.servoing import start_servoing
-from stereoservo.runtime.state import Holding, Jogging, JointMove, Servoing, Source, Teaching, Trials
+from stereoservo.runtime.state import Holding, Jogging, JointMove, Servoing, Source, Teaching, Visiting
 from stereoservo.runtime.trials import start_trials
 
 QUEUE_LENGTH = 16
@@ -60,7 +61,7 @@ def goal_of(source: Source) -> str:
     """Id of the goal that a source works on, or ''."""
     if isinstance(source, Servoing):
         return source.goal.id
-    return source.id if isinstance(source, JointMove | Trials) else ""
+    return source.id if isinstance(source, JointMove | Visiting) else ""
 
 
 def end_source(
@@ -72,7 +73,7 @@ def end_source(
     """End the active source with its one terminal event; the arm then holds."""
     source = present.state.source
     present.state.source = Holding()
-    if isinstance(source, Trials):
+    if isinstance(source, Visiting):
         present.emit("calibration_aborted", id=source.id, message=message, reasons=reasons)
     elif goal_of(source):
         present.emit(kind, id=goal_of(source), message=message, reasons=reasons)
@@ -158,13 +159,29 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
     if isinstance(command, Home):
         if present.settings.home is None:
             raise RefusalError("NO_HOME", "the cell file states neither [joints] home nor [calibration] base")
-        state.source = _move(command.id, present.settings.home, HOME_SPEED * command.speed_scale, present)
+        speed = HOME_SPEED * command.speed_scale
+        home = present.settings.home
+        state.source = _move(command.id, home, speed, present, lease_s=command.lease_s)
         return "moving home"
+    return _calibrate(command, present)
+
+
+def _calibrate(command: Calibrate, present: Present) -> str:
+    state = present.state
     if present.settings.trials is None:
         raise RefusalError("NO_TRIALS", "the cell file has no [calibration] section")
-    state.source = start_trials(command.id, present.q, present.now_ns, present.settings)
-    present.emit("calibration_progress", id=command.id, progress=0.0, message="trial motions begin")
-    return "calibrating"
+    if command.check and state.model is None:
+        raise RefusalError("NO_MODEL", "the cell has no model to check: calibrate first")
+    if command.check and state.model is not None:
+        checking = start_check(command.id, present, state.model)
+        state.source, what = checking, "check motion begins"
+    else:
+        state.source = start_trials(command.id, present.q, present.now_ns, present.settings)
+        what = "trial motions begin"
+    state.source.lease_s = command.lease_s
+    state.source.renew_lease(present.now_ns)
+    present.emit("calibration_progress", id=command.id, progress=0.0, message=what)
+    return "checking" if command.check else "calibrating"
 
 
 def _enable(present: Present) -> str:
@@ -286,7 +303,7 @@ def next_goal(present: Present) -> None:
 
 def _renew(command: RenewGoal, present: Present) -> str:
     source = present.state.source
-    if isinstance(source, Servoing | JointMove) and goal_of(source) == command.id:
+    if isinstance(source, Servoing | JointMove | Visiting) and goal_of(source) == command.id:
         source.renew_lease(present.now_ns)
         return "renewed"
     if goal_of(source) == command.id or any(goal.id == command.id for goal in present.state.queue):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from stereoservo.runtime.cellfile import CalibrationSection, CellFile, CellFileError, check_joints
+from stereoservo.runtime.cellfile import CellFile, CellFileError, check_joints
 from stereoservo.runtime.commands import LawName, PointSource
 from stereoservo.runtime.ports import (
     CameraDescription,
@@ -16,6 +16,8 @@ from stereoservo.runtime.ports import (
 )
 
 SLACK = 1e-3  # of a cell's limits beyond the drive's, for rounding [rad or m]
+LARGEST_RANGE: dict[JointKindName, float] = {"revolute": 0.6, "prismatic": 0.2}
+"""To either side of the base, where the cell file states no range of its own [rad or m]."""
 
 
 class CameraSettings(msgspec.Struct, frozen=True):
@@ -46,7 +48,10 @@ class LimitSettings(msgspec.Struct, frozen=True, eq=False):
 
 
 class TrialSettings(msgspec.Struct, frozen=True, eq=False):
-    """Trial motions in joint order; see ``cellfile.CalibrationSection``."""
+    """Trial motions in joint order; see ``cellfile.CalibrationSection``.
+
+    ``range`` (n,): NaN where the programme itself finds out how far the joint may go.
+    """
 
     base: FloatArray
     range: FloatArray
@@ -57,6 +62,9 @@ class TrialSettings(msgspec.Struct, frozen=True, eq=False):
     min_markers: int
     min_range: float
     wait_s: float
+    spread_joint: int = -1
+    """Joint that visits ``spread_offsets`` (p,) [rad or m] from its base at the stops of others; -1: none."""
+    spread_offsets: FloatArray = msgspec.field(default_factory=lambda: np.zeros(1))
 
 
 class CoreSettings(msgspec.Struct, frozen=True, eq=False):
@@ -119,7 +127,7 @@ def core_settings(
         )
         for section, description in zip(cell.camera, cameras, strict=True)
     )  # fmt: skip
-    trials = None if cell.calibration is None else _trial_settings(cell.calibration, names)
+    trials = None if cell.calibration is None else _trial_settings(cell, joints)
     home = None
     if cell.joints.home:
         base = cell.calibration.base if cell.calibration is not None else {}
@@ -165,10 +173,30 @@ def core_settings(
     )
 
 
-def _trial_settings(section: CalibrationSection, names: tuple[str, ...]) -> TrialSettings:
+def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSettings:
+    section = cell.calibration
+    assert section is not None
+    names = tuple(joint.name for joint in joints.joints)
+    spread_joint, offsets = -1, np.zeros(1)
+    if section.spread is not None:
+        spread = section.spread
+        spread_joint = names.index(spread.joint)
+        limit = next(limit for limit in cell.safety.limit if limit.joint == spread.joint)
+        base, margin = section.base[spread.joint], cell.safety.position_margin + SLACK
+        room = min(limit.max - margin - base, base - limit.min - margin)
+        wanted = spread.range or section.range.get(
+            spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind]
+        )
+        if spread.range is not None and spread.range > room:
+            raise CellFileError(
+                cell.cell.name,
+                "calibration.spread.range",
+                f"is {spread.range:g}; joint {spread.joint!r} has {room:.4g} to either side of its base",
+            )
+        offsets = np.linspace(-1.0, 1.0, spread.positions) * min(wanted, room)
     return TrialSettings(
         base=np.array([section.base[name] for name in names]),
-        range=np.array([section.range[name] for name in names]),
+        range=np.array([section.range.get(name, np.nan) for name in names]),
         stops=section.stops,
         frames=section.frames,
         settle_s=section.settle_s,
@@ -176,4 +204,6 @@ def _trial_settings(section: CalibrationSection, names: tuple[str, ...]) -> Tria
         min_markers=section.min_markers,
         min_range=section.min_range,
         wait_s=section.wait_s,
+        spread_joint=spread_joint,
+        spread_offsets=offsets,
     )

@@ -14,7 +14,7 @@ from stereoservo.runtime.cycle import Lifecycle, ModelReadiness, decode_array, e
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.settings import CoreSettings
 
-STATE_VERSION = 1
+STATE_VERSION = 2
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
 
 
@@ -88,8 +88,8 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
 class Servoing(Leased, tag="law", eq=False, kw_only=True):
     """A law drives the arm to set-points.
 
-    ``set_points`` (c, m, 2) [px] with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the goal,
-    where ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): three that span it.
+    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the
+    goal, where ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): three that span it.
     """
 
     goal: Goal
@@ -131,26 +131,63 @@ class Sums(msgspec.Struct, eq=False, kw_only=True):
     """Frames taken, by camera."""
 
 
-class Trials(Sums, tag="trials", eq=False):
-    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base."""
+class Visiting(Leased, eq=False, kw_only=True):
+    """Goes to configurations and looks from there at rest; see ``visiting``."""
 
     id: str
-    joint: int
-    side: int
-    k: int
     phase: Literal["move", "settle", "collect", "return", "finish"]
     target: FloatArray
     phase_ns: int
     start: FloatArray
     """Measured positions when the current move began."""
+    sums: Sums
     joint_sum: FloatArray
+    joint_frames: int = 0
+    lost_ns: int = 0
+
+
+class Trials(Visiting, tag="trials", eq=False, kw_only=True):
+    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base.
+
+    ``last``, ``before`` (p, c, m, 2) [px], NaN where unseen: the markers at the two outermost stops of this side, for
+    each of the p positions of the spread joint (1 without), at the offsets ``last_at``, ``before_at`` from the base.
+    """
+
+    joint: int
+    side: int
+    k: int
+    count: int
+    """Stops planned on this side."""
+    step: float
+    """Between stops of this side [rad or m]; 0 before the probe has shown how far it may go."""
+    reach: FloatArray
+    """How far the joint may go upwards and downwards (2,), where it is planned from visibility."""
+    turn: int
+    """Position of the spread joint."""
+    seen_turns: int
+    base_pixels: FloatArray
+    last: FloatArray
+    last_at: float
+    before: FloatArray
+    before_at: float
     lowest: FloatArray
     highest: FloatArray
     """Range really visited, by joint."""
     stops: IntArray
     """Stops recorded, by joint."""
-    joint_frames: int = 0
-    lost_ns: int = 0
+    motion_sigmas: FloatArray
+    """Largest motion in the images between base and a stop, in sigmas, by joint."""
+    sigma_px: float
+    """Of one marker at a stop, median."""
+
+
+class Checking(Visiting, tag="checking", eq=False, kw_only=True):
+    """The check motion: ``targets`` (s, n) one after the other."""
+
+    targets: FloatArray
+    index: int
+    seen: int = 0
+    """Stops at which every camera saw enough."""
 
 
 class Teaching(Sums, eq=False):
@@ -162,7 +199,7 @@ class Teaching(Sums, eq=False):
     started_ns: int
 
 
-Source = Holding | Jogging | JointMove | Servoing | Trials
+Source = Holding | Jogging | JointMove | Servoing | Trials | Checking
 
 
 class CoreState(msgspec.Struct, eq=False):
