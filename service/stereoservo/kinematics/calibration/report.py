@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import rq
 
-from stereoservo.kinematics.calibration import upgrade
+from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, predicted
 from stereoservo.kinematics.calibration.statistics import (
     chi2_within,
@@ -169,11 +169,9 @@ def build_model(
     if stratum == "projective":
         frame: FloatArray = np.eye(4)
     elif stratum == "affine":
-        affine_to_projective = np.eye(4)
-        affine_to_projective[3] = np.append(-plane[:3], 1.0) / plane[3]
-        frame = affine_to_projective
+        frame = affine_to_projective(plane)
     else:
-        frame = upgrade.projective_frame(normaliser, rig.cameras[0][:, :3], plane)
+        frame = euclidean_to_projective(plane, normaliser @ rig.cameras[0][:, :3])
     back: FloatArray = np.asarray(np.linalg.inv(frame), dtype=np.float64)
     points = rig.points @ frame.T
     points = points / (points @ plane)[:, None]

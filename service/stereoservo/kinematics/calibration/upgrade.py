@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from stereoservo.geometry.displacements import exp_rotation, nearest_rotation_generator
+from stereoservo.geometry.strata import euclidean_to_projective, projective_to_euclidean
 from stereoservo.kinematics.calibration.bundle import Rig
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,10 +90,7 @@ def metric_rig(rig: Rig, plane: FloatArray, intrinsics: FloatArray, spans: Float
 
 
 def _transformed(rig: Rig, plane: FloatArray, intrinsics: FloatArray) -> Rig:
-    upgrade = np.eye(4)
-    upgrade[:3, :3] = np.linalg.inv(intrinsics)
-    upgrade[3] = plane
-    back = np.linalg.inv(upgrade)
+    upgrade, back = projective_to_euclidean(plane, intrinsics), euclidean_to_projective(plane, intrinsics)
     points = rig.points @ upgrade.T
     return Rig(
         rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:], rig.lenses
@@ -157,17 +155,3 @@ def nominal_intrinsics(focal: float) -> FloatArray:
     widths].
     """
     return np.diag([focal, focal, 1.0])
-
-
-def projective_frame(normaliser: FloatArray, intrinsics: FloatArray, plane: FloatArray) -> FloatArray:
-    """``H_EP`` (4, 4): Euclidean points into the projective frame in which ``plane`` (4,) is the plane at
-    infinity.
-
-    ``intrinsics`` (3, 3) = K; the left camera becomes ``[N⁻¹ | 0]`` and ``plane @ (H_EP X) = 1`` for ``X`` of
-    height 1.
-    """
-    frame = np.zeros((4, 4))
-    frame[:3, :3] = normaliser @ intrinsics
-    frame[3, :3] = -plane[:3] @ frame[:3, :3] / plane[3]
-    frame[3, 3] = 1.0 / plane[3]
-    return frame
