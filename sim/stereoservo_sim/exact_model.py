@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.geometry.cameras import pixel_normaliser
-from stereoservo.kinematics.calibration.upgrade import projective_frame
+from stereoservo.geometry.strata import euclidean_to_projective
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, Stratum
 from stereoservo_sim.synthetic import SyntheticCell
 
@@ -44,7 +44,7 @@ def exact_model(
     zero = cell.home if zero is None else zero
     normaliser = pixel_normaliser(cell.width, cell.height)
     to_left, infinity = cell.poses[0], np.array(plane)
-    frame = projective_frame(normaliser, cell.intrinsics[0], infinity)
+    frame = euclidean_to_projective(infinity, normaliser @ cell.intrinsics[0])
     change = frame @ to_left
     back = np.linalg.inv(change)
     cameras = np.array([K @ pose[:3] for K, pose in zip(cell.intrinsics, cell.poses, strict=True)]) @ back

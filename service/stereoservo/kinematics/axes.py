@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import rq
 
+from stereoservo.geometry.strata import projective_to_affine, upper_triangular
 from stereoservo.kinematics.model import CellModel, Stratum
 
 FloatArray = npt.NDArray[np.float64]
@@ -51,10 +51,7 @@ def stratum_frame(stratum: Stratum, plane: FloatArray, to_euclidean: FloatArray 
     """Homography (4, 4) from the model's projective frame into one of its stratum."""
     if stratum == "metric" and to_euclidean is not None:
         return to_euclidean
-    frame = np.eye(4)
-    if stratum == "affine":
-        frame[3] = plane
-    return frame
+    return projective_to_affine(plane) if stratum == "affine" else np.eye(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +118,6 @@ def euclidean_centres(cameras: FloatArray) -> FloatArray:
 
 def camera_intrinsics(matrix: FloatArray) -> FloatArray:
     """``fx, skew, fy, u0, v0`` (5,) [px] of a camera (3, 4) in a Euclidean frame."""
-    K, _ = rq(matrix[:, :3])
-    K = K * np.sign(np.diag(K))
-    result: FloatArray = K[[0, 0, 1, 0, 1], [0, 1, 1, 2, 2]] / K[2, 2]
+    K, _ = upper_triangular(matrix[:, :3])
+    result: FloatArray = K[[0, 0, 1, 0, 1], [0, 1, 1, 2, 2]]
     return result
