@@ -321,7 +321,7 @@ def normal_equations(
     core += prior.T @ prior
     sizes = np.sqrt(np.append(np.diag(core)[:-1], np.diagonal(square, axis1=1, axis2=2)))
     sizes[sizes == 0.0] = 1.0
-    across, along = np.append(sizes[:width], 1.0), sizes[width:].reshape(-1, q)
+    across, along = np.append(sizes[:width], 1.0), sizes[width:].reshape(len(rig.points), q)
     return NormalEquations(
         core / np.outer(across, across),
         cross / along[:, :, None] / across,
