@@ -6,7 +6,7 @@ follow from the noise of the pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from stereoservo.geometry.cameras import triangulate
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.strata import heights_of_one_side
 from stereoservo.geometry.translation_fit import (
     Images,
     TranslationFit,
@@ -44,6 +45,8 @@ TAIL = 1e-3
 """Probability with which one test rejects a good motion."""
 ROUNDS = 5
 """Most times that the agreeing motions are chosen again."""
+HEIGHT_DEVIATION = 1.0 / 3.0
+"""Largest relative standard deviation of a point's height: three of them reach the plane at infinity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,18 +56,20 @@ class MotionJudgement:
     ``reason`` why it is left out, empty where it is used: ``unseen`` (too few points before and after),
     ``points`` (no homography fits: wrong matches), ``conditioning`` (``σ₂`` of the homography's generator above
     what its noise explains), ``not_a_translation`` (a homography fits, a translation does not), ``no_motion``
-    (too small to tell the plane at infinity), ``other_plane`` (a translation, but not with the plane at
+    (no plane at infinity in it at all), ``other_plane`` (a translation, but not with the plane at
     infinity of the others). ``conditioning`` σ₁/σ₂ and ``least_conditioning``, below which noise does not
     explain it; ``excess`` the chi-square by which the translation fits worse than the homography, of nine
-    freedoms; ``distance`` the squared Mahalanobis distance of its plane from that of the others, of three. NaN
-    where not computed.
+    freedoms; ``distance`` the squared Mahalanobis distance of its plane from that of the others, of three;
+    ``height_deviation`` the largest relative standard deviation of a point's height above its own plane: a motion above
+    `HEIGHT_DEVIATION` tells too little by itself, but adds to others. NaN where not computed.
     """
 
     reason: Reason
     conditioning: float
     least_conditioning: float
     excess: float
-    distance: float
+    distance: float = float("nan")
+    height_deviation: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +117,8 @@ def estimate_translations(
     if not reject:
         Hs = np.stack([translation_homography(Ps, rest, p) for p in pixels[1:]])
         fit = _joint(Ps, pixels, noise, rest, Hs, weighting, np.ones(n, dtype=bool))
-        blank = MotionJudgement("", np.nan, np.nan, np.nan, np.nan)
+        blank = MotionJudgement("", np.nan, np.nan, np.nan)
+        _require_heights(rest, fit)
         return TranslationEstimate(fit, np.ones(n, dtype=bool), (blank,) * n, Hs)
     singles = [_judge_alone(images, pixels, noise, rest, weighting, s) for s in range(1, n + 1)]
     Hs = np.stack([np.full((4, 4), np.nan) if m.homography is None else m.homography for m in singles])
@@ -128,7 +134,34 @@ def estimate_translations(
         used = again
     else:
         fit = _joint(Ps, pixels, noise, rest, Hs, weighting, used)
+    _require_heights(rest, fit)
     return TranslationEstimate(fit, used, _verdicts(singles, used, distances), Hs)
+
+
+def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
+    """Largest standard deviation of the heights ``hᵀM`` of points (m, 4), relative to the heights, where that of the
+    points' middle is one. NaN points are left out.
+    """
+    M = points[np.isfinite(points).all(axis=1)]
+    M = M / (M @ fit.plane)[:, None]
+    # Heights 1 at the middle: what moves all of them alike is scale.
+    M = M - M.mean(axis=0)
+    return float(np.sqrt(np.einsum("ni,ij,nj->n", M, fit.plane_covariance, M).max()))
+
+
+def _require_heights(rest: FloatArray, fit: TranslationFit) -> None:
+    """Raise GeometryError where the plane at infinity is not known well enough, or cuts the points."""
+    deviation = height_deviation(rest, fit)
+    if not deviation <= HEIGHT_DEVIATION:
+        raise GeometryError(
+            "degenerate",
+            f"the motions leave the plane at infinity undetermined: the points' heights above it are known to "
+            f"{100 * deviation:.3g} % (at most {100 * HEIGHT_DEVIATION:.3g} %); longer motions, other directions than "
+            "the optical axis, more motions or less noise are needed",
+            deviation=deviation,
+            limit=HEIGHT_DEVIATION,
+        )
+    heights_of_one_side(fit.plane, rest[np.isfinite(rest).all(axis=1)])
 
 
 def _joint(
@@ -161,7 +194,7 @@ def _judge_alone(
     try:
         start = translation_homography(Ps, rest, pixels[stop])
     except GeometryError:
-        return _Single(None, None, None, MotionJudgement("unseen", nan, nan, nan, nan))
+        return _Single(None, None, None, MotionJudgement("unseen", nan, nan, nan))
     both = (images.weights[pair] > 0).any(axis=1).all(axis=0) & np.isfinite(rest).all(axis=1)
     white = Images(Ps @ np.linalg.inv(W), images.pixels[pair][:, :, both], images.weights[pair][:, :, both])
     M = rest[both] @ W.T
@@ -171,7 +204,7 @@ def _judge_alone(
         best = minimise(white, with_rest(motion), x, M, free_points=True)
         covariance = covariance_of(best.information, "the homography")
     except GeometryError:
-        return _Single(start, None, None, MotionJudgement("points", nan, nan, nan, nan))
+        return _Single(start, None, None, MotionJudgement("points", nan, nan, nan))
     H, slopes = motion(best.x)
     back = np.linalg.inv(W)
     refined = conjugate(np.asarray(back, dtype=np.float64), H[0])
@@ -179,22 +212,23 @@ def _judge_alone(
     least = svd.singular[0] / _second_singular_noise(weighting.left @ back, H[0], slopes[0], covariance)
     freedom = white.measurements - 15 - 3 * int(both.sum())
     if best.cost > chi2_distribution.isf(TAIL, max(1, freedom)):
-        return _Single(refined, None, None, MotionJudgement("points", svd.conditioning, least, nan, nan))
+        return _Single(refined, None, None, MotionJudgement("points", svd.conditioning, least, nan))
     try:
         fit = _alone(Ps, pixels[pair][:, :, both], noise[pair][:, :, both], rest[both], svd)
     except GeometryError as error:
         why: Reason = "not_a_translation" if error.code == "no_model" else "no_motion"
-        return _Single(refined, None, None, MotionJudgement(why, svd.conditioning, least, nan, nan))
+        return _Single(refined, None, None, MotionJudgement(why, svd.conditioning, least, nan))
     excess = fit.cost - best.cost
     reason: Reason = ""
     if excess > chi2_distribution.isf(TAIL, 9):
         reason = "not_a_translation"
     elif svd.conditioning < least:
         reason = "conditioning"
-    judgement = MotionJudgement(reason, svd.conditioning, least, excess, nan)
     if reason:
-        return _Single(refined, None, None, judgement)
+        return _Single(refined, None, None, MotionJudgement(reason, svd.conditioning, least, excess))
     plane, spread = _height_one(weighting.right, rest, fit.plane, fit.plane_covariance)
+    deviation = height_deviation(rest, fit)
+    judgement = MotionJudgement("", svd.conditioning, least, excess, height_deviation=deviation)
     return _Single(refined, plane, spread, judgement)
 
 
@@ -248,10 +282,14 @@ def _distance(single: _Single, plane: FloatArray, covariance: FloatArray) -> flo
 
 
 def _largest_agreement(singles: list[_Single]) -> BoolArray:
-    """The motions that agree with the one that most agree with; of equals, the one that knows its plane best."""
+    """The motions that agree with the one that most agree with; of equals, the one that knows its plane best.
+
+    Motions that tell too little by themselves agree with anything: only where there are no others are they asked.
+    """
     limit = float(chi2_distribution.isf(TAIL, 3))
     best: tuple[int, float, BoolArray] | None = None
-    for single in singles:
+    strong = [m for m in singles if m.judgement.height_deviation <= HEIGHT_DEVIATION]
+    for single in strong or singles:
         if single.plane is None or single.covariance is None:
             continue
         agree = np.array([_distance(other, single.plane, single.covariance) <= limit for other in singles])
@@ -282,13 +320,6 @@ def _verdicts(singles: list[_Single], used: BoolArray, distances: FloatArray) ->
     for single, use, distance in zip(singles, used, distances, strict=True):
         alone = single.judgement
         reason: Reason = alone.reason or ("" if use else "other_plane")
-        verdicts.append(
-            MotionJudgement(
-                reason,
-                alone.conditioning,
-                alone.least_conditioning,
-                alone.excess,
-                float(distance) if np.isfinite(distance) else float("nan"),
-            )
-        )
+        known = float(distance) if np.isfinite(distance) else float("nan")
+        verdicts.append(replace(alone, reason=reason, distance=known))
     return tuple(verdicts)

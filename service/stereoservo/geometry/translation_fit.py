@@ -17,6 +17,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray, whitener
+from stereoservo.geometry.strata import projective_to_affine
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -49,6 +50,11 @@ class TranslationFit:
     def homographies(self) -> FloatArray:
         """``H_s`` (n, 4, 4), normalised: rest to the n-th stop."""
         return np.asarray(np.eye(4) + self.directions[:, :, None] * self.plane, dtype=np.float64)
+
+    @property
+    def affine_upgrade(self) -> FloatArray:
+        """``H_PA`` (4, 4) (2.14): the affine calibration of the rig, projective points to affine ones."""
+        return projective_to_affine(self.plane)
 
     @property
     def variance_factor(self) -> float:

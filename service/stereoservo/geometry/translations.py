@@ -225,8 +225,14 @@ def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
     Raises GeometryError for coplanar points, and points or cameras that leave a direction out of the images.
     """
     M = M[np.isfinite(M).all(axis=1)]
-    right = whitener(M)
-    unit = M / np.linalg.norm(M @ right.T, axis=1, keepdims=True)
+    if len(M) < 5:
+        raise GeometryError(
+            "too_few",
+            f"{len(M)} points are known in space; at least 5 are needed, seen from two centres",
+            points=len(M),
+        )
+    right = 2.0 * whitener(M)  # unit 4-vectors have second moments I/4
+    unit = 2.0 * M / np.linalg.norm(M @ right.T, axis=1, keepdims=True)
     rows = projection_jacobian_many(Ps, unit)
     moments = np.einsum("cnai,cnaj->ij", rows, rows) / len(unit)
     values, vectors = np.linalg.eigh(moments)

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.geometry.cameras import camera_centre, canonical_pair
-from stereoservo.geometry.homogeneous import to_homogeneous
+from stereoservo.geometry.homogeneous import from_homogeneous, move_points, to_homogeneous
 from stereoservo.geometry.homography import homography_from_points
+from stereoservo.geometry.strata import projective_to_affine
 from stereoservo.geometry.translation_fit import linearise, read_images, shared_plane, with_rest
 from stereoservo_sim.rig import StereoRig, project, stereo_rig
 
@@ -69,7 +70,7 @@ def projective_cameras(F: FloatArray, pixels: FloatArray) -> FloatArray:
 
 def upgrade(plane: FloatArray, points: FloatArray) -> FloatArray:
     """Affine structure N (n, 3) of projective points (n, 4) by ``H_PA`` (2.14) of the plane at infinity (4,)."""
-    return np.asarray(points[:, :3] / (points @ plane)[:, None])
+    return from_homogeneous(move_points(projective_to_affine(plane), points))
 
 
 def plane_at_infinity_of(points: FloatArray, X: FloatArray) -> FloatArray:

@@ -185,7 +185,8 @@ def _draw_rectification(folder: Path) -> Path:
     cameras = projective_cameras(fundamental_of(rig), images)
     M = triangulate(cameras, images)
     # A frame further from affine than the canonical one, so that the projective distortion shows.
-    skew = M[:, :3] / (M[:, 3:] + 0.6 * (M[:, :1] - M[:, :1].mean()) / np.ptp(M[:, 0]))
+    across = (M[:, :1] - M[:, :1].mean()) / np.ptp(M[:, 0])
+    skew = M[:, :3] / (M[:, 3:] * (1.0 + 0.8 * across))
     figure = Figure(figsize=(9, 4), layout="constrained")
     FigureCanvasAgg(figure)
     plane = plane_at_infinity_of(M, X)
