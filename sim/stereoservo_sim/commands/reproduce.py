@@ -116,6 +116,24 @@ def run_grid_command(options: Options, progress: ProgressCall) -> dict[str, Any]
     return _with_plots(answer, draw_grid, options.plot)
 
 
+def run_pan_tilt_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``pan-tilt`` from its options; 20 seeds by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.pan_tilt import draw_pan_tilt, run_pan_tilt
+
+    answer = run_pan_tilt(seeds=options.seeds or 20, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_pan_tilt, options.plot)
+
+
+def run_homing_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``homing`` from its options; 10 seeds by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.homing import draw_homing, run_homing
+
+    answer = run_homing(seeds=options.seeds or 10, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_homing, options.plot)
+
+
 def run_house_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
     """``house`` from its options; 50 seeds by default."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -155,6 +173,37 @@ def show_rows(answer: dict[str, Any], console: Console) -> None:
         console.print(f"wrote {path}")
 
 
+def show_pan_tilt(answer: dict[str, Any], console: Console) -> None:
+    """Table 4.1 with medians over seeds, the thesis's figures in brackets."""
+    table = Table(
+        title=f"pan-tilt: {answer['seeds']} seeds, medians [px], (thesis's table 4.1)", title_justify="left"
+    )
+    measures = {
+        "delta_u_mean": "u mean",
+        "delta_u_sd": "u sd",
+        "delta_v_mean": "v mean",
+        "delta_v_sd": "v sd",
+        "delta_lr": "LR",
+        "perfect_calibration_delta_lr": "LR, head known",
+        "calibration_alone_delta_lr": "LR, no noise",
+    }
+    for column in ("condition", "noise", *measures.values()):
+        table.add_column(column, justify="left" if column in ("condition", "noise") else "right")
+    for row in answer["rows"]:
+        beside = answer["thesis"][row["condition"]] if row["noise"] == "drifting" else {}
+        cells = []
+        for key in measures:
+            median = row[key]["median"]
+            thesis = f" ({beside[key]:.3g})" if key in beside else ""
+            cells.append("-" if median is None else f"{median:.3f}{thesis}")
+        table.add_row(row["condition"], row["noise"], *cells)
+    console.print(table)
+    for assumption in answer["assumptions"]:
+        console.print(f"assumed: {assumption}")
+    for path in answer.get("plots", []):
+        console.print(f"wrote {path}")
+
+
 def _cell(value: Any) -> str:
     if isinstance(value, dict):
         return (
@@ -184,6 +233,18 @@ EXPERIMENTS: dict[str, Experiment] = {
         "fig. 3.6: affine calibration before a grid, single motions beside cumulative estimates",
         frozenset({"seeds"}),
         run_grid_command,
+        show_rows,
+    ),
+    "pan-tilt": Experiment(
+        "table 4.1, figs 4.8, 4.9: a pan-tilt head calibrates itself and predicts the image after a motion",
+        frozenset({"seeds"}),
+        run_pan_tilt_command,
+        show_pan_tilt,
+    ),
+    "homing": Experiment(
+        "fig. 4.10: a pan-tilt head finds home from one point, its errors beside the Cramer-Rao bound",
+        frozenset({"seeds"}),
+        run_homing_command,
         show_rows,
     ),
     "house": Experiment(
