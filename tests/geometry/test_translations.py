@@ -495,6 +495,17 @@ def test_two_motions_of_which_one_is_bad_cannot_be_told_apart():
     assert error.data["reasons"] == ["points", ""]
 
 
+def test_linear_estimates_from_coplanar_points_are_refused_at_any_noise():
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        scene, shifts = Scene(rng, flat=True), shifts_of(rng, 3)
+        exact = scene.pixels(scene.moved(shifts))
+        for sigma in (0.02, 0.5):
+            error = refusal(scene, exact + sigma * rng.normal(size=exact.shape), sigma)
+            assert error.code == "degenerate"
+            assert "coplanar" in str(error)
+
+
 def test_zero_baseline_is_refused():
     rng = np.random.default_rng(8)
     scene, shifts = Scene(rng, baseline=0.0), shifts_of(rng, 3)

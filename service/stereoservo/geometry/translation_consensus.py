@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.geometry.cameras import triangulate
+from stereoservo.geometry.cameras import triangulate, triangulation_covariance
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
@@ -114,6 +114,7 @@ def estimate_translations(
         )
     rest = triangulate(Ps, pixels[0], noise[0])
     weighting = image_weighting(Ps, rest)
+    _refuse_flat(Ps, rest, np.where(images.weights[0] > 0, noise[0], np.inf))
     if not reject:
         Hs = np.stack([translation_homography(Ps, rest, p) for p in pixels[1:]])
         fit = _joint(Ps, pixels, noise, rest, Hs, weighting, np.ones(n, dtype=bool))
@@ -136,6 +137,37 @@ def estimate_translations(
         fit = _joint(Ps, pixels, noise, rest, Hs, weighting, used)
     _require_heights(rest, fit)
     return TranslationEstimate(fit, used, _verdicts(singles, used, distances), Hs)
+
+
+def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
+    """Sum of squared distances of triangulated points M (m, 4) from the plane that fits best, over their variances.
+
+    ``sigmas`` (c, m) [px], infinite where a camera does not see a point. Chi-square of m − 3 freedoms where the points
+    are coplanar.
+    """
+    C = triangulation_covariance(Ps, M, sigmas)
+    weights = 1.0 / np.linalg.norm(M, axis=1)
+    plane = np.zeros(4)
+    for _ in range(10):  # the variances follow the plane
+        plane = np.linalg.svd(M * weights[:, None])[2][3]
+        weights = 1.0 / np.sqrt(np.maximum(np.einsum("i,nij,j->n", plane, C, plane), 1e-300))
+    return float(((M @ plane * weights) ** 2).sum())
+
+
+def _refuse_flat(Ps: FloatArray, rest: FloatArray, sigmas: FloatArray) -> None:
+    """Raise GeometryError where the noise explains what is not coplanar in the points."""
+    known = np.isfinite(rest).all(axis=1)
+    cost = flatness(Ps, rest[known], sigmas[:, known])
+    limit = float(chi2_distribution.isf(TAIL, int(known.sum()) - 3))
+    if cost <= limit:
+        raise GeometryError(
+            "degenerate",
+            f"the {int(known.sum())} points are coplanar to within their noise (chi-square {cost:.4g} of "
+            f"{limit:.4g}); "
+            "a homography of space needs points off one plane",
+            chi2=cost,
+            limit=limit,
+        )
 
 
 def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
