@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from stereoservo.geometry.cameras import project, project_many, triangulate
@@ -197,9 +197,9 @@ def cost(H, incidences, Ps, sigma):
 
                 def displacement(y, free=free, u=u, scale=scale):
                     image = Ps @ (free @ (scale + np.linalg.norm(scale) * y))
-                    return (((image[:, :2] / image[:, 2:] - u) / sigma) ** 2).sum()
+                    return ((image[:, :2] / image[:, 2:] - u) / sigma).ravel()
 
-                total += minimize(displacement, np.zeros(3), method="BFGS").fun
+                total += 2.0 * least_squares(displacement, np.zeros(3), method="lm").cost
             elif len(incidence.second) == 1:
                 total += (((u - incidence.images) / sigma) ** 2).sum()
             else:
@@ -231,3 +231,20 @@ def test_refinement_refuses_too_few_pixels_other_cameras_and_freedoms(rig):
         homography_refine_incidences(truth, incidences, rig.Ps[:1])
     with pytest.raises(GeometryError, match="do not determine"):
         homography_refine_incidences(truth, incidences[4:8], rig.Ps)  # four lines
+
+
+def test_points_that_are_coplanar_within_noise_are_refused(rig):
+    rng = np.random.default_rng(7)
+    G = frame(rng)
+    for relief, refused in ((1e-4, True), (3e-2, False)):
+        X = rig.points(rng, 9)
+        X[:, 2] = X[:, 2].mean() + relief * rng.uniform(-1, 1, 9)
+        pixels = rig.pixels(X) + rng.normal(0, 0.3, (2, 9, 2))
+        incidences = [Incidence(G @ X[i], X[i], pixels[:, i]) for i in range(9)]
+        start = np.linalg.inv(G)
+        if not refused:
+            homography_refine_incidences(start, incidences, rig.Ps, 0.3)
+            continue
+        with pytest.raises(GeometryError, match="nearly in one plane") as error:
+            homography_refine_incidences(start, incidences, rig.Ps, 0.3)
+        assert error.value.data["deviations"] < error.value.data["needed"]

@@ -94,7 +94,7 @@ def _image_jacobian(Ps: FloatArray, H: FloatArray, M: FloatArray) -> FloatArray:
     return jacobian
 
 
-def _whitening(
+def pixel_whitening(
     Ps: FloatArray, H: FloatArray, M: FloatArray, weights: FloatArray, M_covariance: FloatArray | None
 ) -> FloatArray:
     """``(n, 2c, 2c)``: pixel differences of each point into uncorrelated ones of unit size, 0 where not seen.
@@ -136,7 +136,7 @@ def homography_refine(
     result = np.asarray(H, dtype=np.float64)
     # The weights follow the solution where the points' covariance enters them: twice is enough, it is small.
     for _ in range(1 if M_covariance is None else 2):
-        whitening = _whitening(Ps, result, M_from, weights, M_covariance)
+        whitening = pixel_whitening(Ps, result, M_from, weights, M_covariance)
         result = _least_squares(result, Ps, M_from, pixels, whitening)
     return result
 
@@ -183,7 +183,7 @@ def homography_covariance(
     H = unit_determinant(H, "the homography")
     # Steps that keep the determinant: tr(H⁻¹ dH) = 0.
     chart = np.linalg.svd(np.linalg.inv(H).T.reshape(1, 16))[2][1:].T
-    J = _whitening(Ps, H, M_from, weights, M_covariance) @ _image_jacobian(Ps, H, M_from)
+    J = pixel_whitening(Ps, H, M_from, weights, M_covariance) @ _image_jacobian(Ps, H, M_from)
     _, singular, rows = np.linalg.svd(J.reshape(-1, 16) @ chart, full_matrices=False)
     if len(singular) < 15 or not singular[14] > 1e-10 * singular[0]:
         raise GeometryError(

@@ -23,6 +23,8 @@ RANK = 1e-12
 
 UNDETERMINED = 0.3
 """Standard deviation of a homography, relative to its norm, above which it counts as not determined."""
+REGULAR = 5.0
+"""Standard deviations by which a homography's determinant must differ from zero."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,14 @@ def homography_refine_incidences(
     fit = least_squares(
         residuals, np.zeros(15), jac="3-point", method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=5000
     )
-    singular = np.linalg.svd(np.asarray(fit.jac, dtype=np.float64), compute_uv=False)
+    refined = (base + chart @ fit.x).reshape(4, 4)
+    _refuse_undetermined(refined, chart, np.asarray(fit.jac, dtype=np.float64), sigma)
+    return unit_determinant(refined @ W, "the refined homography")
+
+
+def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray, sigma: float) -> None:
+    """Raise GeometryError where noise leaves ``H`` (4, 4), moved along ``chart`` (16, 15), open or near-singular."""
+    _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
     uncertainty = 1.0 / max(float(singular[14]), 1e-300)
     if uncertainty > UNDETERMINED:
         raise GeometryError(
@@ -186,7 +195,17 @@ def homography_refine_incidences(
             uncertainty=uncertainty,
             singular=singular,
         )
-    return unit_determinant((base + chart @ fit.x).reshape(4, 4) @ W, "the refined homography")
+    # Of the determinant, relative: tr(H⁻¹ dH) over the covariance of dH.
+    spread = np.linalg.inv(H).T.ravel() @ chart @ (rows.T / singular)
+    deviations = 1.0 / max(float(np.linalg.norm(spread)), 1e-300)
+    if deviations < REGULAR:
+        raise GeometryError(
+            "degenerate",
+            f"with {sigma:.3g} px of noise the homography is only {deviations:.3g} standard deviations from a singular "
+            f"one, {REGULAR:g} are needed; the primitives are nearly in one plane",
+            deviations=deviations,
+            needed=REGULAR,
+        )
 
 
 @dataclass(frozen=True)
