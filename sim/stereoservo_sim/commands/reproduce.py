@@ -174,34 +174,38 @@ def show_rows(answer: dict[str, Any], console: Console) -> None:
 
 
 def show_pan_tilt(answer: dict[str, Any], console: Console) -> None:
-    """Table 4.1 with medians over seeds, the thesis's figures in brackets."""
-    table = Table(
-        title=f"pan-tilt: {answer['seeds']} seeds, medians [px], (thesis's table 4.1)", title_justify="left"
-    )
+    """Table 4.1 with medians over seeds, one table a noise; the thesis's figures in brackets."""
     measures = {
-        "delta_u_mean": "u mean",
-        "delta_u_sd": "u sd",
-        "delta_v_mean": "v mean",
-        "delta_v_sd": "v sd",
+        "delta_u_mean": "u, mean",
+        "delta_u_sd": "u, deviation",
+        "delta_v_mean": "v, mean",
+        "delta_v_sd": "v, deviation",
         "delta_lr": "LR",
         "perfect_calibration_delta_lr": "LR, head known",
         "calibration_alone_delta_lr": "LR, no noise",
     }
-    for column in ("condition", "noise", *measures.values()):
-        table.add_column(column, justify="left" if column in ("condition", "noise") else "right")
-    for row in answer["rows"]:
-        beside = answer["thesis"][row["condition"]] if row["noise"] == "drifting" else {}
-        cells = []
-        for key in measures:
-            median = row[key]["median"]
-            thesis = f" ({beside[key]:.3g})" if key in beside else ""
-            cells.append("-" if median is None else f"{median:.3f}{thesis}")
-        table.add_row(row["condition"], row["noise"], *cells)
-    console.print(table)
+    for noise in dict.fromkeys(row["noise"] for row in answer["rows"]):
+        rows = [row for row in answer["rows"] if row["noise"] == noise]
+        table = Table(
+            title=f"{noise} tracks, {answer['seeds']} seeds: medians [px] (thesis)", title_justify="left"
+        )
+        table.add_column("")
+        for row in rows:
+            table.add_column(row["condition"], justify="right")
+        for key, name in measures.items():
+            table.add_row(
+                name, *(_beside(row[key], answer["thesis"][row["condition"]].get(key)) for row in rows)
+            )
+        console.print(table)
     for assumption in answer["assumptions"]:
         console.print(f"assumed: {assumption}")
     for path in answer.get("plots", []):
         console.print(f"wrote {path}")
+
+
+def _beside(ours: dict[str, Any], thesis: float | None) -> str:
+    median = "-" if ours["median"] is None else f"{ours['median']:.3f}"
+    return median if thesis is None else f"{median} ({thesis:.3g})"
 
 
 def _cell(value: Any) -> str:
