@@ -60,25 +60,13 @@ def fundamental_robust(
     left, right = _matches(left, right)
     isotropic_normaliser(left), isotropic_normaliser(right)  # refuse single points before the random search
     threshold = INLIER_SIGMAS * sigma_px
-    parameters = cv2.UsacParams()
-    parameters.confidence = 0.9999
-    parameters.isParallel = False
-    parameters.maxIterations = max_iterations
-    parameters.randomGeneratorState = 20010701
-    parameters.score = cv2.SCORE_METHOD_MAGSAC
-    parameters.threshold = threshold
-    try:
-        found, mask = cv2.findFundamentalMat(left, right, parameters)
-    except cv2.error as error:  # its search asserts on some hopeless inputs
-        raise GeometryError(
-            "no_model", f"no fundamental matrix fits the {len(left)} matches: {error}", matches=len(left)
-        ) from error
-    if found is None or np.shape(found) != (3, 3) or not np.isfinite(found).all():
+    found = _sampled(left, right, threshold, max_iterations)
+    if found is None:
         raise GeometryError(
             "no_model", f"no fundamental matrix fits the {len(left)} matches", matches=len(left)
         )
-    F = _unit(np.asarray(found, dtype=np.float64))
-    inliers = np.asarray(mask).ravel().astype(bool)
+    F = _unit(found)
+    inliers = np.abs(sampson_distances(F, left, right)) <= threshold
     for _ in range(10):
         if int(inliers.sum()) < MIN_MATCHES:
             raise GeometryError(
@@ -94,6 +82,32 @@ def fundamental_robust(
         inliers = again
     _refuse_plane(left[inliers], right[inliers], sigma_px)
     return F, inliers
+
+
+def _sampled(
+    left: FloatArray, right: FloatArray, threshold: float, max_iterations: int
+) -> FloatArray | None:
+    """``F`` (3, 3) by MAGSAC, where its search ends without a model by least median of squares; None where neither
+    finds one.
+    """
+    parameters = cv2.UsacParams()
+    parameters.confidence = 0.9999
+    parameters.isParallel = False
+    parameters.maxIterations = max_iterations
+    parameters.randomGeneratorState = 20010701
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.threshold = threshold
+    for search in (
+        lambda: cv2.findFundamentalMat(left, right, parameters),
+        lambda: cv2.findFundamentalMat(left, right, cv2.FM_LMEDS, threshold, 0.9999, max_iterations),
+    ):
+        try:
+            found, _ = search()
+        except cv2.error:
+            continue  # OpenCV's searches assert on some inputs, good ones among them
+        if found is not None and np.shape(found) == (3, 3) and np.isfinite(found).all():
+            return np.asarray(found, dtype=np.float64)
+    return None
 
 
 def fundamental_refine(

@@ -1,4 +1,9 @@
-"""Separate joints (5.52): each joint's generator from its own trial, at the configuration of that trial."""
+"""Separate joints (5.52): each joint's generator from its own trial, at the configuration of that trial.
+
+A trial may be driven several times over, each with the joints behind the moving one (towards the markers) at other
+fixed positions: every such *distal configuration* shows the markers as a rigid structure of its own, so that four
+dots of a plate become sixteen virtual markers off one plane (5.5, fig. 5.16).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, solve
+from stereoservo.kinematics.calibration.charts import Kind
 from stereoservo.kinematics.calibration.starts import common_points, linear_generator, nominal_generator
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, finite_rows
 
@@ -35,15 +41,16 @@ MISFIT = 20.0
 
 @dataclass(frozen=True)
 class JointTrial:
-    """A joint's own trial: ``stops`` (k,), ``base`` (n,) the locked configuration, ``reference`` its middle
-    position.
+    """A joint's own trial: ``stops`` (k,), the distal configuration ``groups`` (k,) of each, ``base`` (n,) the
+    configuration of group 0 with the joint in the middle.
 
-    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base with the joint at ``reference``, NaN for
-    markers that the trial does not show.
+    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base, NaN for markers that the trial does not show
+    there.
     """
 
     joint: int
     stops: IntArray
+    groups: IntArray
     base: FloatArray
     generator: FloatArray
     points: FloatArray
@@ -57,10 +64,12 @@ def measurements(trials: TrialData, usable: BoolArray, offsets: FloatArray) -> M
     )
 
 
-def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntArray, FloatArray]:
-    """Stops (k,) at which only ``joint`` differs from the trial's base (n,). Raises CalibrationError.
+def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Stops (k,) at which only ``joint`` moves, the distal configuration of each (k,), and the base (n,).
 
-    Stops of other trials that happen to stand on the base belong to it, too.
+    Joints before ``joint`` stand as at the base; joints behind it stand in one of the configurations in which the
+    trial was driven, counted from 0, the base's own. Stops of other trials that happen to stand there belong to it,
+    too. Raises CalibrationError.
     """
     name, unit = trials.joint_names[joint], _unit(trials, joint)
     own = trials.trials == joint
@@ -82,14 +91,12 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
             range=moved,
             minimum=MIN_RANGE,
         )
-    base = np.median(positions[own], axis=0)
-    others = np.delete(np.abs(positions - base), joint, axis=1).max(axis=1, initial=0.0)
-    still = others <= STILL
+    base, groups = _distal_groups(positions, own, joint)
     shown = finite_rows(points).sum(axis=1) >= MIN_SHOWN
-    stops = np.flatnonzero(still & shown)
+    stops = np.flatnonzero((groups >= 0) & shown)
     distinct = len(np.unique(np.round(positions[stops, joint] / STILL)))
     if distinct < MIN_STOPS:
-        lost, strayed = int((own & ~shown).sum()), int((own & ~still).sum())
+        lost, strayed = int((own & ~shown).sum()), int((own & (groups < 0)).sum())
         raise CalibrationError(
             "too_few_stops",
             f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of "
@@ -110,8 +117,34 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
             range=float(np.ptp(positions[stops, joint])),
             minimum=MIN_RANGE,
         )
-    _check_effect(trials, stops, joint)
-    return stops, base
+    largest = np.bincount(groups[stops]).argmax()
+    _check_effect(trials, stops[groups[stops] == largest], joint)
+    return stops, groups[stops], base
+
+
+def _distal_groups(positions: FloatArray, own: BoolArray, joint: int) -> tuple[FloatArray, IntArray]:
+    """The base (n,) of the trial ``own`` (s,), and the distal configuration (s,) of each stop, -1 off the trial.
+
+    A configuration counts with two of the trial's stops: one shows no motion.
+    """
+    base = np.median(positions[own], axis=0)
+    still = (np.abs(positions[:, :joint] - base[:joint]) <= STILL).all(axis=1)
+    distal = positions[:, joint + 1 :]
+    groups = np.full(len(positions), -1)
+    count, left = 0, own & still
+    # The configuration nearest to the middle comes first, and is the base's.
+    order = np.argsort(np.abs(distal - base[joint + 1 :]).sum(axis=1), kind="stable")
+    for k in order[left[order]]:
+        if not left[k]:
+            continue
+        here = (np.abs(distal - distal[k]) <= STILL).all(axis=1) & still
+        left &= ~here
+        if int((here & own).sum()) >= 2:
+            groups[here] = count
+            if count == 0 and (np.abs(distal[k] - base[joint + 1 :]) > STILL).any():
+                base[joint + 1 :] = distal[k]
+            count += 1
+    return base, groups
 
 
 def separate_joint(
@@ -119,55 +152,26 @@ def separate_joint(
 ) -> JointTrial:
     """Generator of ``joint`` and the markers from its own trial, cameras (c, 3, 4) fixed (5.52).
 
-    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). A linear start over all pairs of stops, then
-    least squares with free markers; a start as if the cameras were nominal ones where that does not fit.
-    Raises CalibrationError naming the joint.
+    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). Starts one after the other until one fits: linear
+    over all pairs of stops; as if the cameras were nominal ones. Then least squares with free markers, each of a
+    distal configuration its own. Raises CalibrationError naming the joint.
     """
     name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
-    stops, base = trial_stops(trials, points, joint)
+    stops, groups, base = trial_stops(trials, points, joint)
+    sights = virtual_markers(trials, points, usable, stops, groups)
     angles = trials.positions[stops, joint] - base[joint]
-    here: BoolArray = usable[:, stops] & finite_rows(points[stops])
-    shown: BoolArray = np.asarray(here.any(axis=(0, 1)), dtype=bool)
-    if int(shown.sum()) < MIN_MARKERS:
+    m = len(trials.marker_ids)
+    seen = np.asarray(sights.usable.any(axis=(0, 1)).reshape(-1, m).any(axis=0), dtype=bool)
+    if int(seen.sum()) < MIN_MARKERS:
         raise CalibrationError(
             "too_few_markers",
-            f"joint {name!r}: {int(shown.sum())} markers are seen by two cameras in its trial; at least "
+            f"joint {name!r}: {int(seen.sum())} markers are seen by two cameras in its trial; at least "
             f"{MIN_MARKERS} are needed",
             joint=name,
-            markers=int(shown.sum()),
+            markers=int(seen.sum()),
             minimum=MIN_MARKERS,
         )
-    offsets = np.zeros((len(trials.positions), 1))
-    offsets[stops, 0] = angles
-    mask: BoolArray = np.zeros(usable.shape, dtype=bool)
-    mask[:, stops] = here
-    data = measurements(trials, mask, offsets)
-    best, least = None, np.inf
-    for start in (linear_generator, nominal_generator):
-        generator = start(
-            kind, cameras, points[stops], here, trials.pixels[:, stops], trials.sigmas[:, stops], angles
-        )
-        if generator is None:
-            continue
-        structure = common_points(generator, kind, points[stops], angles)
-        structure[~shown] = [0.0, 0.0, 1.0, 1.0]
-        rig = Rig((kind,), generator[None], cameras, structure)
-        fit = solve(
-            rig,
-            data,
-            "projective",
-            cameras=False,
-            loss="soft_l1",
-            loss_scale=3.0,
-            max_evaluations=40,
-        )
-        # The median of a chi-square with two degrees of freedom is ln 4.
-        squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
-        typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
-        if typical < least:
-            best, least = fit.rig, typical
-        if least < GOOD_FIT:
-            break
+    best, least = best_start(kind, cameras, sights, angles)
     if best is None or not least < MISFIT:
         raise CalibrationError(
             "joint_kind",
@@ -179,7 +183,92 @@ def separate_joint(
             residual_sigmas=least,
             maximum=MISFIT,
         )
-    return JointTrial(joint, stops, base, best.generators[0], np.where(shown[:, None], best.points, np.nan))
+    shown = sights.usable[:, :, :m].any(axis=(0, 1))
+    return JointTrial(
+        joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan)
+    )
+
+
+@dataclass(frozen=True)
+class Sights:
+    """What a joint's trial shows of its virtual markers, those of group g at ``g m`` to ``g m + m - 1``.
+
+    ``points`` (k, v, 4), NaN where not usable; ``usable`` (c, k, v); ``pixels`` (c, k, v, 2) [px]; ``sigmas``
+    (c, k, v) [px].
+    """
+
+    points: FloatArray
+    usable: BoolArray
+    pixels: FloatArray
+    sigmas: FloatArray
+
+
+def virtual_markers(
+    trials: TrialData, points: FloatArray, usable: BoolArray, stops: IntArray, groups: IntArray
+) -> Sights:
+    """The markers (m) of G distal ``groups`` (k,) at ``stops`` (k,) as G m rigid virtual ones."""
+    c, m, k = len(trials.cameras), len(trials.marker_ids), len(stops)
+    count = int(groups.max()) + 1
+    spread = Sights(
+        np.full((k, count * m, 4), np.nan),
+        np.zeros((c, k, count * m), dtype=bool),
+        np.full((c, k, count * m, 2), np.nan),
+        np.ones((c, k, count * m)),
+    )
+    here: BoolArray = usable[:, stops] & finite_rows(points[stops])
+    for g in range(count):
+        at, rows = slice(g * m, (g + 1) * m), np.flatnonzero(groups == g)
+        spread.points[rows, at] = points[stops[rows]]
+        spread.usable[:, rows, at] = here[:, rows]
+        spread.pixels[:, rows, at] = trials.pixels[:, stops[rows]]
+        spread.sigmas[:, rows, at] = trials.sigmas[:, stops[rows]]
+    return spread
+
+
+def best_start(
+    kind: Kind, cameras: FloatArray, sights: Sights, angles: FloatArray
+) -> tuple[Rig | None, float]:
+    """The single joint of ``kind`` that explains the ``sights`` at ``angles`` (k,) best, with its median residual
+    [sigmas]; starts are tried until one fits.
+    """
+    camera, stop, marker = np.nonzero(sights.usable)
+    data = Measurements(
+        angles[:, None],
+        camera,
+        stop,
+        marker,
+        sights.pixels[sights.usable].reshape(-1, 2),
+        sights.sigmas[sights.usable].ravel(),
+    )
+    shown = sights.usable.any(axis=(0, 1))
+    best, least = None, np.inf
+    for start in (linear_generator, nominal_generator):
+        generator = start(kind, cameras, sights.points, sights.usable, sights.pixels, sights.sigmas, angles)
+        if generator is None:
+            continue
+        structure = common_points(generator, kind, sights.points, angles)
+        structure[~shown] = [0.0, 0.0, 1.0, 1.0]
+        rig = Rig((kind,), generator[None], cameras, structure)
+        try:
+            fit = solve(
+                rig,
+                data,
+                "projective",
+                cameras=False,
+                loss="soft_l1",
+                loss_scale=3.0,
+                max_evaluations=80,
+            )
+        except np.linalg.LinAlgError:
+            continue  # a point of this start lies in a focal plane; the next one may do
+        # The median of a chi-square with two degrees of freedom is ln 4.
+        squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+        typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
+        if typical < least:
+            best, least = fit.rig, typical
+        if least < GOOD_FIT:
+            break
+    return best, least
 
 
 def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
