@@ -3,7 +3,7 @@
 A line is a 6-vector ``(d, m)``: of points ``A``, ``B`` the direction ``d = A₄ B₁₂₃ - B₄ A₁₂₃`` and the moment
 ``m = A₁₂₃ x B₁₂₃``, with ``dᵀm = 0``. In a Euclidean frame d is the direction and m the moment about the origin.
 Two points span it and two planes meet in it (thesis 2.5.2); stacks come first: ``(n, 6)``. An image line ``l`` (3,)
-holds the pixels with ``lᵀ(u, v, 1) = 0`` and is scaled so that this is a signed distance [px].
+holds the ideal pixels with ``lᵀ(u, v, 1) = 0`` and is scaled so that this is a signed distance [px].
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Five points of which no four are coplanar are a frame of space. When cameras have moved, their new canonical frame
 differs from the old one by one homography ``H``, which the points' images give; what was known moves with it: points
 ``H M``, generators ``H Ĝ H⁻¹``, cameras that stood still ``P H⁻¹``. With six points a single moved camera is resected
-in the old frame and needs no second one.
+in the old frame and needs no second one. Pixels are ideal ones (undistorted).
 """
 
 from __future__ import annotations
