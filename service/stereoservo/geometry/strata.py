@@ -174,10 +174,18 @@ def strata_of_quadric(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
             eigenvalues=values,
         )
     plane = vectors[:, 0] * (np.sign(vectors[3, 0]) or 1.0)
+    return plane, triangular_root(Q[:3, :3] * np.sign(np.trace(Q)))
+
+
+def triangular_root(omega: FloatArray) -> FloatArray:
+    """Upper triangular ``K`` (3, 3), positive diagonal, ``K₃₃ = 1``, with ``K Kᵀ ~ ω*`` (3, 3).
+
+    Raises LinAlgError where ``omega`` is not positive definite.
+    """
     flip = np.eye(3)[::-1]
-    omega = Q[:3, :3] * np.sign(np.trace(Q))
-    K = flip @ np.linalg.cholesky(flip @ omega @ flip) @ flip
-    return plane, K / K[2, 2]
+    root = flip @ np.linalg.cholesky(flip @ omega @ flip) @ flip
+    K: FloatArray = root / root[2, 2]
+    return K
 
 
 def fixed_plane_residual(generators: FloatArray, plane: FloatArray) -> FloatArray:

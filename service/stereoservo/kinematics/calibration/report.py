@@ -5,9 +5,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import rq
 
-from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
+from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective, upper_triangular
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, predicted
 from stereoservo.kinematics.calibration.statistics import (
     chi2_within,
@@ -205,9 +204,7 @@ def build_model(
 
 def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
     """fx, skew, fy, u0, v0 [px] of a camera (3, 4) in a Euclidean frame."""
-    K, _ = rq(matrix[:, :3])
-    K = K * np.sign(np.diag(K))
-    K = K / K[2, 2]
+    K, _ = upper_triangular(matrix[:, :3])
     return float(K[0, 0]), float(K[0, 1]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 

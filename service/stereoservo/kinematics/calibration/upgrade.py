@@ -13,7 +13,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from stereoservo.geometry.displacements import exp_rotation, nearest_rotation_generator
-from stereoservo.geometry.strata import euclidean_to_projective, projective_to_euclidean
+from stereoservo.geometry.screws import screw_twist
+from stereoservo.geometry.strata import euclidean_to_projective, projective_to_euclidean, triangular_root
 from stereoservo.kinematics.calibration.bundle import Rig
 
 FloatArray = npt.NDArray[np.float64]
@@ -111,11 +112,7 @@ def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
     chord = middle_after - middle
     chord = chord - axis * (axis @ chord)
     centre = middle + 0.5 * chord + 0.5 * np.cross(axis, chord) / np.tan(0.5 * angle)
-    result = np.zeros((4, 4))
-    x, y, z = axis
-    result[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
-    result[:3, 3] = -np.cross(axis, centre)
-    return result
+    return screw_twist(axis, centre)
 
 
 def intrinsics_linear(
@@ -138,16 +135,6 @@ def intrinsics_linear(
     omega = omega * np.sign(omega[2, 2])
     unique = bool(values[4] > SEPARATION * np.sqrt(9 * len(blocks)))
     return (triangular_root(omega) if np.linalg.eigvalsh(omega)[0] > 0.0 else None), unique
-
-
-def triangular_root(omega: FloatArray) -> FloatArray:
-    """Upper triangular ``K̃`` (3, 3), positive diagonal, ``K̃₃₃ = 1``, with ``K̃ K̃ᵀ ~ Ω``. Raises
-    LinAlgError if indefinite.
-    """
-    flip = np.eye(3)[::-1]
-    root = flip @ np.linalg.cholesky(flip @ omega @ flip) @ flip
-    result: FloatArray = root / root[2, 2]
-    return result
 
 
 def nominal_intrinsics(focal: float) -> FloatArray:
