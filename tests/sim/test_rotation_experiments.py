@@ -9,7 +9,6 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from stereoservo.kinematics.head import feed_forward
-from stereoservo.kinematics.joint_sights import predicted_pixels
 from stereoservo_sim.commands.reproduce import EXPERIMENTS
 from stereoservo_sim.experiments.homing import draw_homing, run_homing
 from stereoservo_sim.experiments.pan_tilt import (
@@ -30,7 +29,6 @@ from stereoservo_sim.experiments.thesis_head import (
     calibrated,
     general_positions,
     head,
-    perfect,
     tracked,
     tracks_of,
     trajectories,
@@ -74,14 +72,6 @@ def test_the_head_is_that_of_the_thesis():
     axis = cell.axes(cell.home)[1][0]
     up = np.linalg.inv(cell.flange(cell.home))[:3, :3] @ axis
     assert abs(up @ np.array([0.0, -np.cos(np.radians(20)), -np.sin(np.radians(20))])) == pytest.approx(1.0)
-
-
-def test_the_perfect_head_projects_as_the_cell_does():
-    rng = np.random.default_rng(2)
-    cell = head(rng)
-    q = general_positions(cell, rng, 3)
-    predicted = predicted_pixels(perfect(cell), q, cell.markers(cell.home[None])[0])
-    assert np.abs(predicted.swapaxes(0, 1) - cell.pixels(q)).max() < 1e-6
 
 
 def test_tracker_noise_is_what_it_is_said_to_be():

@@ -19,7 +19,8 @@ from scipy.stats import chi2
 
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo.kinematics.joint_angles import homing_problem, sensitivity, way_home
-from stereoservo.kinematics.joint_sights import JointAnglesError, SeenChain
+from stereoservo.kinematics.joint_sights import JointAnglesError, SeenChain, seen_chain
+from stereoservo_sim.exact_model import exact_model
 from stereoservo_sim.experiments.affine_measures import spread
 from stereoservo_sim.experiments.thesis_head import (
     ASSUMPTIONS,
@@ -28,7 +29,6 @@ from stereoservo_sim.experiments.thesis_head import (
     calibrated,
     general_positions,
     head,
-    perfect,
     tracks_of,
     trial_data,
 )
@@ -129,7 +129,7 @@ def run_homing(*, seeds: int, seed: int, progress: ProgressCall, trials: int = T
             calibration = calibrated(data)
             for name, seen, known in (
                 ("calibrated", calibration.seen, calibration),
-                ("perfect", perfect(cell), None),
+                ("perfect", seen_chain(exact_model(cell)), None),
             ):
                 found[name].append(homings(seen, known, cell.home, at_home, positions, pixels))
         except (CalibrationError, JointAnglesError) as error:

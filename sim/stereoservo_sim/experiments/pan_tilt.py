@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo.kinematics.head import feed_forward
-from stereoservo.kinematics.joint_sights import SeenChain
+from stereoservo.kinematics.joint_sights import SeenChain, seen_chain
+from stereoservo_sim.exact_model import exact_model
 from stereoservo_sim.experiments.affine_measures import spread
 from stereoservo_sim.experiments.thesis_head import (
     ASSUMPTIONS,
@@ -31,7 +32,6 @@ from stereoservo_sim.experiments.thesis_head import (
     calibrated,
     general_positions,
     head,
-    perfect,
     tracked,
     tracks_of,
     trial_data,
@@ -117,7 +117,10 @@ def trial(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> dict[s
     calibrated one on ``exact`` images. Raises CalibrationError.
     """
     tracks = tracks_of(cell, noise, rng)
-    heads = {"calibrated": calibrated(trial_data(cell, tracks)).seen, "perfect": perfect(cell)}
+    heads = {
+        "calibrated": calibrated(trial_data(cell, tracks)).seen,
+        "perfect": seen_chain(exact_model(cell)),
+    }
     answer: dict[str, dict[str, FloatArray]] = {}
     for condition, (positions, pixels, exact, pairs) in _sequences(cell, tracks, rng).items():
         pixels, exact = pixels[:, :, CALIBRATING_POINTS:], exact[:, :, CALIBRATING_POINTS:]

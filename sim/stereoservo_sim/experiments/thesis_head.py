@@ -223,14 +223,3 @@ def _rig_of(model: CellModel) -> tuple[Rig, Stratum]:
         cameras[0] = np.triu(cameras[0])
     generators = (upgrade @ model.generators @ back)[::-1]
     return Rig(("revolute", "revolute"), generators, cameras, points), stratum
-
-
-def perfect(cell: SyntheticCell) -> SeenChain:
-    """The head as it is, in the Euclidean frame of its cameras at home: what an endless calibration would find."""
-    rest, h = cell.flange(cell.home), 1e-3
-    generators = []
-    for unit in np.eye(2):
-        ahead, behind = (np.linalg.inv(cell.flange(cell.home + sign * h * unit)) @ rest for sign in (1, -1))
-        generators.append((ahead - behind) / (2.0 * np.sin(h)))
-    chain = ProjectiveChain(("revolute", "revolute"), np.array(generators), cell.home, tip_first=True)
-    return SeenChain(chain, cell.intrinsics @ cell.poses[:, :3], cell.lenses, ("pan", "tilt"))
