@@ -37,6 +37,8 @@ AMBIGUOUS = 25.0
 """Chi-square by which another configuration may fit worse and still count as possible."""
 MAX_SIGMA_FACTOR = 3.0
 """Residual [stated sigmas, rms] above which the pixels are not those of this chain and these points."""
+EXACT = 1e-4
+"""Cost at which equations without redundancy count as solved."""
 MISFIT_TAIL = 1e-6
 """Probability below which a cost is not put down to chance."""
 LARGEST_DEVIATION = 0.1
@@ -87,42 +89,20 @@ def measured_joints(
             joints=seen.joint_names,
         )
     bounds = _bounds(seen, limits, local=start is not None)
-    q = _starts(bounds) if start is None else np.asarray(start, dtype=np.float64).reshape(1, n)
     if start is None:
-        q = _descent(problem.linearise_rays, q, RAY_STEPS)[0]
-        q = _distinct(q, seen)
-    q, costs, front = _descent(problem.linearise, q, PIXEL_STEPS)
-    q = _wrapped(q, bounds, seen)
-    q, costs = q[front], costs[front]
-    if not len(q):
+        near = _distinct(_descent(problem.linearise_rays, _starts(bounds), RAY_STEPS)[0], seen)
+    else:
+        near = np.asarray(start, dtype=np.float64).reshape(1, n)
+    ends, costs, front = _descent(problem.linearise, near, PIXEL_STEPS)
+    if not front.any():
         raise JointAnglesError(
             "no_agreement", "no configuration puts the points before the cameras that see them", cost=None
         )
-    best = float(costs.min())
-    freedom = max(0, problem.freedom)
-    factor = max(1.0, best / max(1, freedom))
-    ceiling = MAX_SIGMA_FACTOR**2 * (float(chi2_distribution.isf(MISFIT_TAIL, freedom)) if freedom else 1e-3)
-    if best > ceiling:
-        raise JointAnglesError(
-            "no_agreement",
-            f"no configuration explains the pixels: the residual is {np.sqrt(factor):.3g} times the stated noise, at "
-            f"most {MAX_SIGMA_FACTOR:g} is believed. Are these the points, the cameras, the chain?",
-            sigma_factor=float(np.sqrt(factor)),
-            maximum=MAX_SIGMA_FACTOR,
-        )
-    possible = np.flatnonzero(costs - best <= AMBIGUOUS * factor)
-    ordered = possible[np.argsort(costs[possible], kind="stable")]
+    q, costs = _wrapped(ends[front], bounds, seen), costs[front]
+    ordered = _possible(problem, costs)
     _refuse_open(problem, q[ordered[0]], largest_deviation)
-    found: list[JointAngles] = []
-    for i in ordered:
-        information = _information(problem, q[i])
-        if any(_same(q[i] - other.q, float(costs[i]) - other.cost, information, seen) for other in found):
-            continue
-        covariance: FloatArray = np.asarray(
-            np.linalg.pinv(information, rcond=1e-13, hermitian=True), dtype=np.float64
-        )
-        found.append(JointAngles(q[i], covariance, float(costs[i]), freedom))
-    inside = tuple(a for a in found if _inside(a, bounds))
+    found = _told_apart(problem, q[ordered], costs[ordered])
+    inside = tuple(angles for angles in found if _inside(angles, bounds))
     if not inside:
         raise JointAnglesError(
             "outside_limits",
@@ -131,6 +111,40 @@ def measured_joints(
             limits=bounds.tolist(),
         )
     return inside
+
+
+def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]:
+    """Which ends of the search, of ``costs`` (s,), the pixels do not rule out, the best first. Raises JointAnglesError
+    where even the best does not explain them.
+    """
+    best = float(costs.min())
+    freedom = max(0, problem.freedom)
+    factor = max(1.0, best / max(1, freedom))
+    # As many equations as joints are solved exactly or not at all.
+    chance = float(chi2_distribution.isf(MISFIT_TAIL, freedom)) if freedom else EXACT
+    if best > MAX_SIGMA_FACTOR**2 * chance:
+        raise JointAnglesError(
+            "no_agreement",
+            f"no configuration explains the pixels: the residual is {np.sqrt(factor):.3g} times the stated noise, at "
+            f"most {MAX_SIGMA_FACTOR:g} is believed. Are these the points, the cameras, the chain?",
+            sigma_factor=float(np.sqrt(factor)),
+            maximum=MAX_SIGMA_FACTOR,
+        )
+    possible = np.flatnonzero(costs - best <= AMBIGUOUS * factor)
+    return np.asarray(possible[np.argsort(costs[possible], kind="stable")], dtype=np.int64)
+
+
+def _told_apart(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list[JointAngles]:
+    """Each configuration once, from ends ``q`` (s, n) in order of their ``costs`` (s,)."""
+    found: list[JointAngles] = []
+    for end, cost in zip(q, costs, strict=True):
+        slope = problem.linearise(end[None])[1][0]
+        information: FloatArray = slope.T @ slope
+        if any(_same(end - other.q, float(cost) - other.cost, information, problem.seen) for other in found):
+            continue
+        covariance = np.asarray(np.linalg.pinv(information, rcond=1e-13, hermitian=True), dtype=np.float64)
+        found.append(JointAngles(end, covariance, float(cost), max(0, problem.freedom)))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,11 +351,6 @@ def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
     middle = np.where(revolute, bounds.mean(axis=1), 0.0)
     turned = middle + np.mod(q - middle + np.pi, 2.0 * np.pi) - np.pi
     return np.where(revolute, turned, q)
-
-
-def _information(problem: JointProblem, q: FloatArray) -> FloatArray:
-    slope = problem.linearise(q[None])[1][0]
-    return np.asarray(slope.T @ slope, dtype=np.float64)
 
 
 def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:

@@ -7,7 +7,7 @@ carry a covariance; the residuals are then whitened by what pixels and points le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -243,11 +243,6 @@ def joint_problem(
         values, vectors = np.linalg.eigh(np.where(known[:, None, None], point_covariance, 0.0))
         factors = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return JointProblem(seen, np.where(known[:, None], points, 0.0), factors, ideal, roots, steps)
-
-
-def with_chain(problem: JointProblem, seen: SeenChain) -> JointProblem:
-    """The same sights for another calibration: what its uncertainty does is read from the difference."""
-    return replace(problem, seen=seen)
 
 
 def points_seen(
