@@ -23,7 +23,6 @@ from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
 from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
 from stereoservo_sim.drives import DriveBank, IdealPlant, Plant
-from stereoservo_sim.rig import project
 from stereoservo_sim.world import demo_cell
 
 FloatArray = npt.NDArray[np.float64]
@@ -160,7 +159,7 @@ class FakeCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, 
 
 
 class FakeCameraDriver(SimulatedCamera):
-    """A camera that delivers the markers of the simulated cell as observations: projection plus Gaussian
+    """A camera that delivers the markers of the simulated cell as observations: raw pixels plus Gaussian
     noise.
     """
 
@@ -179,7 +178,7 @@ class FakeCameraDriver(SimulatedCamera):
         self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
     ) -> CameraObservation:
         """The markers that this camera sees with the arm at ``q`` (n,)."""
-        pixels, _ = project(self.camera.P, self.cell.marker_positions(q))
+        pixels, _ = self.cell.in_world(self.camera, q).image_of(self.cell.marker_positions(q))
         seen = self.cell.visible(q, self.camera)
         # The same numbers are drawn whatever is seen: one marker's fate does not change another's noise.
         noise = rng.standard_normal(pixels.shape) * self._fake.noise_px

@@ -5,6 +5,7 @@ the shutter.
 from __future__ import annotations
 
 import zlib
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import msgspec
@@ -15,7 +16,7 @@ from msgspec import Meta
 from stereoservo.runtime.ports import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
 from stereoservo_drivers.lifecycle import DriverLifecycle, State
 from stereoservo_sim.history import FILE_NAME, HistoryError, JointHistory
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world import simulated_cell
 
 FloatArray = npt.NDArray[np.float64]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -25,7 +26,8 @@ HOLD_NS = 100_000_000
 class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of every simulated camera.
 
-    ``view``: which camera of the simulated rig it is (default: the one with the driver's own name).
+    ``view``: which camera of the simulated rig it is (default: the one with the driver's own name). ``k1``: how its
+    lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole.
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later. ``drop_rate``: chance
     that a frame is lost; ``dropouts``: spans [s, s] after activation without frames; ``freeze_after_s``:
     from then on the picture stands still though frames keep coming. ``seed``: of noise and losses
@@ -33,6 +35,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """
 
     view: str = ""
+    k1: float = 0.0
     rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 30.0
     latency_s: NonNegative = 0.012
     phase_s: NonNegative = 0.0
@@ -45,6 +48,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class SimulatedCamera:
     """A camera of the simulated cell. Shows the arm as it truly stood at the shutter time.
 
+    It stands before the arm, or rides on it before the standing body, as the cell file's ``mount`` says.
     ``blackout`` may be set while it runs: no frame arrives until it is cleared. Before the simulated arm
     has ever moved the camera shows it at the cell's base; when the arm's process is silent, where it was
     last.
@@ -55,16 +59,23 @@ class SimulatedCamera:
 
     def __init__(self, options: CameraOptions, context: DriverContext) -> None:
         self.name = context.camera
-        self.cell = demo_cell()
+        self.cell = simulated_cell(context.mount)
         self._options = options
         self._context = context
         view = options.view or context.camera
         try:
-            self.camera = self.cell.rig.camera(view)
+            self.camera = replace(self.cell.rig.camera(view), k1=options.k1)
         except KeyError as error:
             raise DriverError(
                 "option", f"driver {self.driver!r}: view: {error.args[0]}", view=view
             ) from error
+        if not self.camera.sees_whole_image:
+            raise DriverError(
+                "option",
+                f"driver {self.driver!r}: k1: {options.k1:g} leaves the corners of this camera's image dark; "
+                f"{self.camera.least_k1:.3f} or more is valid",
+                k1=options.k1,
+            )
         self._life = DriverLifecycle(f"camera driver {self.driver!r} ({self.name})")
         self._history: JointHistory | None = None
         self._seed = context.seed if options.seed is None else options.seed

@@ -2,25 +2,25 @@
 
 The marker body is drawn by area coverage: spans of every dot and plate are found exactly on sixteen lines
 a pixel row, so that centroids are true to a few thousandths of a pixel. (A rasteriser's images are biased
-by up to half a pixel, and even antialiased ones by hundredths.)
+by up to half a pixel, and even antialiased ones by hundredths.) Behind a lens that bends, a dot is the exact image of
+its rim, so that it is also off its centre's image as a real one is; what stands behind the body is bent as a picture.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.geometry.distortion import distort
+from stereoservo_sim.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
+from stereoservo_sim.bending import BentImage, bend_outline, unit_circle
 from stereoservo_sim.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.rig import PinholeCamera, project
 from stereoservo_sim.robots import shape_segments
 from stereoservo_sim.world import SimulatedCell
-
-if TYPE_CHECKING:
-    from stereoservo_sim.backdrop import PybulletBackdrop
 
 FloatArray = npt.NDArray[np.float64]
 ImageArray = npt.NDArray[np.uint8]
@@ -45,45 +45,51 @@ class RenderSettings:
 
 
 class Renderer:
-    """Images of the simulated cell in one camera. Keeps the still background and a field of noise."""
+    """Images of the simulated cell in one camera of its rig. Keeps the background and a field of noise.
+
+    Raises ValueError where the camera's lens leaves the image's corners dark.
+    """
 
     def __init__(self, cell: SimulatedCell, camera: PinholeCamera, settings: RenderSettings) -> None:
         self.cell = cell
         self.camera = camera
         self.settings = settings
-        self._room = _room(camera) if settings.background == "arm" else _plain(camera)
-        self._backdrop = _backdrop(cell, camera) if settings.background == "pybullet" else None
+        self._bending = BentImage(camera)
+        self._backdrop = _backdrop(cell, self._bending.pinhole, settings.background)
         shape = (camera.height + _NOISE_MARGIN, camera.width + _NOISE_MARGIN)
         field = np.random.default_rng(20010101).standard_normal(shape) * settings.noise_grey
         self._noise = field.astype(np.float32)
 
     def render(self, q: FloatArray, rng: np.random.Generator) -> ImageArray:
         """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise."""
-        background, front = self._room, []
+        background, front = self._backdrop.image(q), []
         if self.settings.background == "arm":
-            background = self._room.copy()
+            background = background.copy()
             front = self._draw_arm(background, q)
-        elif self._backdrop is not None:
-            background = self._backdrop.image(q)
+        elif self.settings.background == "pybullet":
             front = self._draw_arm(background.copy(), q)  # only what stands before the body is drawn again
-        image = background.astype(np.float32)
+        image = self._bending.image(background).astype(np.float32)
         region = draw_body(image, self.cell, self.camera, q)
         for polygon, level in front:
-            _cover(image, polygon, level)
+            blend_polygon(image, self._bending.outline(polygon), level)
         if region is not None and self.settings.blur_px > 0:
             _blur(image, region, self.settings.blur_px)
         return self._expose(image, rng)
 
     def _draw_arm(self, image: ImageArray, q: FloatArray) -> list[tuple[FloatArray, float]]:
-        """Links behind the body are drawn, those in front of it returned as (outline (k, 2), grey level)."""
+        """Links behind the body are drawn, those in front of it returned as (outline (k, 2), grey level).
+
+        ``image`` and outlines are those of the pinhole, before the lens bends them.
+        """
         ends, radii = shape_segments(self.cell.robot, q)
-        body_depth = float(project(self.camera.P, self.cell.marker_positions(q))[1].min())
+        camera = self.cell.in_world(self._bending.pinhole, q)
+        body_depth = float(project(camera.P, self.cell.marker_positions(q))[1].min())
         links = []
         for i, (segment, radius) in enumerate(zip(ends, radii, strict=True)):
-            centres, depths = project(self.camera.P, segment)
+            centres, depths = project(camera.P, segment)
             if depths.min() < 0.1:
                 continue
-            sizes = self.camera.K[0, 0] * radius / depths
+            sizes = camera.K[0, 0] * radius / depths
             links.append((float(depths.mean()), float(depths.min()), i, centres, sizes))
         front = []
         for _, nearest, i, centres, sizes in sorted(links, key=lambda link: -link[0]):
@@ -105,10 +111,14 @@ class Renderer:
         return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
-def _backdrop(cell: SimulatedCell, camera: PinholeCamera) -> PybulletBackdrop:
-    from stereoservo_sim.backdrop import PybulletBackdrop  # pybullet is loaded only where it is asked for
+def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> Backdrop:
+    if background == "pybullet":
+        from stereoservo_sim.pybullet_backdrop import (
+            PybulletBackdrop,  # the engine only where it is asked for
+        )
 
-    return PybulletBackdrop(cell.robot, camera)
+        return PybulletBackdrop(cell, pinhole)
+    return RoomBackdrop(cell, pinhole) if background == "arm" else PlainBackdrop(pinhole)
 
 
 def draw_body(
@@ -122,10 +132,11 @@ def draw_body(
     Returns:
         The region touched (left, top, right, bottom) [px], or None where nothing was drawn.
     """
-    flange = cell.flange(q)
+    camera = cell.in_world(camera, q)
+    body = cell.body_pose(q)
     faces = []
     for face, flange_to_face in zip(cell.body.faces, cell.body.flange_to_face, strict=True):
-        pose = flange @ flange_to_face
+        pose = body @ flange_to_face
         sight = camera.centre - pose[:3, 3]
         cosine = float(-pose[:3, 2] @ sight / np.linalg.norm(sight))
         faces.append((cosine, face, camera.P @ pose[:, [0, 1, 3]]))
@@ -136,13 +147,33 @@ def draw_body(
         if corners[:, 2].min() < 0.05:  # at the camera: nothing sensible to draw
             continue
         outline = corners[:, :2] / corners[:, 2:]
+        if camera.k1 != 0.0:
+            outline = bend_outline(camera, outline)
         boxes.append((outline.min(axis=0), outline.max(axis=0)))
         shade = 0.6 + 0.4 * abs(cosine)
         blend_polygon(image, outline, (PLATE_LEVEL if cosine > 0 else BACK_LEVEL) * shade)
         if cosine > 0:
             for centre in face.positions:
-                blend_ellipse(image, circle_image(H, centre, face.radius), DOT_LEVEL * shade)
+                _draw_dot(image, camera, H, centre, face.radius, DOT_LEVEL * shade)
     return _region(boxes, camera)
+
+
+def _draw_dot(
+    image: npt.NDArray[np.float32],
+    camera: PinholeCamera,
+    H: FloatArray,
+    centre: FloatArray,
+    radius: float,
+    level: float,
+) -> None:
+    """A disc at ``centre`` (2,) [m] of the plane that ``H`` (3, 3) takes to ideal pixels."""
+    if camera.k1 == 0.0:
+        blend_ellipse(image, circle_image(H, centre, radius), level)
+        return
+    rim = (centre + radius * unit_circle()) @ H[:, :2].T + H[:, 2]
+    outline = distort(camera.lens, rim[:, :2] / rim[:, 2:])
+    if np.isfinite(outline).all():  # else the lens does not show it
+        blend_polygon(image, outline, level)
 
 
 def circle_image(H: FloatArray, centre: FloatArray, radius: float) -> FloatArray:
@@ -172,31 +203,9 @@ def _blur(image: npt.NDArray[np.float32], region: tuple[int, int, int, int], sig
     part[...] = cv2.GaussianBlur(part, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
 
 
-def _cover(image: npt.NDArray[np.float32], outline: FloatArray, level: float) -> None:
-    blend_polygon(image, outline, level)
-
-
 def _capsule_outline(centres: FloatArray, sizes: FloatArray) -> FloatArray:
     """Convex outline (k, 2) of the images of a capsule's two end spheres, (2, 2) and (2,) [px]."""
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = (centres[:, None] + sizes[:, None, None] * ring).reshape(-1, 2)
     return cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
-
-
-def _plain(camera: PinholeCamera) -> ImageArray:
-    return np.full((camera.height, camera.width), 90, dtype=np.uint8)
-
-
-def _room(camera: PinholeCamera) -> ImageArray:
-    """A wall and a floor, dimmer than the dots and unevenly lit."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
-    wall = 100 + 18 * np.cos(u / camera.width * 2.2) - 12 * v / camera.height
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
-    rays = rays @ camera.world_to_camera[:3, :3]
-    with np.errstate(divide="ignore"):
-        reach = np.where(rays[..., 2] < -1e-3, -camera.centre[2] / rays[..., 2], np.inf)
-    ground = camera.centre[:2] + np.where(np.isfinite(reach), reach, 0)[..., None] * rays[..., :2]
-    tiles = 82 + 9 * ((np.floor(ground[..., 0] / 0.4) + np.floor(ground[..., 1] / 0.4)) % 2)
-    room = np.where(reach < 6.0, tiles, wall)
-    return np.asarray(cv2.GaussianBlur(room.astype(np.float32), (0, 0), 1.0)).astype(np.uint8)

@@ -4,15 +4,18 @@ markers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.kinematics.model import Mount
 from stereoservo_sim.body import MarkerBody, roof_body
-from stereoservo_sim.rig import PinholeCamera, StereoRig, look_at, project, stereo_rig
+from stereoservo_sim.rig import PinholeCamera, StereoRig, inverse_pose, look_at, stereo_rig
 from stereoservo_sim.robots import RX90, Robot, flange_pose, shape_segments
+from stereoservo_sim.synthetic import rotation, translation
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -23,60 +26,79 @@ MAX_INCIDENCE = float(np.deg2rad(72.0))
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCell:
-    """Arm, body on its flange, cameras; ``base`` (n,) [rad] is the configuration around which the cell is
-    laid out.
+    """Arm, body, cameras; ``base`` (n,) [rad] is the configuration around which the cell is laid out.
+
+    Eye-to-hand the body is on the flange and the rig stands in the world. Where ``stand`` (4, 4) is given, the body
+    stands there in the world, and the rig, given in the flange's frame, is carried (eye-in-hand).
     """
 
     robot: Robot
     body: MarkerBody
     rig: StereoRig
     base: FloatArray
+    stand: FloatArray | None = None
+
+    def with_lenses(self, k1: Mapping[str, float]) -> SimulatedCell:
+        """The same cell with lenses of ``k1`` by the cameras' names."""
+        return replace(self, rig=self.rig.with_lenses(k1))
 
     def flange(self, q: FloatArray) -> FloatArray:
         """Pose of the flange in the world at ``q`` (n,), (4, 4)."""
         return flange_pose(self.robot, q)
 
+    def body_pose(self, q: FloatArray) -> FloatArray:
+        """Pose of the body in the world at ``q`` (n,), (4, 4)."""
+        return self.flange(q) if self.stand is None else self.stand
+
+    def in_world(self, camera: PinholeCamera, q: FloatArray) -> PinholeCamera:
+        """A camera of the rig as it stands in the world at ``q`` (n,)."""
+        return camera if self.stand is None else camera.moved(self.flange(q))
+
     def marker_positions(self, q: FloatArray) -> FloatArray:
         """Markers in the world at ``q`` (n,), (m, 3) [m], rows as ``body.ids``."""
-        pose = self.flange(q)
+        pose = self.body_pose(q)
         return self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
 
     def marker_positions_rig(self, q: FloatArray) -> FloatArray:
         """Markers in the rig's frame at ``q`` (n,), (m, 3) [m]: what errors in millimetres are judged by."""
         frame = self.rig.world_to_rig
+        if self.stand is not None:
+            frame = frame @ inverse_pose(self.flange(q))
         return self.marker_positions(q) @ frame[:3, :3].T + frame[:3, 3]
 
     def truth_pixels(self, q: FloatArray) -> dict[str, FloatArray]:
-        """Noise-free images of all marker centres at ``q`` (n,), seen or not: camera name -> (m, 2) [px]."""
+        """Noise-free raw pixels of all marker centres at ``q`` (n,), seen or not: camera name -> (m, 2)."""
         points = self.marker_positions(q)
-        return {camera.name: project(camera.P, points)[0] for camera in self.rig.cameras}
+        return {camera.name: self.in_world(camera, q).image_of(points)[0] for camera in self.rig.cameras}
 
     def visible(
         self, q: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
     ) -> BoolArray:
-        """Which markers ``camera`` sees at ``q`` (n,), (m,): as :meth:`turned_to`, and no link stands
-        before them.
+        """Which markers ``camera`` of the rig sees at ``q`` (n,), (m,): as :meth:`turned_to`, and no link
+        stands before them.
         """
-        pose = self.flange(q)
-        seen = self.turned_to(pose, camera, max_incidence=max_incidence)
-        points = self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
+        camera = self.in_world(camera, q)
+        seen = self.turned_to(self.body_pose(q), camera, max_incidence=max_incidence)
+        points = self.marker_positions(q)
         return seen & ~self._behind_arm(q, points, camera.centre)
 
     def turned_to(
-        self, flange: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
+        self, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
     ) -> BoolArray:
-        """Which markers have their whole dot in the image and their face turned to ``camera``, (m,).
+        """Which markers of the body at ``pose`` have their whole dot in the image and their face turned to
+        ``camera``, (m,).
 
-        ``flange`` (4, 4) may be any pose, also one that the arm does not take.
+        ``pose`` (4, 4) of body and camera in one frame; it may be one that the arm does not take.
         """
-        points = self.body.marker_points @ flange[:3, :3].T + flange[:3, 3]
-        normals = self.body.marker_normals @ flange[:3, :3].T
+        points = self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
+        normals = self.body.marker_normals @ pose[:3, :3].T
         radii = np.concatenate([np.full(len(face.ids), face.radius) for face in self.body.faces])
-        pixels, depths = project(camera.P, points)
+        pixels, depths = camera.image_of(points)
         sight = camera.centre - points
         distances = np.linalg.norm(sight, axis=1)
         turned = np.sum(sight * normals, axis=1) > np.cos(max_incidence) * distances
-        border = camera.K[0, 0] * radii / np.maximum(depths, 1e-6) + 2.0
+        stretch = 1.0 + 3.0 * max(camera.k1, 0.0) * (distances / np.maximum(depths, 1e-6)) ** 2
+        border = stretch * camera.K[0, 0] * radii / np.maximum(depths, 1e-6) + 2.0
         inside = (
             (depths > 0.05)
             & np.all(pixels >= border[:, None], axis=1)
@@ -118,6 +140,21 @@ def demo_cell() -> SimulatedCell:
     return SimulatedCell(robot=RX90, body=body, rig=rig, base=base)
 
 
+@lru_cache(maxsize=1)
+def hand_cell() -> SimulatedCell:
+    """The same arm with the stereo rig on its flange, before the same body that stands 0.85 m away."""
+    base = demo_cell().base
+    body = roof_body()
+    flange_to_rig = translation(0.03, -0.02, 0.07) @ rotation("z", 8.0) @ rotation("x", -2.0)
+    rig = stereo_rig(
+        inverse_pose(flange_to_rig), baseline=0.16, vergence=2 * float(np.arctan(0.08 / 0.85)), focal=500.0
+    )
+    facing = rotation("y", 6.0) @ rotation("x", 180.0) @ rotation("z", -85.0)
+    ahead = translation(0.0, 0.0, 0.85) @ facing @ translation(*-body.marker_points.mean(axis=0))
+    stand = flange_pose(RX90, base) @ flange_to_rig @ ahead
+    return SimulatedCell(robot=RX90, body=body, rig=rig, base=base, stand=stand)
+
+
 DEMO_GOALS: dict[str, FloatArray] = {
     "near": np.array([-0.01, -1.44, -0.16, 1.13, 0.17, -0.79]),
     "roll": np.array([-0.18, -1.44, -0.36, 0.36, 1.07, -2.44]),
@@ -129,3 +166,22 @@ two of them or the base, along straight lines in joint space and in Cartesian sp
 From the base: ``near`` is 29 degrees and 0.12 m away, ``roll`` 132 degrees (nearly about the line of
 sight) and 0.13 m, ``far`` 94 degrees and 0.37 m.
 """
+
+HAND_GOALS: dict[str, FloatArray] = {
+    "near": np.array([0.24, -1.18, -0.45, 1.05, 0.61, -1.47]),
+    "roll": np.array([0.28, -1.37, 0.0, 1.20, 0.70, 0.95]),
+    "far": np.array([0.37, -1.41, -0.39, 0.52, 1.19, -1.96]),
+}
+"""The same for :func:`hand_cell`: the body as the carried rig sees it turns by 33, 124 and 82 degrees and moves by
+0.18, 0.18 and 0.39 m.
+"""
+
+
+def simulated_cell(mount: Mount) -> SimulatedCell:
+    """The embedded cell whose cameras are mounted so."""
+    return hand_cell() if mount == "eye_in_hand" else demo_cell()
+
+
+def goals_of(mount: Mount) -> dict[str, FloatArray]:
+    """Configurations (n,) [rad] by name that :func:`simulated_cell` is worth driving to."""
+    return HAND_GOALS if mount == "eye_in_hand" else DEMO_GOALS

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
 from stereoservo.runtime.clock import VirtualClock
 from stereoservo.runtime.ports import DriverContext, DriverError
+from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_drivers.fake import FakeCameraDriver, FakeJointDriver
 from stereoservo_drivers.pybullet import PybulletCameraDriver
 from stereoservo_sim.history import FILE_NAME, JointHistory
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world import demo_cell, simulated_cell
 
 MS = 1_000_000
 CELL = demo_cell()
@@ -197,6 +200,46 @@ def test_a_frame_waits_for_an_arm_that_is_a_little_late(tmp_path):
     cell.arm.read_state()
     (item,) = camera.poll()
     assert item.t_shutter_ns == cell.clock.now_ns()
+
+
+@pytest.mark.parametrize(
+    ("mount", "k1"), [("eye_to_hand", -0.3), ("eye_in_hand", 0.0), ("eye_in_hand", -0.15)]
+)
+def test_lens_and_mount_of_the_cell_file_are_what_is_shown(tmp_path, mount, k1):
+    """Fake and rendering camera alike, with the arm in motion: against OpenCV, by the arm's own kinematics."""
+    cell = Cell(tmp_path, [], shared=True)
+    cameras = []
+    for kind, options in ((FakeCameraDriver, {"noise_px": 0.0}), (PybulletCameraDriver, {"noise": 0.0})):
+        context = replace(cell.context("right"), mount=mount)
+        cameras.append(kind({"k1": k1, **options}, context))
+        cameras[-1].configure()
+        cameras[-1].activate()
+    cell.cameras = cameras
+    observations, frames = cell.run(0.4, velocity=[0.1, -0.1, 0.1, 0.3, 0.2, -0.5])
+    detector = DotDetector({}, cell.context("right"))
+    simulated = simulated_cell(mount)
+    camera = simulated.rig.camera("right")
+    assert len(observations) == len(frames) > 8
+    for observation, frame in zip(observations, frames, strict=True):
+        q = cell.world.at(observation.t_shutter_ns)
+        to_camera = camera.world_to_camera
+        pose = simulated.flange(q)
+        if mount == "eye_in_hand":
+            pose = np.linalg.inv(pose) @ simulated.stand
+        points = simulated.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
+        rotation, _ = cv2.Rodrigues(to_camera[:3, :3])
+        lens = np.array([k1, 0, 0, 0.0])
+        expected = cv2.projectPoints(points, rotation, to_camera[:3, 3], camera.K, lens)[0][:, 0]
+        assert np.abs(observation.pixels - expected[observation.ids]).max() < 1e-6
+        found = detector.detect(frame, None)
+        assert len(found.ids) == 14
+        assert np.abs(found.pixels - expected[found.ids]).max() < 0.02
+
+
+def test_a_lens_that_leaves_corners_dark_is_refused(tmp_path):
+    context = DriverContext(VirtualClock(), "t", tmp_path, tmp_path, "left")
+    with pytest.raises(DriverError, match=r"k1: -0.7 leaves the corners .* dark; -0.591 or more is valid"):
+        FakeCameraDriver({"k1": -0.7}, context)
 
 
 def test_an_unknown_view_and_another_arm_are_refused(tmp_path):

@@ -70,6 +70,11 @@ CASES = {
     "other joint": ("j1 = 0.1", "j7 = 0.1", ["j7", "j1"]),
     "joint without limits": ('joint = "j1"', 'joint = "j2"', ["j1", "j2"]),
     "camera twice": ("[safety]", '[[camera]]\nname = "left"\ndriver = "fake"\n[safety]', ["left", "twice"]),
+    "mixed mounts": (
+        "[safety]",
+        '[[camera]]\nname = "hand"\ndriver = "fake"\nmount = "eye_in_hand"\n[safety]',
+        ["camera.mount", "'left' is eye_to_hand", "'hand' is eye_in_hand", "mounted alike"],
+    ),
     "empty keep-out": (
         "[calibration]",
         '[[safety.keep_out]]\nname = "a"\nranges = {}\n[calibration]',

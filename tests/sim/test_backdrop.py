@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo_sim.backdrop import REFRESH_FRAMES, PybulletBackdrop
+from stereoservo_sim.backdrop import REFRESH_FRAMES
+from stereoservo_sim.pybullet_backdrop import PybulletBackdrop
 from stereoservo_sim.rig import project
 from stereoservo_sim.robots import shape_segments
 from stereoservo_sim.world import demo_cell
@@ -18,7 +19,7 @@ CELL = demo_cell()
 def test_links_stand_where_the_kinematics_put_them(seed: int, view: str) -> None:
     camera = CELL.rig.camera(view)
     q = CELL.base + np.random.default_rng(seed).uniform(-0.2, 0.2, 6)
-    image = PybulletBackdrop(CELL.robot, camera).image(q)
+    image = PybulletBackdrop(CELL, camera).image(q)
     floor = np.median(image[-100:])
     ends, _ = shape_segments(CELL.robot, q)
     seen = 0
@@ -32,7 +33,7 @@ def test_links_stand_where_the_kinematics_put_them(seed: int, view: str) -> None
 
 
 def test_backdrop_is_kept_until_the_arm_has_moved_and_time_has_passed() -> None:
-    backdrop = PybulletBackdrop(CELL.robot, CELL.rig.cameras[0])
+    backdrop = PybulletBackdrop(CELL, CELL.rig.cameras[0])
     first = backdrop.image(CELL.base)
     moved = CELL.base + 0.3
     for _ in range(REFRESH_FRAMES - 1):

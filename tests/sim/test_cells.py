@@ -1,22 +1,58 @@
-"""The shipped cell file and the one in deploy/ are one."""
+"""The shipped cell files and those in deploy/ are the same, and fit the simulation."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from stereoservo.runtime.cellfile import load_cell_file
-from stereoservo_sim.cells import demo_cell_path, demo_cell_text
-from stereoservo_sim.world import demo_cell
+import pytest
 
-DEPLOYED = Path(__file__).parents[2] / "deploy" / "cells" / "demo.toml"
+from stereoservo.runtime.cellfile import check_cell, load_cell_file
+from stereoservo_sim.cells import CELLS, demo_cell_path, demo_cell_text, shipped_cell_path
+from stereoservo_sim.demonstration.truth import true_cell
 
-
-def test_the_deployed_cell_file_is_the_packaged_one():
-    assert DEPLOYED.read_bytes() == demo_cell_path().read_bytes()
-    assert demo_cell_text() == DEPLOYED.read_text(encoding="utf-8")
+DEPLOYED = Path(__file__).parents[2] / "deploy" / "cells"
 
 
-def test_the_cell_file_names_what_the_simulation_has():
-    cell = load_cell_file(demo_cell_path())
-    assert [camera.name for camera in cell.camera] == [camera.name for camera in demo_cell().rig.cameras]
-    assert [limit.joint for limit in cell.safety.limit] == list(demo_cell().robot.joint_names)
+@pytest.mark.parametrize("name", CELLS)
+def test_the_deployed_cell_file_is_the_packaged_one(name: str) -> None:
+    assert (DEPLOYED / f"{name}.toml").read_bytes() == shipped_cell_path(name).read_bytes()
+    assert load_cell_file(shipped_cell_path(name)).cell.name == name
+
+
+def test_the_demo_cell_is_the_first() -> None:
+    assert demo_cell_path() == shipped_cell_path("demo")
+    assert demo_cell_text() == (DEPLOYED / "demo.toml").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="no cell 'fisheye' is shipped; there are demo, wide, eye_in_hand"):
+        shipped_cell_path("fisheye")
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_the_cell_file_names_what_the_simulation_has(name: str) -> None:
+    cell = load_cell_file(shipped_cell_path(name))
+    truth = true_cell(cell)
+    assert [camera.name for camera in cell.camera] == [camera.name for camera in truth.rig.cameras]
+    assert [limit.joint for limit in cell.safety.limit] == list(truth.robot.joint_names)
+
+
+def test_the_truth_has_the_mount_and_the_lenses_of_the_cell_file() -> None:
+    assert [camera.k1 for camera in true_cell(load_cell_file(shipped_cell_path("wide"))).rig.cameras] == [
+        -0.3,
+        -0.3,
+    ]
+    assert true_cell(load_cell_file(shipped_cell_path("demo"))).stand is None
+    assert true_cell(load_cell_file(shipped_cell_path("eye_in_hand"))).stand is not None
+
+
+def test_a_camera_under_another_name_keeps_its_view() -> None:
+    tree = {
+        "schema": 1, "cell": {"name": "x"}, "joints": {"driver": "fake"},
+        "camera": [{"name": "a", "driver": "fake", "options": {"view": "right", "k1": -0.1}}],
+        "safety": {"limit": [{"joint": "j1", "min": -1, "max": 1, "velocity": 1, "acceleration": 1}]},
+    }  # fmt: skip
+    (camera,) = true_cell(check_cell(tree)).rig.cameras
+    right = true_cell(load_cell_file(demo_cell_path())).rig.camera("right")
+    assert (camera.name, camera.k1) == ("a", -0.1)
+    assert (camera.world_to_camera == right.world_to_camera).all()
+    tree["camera"] = [{"name": "top", "driver": "fake"}]
+    with pytest.raises(ValueError, match="camera 'top' is not simulated"):
+        true_cell(check_cell(tree))

@@ -68,7 +68,8 @@ def describe_cell(
         )
     cameras = []
     for section in cell.camera:
-        driver, detector = make_camera(section, DriverContext(**common, camera=section.name))  # type: ignore[arg-type]
+        context = DriverContext(**common, camera=section.name, mount=section.mount)  # type: ignore[arg-type]
+        driver, detector = make_camera(section, context)
         cameras.append(describe_camera(section, driver, detector, cell_path))
     return joints, tuple(cameras)
 

@@ -132,7 +132,7 @@ def _product(A: FloatArray, B: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Markers by kinematics alone at one configuration: operators there (5.21), points, ideal pixels, their Jacobian."""
+    """Markers by kinematics alone at one configuration: operators (5.21), points, ideal pixels, their Jacobian."""
 
     operators: FloatArray
     points: FloatArray

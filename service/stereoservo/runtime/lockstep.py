@@ -27,6 +27,7 @@ from stereoservo.runtime.ports import (
     Frame,
     JointDriver,
     JointState,
+    Mount,
     Prior,
 )
 from stereoservo.runtime.record import encode_step, fingerprint
@@ -70,7 +71,7 @@ class LockstepCell:
         self.detectors: list[Detector | None] = []
         descriptions: list[CameraDescription] = []
         for section in cell.camera:
-            camera, detector = make_camera(section, self._driver_context(section.name))
+            camera, detector = make_camera(section, self._driver_context(section.name, section.mount))
             self.cameras.append(camera)
             self.detectors.append(detector)
             descriptions.append(describe_camera(section, camera, detector))
@@ -95,9 +96,9 @@ class LockstepCell:
             camera.configure()
             camera.activate()
 
-    def _driver_context(self, camera: str) -> DriverContext:
+    def _driver_context(self, camera: str, mount: Mount = "eye_to_hand") -> DriverContext:
         name, runtime_dir, cell_dir, seed = self._context
-        return DriverContext(self.clock, name, runtime_dir, cell_dir, camera, seed, self.services)
+        return DriverContext(self.clock, name, runtime_dir, cell_dir, camera, seed, self.services, mount)
 
     def step(self) -> StepOutputs:
         """One period of virtual time."""

@@ -164,7 +164,10 @@ class Clock(Protocol):
 
 @dataclass(frozen=True)
 class DriverContext:
-    """What the service gives a driver at construction, beside its own options."""
+    """What the service gives a driver at construction, beside its own options.
+
+    ``camera``, ``mount``: of a camera driver or detector, as the cell file has them.
+    """
 
     clock: Clock
     cell: str
@@ -174,6 +177,7 @@ class DriverContext:
     seed: int = 0
     services: dict[str, Any] = field(default_factory=dict)
     """In-process objects shared between drivers of one process (lockstep: the simulated world)."""
+    mount: Mount = "eye_to_hand"
 
 
 @runtime_checkable

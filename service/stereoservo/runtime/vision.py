@@ -201,6 +201,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
         cell_dir=Path(plan.cell_path).parent,
         camera=camera,
         seed=plan.seed,
+        mount=section.mount,
     )
     path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
     lock = (

@@ -5,15 +5,23 @@ from __future__ import annotations
 from importlib.resources import as_file, files
 from pathlib import Path
 
-DEMO = "demo.toml"
+CELLS = ("demo", "wide", "eye_in_hand")
+"""By name: the embedded cell; with lenses that bend; with the cameras on the arm."""
+
+
+def shipped_cell_path(name: str) -> Path:
+    """Path of a shipped cell file in the installed package. Raises ValueError where there is none of that name."""
+    if name not in CELLS:
+        raise ValueError(f"no cell {name!r} is shipped; there are {', '.join(CELLS)} (or give a .toml file)")
+    with as_file(files(__package__).joinpath(f"{name}.toml")) as path:
+        return path
 
 
 def demo_cell_text() -> str:
     """The demo's cell file as text."""
-    return files(__package__).joinpath(DEMO).read_text(encoding="utf-8")
+    return demo_cell_path().read_text(encoding="utf-8")
 
 
 def demo_cell_path() -> Path:
     """Path of the demo's cell file in the installed package."""
-    with as_file(files(__package__).joinpath(DEMO)) as path:
-        return path
+    return shipped_cell_path("demo")

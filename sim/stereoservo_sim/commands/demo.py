@@ -16,14 +16,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.demonstration.conduct import (
-    DEMO_CELL,
     DemoFailedError,
     Stage,
     conduct_live,
     conduct_lockstep,
 )
 from stereoservo_sim.demonstration.results import summary
+from stereoservo_sim.demonstration.truth import true_cell
 
 
 def demo(
@@ -38,12 +39,18 @@ def demo(
         Path, typer.Option("--out", help="Directory for report, recording and model (made where missing).")
     ] = Path("stereoservo-demo"),
     cell: Annotated[
-        Path | None, typer.Option("--cell", help="Another cell file of the simulated cell.")
-    ] = None,
+        str,
+        typer.Option(
+            "--cell", metavar="NAME|PATH", help=f"{', '.join(CELLS)}, or a .toml file of a simulated cell."
+        ),
+    ] = CELLS[0],
 ) -> None:
     """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
-    path = DEMO_CELL if cell is None else cell
-    load_cell_file(path)
+    try:
+        path = Path(cell) if cell.endswith(".toml") else shipped_cell_path(cell)
+        true_cell(load_cell_file(path))
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--cell") from error
     out.mkdir(parents=True, exist_ok=True)
     conduct = conduct_lockstep if lockstep else conduct_live
     started = time.monotonic()

@@ -23,10 +23,10 @@ from stereoservo_sim.demonstration.lockstep import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import Calibrated, perform
 from stereoservo_sim.demonstration.truth import TruthLog
 from stereoservo_sim.history import JointHistory
+from stereoservo_sim.world import goals_of
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-DEMO_CELL = Path(__file__).parent.parent / "cells" / "demo.toml"
 
 
 class DemoFailedError(Exception):
@@ -73,13 +73,17 @@ def conduct_lockstep(cell_path: Path, out: Path, seed: int, stage: Stage) -> Dem
             lockstep.on_step = _every(2000, log.take)
             names = lockstep.settings.joint_names
             calibrated, outcomes = perform(
-                LockstepDemonstrator(lockstep, seed, stage.progress), names, stage.tell
+                LockstepDemonstrator(lockstep, seed, stage.progress), names, _configurations(cell), stage.tell
             )
             times, positions = log.end()
     save_model(calibrated.model, out / "model.json")
     return Demonstration(
         cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True
     )
+
+
+def _configurations(cell: CellFile) -> dict[str, FloatArray]:
+    return goals_of(cell.camera[0].mount)
 
 
 def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], None]:
@@ -110,7 +114,9 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
             log.follow()
             with Client(cell.cell.name) as client:
                 names = tuple(joint.name for joint in client.info().joints)
-                calibrated, outcomes = perform(LiveDemonstrator(client, stage.progress), names, stage.tell)
+                calibrated, outcomes = perform(
+                    LiveDemonstrator(client, stage.progress), names, _configurations(cell), stage.tell
+                )
                 loop = client.status().loop
             times, positions = log.end()
             code = daemon.stop()

@@ -9,13 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.geometry.cameras import project_many
+from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
 from stereoservo_sim.demonstration.conduct import Demonstration
 from stereoservo_sim.demonstration.judge import Flight, Judgement
+from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.report import CalibrationPlots, GoalPlots, ReportData, write_report
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world import SimulatedCell
 
 FloatArray = npt.NDArray[np.float64]
 TRACK_POINTS = 200
@@ -24,6 +26,7 @@ TRACK_POINTS = 200
 def write_pages(path: Path, demonstration: Demonstration, flight: Flight, goals: Sequence[Judgement]) -> None:
     """Write the report. Raises OSError."""
     cell = demonstration.cell
+    truth = true_cell(cell)
     limits = {limit.joint: limit.velocity for limit in cell.safety.limit}
     mode = "lockstep, virtual time" if demonstration.lockstep else "real processes over zenoh"
     facts = {
@@ -42,7 +45,7 @@ def write_pages(path: Path, demonstration: Demonstration, flight: Flight, goals:
         title="stereoservo demonstration",
         joints=demonstration.joint_names,
         calibration=None if flight.trials is None else _calibration(demonstration, flight.trials),
-        goals=tuple(_goal(goal, cell.servo.gain) for goal in goals),
+        goals=tuple(_goal(goal, cell.servo.gain, truth) for goal in goals),
         tolerance_px=cell.servo.tolerance_px,
         velocity_limits=np.array([limits[name] for name in demonstration.joint_names]),
         summary="An arm that nobody calibrated learnt itself through two cameras that nobody calibrated, and reached "
@@ -80,8 +83,8 @@ def _calibration(demonstration: Demonstration, trials: TrialData) -> Calibration
 
 
 def residuals(model: CellModel, trials: TrialData) -> FloatArray:
-    """Measured minus predicted pixels (c, s, m, 2), NaN where a marker was not seen."""
-    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
+    """Measured minus predicted raw pixels (c, s, m, 2), NaN where a marker was not seen."""
+    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
     matrices = np.array([camera.matrix for camera in model.cameras])
     rows = [model.marker_ids.index(marker) for marker in trials.marker_ids]
     predicted = np.array(
@@ -90,12 +93,15 @@ def residuals(model: CellModel, trials: TrialData) -> FloatArray:
             for q in trials.positions
         ]
     )
-    found: FloatArray = trials.pixels - predicted.transpose(1, 0, 2, 3)
+    raw = [
+        distort(camera.lens, ideal)
+        for camera, ideal in zip(model.cameras, predicted.transpose(1, 0, 2, 3), strict=True)
+    ]
+    found: FloatArray = trials.pixels - np.array(raw)
     return found
 
 
-def _goal(goal: Judgement, gain: float) -> GoalPlots:
-    cell = demo_cell()
+def _goal(goal: Judgement, gain: float, cell: SimulatedCell) -> GoalPlots:
     chosen = goal.joints[:: max(1, len(goal.joints) // TRACK_POINTS)]
     pixels = [cell.truth_pixels(q) for q in chosen]
     return GoalPlots(

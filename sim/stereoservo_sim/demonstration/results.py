@@ -13,7 +13,7 @@ from stereoservo_sim.demonstration.judge import Judgement, judge_goal, read_flig
 from stereoservo_sim.demonstration.overview import write_overview
 from stereoservo_sim.demonstration.pages import write_pages
 from stereoservo_sim.demonstration.scenario import GOALS
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.demonstration.truth import true_cell
 
 MAX_ERROR_PX = 0.3
 MAX_ERROR_MM = 0.5
@@ -25,18 +25,17 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     ``seconds``: how long the demonstration took. Raises RecordingError, LookupError where a goal was never flown.
     """
     flight = read_flight(demonstration.recording)
+    truth = true_cell(demonstration.cell)
     goals = [
         judge_goal(
             goal.name, goal.law, demonstration.outcomes[goal.name], flight, demonstration.truth_t,
-            demonstration.truth_q, demo_cell(),
+            demonstration.truth_q, truth,
         )
         for goal in GOALS
     ]  # fmt: skip
     report = demonstration.out / "report.html"
     write_pages(report, demonstration, flight, goals)
-    write_overview(
-        demonstration.out / "overview.png", goals, demo_cell(), demonstration.cell.servo.tolerance_px
-    )
+    write_overview(demonstration.out / "overview.png", goals, truth, demonstration.cell.servo.tolerance_px)
     model = demonstration.calibrated.model
     return {
         "converged": not (found := problems(model, goals)),

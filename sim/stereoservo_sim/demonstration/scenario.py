@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
+
 from stereoservo.kinematics.model import CellModel
-from stereoservo_sim.world import DEMO_GOALS
+
+FloatArray = npt.NDArray[np.float64]
 
 TEACH_FRAMES = 20
 REST_S = 0.4  # after a move, before the cameras are believed
@@ -16,14 +20,14 @@ JUDGE_S = 1.2  # rest after a goal, of which one second is judged
 
 @dataclass(frozen=True)
 class ShownGoal:
-    """A goal of the demonstration, one of ``world.DEMO_GOALS``, and the law that reaches it again."""
+    """A goal of the demonstration, one of ``world.goals_of``, and the law that reaches it again."""
 
     name: str
     law: str
 
 
 GOALS = (ShownGoal("near", "stereo"), ShownGoal("roll", "cartesian3"), ShownGoal("far", "cartesian3"))
-"""From home: 29, 132 and 94 degrees of rotation, 0.12, 0.13 and 0.37 m."""
+"""From home: about 27, 130 and 90 degrees of rotation, 0.15, 0.15 and 0.38 m; see ``world``."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +59,12 @@ class Operator(Protocol):
 
 
 def perform(
-    operator: Operator, joint_names: tuple[str, ...], tell: Callable[[str], None]
+    operator: Operator,
+    joint_names: tuple[str, ...],
+    configurations: Mapping[str, FloatArray],
+    tell: Callable[[str], None],
 ) -> tuple[Calibrated, dict[str, str]]:
-    """The whole demonstration; gives the calibration and each goal's outcome."""
+    """The whole demonstration, goals shown at ``configurations`` (n,); the calibration and each goal's outcome."""
     operator.enable()
     tell("calibrating: each joint moves alone in view of both cameras")
     calibrated = operator.calibrate()
@@ -66,7 +73,7 @@ def perform(
     tell(f"calibrated in {calibrated.seconds:.0f} s{rms}")
     for goal in GOALS:
         tell(f"showing goal {goal.name!r}")
-        operator.move(dict(zip(joint_names, DEMO_GOALS[goal.name].tolist(), strict=True)))
+        operator.move(dict(zip(joint_names, configurations[goal.name].tolist(), strict=True)))
         operator.rest(REST_S)
         operator.teach(goal.name, TEACH_FRAMES)
     outcomes = {}

@@ -1,18 +1,38 @@
-"""Where the simulated arm truly was, kept while the demonstration runs, so that it can be judged afterwards."""
+"""The truth of a demonstration: the simulated cell as the cell file has it, and where its arm was all the time."""
 
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.runtime.cellfile import CellFile
 from stereoservo_sim.history import FILE_NAME, JointHistory
+from stereoservo_sim.world import SimulatedCell, simulated_cell
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 POLL_S = 1.0
+
+
+def true_cell(cell: CellFile) -> SimulatedCell:
+    """The simulated cell that a cell file's cameras show: their mount and lenses, under the cell's own names.
+
+    Raises ValueError where a camera is none of the simulated rig.
+    """
+    simulated = simulated_cell(cell.camera[0].mount)
+    cameras = []
+    for section in cell.camera:
+        view = section.options.get("view") or section.name
+        try:
+            camera = simulated.rig.camera(view)
+        except KeyError as error:
+            raise ValueError(f"camera {section.name!r} is not simulated: {error.args[0]}") from error
+        cameras.append(replace(camera, name=section.name, k1=float(section.options.get("k1", 0.0))))
+    return replace(simulated, rig=replace(simulated.rig, cameras=tuple(cameras)))
 
 
 class TruthLog:
