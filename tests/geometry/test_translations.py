@@ -20,6 +20,7 @@ from stereoservo.geometry.translation_fit import (
     shared_plane,
     with_rest,
 )
+from stereoservo.geometry.translation_planar import planar_start
 from stereoservo.geometry.translations import (
     JORDAN_TRANSLATION,
     TRACE_FREE,
@@ -68,6 +69,7 @@ class Scene:
         body = rng.uniform(-0.06, 0.06, (points, 3)) * [1, 1, 0 if flat else 1]
         turn = Rotation.from_rotvec([0.5, 0.3, 0.1]).as_matrix()
         self.X = body @ turn.T + [0, 0, 0.9]
+        self.normal = turn[:, 2]
         K = np.array([[1500, 0, 256], [0, 1500, 256], [0, 0, 1.0]])
         self.P = []
         for side in (-1, 1):
@@ -495,15 +497,46 @@ def test_two_motions_of_which_one_is_bad_cannot_be_told_apart():
     assert error.data["reasons"] == ["points", ""]
 
 
-def test_linear_estimates_from_coplanar_points_are_refused_at_any_noise():
-    for seed in range(10):
+@pytest.mark.parametrize("motions", [1, 4])
+def test_coplanar_points_give_the_plane_at_infinity_at_its_bound(motions):
+    scores = []
+    for seed in range(60):
         rng = np.random.default_rng(seed)
-        scene, shifts = Scene(rng, flat=True), shifts_of(rng, 3)
+        scene, shifts = Scene(rng, flat=True), shifts_of(rng, motions)
+        shifts = np.where(np.abs(shifts @ scene.normal)[:, None] > 0.008, shifts, 0.02 * scene.normal)
         exact = scene.pixels(scene.moved(shifts))
-        for sigma in (0.02, 0.5):
-            error = refusal(scene, exact + sigma * rng.normal(size=exact.shape), sigma)
-            assert error.code == "degenerate"
-            assert "coplanar" in str(error)
+        found = estimate_translations(scene.Ps, exact + 0.02 * rng.normal(size=exact.shape), 0.02)
+        scores.append(plane_score(found.fit, scene.plane))
+        assert found.used.all() or motions > 1
+    assert within_chi2(scores, 3)
+
+
+def test_coplanar_points_without_noise_are_exact_and_their_bad_motions_are_left_out():
+    rng = np.random.default_rng(2)
+    scene, shifts = Scene(rng, flat=True), shifts_of(rng, 6)
+    exact = scene.pixels(scene.moved(shifts))
+    assert same(estimate_translations(scene.Ps, exact, 0.05).fit.plane, scene.plane) < 1e-5
+    spoil(rng, scene, exact, 1, "turn", shifts[0])
+    spoil(rng, scene, exact, 2, "matches", shifts[1])
+    found = estimate_translations(scene.Ps, exact + 0.05 * rng.normal(size=exact.shape), 0.05)
+    assert found.used.tolist() == [False, False, True, True, True, True]
+    assert [j.reason for j in found.judgements[:2]] == ["not_a_translation", "points"]
+
+
+def test_coplanar_points_moved_within_their_plane_or_little_out_of_it_are_refused():
+    rng = np.random.default_rng(3)
+    scene = Scene(rng, flat=True)
+    within = np.linalg.svd(scene.normal[None])[2][1:] * 0.02
+    exact = scene.pixels(scene.moved(within))
+    error = refusal(scene, exact)
+    assert error.code in ("degenerate", "no_model")
+    little = scene.pixels(scene.moved(within[:1] + 0.002 * scene.normal))
+    error = refusal(scene, little + 0.3 * rng.normal(size=little.shape), 0.3)
+    assert error.code == "degenerate"
+    assert error.data["coplanar"]
+    assert error.data["deviation"] > error.data["limit"]
+    with pytest.raises(GeometryError, match="lie in the plane of the points"):
+        planar_start(scene.Ps, to_homogeneous(scene.X) @ scene.frame.T, exact[1:])
 
 
 def test_zero_baseline_is_refused():

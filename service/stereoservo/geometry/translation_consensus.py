@@ -28,8 +28,8 @@ from stereoservo.geometry.translation_fit import (
     read_images,
     with_rest,
 )
+from stereoservo.geometry.translation_planar import planar_start, plane_basis
 from stereoservo.geometry.translations import (
-    TranslationSVD,
     Weighting,
     direction_given_plane,
     image_weighting,
@@ -39,6 +39,7 @@ from stereoservo.geometry.translations import (
 )
 
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 Reason = Literal["", "unseen", "points", "conditioning", "not_a_translation", "no_motion", "other_plane"]
 
 TAIL = 1e-3
@@ -74,21 +75,59 @@ class MotionJudgement:
 
 @dataclass(frozen=True, eq=False)
 class TranslationEstimate:
-    """``fit`` of the motions ``used`` (n,) bool, the verdict on each of the n, and the homographies (n, 4, 4)
-    they were judged by, NaN where there is none.
-    """
+    """``fit`` of the motions ``used`` (n,) bool, and the verdict on each of the n."""
 
     fit: TranslationFit
     used: BoolArray
     judgements: tuple[MotionJudgement, ...]
-    homographies: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What was seen: images of all stops, points (m, 4) at rest, NaN where unknown, and whether they are ``flat``."""
+
+    images: Images
+    pixels: FloatArray
+    noise: FloatArray
+    rest: FloatArray
+    weighting: Weighting
+    flat: bool
+
+    def start(self, stops: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Linear plane at infinity (4,) and directions (n, 4) from rest to each of the stops."""
+        if self.flat:
+            return planar_start(self.images.cameras, self.rest, self.pixels[stops])
+        Hs = [translation_homography(self.images.cameras, self.rest, self.pixels[s]) for s in stops]
+        plane = plane_at_infinity_from_stack(Hs, self.weighting)
+        return plane, np.stack([direction_given_plane(H, plane, self.weighting) for H in Hs])
+
+    def homography(self, stop: int) -> FloatArray:
+        """Linear homography (4, 4) from rest to a stop; of coplanar points that of their translation."""
+        if not self.flat:
+            return translation_homography(self.images.cameras, self.rest, self.pixels[stop])
+        plane, k = self.start(np.array([stop]))
+        return np.asarray(np.eye(4) + np.outer(k[0], plane), dtype=np.float64)
+
+    def deviation(self, fit: TranslationFit) -> float:
+        """Relative deviation of the heights of the points; of coplanar ones also of what lies off their plane, as far
+        to any side as the points reach, measured in the images.
+        """
+        among = height_deviation(self.rest, fit)
+        if not self.flat:
+            return among
+        M = self.rest[np.isfinite(self.rest).all(axis=1)]
+        M = M / np.linalg.norm(M @ self.weighting.right.T, axis=1, keepdims=True)
+        M = 2.0 * M / (M @ fit.plane)[:, None] * float(np.mean(M @ fit.plane))
+        reach = np.linalg.norm((M - M.mean(axis=0)) @ self.weighting.left.T, axis=1).max()
+        back = np.linalg.inv(self.weighting.left)
+        worst = np.linalg.eigvalsh(back.T @ fit.plane_covariance @ back)[3]
+        return max(among, float(reach * np.sqrt(worst) / np.mean(M @ fit.plane)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Single:
-    """One motion by itself: its homography and plane (chart of height 1 at the points' middle)."""
+    """One motion by itself: its plane at infinity in the chart of `_height_one`, None where it has none."""
 
-    homography: FloatArray | None
     plane: FloatArray | None
     covariance: FloatArray | None
     judgement: MotionJudgement
@@ -102,41 +141,51 @@ def estimate_translations(
     Cameras ``Ps`` (c, 3, 4), ``pixels`` (n + 1, c, m, 2) [px] with the stop at rest first, NaN where missing, noise
     ``sigma``, a number or (n + 1, c, m) [px]. Linear start, motions left out that are no translations or do not
     share the plane at infinity (``reject``), then the bundle with free points. Raises GeometryError for shapes
-    that do not fit, where fewer than half of the motions agree, and where the motions used leave the plane at
+    that do not fit, where no majority of the motions agrees, and where the motions used leave the plane at
     infinity undetermined; its data hold the reasons.
+
+    Coplanar points (to within their noise) work where the motions lead out of their plane. The covariance is one of
+    first order: scores against it keep their chi-square while `height_deviation` is below about 2 %.
     """
-    images = read_images(Ps, pixels, sigma)
-    noise = np.broadcast_to(np.asarray(sigma, dtype=np.float64), pixels.shape[:3])
-    n = len(pixels) - 1
-    if n < 1:
+    if len(pixels) < 2:
         raise GeometryError(
-            "too_few", "no motion is given; the stop at rest and one more are needed", motions=n
+            "too_few", "no motion is given; the stop at rest and one more are needed", motions=0
         )
-    rest = triangulate(Ps, pixels[0], noise[0])
-    weighting = image_weighting(Ps, rest)
-    _refuse_flat(Ps, rest, np.where(images.weights[0] > 0, noise[0], np.inf))
+    scene = _scene(Ps, pixels, sigma)
+    n = len(pixels) - 1
     if not reject:
-        Hs = np.stack([translation_homography(Ps, rest, p) for p in pixels[1:]])
-        fit = _joint(Ps, pixels, noise, rest, Hs, weighting, np.ones(n, dtype=bool))
-        blank = MotionJudgement("", np.nan, np.nan, np.nan)
-        _require_heights(rest, fit)
-        return TranslationEstimate(fit, np.ones(n, dtype=bool), (blank,) * n, Hs)
-    singles = [_judge_alone(images, pixels, noise, rest, weighting, s) for s in range(1, n + 1)]
-    Hs = np.stack([np.full((4, 4), np.nan) if m.homography is None else m.homography for m in singles])
+        everything = np.ones(n, dtype=bool)
+        fit = _joint(scene, everything)
+        _require_heights(scene, fit)
+        return TranslationEstimate(fit, everything, (MotionJudgement("", np.nan, np.nan, np.nan),) * n)
+    singles = [_judge_alone(scene, s) for s in range(1, n + 1)]
     used = _largest_agreement(singles)
     for _ in range(ROUNDS):
         _require_majority(used, singles)
-        fit = _joint(Ps, pixels, noise, rest, Hs, weighting, used)
-        z, C = _height_one(weighting.right, rest, fit.plane, fit.plane_covariance)
+        fit = _joint(scene, used)
+        z, C = _height_one(scene.weighting.right, scene.rest, fit.plane, fit.plane_covariance)
         distances = np.array([_distance(m, z, C) for m in singles])
         again = distances <= chi2_distribution.isf(TAIL, 3)
         if np.array_equal(again, used):
             break
         used = again
     else:
-        fit = _joint(Ps, pixels, noise, rest, Hs, weighting, used)
-    _require_heights(rest, fit)
-    return TranslationEstimate(fit, used, _verdicts(singles, used, distances), Hs)
+        _require_majority(used, singles)
+        fit = _joint(scene, used)
+    _require_heights(scene, fit)
+    return TranslationEstimate(fit, used, _verdicts(singles, used, distances))
+
+
+def _scene(Ps: FloatArray, pixels: FloatArray, sigma: FloatArray | float) -> _Scene:
+    images = read_images(Ps, pixels, sigma)
+    noise = np.broadcast_to(np.asarray(sigma, dtype=np.float64), pixels.shape[:3])
+    rest = triangulate(Ps, pixels[0], noise[0])
+    weighting = image_weighting(Ps, rest)
+    known = np.isfinite(rest).all(axis=1)
+    sigmas = np.where(images.weights[0] > 0, noise[0], np.inf)[:, known]
+    limit = chi2_distribution.isf(TAIL, int(known.sum()) - 3)
+    flat = flatness(Ps, rest[known], sigmas) <= limit
+    return _Scene(images, pixels, noise, rest, weighting, bool(flat))
 
 
 def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
@@ -154,22 +203,6 @@ def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
     return float(((M @ plane * weights) ** 2).sum())
 
 
-def _refuse_flat(Ps: FloatArray, rest: FloatArray, sigmas: FloatArray) -> None:
-    """Raise GeometryError where the noise explains what is not coplanar in the points."""
-    known = np.isfinite(rest).all(axis=1)
-    cost = flatness(Ps, rest[known], sigmas[:, known])
-    limit = float(chi2_distribution.isf(TAIL, int(known.sum()) - 3))
-    if cost <= limit:
-        raise GeometryError(
-            "degenerate",
-            f"the {int(known.sum())} points are coplanar to within their noise (chi-square {cost:.4g} of "
-            f"{limit:.4g}); "
-            "a homography of space needs points off one plane",
-            chi2=cost,
-            limit=limit,
-        )
-
-
 def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
     """Largest standard deviation of the heights ``hᵀM`` of points (m, 4), relative to the heights, where that of the
     points' middle is one. NaN points are left out.
@@ -181,95 +214,90 @@ def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
     return float(np.sqrt(np.einsum("ni,ij,nj->n", M, fit.plane_covariance, M).max()))
 
 
-def _require_heights(rest: FloatArray, fit: TranslationFit) -> None:
+def _require_heights(scene: _Scene, fit: TranslationFit) -> None:
     """Raise GeometryError where the plane at infinity is not known well enough, or cuts the points."""
-    deviation = height_deviation(rest, fit)
+    points = scene.rest[np.isfinite(scene.rest).all(axis=1)]
+    deviation = scene.deviation(fit)
     if not deviation <= HEIGHT_DEVIATION:
         raise GeometryError(
             "degenerate",
             f"the motions leave the plane at infinity undetermined: the points' heights above it are known to "
             f"{100 * deviation:.3g} % (at most {100 * HEIGHT_DEVIATION:.3g} %); longer motions, other directions than "
-            "the optical axis, more motions or less noise are needed",
+            "the optical axis, more motions or less noise are needed"
+            + (", or points off one plane: these are coplanar" if scene.flat else ""),
             deviation=deviation,
             limit=HEIGHT_DEVIATION,
+            coplanar=scene.flat,
         )
-    heights_of_one_side(fit.plane, rest[np.isfinite(rest).all(axis=1)])
+    heights_of_one_side(fit.plane, points)
 
 
-def _joint(
-    Ps: FloatArray,
-    pixels: FloatArray,
-    noise: FloatArray,
-    rest: FloatArray,
-    Hs: FloatArray,
-    weighting: Weighting,
-    used: BoolArray,
-) -> TranslationFit:
-    """The bundle over the motions used, from their linear stack (3.37)."""
-    plane = plane_at_infinity_from_stack(Hs[used], weighting)
-    directions = np.stack([direction_given_plane(H, plane, weighting) for H in Hs[used]])
+def _joint(scene: _Scene, used: BoolArray) -> TranslationFit:
+    """The bundle over the motions used, from their linear start: the stack (3.37)."""
     stops = np.concatenate([[True], used])
-    return bundle_translations(Ps, pixels[stops], rest, plane, directions, noise[stops])
+    plane, directions = scene.start(np.flatnonzero(stops)[1:])
+    return bundle_translations(
+        scene.images.cameras, scene.pixels[stops], scene.rest, plane, directions, scene.noise[stops]
+    )
 
 
-def _judge_alone(
-    images: Images,
-    pixels: FloatArray,
-    noise: FloatArray,
-    rest: FloatArray,
-    weighting: Weighting,
-    stop: int,
-) -> _Single:
+def _judge_alone(scene: _Scene, stop: int) -> _Single:
     """Rest and one stop: does a homography fit, is it a translation, and with which plane at infinity?"""
     nan = float("nan")
-    Ps, pair, W = images.cameras, [0, stop], weighting.right
+    images, rest, weighting, pair = scene.images, scene.rest, scene.weighting, [0, stop]
     try:
-        start = translation_homography(Ps, rest, pixels[stop])
+        H_start = scene.homography(stop)
     except GeometryError:
-        return _Single(None, None, None, MotionJudgement("unseen", nan, nan, nan))
+        return _Single(None, None, MotionJudgement("unseen", nan, nan, nan))
+    W = weighting.right
+    back = np.asarray(np.linalg.inv(W), dtype=np.float64)
     both = (images.weights[pair] > 0).any(axis=1).all(axis=0) & np.isfinite(rest).all(axis=1)
-    white = Images(Ps @ np.linalg.inv(W), images.pixels[pair][:, :, both], images.weights[pair][:, :, both])
+    white = Images(images.cameras @ back, images.pixels[pair][:, :, both], images.weights[pair][:, :, both])
     M = rest[both] @ W.T
     M = M / np.linalg.norm(M, axis=1, keepdims=True)
-    motion, x = homography_motion(conjugate(W, start)[None])
+    span = np.linalg.qr(W @ plane_basis(rest[both])[:, :3])[0] if scene.flat else None
+    motion, x = homography_motion(conjugate(W, H_start)[None], span)
     try:
         best = minimise(white, with_rest(motion), x, M, free_points=True)
         covariance = covariance_of(best.information, "the homography")
     except GeometryError:
-        return _Single(start, None, None, MotionJudgement("points", nan, nan, nan))
+        return _Single(None, None, MotionJudgement("points", nan, nan, nan))
     H, slopes = motion(best.x)
-    back = np.linalg.inv(W)
-    refined = conjugate(np.asarray(back, dtype=np.float64), H[0])
-    svd = translation_from_homography(refined, weighting)
-    least = svd.singular[0] / _second_singular_noise(weighting.left @ back, H[0], slopes[0], covariance)
-    freedom = white.measurements - 15 - 3 * int(both.sum())
+    refined = conjugate(back, H[0])
+    conditioning = least = nan
+    if not scene.flat:  # of coplanar points the homography is not known as a whole
+        svd = translation_from_homography(refined, weighting)
+        noise = _second_singular_noise(weighting.left @ back, H[0], slopes[0], covariance)
+        conditioning, least = svd.conditioning, float(svd.singular[0] / noise)
+    freedom = white.measurements - len(x) - 3 * int(both.sum())
     if best.cost > chi2_distribution.isf(TAIL, max(1, freedom)):
-        return _Single(refined, None, None, MotionJudgement("points", svd.conditioning, least, nan))
+        return _Single(None, None, MotionJudgement("points", conditioning, least, nan))
     try:
-        fit = _alone(Ps, pixels[pair][:, :, both], noise[pair][:, :, both], rest[both], svd)
+        plane, directions = (
+            scene.start(np.array([stop])) if scene.flat else (svd.plane, svd.generator @ svd.plane)
+        )
+        fit = bundle_translations(
+            images.cameras,
+            scene.pixels[pair][:, :, both],
+            rest[both],
+            plane,
+            directions.reshape(1, 4),
+            scene.noise[pair][:, :, both],
+        )
     except GeometryError as error:
         why: Reason = "not_a_translation" if error.code == "no_model" else "no_motion"
-        return _Single(refined, None, None, MotionJudgement(why, svd.conditioning, least, nan))
+        return _Single(None, None, MotionJudgement(why, conditioning, least, nan))
     excess = fit.cost - best.cost
     reason: Reason = ""
-    if excess > chi2_distribution.isf(TAIL, 9):
+    if excess > chi2_distribution.isf(TAIL, len(x) - 6):
         reason = "not_a_translation"
-    elif svd.conditioning < least:
+    elif conditioning < least:
         reason = "conditioning"
     if reason:
-        return _Single(refined, None, None, MotionJudgement(reason, svd.conditioning, least, excess))
-    plane, spread = _height_one(weighting.right, rest, fit.plane, fit.plane_covariance)
-    deviation = height_deviation(rest, fit)
-    judgement = MotionJudgement("", svd.conditioning, least, excess, height_deviation=deviation)
-    return _Single(refined, plane, spread, judgement)
-
-
-def _alone(
-    Ps: FloatArray, pixels: FloatArray, noise: FloatArray, rest: FloatArray, svd: TranslationSVD
-) -> TranslationFit:
-    """The bundle of one motion, from the decomposition of its homography."""
-    direction = (svd.generator @ svd.plane)[None]
-    return bundle_translations(Ps, pixels, rest, svd.plane, direction, noise)
+        return _Single(None, None, MotionJudgement(reason, conditioning, least, excess))
+    z, spread = _height_one(W, rest, fit.plane, fit.plane_covariance)
+    deviation = scene.deviation(fit)
+    return _Single(z, spread, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
 
 
 def _second_singular_noise(

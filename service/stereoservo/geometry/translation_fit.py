@@ -16,8 +16,9 @@ import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, whitener
+from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.geometry.strata import projective_to_affine
+from stereoservo.geometry.translations import conditioner
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -149,18 +150,23 @@ def shared_plane(plane: FloatArray, directions: FloatArray) -> tuple[SharedPlane
     return chart, np.concatenate([h[chart.others], (directions[:, chart.others] * size).ravel()])
 
 
-def homography_motion(Hs: FloatArray) -> tuple[Motion, FloatArray]:
-    """Fifteen parameters for each of the homographies ``(n, 4, 4)``, and the map from them."""
+def homography_motion(Hs: FloatArray, span: FloatArray | None = None) -> tuple[Motion, FloatArray]:
+    """Fifteen parameters for each of the homographies ``(n, 4, 4)``, and the map from them; with orthonormal columns
+    ``span`` (4, 3) the eleven that act on the points they span.
+    """
     n = len(Hs)
-    charts = np.stack([np.linalg.svd(H.reshape(1, 16))[2][1:] for H in Hs]).reshape(n, 15, 4, 4)
-    slopes = np.zeros((n, 15 * n, 4, 4))
+    columns = np.eye(4) if span is None else span
+    acting = (Hs @ columns).reshape(n, 1, -1)
+    charts = np.linalg.svd(acting)[2][:, 1:].reshape(n, -1, 4, columns.shape[1]) @ columns.T
+    q = charts.shape[1]
+    slopes = np.zeros((n, q * n, 4, 4))
     for s in range(n):
-        slopes[s, 15 * s : 15 * s + 15] = charts[s]
+        slopes[s, q * s : q * s + q] = charts[s]
 
     def motion(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return Hs + np.einsum("sq,sqij->sij", x.reshape(n, 15), charts), slopes
+        return Hs + np.einsum("sq,sqij->sij", x.reshape(n, q), charts), slopes
 
-    return motion, np.zeros(15 * n)
+    return motion, np.zeros(q * n)
 
 
 def with_rest(motion: Motion) -> Motion:
@@ -328,7 +334,7 @@ def refine_translations(
     images = _only(images, known)
     if points_covariance is not None and points.ndim != 2:
         raise GeometryError("shape", "points_covariance needs points (m, 4) common to all motions")
-    W = whitener(common[:, known].reshape(-1, 4))
+    W = conditioner(common[:, known].reshape(-1, 4))
     size = np.linalg.norm(common[:, known] @ W.T, axis=2, keepdims=True)
     M = common[:, known] @ W.T / size
     seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)
@@ -367,7 +373,7 @@ def bundle_translations(
     _check_start(plane, directions, len(pixels) - 1)
     known = np.isfinite(points).all(axis=1) & ((images.weights > 0).sum(axis=(0, 1)) >= 2)
     images = _only(images, known)
-    W = whitener(points[known])
+    W = conditioner(points[known])
     M = points[known] @ W.T
     M = M / np.linalg.norm(M, axis=1, keepdims=True)
     seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)

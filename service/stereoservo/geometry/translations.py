@@ -218,11 +218,27 @@ class Weighting:
 UNWEIGHTED = Weighting(np.eye(4), np.eye(4))
 
 
+FLAT = 1e-12
+"""Smallest relative second moment that points count with in a whitening: exactly coplanar ones have none."""
+
+
+def conditioner(M: FloatArray) -> FloatArray:
+    """``W`` (4, 4) as `homogeneous.whitener` gives it, for coplanar points (m, 4) too.
+
+    Raises GeometryError for fewer than four points.
+    """
+    if len(M) < 4:
+        raise GeometryError("too_few", f"{len(M)} points are known in space; 4 are needed", points=len(M))
+    unit = M / np.linalg.norm(M, axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(unit.T @ unit / len(unit))
+    return np.asarray((vectors / np.sqrt(np.maximum(values, FLAT * values[3]))).T, dtype=np.float64)
+
+
 def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
     """The weighting in which the norm of G is, to first order, the rms motion of points M (m, 4) in the images of
     cameras (c, 3, 4) [px], as far as a product of one matrix a side can be.
 
-    Raises GeometryError for coplanar points, and points or cameras that leave a direction out of the images.
+    Raises GeometryError for fewer than five points, and points or cameras that leave a direction out of the images.
     """
     M = M[np.isfinite(M).all(axis=1)]
     if len(M) < 5:
@@ -231,7 +247,7 @@ def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
             f"{len(M)} points are known in space; at least 5 are needed, seen from two centres",
             points=len(M),
         )
-    right = 2.0 * whitener(M)  # unit 4-vectors have second moments I/4
+    right = 2.0 * conditioner(M)  # unit 4-vectors have second moments I/4
     unit = 2.0 * M / np.linalg.norm(M @ right.T, axis=1, keepdims=True)
     rows = projection_jacobian_many(Ps, unit)
     moments = np.einsum("cnai,cnaj->ij", rows, rows) / len(unit)
