@@ -125,6 +125,14 @@ def test_gripper_stands_at_its_bound(gripper, structure, sigma):
         assert 0.7 < row["e_q_mm"]["mean"] / row["bound_e_q_mm"] < 1.3
 
 
+@pytest.mark.slow
+def test_gripper_stands_at_its_bound_over_many_seeds():
+    answer = run_gripper(seeds=200, seed=1, progress=silent, sigmas=(0.5,), motions=4)
+    for structure in ("upgrade only", "full"):
+        (row,) = rows_of(answer, motions=4, structure=structure, method="non-linear, free points")
+        assert 0.9 < row["ratio_to_bound"] < 1.1
+
+
 def test_gripper_reaches_the_thesis_with_the_structures_noise_taken_out_and_says_that_the_bound_forbids_it_in_full(
     gripper,
 ):
