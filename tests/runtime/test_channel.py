@@ -56,6 +56,19 @@ def test_a_closed_peer_is_noticed_on_either_side(tmp_path: Path) -> None:
     server.close()
 
 
+def test_last_words_survive_a_send_to_a_peer_that_has_gone(tmp_path: Path) -> None:
+    server = ChannelServer(tmp_path / "a.sock")
+    client = Channel.connect(tmp_path / "a.sock")
+    (peer,) = server.accept()
+    assert peer.send(b"never read")  # what the peer leaves unread resets the connection
+    client.send(b"last words")
+    client.close()
+    assert peer.send(b"x") is False
+    assert peer.receive() == [b"last words"]
+    assert not peer.is_open
+    server.close()
+
+
 def test_a_single_server_keeps_only_the_newest_peer(tmp_path: Path) -> None:
     server = ChannelServer(tmp_path / "a.sock", single=True)
     old = Channel.connect(tmp_path / "a.sock")

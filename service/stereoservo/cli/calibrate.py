@@ -1,24 +1,67 @@
-"""``stereoservo calibrate``: by the running daemon, or by one that is started for it."""
+"""``stereoservo calibrate``: by the running daemon, or one that is started for it; a check; a fit of stored trials."""
 
 from __future__ import annotations
 
+import csv
 import sys
+from collections import defaultdict
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
+import numpy as np
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, note
+from stereoservo.cli.output import (
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+    note,
+)
 from stereoservo.gateway.client import Client
+from stereoservo.gateway.errors import FailedError
+from stereoservo.gateway.fitting import calibration_result
 from stereoservo.gateway.messages import CalibrationResult, EventMessage
+from stereoservo.gateway.stores import ModelStore
+from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.runtime.calibration_files import report_folder
+from stereoservo.runtime.cellfile import CellFile, load_cell_file
+from stereoservo.runtime.check_history import load_checks
 from stereoservo.runtime.daemon import DaemonProcess, NotRunningError, find_daemon
+from stereoservo.runtime.directories import cell_directories
 
 TRIALS_SHARE = 0.9
+SHOWN_CHECKS = 8
 
 
 def calibrate(
     cell: CellArgument,
+    check: Annotated[
+        bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")
+    ] = False,
+    trials: Annotated[
+        Path | None,
+        typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
+    ] = None,
+    lines: Annotated[
+        Path | None,
+        typer.Option(
+            "--lines",
+            metavar="FILE.csv",
+            help="With --trials: pixels along straight lines (camera,line,u,v) that show the lens.",
+        ),
+    ] = None,
+    lines_sigma: Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")] = 0.3,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", metavar="FILE.json", help="With --trials: where the model goes."),
+    ] = None,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
@@ -27,6 +70,14 @@ def calibrate(
 
     With the path of a cell file and no daemon running, one is started for the time of it.
     """
+    if trials is not None:
+        if check:
+            raise CommandError("argument", "--check moves the arm, --trials does not: give one of them")
+        result = fit_again(cell, trials, lines, lines_sigma, output)
+        emit(result, _table(result), json)
+        return
+    if lines is not None or output is not None:
+        raise CommandError("argument", "--lines and --output go with --trials FILE.npz")
     with ExitStack() as stack:
         if endpoint is None and cell.endswith(".toml"):
             try:
@@ -38,14 +89,22 @@ def calibrate(
         if client.status().lifecycle == "inactive":
             client.enable()
         try:
-            result = _calibrate(client)
+            if check:
+                report = _with_bar(client, "check motion", client.check_model)
+                _tell_check(report, client.cell, endpoint, json)
+                return
+            result = _with_bar(
+                client, "trial motions", lambda progress: client.calibrate(progress, report=True)
+            )
         except KeyboardInterrupt:
             client.stop()
             raise
+        except FailedError as error:
+            raise CommandError(error.event.name or "failed", str(error)) from error
     emit(result, _table(result), json)
 
 
-def _calibrate(client: Client) -> CalibrationResult:
+def _with_bar(client: Client, what: str, run: Any) -> Any:
     console = Console(file=sys.stderr)
     columns = (
         TextColumn("{task.description}"),
@@ -54,10 +113,10 @@ def _calibrate(client: Client) -> CalibrationResult:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("trial motions", total=1.0)
+        task = bar.add_task(what, total=1.0)
 
         def progress(event: EventMessage) -> None:
-            if event.kind == "warning":
+            if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
                 note(event.message)
             if event.progress is None:
                 return
@@ -67,9 +126,9 @@ def _calibrate(client: Client) -> CalibrationResult:
                 if fitting
                 else TRIALS_SHARE * event.progress
             )
-            bar.update(task, completed=done, description=event.message or "trial motions")
+            bar.update(task, completed=done, description=event.message or what)
 
-        return client.calibrate(progress)
+        return run(progress)
 
 
 def _table(result: CalibrationResult) -> str:
@@ -79,6 +138,125 @@ def _table(result: CalibrationResult) -> str:
         f"measurements, {result.outliers} left out, chi-square "
         f"{'as expected' if result.covariance_ok else 'NOT as expected'}",
         *(f"  {name:16} {rms:.4f} px" for name, rms in result.per_joint_px.items()),
-        f"  {result.model}",
+        f"  {result.verdict}",
+        f"  model  {result.model}",
+        f"  report {result.report or 'none could be written'}",
     ]
     return "\n".join(lines)
+
+
+# -- check --------------------------------------------------------------------------------------------------
+
+
+def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
+    """The report, with the checks before it where they are kept on this host."""
+    past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
+    history = [
+        {"created": one.created, "epoch": one.model_epoch, "status": one.status, "sigmas": one.sigmas,
+         "rms_px": one.rms_px, "causes": [cause.message for cause in one.causes]}
+        for one in past
+    ]  # fmt: skip
+    tree = {**msgspec.to_builtins(report), "holds": report.status != "recalibrate", "history": history}
+    lines = [report.message]
+    lines += [f"  {report.trend}"] if report.trend else []
+    for what, values in (("joint", report.per_joint), ("camera", report.per_camera)):
+        lines += [f"  {what} {name:16} {value:.2f} sigmas" for name, value in values.items()]
+    worst = sorted(report.per_marker.items(), key=lambda item: -item[1])[:3]
+    lines.append(
+        "  markers, worst first: " + ", ".join(f"{name} {value:.2f}" for name, value in worst) + " sigmas"
+    )
+    if len(history) > 1:
+        lines.append("  checks so far:")
+        lines += [
+            f"    {one.created}  epoch {one.model_epoch}  {one.sigmas:6.2f} sigmas  {one.status}"
+            for one in past
+        ]
+    emit(tree, "\n".join(lines), json)
+
+
+# -- stored trials ------------------------------------------------------------------------------------------
+
+
+def fit_again(
+    cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None
+) -> CalibrationResult:
+    """Fit stored trial data in this process; the model goes beside the cell's others unless ``output`` says where.
+
+    Raises CommandError, CalibrationError, ModelFileError, OSError, CellFileError.
+    """
+    # scipy and the fit are slow to import; commands that only talk to a daemon do without.
+    from stereoservo.kinematics.calibration.trials import CalibrationError, load_trials
+    from stereoservo.kinematics.calibration.verdict import failed
+    from stereoservo.runtime.fit import fit_trials, report_fit
+
+    file = load_cell_file(Path(cell)) if cell.endswith(".toml") else None
+    name = cell if file is None else file.cell.name
+    data = load_trials(path)
+    if file is not None:
+        _must_fit(file, data, path)
+    if output is None:
+        directory = cell_directories(name).models
+        directory.mkdir(parents=True, exist_ok=True)
+        store = ModelStore(directory)
+        epoch = store.next_epoch()
+        output = store.path(epoch)
+    else:
+        epoch = 0
+    priors = None if lines is None else read_lines(lines, lines_sigma, data)
+    try:
+        result, said = fit_trials(data, output, epoch, lens_priors=priors)
+    except CalibrationError as error:
+        kept = report_fit(data, path, output, None, failed(error.code, error.message))
+        raise CommandError(error.code, f"{error}. A report is in {kept}", report=str(kept)) from error
+    try:
+        page: Path | None = report_fit(data, path, output, result, said)
+    except OSError as error:
+        note(f"no report could be written into {report_folder(output)}: {error}")
+        page = None
+    return calibration_result(result.model, output, said, page, path, 0.0)
+
+
+def _must_fit(file: CellFile, data: Any, path: Path) -> None:
+    cameras = [camera.name for camera in file.camera]
+    joints = {limit.joint for limit in file.safety.limit}
+    if [camera.name for camera in data.cameras] != cameras or set(data.joint_names) != joints:
+        raise CommandError(
+            "other_cell",
+            f"{path} is of joints {', '.join(data.joint_names)} and cameras "
+            f"{', '.join(camera.name for camera in data.cameras)}; the cell has joints {', '.join(sorted(joints))} and "
+            f"cameras {', '.join(cameras)}",
+        )
+
+
+def read_lines(path: Path, sigma: float, data: Any) -> dict[str, Any]:
+    """The lens of each camera from a table of pixels along straight lines: ``camera,line,u,v``, with this header.
+
+    Raises CommandError naming the row, GeometryError where the lines do not tell the lens.
+    """
+    from stereoservo.geometry.distortion_lines import lens_from_lines
+
+    sizes = {camera.name: (camera.width, camera.height) for camera in data.cameras}
+    found: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise CommandError("lines", f"{path}: cannot be read: {error.strerror}") from error
+    reader = csv.DictReader(text.splitlines())
+    if reader.fieldnames is None or set(reader.fieldnames) != {"camera", "line", "u", "v"}:
+        raise CommandError(
+            "lines", f"{path}: the first row is {reader.fieldnames}; camera,line,u,v is needed"
+        )
+    for number, row in enumerate(reader, start=2):
+        try:
+            pixel = float(row["u"]), float(row["v"])
+        except (TypeError, ValueError) as error:
+            raise CommandError("lines", f"{path}: row {number}: u and v are numbers [px]") from error
+        if row["camera"] not in sizes:
+            raise CommandError(
+                "lines", f"{path}: row {number}: no camera {row['camera']!r}; cameras: {', '.join(sizes)}"
+            )
+        found[row["camera"]][row["line"]].append(pixel)
+    return {
+        camera: lens_from_lines([np.array(line) for line in of_camera.values()], sigma, *sizes[camera])
+        for camera, of_camera in found.items()
+    }

@@ -83,6 +83,13 @@ def _wire(plan: RunPlan, directories: CellDirectories) -> Check:
 
 def _model(plan: RunPlan, directories: CellDirectories) -> Check:
     model, passed = ModelStore(directories.models).newest_fitting(plan.settings())
+    if model is not None and passed:
+        why = "; ".join(passed)
+        return Check(
+            "model",
+            None,
+            f"epoch {model.epoch} of {model.created} is used, newer ones are passed over: {why}",
+        )
     if model is not None:
         return Check("model", True, f"epoch {model.epoch}, {model.stratum}, of {model.created}")
     return Check("model", None, "; ".join(passed) or "none yet: calibrate")

@@ -36,6 +36,7 @@ def describe(state: StateMessage) -> str:
         f"  {reason.level:7} {' '.join(filter(None, (reason.code, reason.subject)))}: {reason.hint}"
         for reason in state.reasons
     ]
+    lines += [f"  note    {text}" for text in state.notes]
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)

@@ -1,8 +1,12 @@
-"""From trial motions to a model in the core: gathers samples, runs the fit process, hands the model over."""
+"""From trial motions to a model in the core, and from a check motion to what it says: gathers samples, runs the fit or
+the check in a process of its own, hands the model over, tells what came of it.
+"""
 
 from __future__ import annotations
 
-from stereoservo.gateway.fitting import Fit, FitFailedError, calibration_result
+from pathlib import Path
+
+from stereoservo.gateway.fitting import Check, Fit, FitFailedError, calibration_result
 from stereoservo.gateway.messages import CalibrationResult
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servolink import ServoLink
@@ -15,23 +19,36 @@ from stereoservo.runtime.settings import CoreSettings
 
 
 class Calibration:
-    """The cell's model and how it comes about. ``model`` is the one that was given to the core last."""
+    """The cell's model and how it comes about. ``model`` is the one that was given to the core last.
 
-    def __init__(self, settings: CoreSettings, models: ModelStore, link: ServoLink, log: EventLog) -> None:
+    ``notes``: what is wrong with the model files, until a newer model is there.
+    """
+
+    def __init__(
+        self, settings: CoreSettings, models: ModelStore, link: ServoLink, log: EventLog, history: Path
+    ) -> None:
         self._settings = settings
         self._models = models
         self._link = link
         self._log = log
+        self._history = history
         self._job = CalibrationJob(settings)
         self._fit: Fit | None = None
+        self._fit_id = ""
+        self._told = False
+        self._check: Check | None = None
+        self._check_id = ""
         self._result: CalibrationResult | None = None
         self.model: CellModel | None = None
+        self.notes: tuple[str, ...] = ()
 
     def load(self, core_epoch: int) -> None:
         """Give the newest fitting model of the disk to the core, unless that (epoch ``core_epoch``) has it."""
         model, passed = self._models.newest_fitting(self._settings)
-        for text in passed:
-            self._log.add("warning", message=f"model passed over: {text}", origin="gateway")
+        used = "no model is used" if model is None else f"model epoch {model.epoch} is used instead"
+        self.notes = tuple(f"model passed over: {text}; {used}" for text in passed)
+        for text in self.notes:
+            self._log.add("warning", message=text, origin="gateway")
         # Given again to a core that has it, after a restart of the gateway, it would lose its estimates.
         if model is not None and (model.epoch == core_epoch or self._link.give_model(model)):
             self.model = model
@@ -40,63 +57,129 @@ class Calibration:
         """Take an event of the core; ``fresh``: it was not acted upon before a restart of the gateway."""
         self._job.add(event)
         if event.kind == "calibration_finished" and fresh:
-            self._start()
+            self._start_fit()
+        elif event.kind == "check_finished" and fresh:
+            self._start_check()
         elif event.kind == "model" and self._result is not None:
             result, self._result = self._result, None
+            self.notes = ()
             self._log.add(
                 "calibrated",
-                message=f"model epoch {result.epoch}: {result.rms_px:.4f} px rms",
-                id=self._job.id,
+                message=f"model epoch {result.epoch}: {result.rms_px:.4f} px rms. {result.verdict}",
+                id=self._fit_id,
                 calibration=result,
                 origin="gateway",
             )
         elif event.kind == "warning" and event.message.startswith("model refused"):
             self._result = None
-            self._failed(event.message)
+            self._failed(self._fit_id, event.message)
 
-    def _start(self) -> None:
+    def _start_fit(self) -> None:
         self.cancel()
+        self._fit_id, self._told = self._job.id, False
         try:
             epoch = self._models.next_epoch()
             self._fit = Fit(self._job.trials(), self._models.path(epoch), epoch)
         except (CalibrationError, OSError) as error:
-            self._failed(str(error))
+            self._failed(self._fit_id, str(error))
             return
         self._log.add(
-            "fit_started", message=f"{self._job.stops} stops", id=self._job.id, progress=0.0, origin="gateway"
+            "fit_started", message=f"{self._job.stops} stops", id=self._fit_id, progress=0.0, origin="gateway"
         )
 
-    def follow(self) -> None:
-        """Tell the fit's progress; when it has ended, hand its model over."""
-        if self._fit is None:
+    def _start_check(self) -> None:
+        if self._check is not None:
+            self._check.close()
+            self._check = None
+        self._check_id = self._job.id
+        if self.model is None:
+            self._failed(self._check_id, "the model that was to be checked is gone")
             return
-        for step in self._fit.poll():
+        path = self._models.path(self.model.epoch)
+        try:
+            self._check = Check(self._job.trials(), path, self._history, self._settings.tolerance_px)
+        except (CalibrationError, OSError) as error:
+            self._failed(self._check_id, str(error))
+
+    def follow(self) -> None:
+        """Tell the fit's progress; when it has decided, hand its model over; tell what a check says."""
+        if self._fit is not None:
+            self._follow_fit(self._fit)
+        if self._check is not None:
+            self._follow_check(self._check)
+
+    def _follow_fit(self, fit: Fit) -> None:
+        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        for step in fit.poll():
             self._log.add(
                 "fit_progress",
                 message=step.message,
-                id=self._job.id,
+                id=self._fit_id,
                 progress=step.progress,
                 origin="gateway",
             )
-        if not self._fit.ended:
+        if fit.decided and not self._told:
+            self._told = True
+            self._decide(fit)
+        if not ended:
             return
-        fit, self._fit = self._fit, None
+        report = fit.said.get("report")
+        if report is not None:
+            self._log.add(
+                "calibration_report",
+                message=f"report in {report}",
+                id=self._fit_id,
+                name=report,
+                origin="gateway",
+            )
+        elif "model" in fit.said or "error" in fit.said:
+            cause = fit.said.get("report_error", "its process ended early")
+            self._log.add(
+                "calibration_report", message=f"no report could be written: {cause}", id=self._fit_id,
+                accepted=False, origin="gateway",
+            )  # fmt: skip
+        fit.close()
+        self._fit = None
+
+    def _decide(self, fit: Fit) -> None:
         try:
-            model, seconds = fit.result()
-            result = calibration_result(model, fit.model_path, seconds)
+            model, verdict, seconds = fit.model()
+            result = calibration_result(
+                model, fit.model_path, verdict, fit.report_path, fit.trials_path, seconds
+            )
         except (FitFailedError, ModelFileError) as error:
-            self._failed(str(error))
+            kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
+            self._failed(self._fit_id, f"{error}. {kept}", getattr(error, "code", ""))
             return
         if not self._link.give_model(model):
-            self._failed(f"the servo process does not take the model; it is saved as {fit.model_path}")
+            self._failed(
+                self._fit_id, f"the servo process does not take the model; it is saved as {fit.model_path}"
+            )
             return
         self.model, self._result = model, result
 
-    def _failed(self, message: str) -> None:
-        self._log.add("calibration_failed", message=message, id=self._job.id, origin="gateway")
+    def _follow_check(self, check: Check) -> None:
+        ended = check.ended
+        for _ in check.poll():
+            pass
+        if not ended:
+            return
+        try:
+            report = check.report()
+        except FitFailedError as error:
+            self._failed(self._check_id, str(error), error.code)
+        else:
+            text = "; ".join(part for part in (report.message, report.trend) if part)
+            self._log.add("checked", message=text, id=self._check_id, check=report, origin="gateway")
+        check.close()
+        self._check = None
+
+    def _failed(self, goal_id: str, message: str, code: str = "") -> None:
+        self._log.add("calibration_failed", message=message, id=goal_id, name=code, origin="gateway")
 
     def cancel(self) -> None:
-        """End a running fit. Idempotent."""
-        if self._fit is not None:
-            self._fit.cancel()
-            self._fit = None
+        """End what runs. Idempotent."""
+        for job in (self._fit, self._check):
+            if job is not None:
+                job.close()
+        self._fit = self._check = None

@@ -10,6 +10,7 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
@@ -25,7 +26,7 @@ from stereoservo.gateway.errors import (
     RefusedError,
     TimedOutError,
 )
-from stereoservo.gateway.following import EventWatch, GoalHandle, GoalResult
+from stereoservo.gateway.following import EventWatch, GoalHandle, GoalResult, Lease
 from stereoservo.gateway.keys import KeySpace
 from stereoservo.gateway.messages import (
     ENCODING,
@@ -40,6 +41,7 @@ from stereoservo.gateway.messages import (
     encode,
 )
 from stereoservo.gateway.session import client_config, close_session, open_session
+from stereoservo.kinematics.calibration.check_report import CheckReport
 from stereoservo.runtime.commands import (
     Calibrate,
     CancelGoal,
@@ -66,6 +68,7 @@ from stereoservo.runtime.daemon import find_daemon
 POLL_S = 0.01
 TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
 DRAIN = 32
+REPORT_TIMEOUT_S = 120.0
 
 _T = TypeVar("_T")
 
@@ -248,16 +251,16 @@ class Client:
             raise
         return GoalHandle(self, goal, watch)
 
-    def home(self, speed_scale: float = 1.0) -> GoalHandle:
-        """Move every joint to the cell's home position."""
-        command = Home(str(uuid.uuid4()), speed_scale)
+    def home(self, speed_scale: float = 1.0, lease_s: float | None = 5.0) -> GoalHandle:
+        """Move every joint to the cell's home position; the lease is renewed as for goals."""
+        command = Home(str(uuid.uuid4()), speed_scale, lease_s)
         watch = EventWatch(self)
         try:
             self.command("home", command)
         except BaseException:
             watch.close()
             raise
-        return GoalHandle(self, Goal(command.id, JointTarget({})), watch)
+        return GoalHandle(self, Goal(command.id, JointTarget({}), lease_s=lease_s), watch)
 
     def teach(self, name: str, frames: int = 20, timeout_s: float = 30.0) -> EventMessage:
         """Store what the cameras see now as goal ``name``. Raises RefusedError, FailedError."""
@@ -273,27 +276,75 @@ class Client:
         return event
 
     def calibrate(
-        self, progress: Callable[[EventMessage], None] | None = None, timeout_s: float = 1800.0
+        self,
+        progress: Callable[[EventMessage], None] | None = None,
+        timeout_s: float = 3600.0,
+        *,
+        report: bool = False,
+        lease_s: float | None = 5.0,
     ) -> CalibrationResult:
-        """Trial motions, fit, model. ``progress`` hears every event of it. Raises RefusedError,
-        FailedError.
+        """Trial motions, fit, model. ``progress`` hears every event of it. ``report``: wait until that is written, too.
+
+        The motion has a lease that this client renews (``lease_s=None``: none): a client that dies stops it.
+        Raises RefusedError, FailedError (its event's ``name`` is the code of a fit that failed).
         """
-        command = Calibrate(str(uuid.uuid4()))
-        ends = ("calibrated", "calibration_failed", "calibration_aborted")
-
-        def wanted(event: EventMessage) -> bool:
-            if event.id != command.id:
-                return False
-            if progress is not None:
-                progress(event)
-            return event.kind in ends
-
-        with EventWatch(self) as watch:
-            self.command("calibrate", command)
-            event = watch.wait(wanted, "calibration", timeout_s)
+        command = Calibrate(str(uuid.uuid4()), lease_s=lease_s)
+        event = self._calibration(command, "calibrated", progress, timeout_s, report)
         if event.calibration is None:
             raise FailedError("calibration", event)
         return event.calibration
+
+    def check_model(
+        self,
+        progress: Callable[[EventMessage], None] | None = None,
+        timeout_s: float = 600.0,
+        *,
+        lease_s: float | None = 5.0,
+    ) -> CheckReport:
+        """A short check motion, and whether the model in use still holds. Raises RefusedError, FailedError."""
+        command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s)
+        event = self._calibration(command, "checked", progress, timeout_s, False)
+        if event.check is None:
+            raise FailedError("check", event)
+        return event.check
+
+    def _calibration(
+        self,
+        command: Calibrate,
+        success: str,
+        progress: Callable[[EventMessage], None] | None,
+        timeout_s: float,
+        report: bool,
+    ) -> EventMessage:
+        lease: Lease | None = None
+
+        def until(*ends: str) -> Callable[[EventMessage], bool]:
+            def wanted(event: EventMessage) -> bool:
+                if event.id != command.id:
+                    return False
+                if lease is not None and event.kind in ("calibration_finished", "check_finished"):
+                    lease.end()
+                if progress is not None:
+                    progress(event)
+                return event.kind in ends
+
+            return wanted
+
+        with EventWatch(self) as watch:
+            self.command("calibrate", command)
+            lease = Lease(self, command.id, command.lease_s)
+            try:
+                end = watch.wait(
+                    until(success, "calibration_failed", "calibration_aborted"), "calibration", timeout_s
+                )
+            finally:
+                lease.end()
+            if report and end.kind != "calibration_aborted" and end.kind != "checked":
+                with suppress(
+                    TimedOutError
+                ):  # the model is there; its report is told by an event, if it comes
+                    watch.wait(until("calibration_report"), "the report", REPORT_TIMEOUT_S)
+        return end
 
     # -- watching -------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Runs the fit in its own process and follows it without waiting."""
+"""Runs a fit, or a check, in its own process and follows it without waiting."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from typing import IO, Any
 import msgspec
 
 from stereoservo.gateway.messages import CalibrationResult
+from stereoservo.kinematics.calibration.check_report import CheckReport
 from stereoservo.kinematics.calibration.trials import TrialData, save_trials
+from stereoservo.kinematics.calibration.verdict import Verdict
 from stereoservo.kinematics.model import CellModel, load_model
+from stereoservo.runtime.calibration_files import report_folder, trials_file
 from stereoservo.runtime.supervisor import child_environment
 
 FIT_TIMEOUT_S = 600.0
 
 
 class FitFailedError(Exception):
-    """A fit gave no model; ``code`` is the calibration's."""
+    """A fit gave no model, a check no answer; ``code`` is the calibration's."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -36,61 +39,63 @@ class FitProgress(msgspec.Struct, frozen=True):
     message: str
 
 
-class Fit:
-    """One running fit. ``poll`` gives its progress; ``result`` its model once it has ended."""
+class ChildJob:
+    """A process that says JSON objects, one a line. ``said`` keeps all but the progress."""
 
-    def __init__(self, trials: TrialData, model_path: Path, epoch: int) -> None:
-        self.model_path = model_path
-        self.epoch = epoch
-        self._trials_path = model_path.with_name(f"trials-{epoch:06d}.npz")
-        save_trials(trials, self._trials_path)
+    def __init__(self, module: str, *arguments: str) -> None:
         self._started = time.monotonic()
-        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - read when the fit has ended
+        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - read when the process has ended
         self._process = subprocess.Popen(
-            [
-                sys.executable, "-m", "stereoservo.runtime.fit", str(self._trials_path), str(model_path),
-                "--epoch", str(epoch), "--parent", str(os.getpid()),
-            ],
+            [sys.executable, "-m", module, *arguments, "--parent", str(os.getpid())],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._errors, env=child_environment(),
         )  # fmt: skip
         assert self._process.stdout is not None
         self._output = self._process.stdout
         os.set_blocking(self._output.fileno(), False)
         self._buffer = b""
-        self._last: dict[str, Any] = {}
+        self.said: dict[str, Any] = {}
 
     def poll(self) -> Iterator[FitProgress]:
         """What it said since the last poll."""
-        while chunk := self._output.read():
+        while chunk := (b"" if self._output.closed else self._output.read()):
             self._buffer += chunk
         *lines, self._buffer = self._buffer.split(b"\n")
         for line in lines:
-            self._last = msgspec.json.decode(line)
-            if "progress" in self._last:
-                yield msgspec.convert(self._last, FitProgress)
+            said = msgspec.json.decode(line)
+            if "progress" in said:
+                yield msgspec.convert(said, FitProgress)
+            else:
+                self.said |= said
+
+    @property
+    def seconds(self) -> float:
+        """How long it has run."""
+        return time.monotonic() - self._started
 
     @property
     def ended(self) -> bool:
         """Whether the process has ended (it is ended after ``FIT_TIMEOUT_S``)."""
-        if time.monotonic() - self._started > FIT_TIMEOUT_S:
+        if self.seconds > FIT_TIMEOUT_S:
             self.cancel()
         return self._process.poll() is not None
 
-    def result(self) -> tuple[CellModel, float]:
-        """The model and the seconds it took. Raises FitFailedError, ModelFileError."""
-        for _ in self.poll():
-            pass
+    def require(self, key: str) -> Any:
+        """What it said under ``key``. Raises FitFailedError with its own error, or with how it ended."""
+        if key in self.said:
+            return self.said[key]
+        if failure := self.said.get("error"):
+            raise FitFailedError(failure["code"], failure["message"])
         code = self._process.wait()
-        self._output.close()
         self._errors.seek(0)
         said = self._errors.read().decode(errors="replace").strip()
+        last = said.splitlines()[-1] if said else "no message"
+        raise FitFailedError("fit_process", f"the process ended with exit code {code}: {last}")
+
+    def close(self) -> None:
+        """End it, and release what it held. Idempotent."""
+        self.cancel()
+        self._output.close()
         self._errors.close()
-        if failure := self._last.get("error"):
-            raise FitFailedError(failure["code"], failure["message"])
-        if code != 0:
-            last = said.splitlines()[-1] if said else "no message"
-            raise FitFailedError("fit_process", f"the fit process ended with exit code {code}: {last}")
-        return load_model(self.model_path), time.monotonic() - self._started
 
     def cancel(self) -> None:
         """End it. Idempotent."""
@@ -99,7 +104,51 @@ class Fit:
             self._process.wait()
 
 
-def calibration_result(model: CellModel, path: Path, seconds: float) -> CalibrationResult:
+class Fit(ChildJob):
+    """One running fit: a model, or the cause why there is none, and later a report of either."""
+
+    def __init__(self, trials: TrialData, model_path: Path, epoch: int) -> None:
+        self.model_path = model_path
+        self.trials_path = trials_file(model_path, epoch)
+        self.report_path = report_folder(model_path) / "index.html"
+        save_trials(trials, self.trials_path)
+        super().__init__(
+            "stereoservo.runtime.fit", str(self.trials_path), str(model_path), "--epoch", str(epoch)
+        )
+        self._seconds: float | None = None
+
+    @property
+    def decided(self) -> bool:
+        """Whether there is a model, or a cause why there is none."""
+        return "model" in self.said or "error" in self.said or self.ended
+
+    def model(self) -> tuple[CellModel, Verdict, float]:
+        """The model, what is to be said of it, and the seconds it took. Raises FitFailedError, ModelFileError."""
+        self.require("model")
+        if self._seconds is None:
+            self._seconds = self.seconds
+        return load_model(self.model_path), msgspec.convert(self.said["verdict"], Verdict), self._seconds
+
+
+class Check(ChildJob):
+    """One running check of a model."""
+
+    def __init__(self, check: TrialData, model_path: Path, history: Path, limit_px: float) -> None:
+        path = model_path.with_name("check.npz")
+        save_trials(check, path)
+        super().__init__(
+            "stereoservo.runtime.check_process", str(path), str(model_path), str(history), "--limit-px",
+            repr(limit_px),
+        )  # fmt: skip
+
+    def report(self) -> CheckReport:
+        """What the check says. Raises FitFailedError."""
+        return msgspec.convert(self.require("check"), CheckReport)
+
+
+def calibration_result(
+    model: CellModel, path: Path, verdict: Verdict, report: Path | None, trials: Path | None, seconds: float
+) -> CalibrationResult:
     """The figures of a fit that clients want. Raises FitFailedError where the model carries no statistics."""
     statistics = model.statistics
     if statistics is None:
@@ -119,4 +168,8 @@ def calibration_result(model: CellModel, path: Path, seconds: float) -> Calibrat
         joints=len(model.joint_names),
         images=statistics.images,
         seconds=seconds,
+        verdict=verdict.text,
+        grade=verdict.grade,
+        report="" if report is None else str(report),
+        trials="" if trials is None else str(trials),
     )

@@ -120,6 +120,30 @@ class EventWatch:
         self.close()
 
 
+class Lease:
+    """Renews the lease of something that moves the arm, from a thread of this client, until it is ended."""
+
+    def __init__(self, client: Client, goal_id: str, lease_s: float | None) -> None:
+        self._client = client
+        self._id = goal_id
+        self._ended = threading.Event()
+        if lease_s is not None:
+            threading.Thread(
+                target=self._renew, args=(lease_s / 3.0,), name=f"lease {goal_id}", daemon=True
+            ).start()
+
+    def _renew(self, every_s: float) -> None:
+        while not self._ended.wait(every_s):
+            try:
+                self._client.renew(self._id)
+            except zenoh.ZError:  # the session is closed: the lease runs out, as it should
+                return
+
+    def end(self) -> None:
+        """Renew no more. Idempotent."""
+        self._ended.set()
+
+
 class GoalHandle:
     """A goal that was accepted. As a context manager it cancels the goal when left before its end."""
 
@@ -129,19 +153,8 @@ class GoalHandle:
         self._watch = watch
         self._started = time.monotonic()
         self._result: GoalResult | None = None
-        self._ended = threading.Event()
-        if goal.lease_s is not None:
-            self._renewal = threading.Thread(
-                target=self._renew, args=(goal.lease_s / 3.0,), name=f"lease {goal.id}", daemon=True
-            )
-            self._renewal.start()
-
-    def _renew(self, every_s: float) -> None:
-        while not self._ended.wait(every_s):
-            try:
-                self._client.renew(self.id)
-            except zenoh.ZError:  # the session is closed: the lease runs out, as it should
-                return
+        self._ended = False
+        self._lease = Lease(client, goal.id, goal.lease_s)
 
     def wait(self, timeout_s: float = 600.0) -> GoalResult:
         """Wait for its terminal event. Raises TimedOutError (the goal goes on), DaemonLostError."""
@@ -177,7 +190,8 @@ class GoalHandle:
         self._end()
 
     def _end(self) -> None:
-        self._ended.set()
+        self._ended = True
+        self._lease.end()
         self._watch.close()
 
     def __enter__(self) -> Self:
@@ -186,6 +200,6 @@ class GoalHandle:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._result is None and not self._ended.is_set():
+        if self._result is None and not self._ended:
             self._end()
             self.cancel()

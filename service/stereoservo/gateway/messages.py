@@ -11,6 +11,7 @@ from typing import Any, TypeVar, get_args
 import msgspec
 
 from stereoservo.control.reasons import Reason
+from stereoservo.kinematics.calibration.check_report import CheckReport
 from stereoservo.runtime.commands import (
     Calibrate,
     CancelGoal,
@@ -161,6 +162,8 @@ class StateMessage(msgspec.Struct, frozen=True):
     dry_run: bool = False
     differences: tuple[str, ...] = ()
     last_event: int = 0
+    notes: tuple[str, ...] = ()
+    """What the cell's keeper should know, a damaged model file say."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):
@@ -178,7 +181,8 @@ class FeaturesMessage(msgspec.Struct, frozen=True):
 
 class CalibrationResult(msgspec.Struct, frozen=True):
     """What a calibration gave. ``covariance_ok``: the residuals are what the measurement noise explains
-    (chi-square).
+    (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
+    ``report``, ``trials``: files on the daemon's host; the report is there once ``calibration_report`` was told.
     """
 
     rms_px: float
@@ -195,6 +199,10 @@ class CalibrationResult(msgspec.Struct, frozen=True):
     joints: int
     images: int
     seconds: float
+    verdict: str = ""
+    grade: str = ""
+    report: str = ""
+    trials: str = ""
 
 
 class EventMessage(msgspec.Struct, frozen=True):
@@ -216,6 +224,7 @@ class EventMessage(msgspec.Struct, frozen=True):
     progress: float | None = None
     origin: str = "core"
     calibration: CalibrationResult | None = None
+    check: CheckReport | None = None
 
 
 class EventList(msgspec.Struct, frozen=True):

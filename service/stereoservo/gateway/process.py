@@ -119,7 +119,7 @@ class Gateway:
         self._state: StateMessage | None = None
         self._state_heard = 0.0
         self._state_sent = 0.0
-        self._calibration = Calibration(self.settings, self._models, self._link, self.log)
+        self._calibration = Calibration(self.settings, self._models, self._link, self.log, directories.checks)
         self._recordings = Recordings(plan, self.log)
         self._handled_path = directories.runtime / "handled"
         self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
@@ -309,7 +309,7 @@ class Gateway:
             self._store_taught(event)
         self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
-        if event.kind in ("taught", "calibration_finished"):
+        if event.kind in ("taught", "calibration_finished", "check_finished"):
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
             self._handled_path.write_text(str(self._handled))
@@ -348,7 +348,12 @@ class Gateway:
         if state is not None:
             self._state_heard = now
             self._state = state_message(
-                self.plan, self.boot, state, servo_alive=True, last_event=self.log.last
+                self.plan,
+                self.boot,
+                state,
+                servo_alive=True,
+                last_event=self.log.last,
+                notes=self._calibration.notes,
             )
         elif self._state is not None and self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
             self._state = msgspec.structs.replace(self._state, servo_alive=False)

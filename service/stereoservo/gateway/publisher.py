@@ -115,7 +115,13 @@ class EventLog:
 
 
 def state_message(
-    plan: RunPlan, boot: str, state: ServoState, *, servo_alive: bool, last_event: int
+    plan: RunPlan,
+    boot: str,
+    state: ServoState,
+    *,
+    servo_alive: bool,
+    last_event: int,
+    notes: tuple[str, ...] = (),
 ) -> StateMessage:
     """The state as clients see it; numbers that are not finite are left out."""
     status, loop = state.status, state.loop
@@ -155,6 +161,7 @@ def state_message(
         dry_run=plan.dry_run,
         differences=state.differences,
         last_event=last_event,
+        notes=notes,
     )
 
 

@@ -80,15 +80,26 @@ class ModelStore:
 def _misfit(model: CellModel, settings: CoreSettings) -> str:
     """Why ``model`` is not one of this cell; empty when it is."""
     if model.joint_names != settings.joint_names or model.joint_kinds != settings.joint_kinds:
-        return f"is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
+        return f"is of joints {_joints(model)}; the cell has {_joints(settings)}"
     of_model = [(camera.name, camera.width, camera.height) for camera in model.cameras]
     of_cell = [(camera.name, camera.width, camera.height) for camera in settings.cameras]
     if of_model != of_cell:
         return f"is of cameras {of_model}; the cell has {of_cell}"
+    mounts = {camera.mount for camera in settings.cameras}
+    if mounts != {model.mount}:
+        return f"is of cameras mounted {model.mount}; the cell's are {', '.join(sorted(mounts))}"
     unknown = [marker for marker in model.marker_ids if marker not in settings.marker_ids]
     if unknown:
         return f"has markers {unknown} that no detector of the cell reports"
     return ""
+
+
+def _joints(of: CellModel | CoreSettings) -> str:
+    """Names, with the kinds of those that are not revolute."""
+    return ", ".join(
+        name if kind == "revolute" else f"{name} ({kind})"
+        for name, kind in zip(of.joint_names, of.joint_kinds, strict=True)
+    )
 
 
 class Journal:

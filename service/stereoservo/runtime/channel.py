@@ -8,7 +8,6 @@ caller, who decides what to drop.
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 from pathlib import Path
@@ -18,7 +17,6 @@ from typing import Self
 from stereoservo.runtime.directories import check_socket_path
 
 MAX_MESSAGE_BYTES = 1 << 20
-_FULL = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
 
 
 class ChannelError(Exception):
@@ -71,10 +69,8 @@ class Channel:
             return False
         try:
             self._socket.send(message, socket.MSG_NOSIGNAL)
-        except OSError as error:
-            if error.errno not in _FULL:
-                self.close()
-            return False
+        except OSError:
+            return False  # a peer that has gone may have left messages: `receive` finds its end
         return True
 
     def receive(self, limit: int = 64) -> list[bytes]:
@@ -85,6 +81,8 @@ class Channel:
                 message = self._socket.recv(MAX_MESSAGE_BYTES)
             except BlockingIOError:
                 break
+            except ConnectionResetError:
+                continue  # told once, where the peer left messages of ours unread; its own are still there
             except OSError:
                 self.close()
                 break

@@ -44,6 +44,11 @@ class CellDirectories:
         return self.state / "taught.json"
 
     @property
+    def checks(self) -> Path:
+        """What checks of the model said, one JSON object a line."""
+        return self.state / "checks.jsonl"
+
+    @property
     def journal(self) -> Path:
         """Goals and faults, one JSON object a line."""
         return self.state / "journal.jsonl"

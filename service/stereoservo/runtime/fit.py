@@ -1,9 +1,8 @@
-"""The fit process: trial data in, model file out; short-lived and niced, so that the loop does not feel
-it.
+"""The fit process: trial data in, model file out, then a report; short-lived and niced: the loop does not feel it.
 
 ``python -m stereoservo.runtime.fit TRIALS.npz MODEL.json --epoch N`` prints one JSON object a line:
-``{"progress": …, "message": …}``, and at the end ``{"model": …}`` with the statistics or ``{"error": …}``
-with exit code 1.
+``{"progress": …, "message": …}``, then ``{"model": …, "verdict": …}`` or ``{"error": …}``, and last ``{"report": …}``
+or ``{"report_error": …}``. Exit code 1 where there is no model.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import argparse
 import os
 import signal
 import sys
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,37 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from stereoservo.geometry.distortion_lines import LensEstimate
 from stereoservo.kinematics.calibration.fit import fit_model
-from stereoservo.kinematics.calibration.trials import CalibrationError, load_trials
+from stereoservo.kinematics.calibration.report import CalibrationResult
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, load_trials
+from stereoservo.kinematics.calibration.verdict import Verdict, depth_spread, failed, verdict
 from stereoservo.kinematics.model import ModelFileError, save_model, write_atomically
+from stereoservo.runtime.calibration_files import report_folder
 from stereoservo.runtime.lifeline import die_with_parent
 
 NICENESS = 10
 
 
-def _print(line: dict[str, Any]) -> None:
+def print_line(line: dict[str, Any]) -> None:
+    """One JSON object on stdout."""
     sys.stdout.write(msgspec.json.encode(line, enc_hook=_plain).decode() + "\n")
     sys.stdout.flush()
+
+
+def error_line(error: Exception) -> dict[str, Any]:
+    """An error as a line: its code, its text and the values that it speaks of."""
+    if isinstance(error, CalibrationError):
+        return {"error": {"code": error.code, "message": str(error), "data": error.data}}
+    return {"error": {"code": type(error).__name__, "message": str(error), "data": {}}}
+
+
+def become_child(parent: int) -> None:
+    """Nice, and gone with ``parent`` where there is one."""
+    if parent:
+        die_with_parent(parent, signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICENESS)
 
 
 def _plain(value: object) -> object:
@@ -39,7 +59,40 @@ def _plain(value: object) -> object:
 
 
 def _progress(stage: str, fraction: float) -> None:
-    _print({"progress": fraction, "message": stage})
+    print_line({"progress": fraction, "message": stage})
+
+
+def fit_trials(
+    trials: TrialData,
+    model_path: Path,
+    epoch: int,
+    *,
+    progress: Callable[[str, float], None] | None = None,
+    lens_priors: Mapping[str, LensEstimate] | None = None,
+) -> tuple[CalibrationResult, Verdict]:
+    """Fit trial data and save the model and the fit's figures; what is to be said of it.
+
+    Raises CalibrationError, ModelFileError, OSError.
+    """
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    result = fit_model(trials, epoch=epoch, created=created, progress=progress, lens_priors=lens_priors)
+    save_model(result.model, model_path)
+    figures = model_path.with_name(model_path.stem + "-report.json")
+    write_atomically(figures, msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n")
+    return result, verdict(result.model, result.report, depth_spread(result.model, trials))
+
+
+def report_fit(
+    trials: TrialData, trials_path: Path, model_path: Path, result: CalibrationResult | None, said: Verdict
+) -> Path:
+    """Write the report of a fit, or of a failure (``result`` None), beside the model. Raises OSError."""
+    # matplotlib is slow to import; the model must not wait for it.
+    from stereoservo.runtime.calibration_report import write_report
+
+    return write_report(
+        report_folder(model_path), trials, said, trials_path=trials_path,
+        model=None if result is None else result.model, report=None if result is None else result.report,
+    )  # fmt: skip
 
 
 def main() -> int:
@@ -50,26 +103,29 @@ def main() -> int:
     parser.add_argument("--epoch", type=int, required=True)
     parser.add_argument("--parent", type=int, default=0, help="end with this process")
     arguments = parser.parse_args()
-    if arguments.parent:
-        die_with_parent(arguments.parent, signal.SIGKILL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(NICENESS)
+    become_child(arguments.parent)
+    result: CalibrationResult | None = None
     try:
-        created = datetime.now(UTC).isoformat(timespec="seconds")
-        result = fit_model(
-            load_trials(arguments.trials), epoch=arguments.epoch, created=created, progress=_progress
-        )
-        save_model(result.model, arguments.model)
-        report = arguments.model.with_name(arguments.model.stem + "-report.json")
-        write_atomically(report, msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n")
+        trials = load_trials(arguments.trials)
     except CalibrationError as error:
-        _print({"error": {"code": error.code, "message": str(error), "data": error.data}})
+        print_line(error_line(error))
         return 1
+    try:
+        result, said = fit_trials(trials, arguments.model, arguments.epoch, progress=_progress)
+        print_line(
+            {"model": str(arguments.model), "epoch": arguments.epoch, "verdict": msgspec.to_builtins(said)}
+        )
+    except CalibrationError as error:
+        print_line(error_line(error))
+        said = failed(error.code, error.message)
     except (ModelFileError, OSError) as error:
-        _print({"error": {"code": type(error).__name__, "message": str(error), "data": {}}})
+        print_line(error_line(error))
         return 1
-    _print({"model": str(arguments.model), "epoch": result.model.epoch, "report": str(report)})
-    return 0
+    try:
+        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, said))})
+    except OSError as error:
+        print_line({"report_error": str(error)})
+    return 0 if result is not None else 1
 
 
 if __name__ == "__main__":

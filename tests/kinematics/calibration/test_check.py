@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, solve
-from stereoservo.kinematics.calibration.check import CheckReport, check_model_holds
+from stereoservo.kinematics.calibration.check import check_model_holds
+from stereoservo.kinematics.calibration.check_report import CheckReport
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics
 from stereoservo_sim.synthetic import SyntheticCell, pan_tilt, rx90
@@ -199,6 +200,7 @@ def test_nothing_injected_raises_no_alarm() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_rates_over_many_seeds() -> None:
     """Each cause named in at least 95 %, no false alarm in more than 1 %."""
     for cause in CAUSES:

@@ -7,9 +7,7 @@ test says whether they are, likelihood ratios between what may have changed say 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
@@ -17,7 +15,6 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.kinematics.calibration.check_causes import (
     Bench,
     Cause,
-    CauseKind,
     Estimate,
     causes,
     estimate,
@@ -25,6 +22,7 @@ from stereoservo.kinematics.calibration.check_causes import (
     make_bench,
     start_state,
 )
+from stereoservo.kinematics.calibration.check_report import CheckReport, Drift, FoundCause, Status
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.model import CellModel
 
@@ -41,62 +39,6 @@ GROSS = 6.0, 12.0
 """A pixel is left out that differs from its marker's median over the stops by more than so many sigmas, and so many
 times what that marker's other pixels do in that camera."""
 MIN_MEASUREMENTS = 40
-
-Status = Literal["holds", "drifting", "recalibrate"]
-
-
-class FoundCause(msgspec.Struct, frozen=True):
-    """Something that changed. ``ratio``: twice the log of its likelihood ratio, chi-square with ``freedoms`` where
-    nothing changed. ``effect_px``: rms change of the pixels. ``value``, ``deviation``: drift of a joint's zero
-    [rad or m]; of a camera or body the angle it turned [rad].
-    """
-
-    kind: Literal["camera", "cameras", "body", "marker", "joint", "unexplained"]
-    subject: str
-    ratio: float
-    freedoms: int
-    effect_px: float
-    message: str
-    value: float | None = None
-    deviation: float | None = None
-
-
-class Drift(msgspec.Struct, frozen=True):
-    """A cause taken by itself, whether significant or not, for the trend: parameters (q,), the upper triangle of their
-    information (q (q + 1) / 2,), and the rms change of the pixels that they make [px].
-    """
-
-    kind: CauseKind
-    subject: str
-    x: tuple[float, ...]
-    information: tuple[float, ...]
-    effect_px: float
-
-
-class CheckReport(msgspec.Struct, frozen=True):
-    """What a check says. Residuals rms in expected sigmas: in all, ``sigmas``, and by joint, camera and marker (joint:
-    over the stops that it was away from the base). ``chi2`` is expected to be ``measurements``; ``explained_chi2``:
-    what the ``causes`` leave of it. ``limit_px``: change of the pixels that the cell can live with.
-    """
-
-    status: Status
-    message: str
-    model_epoch: int
-    stops: int
-    measurements: int
-    chi2: float
-    explained_chi2: float
-    sigmas: float
-    rms_px: float
-    limit_px: float
-    per_joint: dict[str, float]
-    per_camera: dict[str, float]
-    per_marker: dict[str, float]
-    causes: tuple[FoundCause, ...]
-    drifts: tuple[Drift, ...]
-    left_out: int
-    created: str = ""
-    trend: str = ""
 
 
 def check_model_holds(

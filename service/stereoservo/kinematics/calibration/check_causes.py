@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, full_charts, jacobian, residuals
+from stereoservo.kinematics.calibration.check_report import CauseKind
 from stereoservo.kinematics.calibration.normal_equations import triangle_of
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.model import CellModel
 
 FloatArray = npt.NDArray[np.float64]
-CauseKind = Literal["camera", "cameras", "body", "marker", "joint"]
-
 STEP = 1e-6
 """Of the finite differences, relative to the size of the scene."""
 ROUNDS = 10
@@ -44,7 +42,7 @@ class Cause:
 @dataclass(frozen=True)
 class Bench:
     """A model before the pixels of a check: ``rig`` in its Euclidean frame where it has one, ``data``, and ``loose``
-    (2 k, p), orthogonal-free root of the covariance that the model's own uncertainty adds to the residuals [sigmas²].
+    (2 k, p), which tells the covariance that the model's own uncertainty adds to the residuals: see ``_bound``.
     """
 
     rig: Rig
@@ -88,15 +86,18 @@ def _unbound(B: FloatArray) -> FloatArray:
 
 
 def model_rig(model: CellModel) -> tuple[Rig, tuple[int, ...]]:
-    """The model as a rig, in its Euclidean frame where the stratum is metric, and the order of its joints."""
+    """The model as a rig in the best frame that its stratum has, and the order of its joints."""
     H = model.projective_to_euclidean
-    H = np.eye(4) if H is None else H
+    if H is None:
+        H = np.eye(4)
+        if model.stratum == "affine":
+            H[3] = model.plane_at_infinity
     inverse = np.linalg.inv(H)
     order = tuple(range(len(model.joint_names)))
     if model.tip_first:
         order = order[::-1]
     points = model.marker_points @ H.T
-    if model.stratum == "metric":
+    if model.stratum != "projective":
         points = points / points[:, 3:]
     rig = Rig(
         tuple(model.joint_kinds[j] for j in order),
@@ -149,7 +150,7 @@ def make_bench(model: CellModel, check: TrialData, made_from: TrialData | None, 
     # A direction that the calibration left open has a large finite deviation here instead of none.
     bounded = np.linalg.qr(np.vstack([triangle / sizes, 1e-7 * np.eye(charts.size)]), mode="r")
     slopes = jacobian(rig, charts, np.zeros(charts.size), data) / sizes
-    return Bench(rig, data, _bound(np.linalg.solve(bounded.T, slopes.T).T), order)
+    return Bench(rig, data, _bound(slopes @ np.linalg.inv(np.asarray(bounded))), order)
 
 
 # -- the hypotheses -----------------------------------------------------------------------------------------

@@ -1,0 +1,194 @@
+"""What a calibration is good for, in plain words: grade, why, and what to do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.model import CellModel, Stratum
+
+if TYPE_CHECKING:
+    from stereoservo.kinematics.calibration.report import CalibrationReport
+    from stereoservo.kinematics.calibration.trials import TrialData
+
+FloatArray = npt.NDArray[np.float64]
+Grade = Literal["good", "usable", "not usable"]
+
+LOUD = 1.1
+"""Residuals over stated noise up to which a fit that fails its chi-square is not worth a word."""
+FAR_OUT = 0.02
+"""Share of pixels left out that is worth a word."""
+UNEVEN = 1.3
+"""Residual of one joint over that of all that is worth a word."""
+SHORT_DEG, SHORT_M = 5.0, 0.02
+"""Trial motions so small that a poor deviation is put down to them."""
+LOOSE_PX = 0.5
+"""Deviation of predicted pixels that is worth a word."""
+LOOSE_DEPTH = 0.05
+"""Relative deviation of depths that is worth a word."""
+
+STRATA: dict[Stratum, str] = {
+    "metric": "metric: angles, ratios of lengths and the cameras' intrinsics are known; every law works",
+    "affine": "affine: parallels and ratios along them are known, angles are not; image laws and goals shown to the "
+    "cell work, straight lines are straight, angles of Cartesian paths are not kept",
+    "projective": "projective: what the cameras see is predicted, but nothing of lengths, angles or parallels is "
+    "known; image laws and goals shown to the cell work, Cartesian paths are not straight",
+}
+"""What a stratum means for who works with the cell."""
+
+CURES = {
+    "bad_data": "the data are damaged or not of this cell: look at the text, record anew",
+    "too_few_cameras": "connect a second camera that sees the markers at the same time",
+    "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
+    "another calibration.base",
+    "too_few_stops": "raise calibration.stops, or give the joint more room: calibration.base, calibration.range",
+    "joint_did_not_move": "the encoder reported no motion: is the joint's brake released, is its name the right one?",
+    "joint_without_effect": "the markers did not move with this joint: do they sit behind it, does its drive turn?",
+    "joint_kind": "correct the joint's kind in its driver's description: revolute or prismatic",
+    "views_degenerate": "set the cameras apart (a baseline of a tenth of the distance at least) and show markers that "
+    "do not stay in one plane: two faces, or calibration.spread for a flat plate",
+    "not_identifiable": "larger motions (calibration.range), markers off one plane (a second face, calibration.spread)",
+    "no_convergence": "look at the tracks: did a camera move, are markers mixed up, are joint positions right?",
+    "too_many_outliers": "look at the tracks of the joint named: reflections, mixed-up markers, another joint moving",
+    "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
+    "camera, a wrong joint scale, a detector that understates its noise",
+    "mixed_mounts": "calibrate cameras that stand and cameras on the tip each on their own",
+}
+"""What to do about each cause of a failed calibration, by the code of its CalibrationError."""
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """``text`` says it all in a few sentences; ``reasons`` and ``advice`` are its parts."""
+
+    grade: Grade
+    text: str
+    reasons: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+
+
+def verdict(model: CellModel, report: CalibrationReport, depth_spread: float | None = None) -> Verdict:
+    """Judge a fitted model. ``depth_spread``: largest relative standard deviation of a marker's depth, where known."""
+    reasons: list[str] = []
+    advice: list[str] = []
+    statistics = model.statistics
+    if statistics is None:
+        return Verdict("usable", "usable: the model carries no statistics", ("no statistics",))
+    _residuals(model, report, reasons, advice)
+    _left_out(model, report, reasons, advice)
+    _identified(model, report, depth_spread, reasons, advice)
+    grade: Grade = "usable" if reasons else "good"
+    said = f"residual {statistics.rms_px:.3g} px rms" + (
+        ", as the measurement noise explains" if statistics.chi2_ok else ""
+    )
+    stratum = STRATA[model.stratum]
+    text = f"{grade}: {'; '.join(reasons)}" if reasons else f"good: {said}"
+    text += f". Stratum {stratum}."
+    if advice:
+        text += " " + " ".join(f"{line[0].upper()}{line[1:]}." for line in advice)
+    return Verdict(grade, text, tuple(reasons), tuple(advice))
+
+
+def failed(code: str, message: str) -> Verdict:
+    """What is to be said of a calibration that gave no model."""
+    cure = CURES.get(code, "look at the tracks in the report")
+    return Verdict(
+        "not usable", f"not usable: {message.rstrip('.')}. What to do: {cure}.", (message,), (cure,)
+    )
+
+
+def _residuals(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:
+    statistics = model.statistics
+    if statistics is None or statistics.chi2_ok:
+        return
+    factor = report.sigma_factor
+    if factor < 1.0:
+        if factor < 1.0 / LOUD:
+            reasons.append(
+                f"residuals are only {factor:.2f} times the stated noise: the detector states too much of it, and "
+                "deviations here are too large by as much"
+            )
+        return
+    if factor <= LOUD:
+        return
+    reasons.append(f"residuals are {factor:.2f} times the stated noise: lens, play, or positions")
+    advice.append(
+        "see the residual vectors in the report: a pattern over the image is the lens, one joint alone is that joint's "
+        "play or encoder, all alike is a detector that understates its noise"
+    )
+    worst = max(statistics.joints, key=lambda joint: joint.rms_px)
+    if worst.rms_px > UNEVEN * statistics.rms_px:
+        reasons.append(f"joint {worst.name} is worst with {worst.rms_px:.3g} px")
+
+
+def _left_out(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:
+    statistics = model.statistics
+    if statistics is None:
+        return
+    pixels = statistics.measurements / 2 + statistics.outliers
+    share = statistics.outliers / max(pixels, 1.0)
+    if share > FAR_OUT:
+        reasons.append(f"{share:.0%} of the pixels do not fit and were left out")
+        advice.append("look at the tracks in the report for reflections and mixed-up markers")
+    if report.markers_left_out:
+        markers = ", ".join(str(marker) for marker in report.markers_left_out)
+        reasons.append(f"marker {markers} was seen by two cameras too rarely and is not in the model")
+
+
+def _identified(
+    model: CellModel, report: CalibrationReport, depth: float | None, reasons: list[str], advice: list[str]
+) -> None:
+    statistics = model.statistics
+    if statistics is None:
+        return
+    loose = depth is not None and depth > LOOSE_DEPTH
+    if depth is not None and loose:
+        reasons.append(f"depths are known to {depth:.0%} only")
+    if report.prediction_max_px > LOOSE_PX:
+        reasons.append(f"predicted pixels are known to {report.prediction_max_px:.2g} px at worst only")
+        loose = True
+    if model.stratum != "metric":
+        reasons.append(f"the data identify the {model.stratum} stratum only")
+        why = [note for note in report.notes if "refused" in note]
+        if why:
+            reasons.append(why[0])
+    if not loose and model.stratum == "metric":
+        return
+    for joint, kind in zip(statistics.joints, model.joint_kinds, strict=True):
+        small = np.degrees(joint.range) < SHORT_DEG if kind == "revolute" else joint.range < SHORT_M
+        if small:
+            moved = f"{np.degrees(joint.range):.1f}°" if kind == "revolute" else f"{joint.range:.3f} m"
+            reasons.append(f"joint {joint.name} moved {moved} only")
+            advice.append(f"raise calibration.range.{joint.name}")
+    if not advice and loose:
+        advice.append("larger trial motions, markers larger in the image or more stops make it better")
+
+
+def depth_spread(model: CellModel, trials: TrialData) -> float | None:
+    """Largest relative standard deviation of a marker's depth in the left camera; None in the projective stratum.
+
+    From the curvature of the fit at the model, over the trials' own stops and sigmas.
+    """
+    from stereoservo.kinematics.calibration.check_causes import model_rig, pixels_of
+    from stereoservo.kinematics.calibration.normal_equations import triangle_of
+    from stereoservo.kinematics.calibration.rig import full_charts
+
+    if model.stratum == "projective":
+        return None
+    rig, order = model_rig(model)
+    data = pixels_of(model, trials, order)
+    charts = full_charts(rig, model.stratum)
+    triangle = triangle_of(rig, charts, data)[:-1, :-1]
+    sizes = np.linalg.norm(triangle, axis=0)
+    if not (sizes > 0.0).all():
+        return None
+    root = np.linalg.pinv(triangle / sizes) / sizes[:, None]
+    at = charts.start(3)
+    depths = rig.points @ rig.cameras[0][2]
+    spreads = []
+    for i, basis in enumerate(charts.points):
+        rows = basis @ rig.cameras[0][2] @ root[at + 3 * i : at + 3 * i + 3]
+        spreads.append(float(np.linalg.norm(rows)) / abs(float(depths[i])))
+    return max(spreads)

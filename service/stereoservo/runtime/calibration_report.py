@@ -1,0 +1,371 @@
+"""The report of a calibration: one self-contained page of what was measured, how it fits, and what it is good for.
+
+A folder beside the model file, written whole or not at all, by the fit process once the model is safe.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from stereoservo.kinematics.calibration.check_causes import model_rig, pixels_of
+from stereoservo.kinematics.calibration.report import CalibrationReport
+from stereoservo.kinematics.calibration.rig import Measurements, predicted
+from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.kinematics.calibration.verdict import STRATA, Verdict
+from stereoservo.kinematics.model import CellModel
+
+FloatArray = npt.NDArray[np.float64]
+
+DPI = 90
+HISTOGRAM = np.linspace(-5.0, 5.0, 41)
+LISTED = 60
+"""Pixels left out that are listed one by one."""
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222 }
+h1 { font-size: 1.5em } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ccc }
+table { border-collapse: collapse } td, th { padding: .15em .8em; text-align: right; border-bottom: 1px solid #eee }
+td:first-child, th:first-child { text-align: left } img { max-width: 100% }
+.verdict { padding: .8em 1em; border-left: 6px solid } .good { border-color: #2a7; background: #eefaf3 }
+.usable { border-color: #d90; background: #fff8e8 } .not { border-color: #c33; background: #fdeeee }
+"""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What a model leaves of the trials: ``pixels`` (k, 2) measured less predicted [px], in ``sigmas`` (k, 2); the
+    camera and the trial's joint (-1: the base) of each, and whether the fit left it out.
+    """
+
+    data: Measurements
+    pixels: FloatArray
+    sigmas: FloatArray
+    joint: npt.NDArray[np.int64]
+    left_out: npt.NDArray[np.bool_]
+
+
+def residuals_of(model: CellModel, trials: TrialData, report: CalibrationReport) -> Residuals:
+    """Residuals of every pixel of the model's markers. Raises CalibrationError where the trials are not the model's."""
+    rig, order = model_rig(model)
+    data = pixels_of(model, trials, order)
+    pixels = data.pixels - predicted(rig, data)
+    outliers = {(out.camera, out.stop, out.marker) for out in report.outliers}
+    names = [camera.name for camera in model.cameras]
+    left_out = np.array(
+        [
+            (names[c], int(s), model.marker_ids[m]) in outliers
+            for c, s, m in zip(data.camera, data.stop, data.marker, strict=True)
+        ],
+        dtype=bool,
+    )
+    return Residuals(data, pixels, pixels / data.sigmas[:, None], trials.trials[data.stop], left_out)
+
+
+def write_report(
+    folder: Path,
+    trials: TrialData,
+    verdict: Verdict,
+    *,
+    model: CellModel | None = None,
+    report: CalibrationReport | None = None,
+    trials_path: Path | None = None,
+) -> Path:
+    """Write ``folder/index.html``, in place of an older one; gives its path. Without a model: the report of a failure.
+
+    Raises OSError.
+    """
+    page = _page(trials, verdict, model, report, trials_path).encode()
+    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        with (scratch / "index.html").open("wb") as file:
+            file.write(page)
+            file.flush()
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        scratch.chmod(0o777 & ~umask)
+        if folder.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old.", dir=folder.parent))
+            folder.rename(old / folder.name)
+            scratch.rename(folder)
+            shutil.rmtree(old)
+        else:
+            scratch.rename(folder)
+    except BaseException:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+    return folder / "index.html"
+
+
+def _page(
+    trials: TrialData,
+    verdict: Verdict,
+    model: CellModel | None,
+    report: CalibrationReport | None,
+    trials_path: Path | None,
+) -> str:
+    title = "Calibration failed" if model is None else f"Calibration: model epoch {model.epoch}"
+    parts = [
+        f"<h1>{_e(title)}</h1>",
+        f'<p class="verdict {verdict.grade.split()[0]}">{_e(verdict.text)}</p>',
+    ]
+    if model is not None and report is not None:
+        rest = residuals_of(model, trials, report)
+        parts += [
+            f"<p>{_facts(model, report)}</p>",
+            "<h2>Residuals by joint and camera</h2>",
+            "<p>Residual rms beside the floor that the stated noise sets. A joint far above its floor has play, a "
+            "wrong scale or an encoder fault; a camera far above all others has a lens or a detector of its own.</p>",
+            _image(draw_levels(model, trials, rest)),
+            _joints(model, trials, rest),
+            "<h2>Residual histograms</h2>",
+            "<p>Residuals in stated sigmas against the Gaussian that they should be (line).</p>",
+            _image(draw_histograms(model, rest)),
+            "<h2>Residual vectors</h2>",
+            "<p>Where in the image the residuals lie. Arrows without a pattern are noise; a ring or a swirl is the "
+            "lens.</p>",
+            _image(draw_vectors(model, rest)),
+            "<h2>What is known, and how well</h2>",
+            _cameras(model, report),
+            "<h2>Left out</h2>",
+            _outliers(report),
+        ]
+        if report.notes:
+            parts += [
+                "<h2>Notes of the fit</h2>",
+                "<ul>",
+                *(f"<li>{_e(n)}</li>" for n in report.notes),
+                "</ul>",
+            ]
+    parts += [
+        "<h2>Tracks</h2>",
+        "<p>Every marker at every stop, one colour for the trial of each joint. Tracks must be smooth arcs or lines; a "
+        "dot off its arc is a wrong match.</p>",
+        _image(draw_tracks(trials)),
+        _seen(trials),
+    ]
+    if trials_path is not None:
+        parts.append(
+            f"<p>The trial data are in <code>{_e(trials_path)}</code>; "
+            f"<code>stereoservo calibrate CELL --trials {_e(trials_path)}</code> fits them again.</p>"
+        )
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{_e(title)}</title><style>{_STYLE}</style>'
+        f"<body>{chr(10).join(parts)}</body></html>\n"
+    )
+
+
+def _e(value: object) -> str:
+    return html.escape(str(value))
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+    lines = ["<table><tr>" + "".join(f"<th>{_e(cell)}</th>" for cell in head) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{_e(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    return "\n".join([*lines, "</table>"])
+
+
+def _image(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+
+
+# -- words and tables ---------------------------------------------------------------------------------------
+
+
+def _facts(model: CellModel, report: CalibrationReport) -> str:
+    statistics = model.statistics
+    if statistics is None:
+        return ""
+    return _e(
+        f"{statistics.images} images, {statistics.measurements} measurements, {statistics.parameters} parameters "
+        f"net of gauge; residual {statistics.rms_px:.4g} px rms; chi-square {statistics.chi2:.0f} with "
+        f"{statistics.degrees_of_freedom} degrees of freedom ({'' if statistics.chi2_ok else 'NOT '}inside the "
+        f"two-sided 99.9 % interval); residuals {report.sigma_factor:.3f} times the stated noise; predicted pixels "
+        f"known to {report.prediction_rms_px:.3g} px rms, {report.prediction_max_px:.3g} px at worst. "
+        f"Stratum {STRATA[model.stratum]}."
+    )
+
+
+def floors(model: CellModel, trials: TrialData, rest: Residuals) -> FloatArray:
+    """Expected residual rms (n,) [px] of each joint's trial: its sigmas, less the share that the parameters took."""
+    statistics = model.statistics
+    share = 1.0
+    if statistics is not None and statistics.measurements > 0:
+        share = float(np.sqrt(max(statistics.degrees_of_freedom, 0) / statistics.measurements))
+    known = {} if statistics is None else {
+        joint.name: getattr(joint, "expected_px", None) for joint in statistics.joints
+    }  # fmt: skip
+    found = []
+    for j, name in enumerate(model.joint_names):
+        mine = (rest.joint == j) & ~rest.left_out
+        own = float(np.sqrt((rest.data.sigmas[mine] ** 2).mean())) if mine.any() else 0.0
+        stated = known.get(name)
+        found.append(share * own if stated is None else float(stated))
+    return np.array(found)
+
+
+def _joints(model: CellModel, trials: TrialData, rest: Residuals) -> str:
+    statistics = model.statistics
+    if statistics is None:
+        return ""
+    rows: list[tuple[object, ...]] = []
+    for joint, kind, floor in zip(
+        statistics.joints, model.joint_kinds, floors(model, trials, rest), strict=True
+    ):
+        span = f"{np.degrees(joint.range):.1f}°" if kind == "revolute" else f"{joint.range:.4f} m"
+        rows.append((joint.name, kind, joint.stops, span, f"{joint.rms_px:.4f}", f"{floor:.4f}"))
+    return _table(("joint", "kind", "stops", "moved", "rms [px]", "floor [px]"), rows)
+
+
+def _cameras(model: CellModel, report: CalibrationReport) -> str:
+    rows: list[tuple[object, ...]] = []
+    for camera, known in zip(report.cameras, model.cameras, strict=True):
+        inner = "" if camera.intrinsics is None else ", ".join(f"{value:.2f}" for value in camera.intrinsics)
+        k, cu, cv, _ = known.lens
+        lens = "pinhole" if k == 0.0 else f"k {k:.5f} about ({cu:.1f}, {cv:.1f})"
+        rows.append((camera.name, f"{camera.rms_px:.4f}", camera.pixels, camera.outliers, inner, lens))
+    return _table(("camera", "rms [px]", "pixels", "left out", "fx, skew, fy, u0, v0 [px]", "lens"), rows)
+
+
+def _outliers(report: CalibrationReport) -> str:
+    if not report.outliers and not report.markers_left_out:
+        return "<p>Nothing.</p>"
+    page = ""
+    if report.markers_left_out:
+        page = f"<p>Markers seen too rarely: {_e(', '.join(map(str, report.markers_left_out)))}.</p>"
+    worst = sorted(report.outliers, key=lambda out: -out.distance_px)
+    rows: list[tuple[object, ...]] = [
+        (out.camera, out.stop, out.marker, f"{out.distance_px:.3g}") for out in worst[:LISTED]
+    ]
+    if rows:
+        page += _table(("camera", "stop", "marker", "distance [px]"), rows)
+    if len(worst) > LISTED:
+        page += f"<p>… and {len(worst) - LISTED} more.</p>"
+    return page
+
+
+def _seen(trials: TrialData) -> str:
+    rows: list[tuple[object, ...]] = []
+    for j, name in enumerate((*trials.joint_names, "base")):
+        own = trials.trials == (j if j < len(trials.joint_names) else -1)
+        counts = trials.visible[:, own].sum(axis=2) if own.any() else np.zeros((len(trials.cameras), 1))
+        span = np.ptp(trials.positions[own, j]) if own.any() and j < len(trials.joint_names) else 0.0
+        rows.append(
+            (name, int(own.sum()), f"{span:.3f}", *(f"{row.min():.0f} to {row.max():.0f}" for row in counts))
+        )
+    head = ("trial", "stops", "moved [rad or m]", *(f"markers in {camera.name}" for camera in trials.cameras))
+    return _table(head, rows)
+
+
+# -- pictures -----------------------------------------------------------------------------------------------
+
+
+def _axes(figure: Figure, rows: int, columns: int, **options: Any) -> npt.NDArray[Any]:
+    return np.asarray(figure.subplots(rows, columns, squeeze=False, **options)).ravel()
+
+
+def _view(axes: Any, name: str, width: int, height: int) -> None:
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=name, xlabel="u [px]", ylabel="v [px]")
+
+
+def draw_tracks(trials: TrialData) -> Figure:
+    """All markers in each camera, the trials of the joints in their colours."""
+    c = len(trials.cameras)
+    figure = Figure(figsize=(5.8 * c, 5.0), layout="constrained")
+    colours = matplotlib.colormaps["tab10"]
+    for k, (axes, camera) in enumerate(zip(_axes(figure, 1, c), trials.cameras, strict=True)):
+        _view(axes, camera.name, camera.width, camera.height)
+        for j, name in enumerate(trials.joint_names):
+            own = np.flatnonzero(trials.trials == j)
+            order = own[np.argsort(trials.positions[own, j])]
+            for m in range(len(trials.marker_ids)):
+                line = trials.pixels[k, order, m]
+                axes.plot(*line.T, ".-", color=colours(j % 10), ms=3, lw=0.6, label=name if m == 0 else None)
+        base = trials.pixels[k, trials.trials < 0].reshape(-1, 2)
+        axes.plot(*base.T, "k+", ms=5, label="base")
+        axes.legend(fontsize="small", loc="best")
+    return figure
+
+
+def draw_levels(model: CellModel, trials: TrialData, rest: Residuals) -> Figure:
+    """Residual rms of each joint beside its floor, and of each camera."""
+    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+    left, right = _axes(figure, 1, 2)
+    kept = ~rest.left_out
+    squares = (rest.pixels**2).mean(axis=1)
+    trials_of = [kept & (rest.joint == j) for j in range(len(model.joint_names))]
+    levels = [float(np.sqrt(squares[own].mean())) if own.any() else 0.0 for own in trials_of]
+    at = np.arange(max(len(levels), len(model.cameras)))
+    mine = at[: len(levels)]
+    left.bar(mine - 0.2, levels, 0.4, label="residual rms")
+    left.bar(mine + 0.2, floors(model, trials, rest), 0.4, label="floor", color="0.7")
+    left.set(xticks=mine, xticklabels=model.joint_names, ylabel="[px]", title="by joint")
+    left.legend(fontsize="small")
+    cameras = [kept & (rest.data.camera == c) for c in range(len(model.cameras))]
+    right.bar(
+        [camera.name for camera in model.cameras], [float(np.sqrt(squares[m].mean())) for m in cameras], 0.5
+    )
+    stated = [float(np.sqrt((rest.data.sigmas[m] ** 2).mean())) for m in cameras]
+    right.hlines(stated, at[: len(stated)] - 0.35, at[: len(stated)] + 0.35, color="k", label="stated noise")
+    right.set(ylabel="[px]", title="by camera")
+    right.legend(fontsize="small")
+    return figure
+
+
+def draw_histograms(model: CellModel, rest: Residuals) -> Figure:
+    """Residuals in sigmas, of each joint's trial and of each camera, against the standard Gaussian."""
+    kept = ~rest.left_out
+    groups = [(name, rest.joint == j) for j, name in enumerate(model.joint_names)]
+    groups += [(f"camera {camera.name}", rest.data.camera == c) for c, camera in enumerate(model.cameras)]
+    columns = 4
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(11.0, 2.2 * rows), layout="constrained")
+    x = np.linspace(-5.0, 5.0, 200)
+    panels = _axes(figure, rows, columns, sharex=True)
+    for axes, (name, mine) in zip(panels, groups, strict=False):
+        values = rest.sigmas[mine & kept].ravel()
+        if values.size:
+            axes.hist(np.clip(values, -5.0, 5.0), HISTOGRAM, density=True, color="0.75")
+        axes.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), "C3", lw=1.0)
+        spread = float(np.sqrt((values**2).mean())) if values.size else 0.0
+        axes.set(title=f"{name}: {spread:.2f} sigmas", yticks=[])
+        axes.title.set_size("small")
+    for axes in panels[len(groups) :]:
+        axes.axis("off")
+    return figure
+
+
+def draw_vectors(model: CellModel, rest: Residuals) -> Figure:
+    """Residual vectors over each image, magnified so that the rms is a thirtieth of the width."""
+    c = len(model.cameras)
+    figure = Figure(figsize=(5.8 * c, 4.8), layout="constrained")
+    kept = ~rest.left_out
+    rms = float(np.sqrt((rest.pixels[kept] ** 2).mean())) if kept.any() else 1.0
+    for k, (axes, camera) in enumerate(zip(_axes(figure, 1, c), model.cameras, strict=True)):
+        mine = kept & (rest.data.camera == k)
+        gain = camera.width / 30.0 / max(rms, 1e-12)
+        _view(axes, f"{camera.name}, magnified {gain:.3g} times", camera.width, camera.height)
+        if mine.any():
+            axes.quiver(
+                *rest.data.pixels[mine].T, *(gain * rest.pixels[mine]).T, angles="xy", scale_units="xy", scale=1.0,
+                width=0.002,
+            )  # fmt: skip
+    return figure
