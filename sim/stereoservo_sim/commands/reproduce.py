@@ -6,20 +6,17 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from stereoservo_sim.commands.progress import ProgressCall, progress_bar
 from stereoservo_sim.experiments.errors import ExperimentError
-
-ProgressCall = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -181,6 +178,7 @@ def show_pan_tilt(answer: dict[str, Any], console: Console) -> None:
         "delta_v_mean": "v, mean",
         "delta_v_sd": "v, deviation",
         "delta_lr": "LR",
+        "separate_rotations_delta_lr": "LR, joints by themselves",
         "perfect_calibration_delta_lr": "LR, head known",
         "calibration_alone_delta_lr": "LR, no noise",
     }
@@ -287,7 +285,7 @@ def reproduce(
         for name in ("data", "hand_tag", "table_tags", "seeds"):
             if getattr(options, name) is not None and name not in chosen.takes:
                 raise ExperimentError("option", f"{experiment} does not take --{name.replace('_', '-')}")
-        with _progress_bar() as progress:
+        with progress_bar() as progress:
             answer = chosen.run(options, progress)
     except (ExperimentError, OSError) as error:
         _fail(error, as_json)
@@ -321,22 +319,3 @@ def _tag_list(text: str) -> tuple[int, ...]:
         return tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError:
         raise ExperimentError("option", f"--table-tags {text!r}; needed: ids by commas, like 0,2,3") from None
-
-
-@contextmanager
-def _progress_bar() -> Iterator[ProgressCall]:
-    """A bar on stderr where that is a terminal, else nothing."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda stage, done, total: None
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        tasks: dict[str, Any] = {}
-
-        def tell(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
-
-        yield tell

@@ -1,0 +1,125 @@
+"""``bench calibration``: the fit of a thesis-sized problem, its cost an image, and a dense least squares beside it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from stereoservo.kinematics.axes import framed
+from stereoservo.kinematics.calibration.bundle import Rig, full_charts, jacobian, moved, residuals, solve
+from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.kinematics.calibration.separate import measurements
+from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo_sim.benchmarks.timing import summary, timed
+from stereoservo_sim.exact_model import exact_model
+from stereoservo_sim.synthetic import SyntheticCell, rx90, two_faces
+
+FloatArray = npt.NDArray[np.float64]
+ProgressCall = Callable[[str, int, int], None]
+
+SIGMA = 0.05
+"""[px]"""
+STOPS = 20
+IMAGES = (100, 300, 1000, 3000, 10_000)
+"""About how many, for the cost an image."""
+START = 30.0
+"""How far the common start of the two least squares lies from the truth [standard deviations]."""
+
+
+def thesis_sized() -> SyntheticCell:
+    """Six revolute joints, 16 markers, two cameras."""
+    more = [(0.02, -0.01, 0.06), (-0.02, 0.01, 0.06)]
+    return rx90(np.vstack([two_faces(), more]))
+
+
+def run_calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """Time of ``fit_model`` over fresh noise, of one image, and of scipy's dense least squares from the same start."""
+    cell = thesis_sized()
+    count = max(3, repetitions)
+    data = [cell.trials(SIGMA, np.random.default_rng([seed, k]), STOPS) for k in range(count)]
+
+    def fit(k: int) -> None:
+        fit_model(data[k], epoch=1)
+        progress("fits", min(k + 1, count), count)
+
+    wall, cpu = timed(fit, count)
+    result = {
+        "problem": {
+            "joints": len(cell.kinds),
+            "stops_per_joint": STOPS,
+            "markers": len(cell.body),
+            "cameras": len(cell.poses),
+            "images": data[0].images,
+            "measurements": int(2 * data[0].visible.sum()),
+        },
+        "fit_wall_s": summary(wall),
+        "fit_cpu_s": summary(cpu),
+        "per_image": _per_image(cell, seed, progress),
+        "least_squares": _beside_scipy(cell, data[0], count, seed, progress),
+    }
+    times = [row["fit_ms_an_image"] for row in result["per_image"]]
+    result["fit_ms_an_image_last_over_first"] = times[-1] / times[0]
+    return result
+
+
+def _per_image(cell: SyntheticCell, seed: int, progress: ProgressCall) -> list[dict[str, float]]:
+    """CPU time of one fit over its number of images."""
+    rows = []
+    for k, images in enumerate(IMAGES):
+        stops = max(4, round(images / (len(cell.kinds) * len(cell.poses))))
+        trials = cell.trials(SIGMA, np.random.default_rng([seed, 1000 + k]), stops)
+        at = time.process_time()
+        fit_model(trials, epoch=1)
+        spent = time.process_time() - at
+        rows.append(
+            {
+                "images": trials.images,
+                "fit_cpu_s": round(spent, 3),
+                "fit_ms_an_image": 1e3 * spent / trials.images,
+            }
+        )
+        progress("cost an image", k + 1, len(IMAGES))
+    return rows
+
+
+def _beside_scipy(
+    cell: SyntheticCell, trials: TrialData, count: int, seed: int, progress: ProgressCall
+) -> dict[str, Any]:
+    """The metric bundle, ours and scipy's on the dense Jacobian of the same residuals, from one common start."""
+    parts = framed(exact_model(cell))
+    truth = Rig(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
+    data = measurements(trials, trials.visible, trials.positions - parts.zero)
+    charts = full_charts(truth, "metric")
+    slope = jacobian(truth, charts, np.zeros(charts.size), data)
+    noise = np.random.default_rng([seed, 2000]).standard_normal(charts.size)
+    start = moved(truth, charts, START * np.linalg.solve(np.linalg.qr(slope, mode="r"), noise))
+    here = full_charts(start, "metric")
+    costs: dict[str, float] = {}
+
+    def ours(_: int) -> None:
+        costs["ours"] = solve(start, data, "metric").cost
+
+    def dense(k: int) -> None:
+        found = least_squares(
+            lambda x: residuals(moved(start, here, x), data),
+            np.zeros(here.size),
+            jac=lambda x: jacobian(start, here, x, data),
+            x_scale="jac",
+            xtol=1e-10,
+            ftol=1e-10,
+        )
+        costs["scipy"] = 2.0 * found.cost
+        progress("scipy", min(k + 1, count), count)
+
+    mine, theirs = timed(ours, count)[1], timed(dense, count)[1]
+    return {
+        "ours_cpu_s": summary(mine),
+        "scipy_dense_cpu_s": summary(theirs),
+        "scipy_over_ours": float(np.median(theirs) / np.median(mine)),
+        "chi2": {**costs, "freedom": 2 * len(data.pixels) - charts.size},
+    }

@@ -1,0 +1,94 @@
+"""``stereoservo bench WHAT``: how long things take here, with a baseline in the same run."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from stereoservo_sim.commands.progress import ProgressCall, progress_bar
+from stereoservo_sim.experiments.errors import ExperimentError
+
+Bench = Callable[[int, int, ProgressCall], dict[str, Any]]
+
+
+def _calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.calibration import run_calibration
+
+    return run_calibration(repetitions, seed, progress)
+
+
+def _cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.cycle import run_cycle
+
+    return run_cycle(repetitions, seed, progress)
+
+
+def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.features import run_features
+
+    return run_features(repetitions, seed, progress)
+
+
+BENCHES: dict[str, Bench] = {"calibration": _calibration, "cycle": _cycle, "features": _features}
+"""By the name given on the command line."""
+
+
+def bench(
+    what: Annotated[str, typer.Argument(help="Which one: " + ", ".join(BENCHES) + ".")],
+    repetitions: Annotated[
+        int, typer.Option(min=1, help="Timed fits of `calibration`; the others take a multiple of it.")
+    ] = 7,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """Time one part on this machine, beside a baseline. Nothing is judged: machines are shared and stall."""
+    try:
+        run = _find(what)
+        # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        from stereoservo_sim.benchmarks.timing import machine, stolen_share, stolen_ticks
+
+        before = stolen_ticks()
+        with progress_bar() as progress:
+            figures = run(repetitions, seed, progress)
+    except ExperimentError as error:
+        print(f"error: {error}", file=sys.stderr)
+        if as_json:
+            print(json.dumps({"error": {"code": error.code, "message": str(error), **error.data}}))
+        raise typer.Exit(1) from error
+    facts = machine()
+    facts["stolen_share"] = stolen_share(before, stolen_ticks())
+    answer = {"bench": what, "seed": seed, **figures, "machine": facts}
+    if as_json:
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        _show(answer, Console(markup=False, highlight=False))
+
+
+def _find(what: str) -> Bench:
+    if what not in BENCHES:
+        known = sorted(BENCHES)
+        raise ExperimentError("bench", f"no bench {what!r}; known: {', '.join(known)}", known=known)
+    return BENCHES[what]
+
+
+def _show(answer: dict[str, Any], console: Console) -> None:
+    """One line a figure, nested names joined by points."""
+    for name, value in _flat(answer, ""):
+        console.print(f"{name:<44} {f'{value:.4g}' if isinstance(value, float) else value}", soft_wrap=True)
+
+
+def _flat(value: Any, name: str) -> list[tuple[str, Any]]:
+    if isinstance(value, dict):
+        return [
+            line for key, inner in value.items() for line in _flat(inner, f"{name}.{key}" if name else key)
+        ]
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return [line for k, inner in enumerate(value) for line in _flat(inner, f"{name}[{k}]")]
+    return [(name, value)]
