@@ -154,6 +154,9 @@ def test_pan_tilt_answers_and_draws(tmp_path):
         # The thesis's tracker drifts as ours does: its distances, within a quarter.
         thesis = answer["thesis"][row["condition"]]["delta_lr"]
         assert row["delta_lr"]["median"] == pytest.approx(thesis, rel=0.25)
+    for row in answer["rows"]:
+        # Two rotations by themselves, as in the thesis, do as well on their own trajectories; more noise is common.
+        assert row["separate_rotations_delta_lr"]["median"] < 1.5 * row["delta_lr"]["median"]
     assert all(path.stat().st_size > 10_000 for path in draw_pan_tilt(answer, tmp_path / "new"))
     assert len(answer["example"]["feed-forward"]["pairs"]) == 35
 

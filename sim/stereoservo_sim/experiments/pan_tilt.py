@@ -16,6 +16,7 @@ import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo.kinematics.head import feed_forward
 from stereoservo.kinematics.joint_sights import SeenChain, seen_chain
@@ -32,6 +33,7 @@ from stereoservo_sim.experiments.thesis_head import (
     calibrated,
     general_positions,
     head,
+    separate_rotations,
     tracked,
     tracks_of,
     trial_data,
@@ -113,12 +115,14 @@ def measures(errors: FloatArray) -> dict[str, float]:
 
 
 def trial(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> dict[str, dict[str, FloatArray]]:
-    """Errors (pairs, c, m, 2) of each condition with the ``calibrated`` head, with the ``perfect`` one, and of the
-    calibrated one on ``exact`` images. Raises CalibrationError.
+    """Errors (pairs, c, m, 2) of each condition with the ``calibrated`` head, with one of two ``separate`` rotations,
+    with the ``perfect`` one, and of the calibrated one on ``exact`` images. Raises CalibrationError, GeometryError.
     """
     tracks = tracks_of(cell, noise, rng)
+    trials = trial_data(cell, tracks)
     heads = {
-        "calibrated": calibrated(trial_data(cell, tracks)).seen,
+        "calibrated": calibrated(trials).seen,
+        "separate": separate_rotations(trials),
         "perfect": seen_chain(exact_model(cell)),
     }
     answer: dict[str, dict[str, FloatArray]] = {}
@@ -173,8 +177,8 @@ def run_pan_tilt(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, 
             cell = head(rng)
             try:
                 errors = trial(cell, noise, rng)
-            except CalibrationError as error:
-                failed.append({"noise": noise, "seed": i, "code": error.code, "message": error.message})
+            except (CalibrationError, GeometryError) as error:
+                failed.append({"noise": noise, "seed": i, "code": error.code, "message": str(error)})
                 continue
             for condition, kinds in errors.items():
                 for kind, values in kinds.items():
@@ -219,15 +223,17 @@ def _row(
     noise: Noise, condition: str, found: dict[tuple[Noise, str, str], list[dict[str, float]]]
 ) -> dict[str, Any]:
     ours = found.get((noise, condition, "calibrated"), [])
-    floor = found.get((noise, condition, "perfect"), [])
-    exact = found.get((noise, condition, "exact"), [])
+    beside = {
+        "perfect_calibration_delta_lr": found.get((noise, condition, "perfect"), []),
+        "separate_rotations_delta_lr": found.get((noise, condition, "separate"), []),
+        "calibration_alone_delta_lr": found.get((noise, condition, "exact"), []),
+    }
     return {
         "condition": condition,
         "noise": noise,
         "seeds": len(ours),
         **{name: spread([values[name] for values in ours]) for name in MEASURES},
-        "perfect_calibration_delta_lr": spread([values["delta_lr"] for values in floor]),
-        "calibration_alone_delta_lr": spread([values["delta_lr"] for values in exact]),
+        **{name: spread([values["delta_lr"] for values in runs]) for name, runs in beside.items()},
     }
 
 

@@ -13,10 +13,14 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.rotation_fit import bundle_rotation
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, moved, solve
 from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.kinematics.calibration.starts import common_points, linear_generator
 from stereoservo.kinematics.calibration.statistics import covariance_root
 from stereoservo.kinematics.calibration.trials import TrialCamera, TrialData
+from stereoservo.kinematics.calibration.views import first_views
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.joint_sights import SeenChain, pinhole_lenses
 from stereoservo.kinematics.model import CellModel, Stratum
@@ -223,3 +227,29 @@ def _rig_of(model: CellModel) -> tuple[Rig, Stratum]:
         cameras[0] = np.triu(cameras[0])
     generators = (upgrade @ model.generators @ back)[::-1]
     return Rig(("revolute", "revolute"), generators, cameras, points), stratum
+
+
+def separate_rotations(trials: TrialData) -> SeenChain:
+    """The head from two rotations estimated one by one (4.42), as in the thesis: cameras by their epipolar geometry,
+    each generator linear, then of maximum likelihood with free points.
+
+    Both trajectories start at the first stop, which is the chain's zero. Raises CalibrationError, GeometryError where
+    nothing like a rotation is seen.
+    """
+    cameras, points, usable = first_views(trials)
+    zero = trials.positions[0]
+    generators = []
+    for joint in range(2):
+        stops = np.flatnonzero((trials.trials == joint) | (np.arange(len(trials.trials)) == 0))
+        angles = trials.positions[stops, joint] - zero[joint]
+        pixels, sigmas = trials.pixels[:, stops], trials.sigmas[:, stops]
+        start = linear_generator("revolute", cameras, points[stops], usable[:, stops], pixels, sigmas, angles)
+        if start is None:
+            raise GeometryError(
+                "degenerate", f"the images of joint {trials.joint_names[joint]!r} show no rotation"
+            )
+        structure = common_points(start, "revolute", points[stops], angles)
+        fit = bundle_rotation(cameras, pixels.swapaxes(0, 1), structure, start, angles, sigmas.swapaxes(0, 1))
+        generators.append(fit.generator)
+    chain = ProjectiveChain(("revolute", "revolute"), np.array(generators), zero, tip_first=True)
+    return SeenChain(chain, cameras, pinhole_lenses(len(cameras)), ("pan", "tilt"))
