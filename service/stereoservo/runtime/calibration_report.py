@@ -28,6 +28,7 @@ from stereoservo.kinematics.calibration.report import CalibrationReport
 from stereoservo.kinematics.calibration.rig import Measurements, predicted
 from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo.kinematics.calibration.verdict import STRATA, Verdict
+from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo.kinematics.model import CellModel
 
 FloatArray = npt.NDArray[np.float64]
@@ -120,9 +121,9 @@ def _page(
     report: CalibrationReport | None,
     trials_path: Path | None,
 ) -> str:
-    title = "Calibration failed" if model is None else f"Calibration: model epoch {model.epoch}"
+    heading = "Calibration failed" if model is None else f"Calibration: model epoch {model.epoch}"
     parts = [
-        f"<h1>{_e(title)}</h1>",
+        f"<h1>{_e(heading)}</h1>",
         f'<p class="verdict {verdict.grade.split()[0]}">{_e(verdict.text)}</p>',
     ]
     if model is not None and report is not None:
@@ -132,8 +133,8 @@ def _page(
             "<h2>Residuals by joint and camera</h2>",
             "<p>Residual rms beside the floor that the stated noise sets. A joint far above its floor has play, a "
             "wrong scale or an encoder fault; a camera far above all others has a lens or a detector of its own.</p>",
-            _image(draw_levels(model, trials, rest)),
-            _joints(model, trials, rest),
+            _image(draw_levels(model, report, rest)),
+            _joints(model, rest),
             "<h2>Residual histograms</h2>",
             "<p>Residuals in stated sigmas against the Gaussian that they should be (line).</p>",
             _image(draw_histograms(model, rest)),
@@ -142,17 +143,14 @@ def _page(
             "lens.</p>",
             _image(draw_vectors(model, rest)),
             "<h2>What is known, and how well</h2>",
-            _cameras(model, report),
+            _cameras(report),
+            _quantities(model),
             "<h2>Left out</h2>",
             _outliers(report),
         ]
-        if report.notes:
-            parts += [
-                "<h2>Notes of the fit</h2>",
-                "<ul>",
-                *(f"<li>{_e(n)}</li>" for n in report.notes),
-                "</ul>",
-            ]
+        for title, lines in (("Notes of the fit", report.notes), ("Taken as stated", report.untested)):
+            if lines:
+                parts += [f"<h2>{title}</h2>", "<ul>", *(f"<li>{_e(line)}</li>" for line in lines), "</ul>"]
     parts += [
         "<h2>Tracks</h2>",
         "<p>Every marker at every stop, one colour for the trial of each joint. Tracks must be smooth arcs or lines; a "
@@ -166,7 +164,7 @@ def _page(
             f"<code>stereoservo calibrate CELL --trials {_e(trials_path)}</code> fits them again.</p>"
         )
     return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{_e(title)}</title><style>{_STYLE}</style>'
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{_e(heading)}</title><style>{_STYLE}</style>'
         f"<body>{chr(10).join(parts)}</body></html>\n"
     )
 
@@ -204,45 +202,68 @@ def _facts(model: CellModel, report: CalibrationReport) -> str:
     )
 
 
-def floors(model: CellModel, trials: TrialData, rest: Residuals) -> FloatArray:
-    """Expected residual rms (n,) [px] of each joint's trial: its sigmas, less the share that the parameters took."""
+def floors(model: CellModel, rest: Residuals) -> FloatArray:
+    """Expected residual rms (n,) [px] of each joint's trial: the fit's, or its sigmas where the model has none."""
     statistics = model.statistics
-    share = 1.0
-    if statistics is not None and statistics.measurements > 0:
-        share = float(np.sqrt(max(statistics.degrees_of_freedom, 0) / statistics.measurements))
-    known = {} if statistics is None else {
-        joint.name: getattr(joint, "expected_px", None) for joint in statistics.joints
-    }  # fmt: skip
     found = []
-    for j, name in enumerate(model.joint_names):
+    for j in range(len(model.joint_names)):
+        stated = None if statistics is None else statistics.joints[j].expected_px
         mine = (rest.joint == j) & ~rest.left_out
         own = float(np.sqrt((rest.data.sigmas[mine] ** 2).mean())) if mine.any() else 0.0
-        stated = known.get(name)
-        found.append(share * own if stated is None else float(stated))
+        found.append(own if stated is None else stated)
     return np.array(found)
 
 
-def _joints(model: CellModel, trials: TrialData, rest: Residuals) -> str:
+def _joints(model: CellModel, rest: Residuals) -> str:
     statistics = model.statistics
     if statistics is None:
         return ""
     rows: list[tuple[object, ...]] = []
-    for joint, kind, floor in zip(
-        statistics.joints, model.joint_kinds, floors(model, trials, rest), strict=True
-    ):
+    for joint, kind, floor in zip(statistics.joints, model.joint_kinds, floors(model, rest), strict=True):
         span = f"{np.degrees(joint.range):.1f}°" if kind == "revolute" else f"{joint.range:.4f} m"
         rows.append((joint.name, kind, joint.stops, span, f"{joint.rms_px:.4f}", f"{floor:.4f}"))
     return _table(("joint", "kind", "stops", "moved", "rms [px]", "floor [px]"), rows)
 
 
-def _cameras(model: CellModel, report: CalibrationReport) -> str:
+def _quantities(model: CellModel) -> str:
     rows: list[tuple[object, ...]] = []
-    for camera, known in zip(report.cameras, model.cameras, strict=True):
+    open_: list[str] = []
+    for quantity in gauge_free_quantities(model):
+        if quantity.value is None:
+            open_.append(f"{quantity.name}: {quantity.reason}")
+            continue
+        deviation = "" if quantity.std is None else f"{quantity.std:.2g}"
+        rows.append((quantity.name, f"{quantity.value:.6g}", deviation, quantity.unit))
+    page = _table(("quantity", "value", "deviation", "unit"), rows)
+    if open_:
+        page += "<p>Not determined:</p><ul>" + "".join(f"<li>{_e(line)}</li>" for line in open_) + "</ul>"
+    return page
+
+
+def _cameras(report: CalibrationReport) -> str:
+    rows: list[tuple[object, ...]] = []
+    for camera in report.cameras:
         inner = "" if camera.intrinsics is None else ", ".join(f"{value:.2f}" for value in camera.intrinsics)
-        k, cu, cv, _ = known.lens
-        lens = "pinhole" if k == 0.0 else f"k {k:.5f} about ({cu:.1f}, {cv:.1f})"
-        rows.append((camera.name, f"{camera.rms_px:.4f}", camera.pixels, camera.outliers, inner, lens))
-    return _table(("camera", "rms [px]", "pixels", "left out", "fx, skew, fy, u0, v0 [px]", "lens"), rows)
+        lens = "pinhole"
+        if camera.lens is not None:
+            stds = camera.lens_std or (0.0, 0.0, 0.0)
+            lens = "k {:.5f} ± {:.1g}, centre ({:.1f} ± {:.1g}, {:.1f} ± {:.1g})".format(
+                *(value for pair in zip(camera.lens, stds, strict=True) for value in pair)
+            )
+        rms = f"{camera.rms_px:.4f}", f"{camera.expected_px:.4f} ± {camera.standard_error_px:.1g}"
+        rows.append((camera.name, *rms, camera.pixels, camera.outliers, inner, lens))
+    head = ("camera", "rms [px]", "floor [px]", "pixels", "left out", "fx, skew, fy, u0, v0 [px]", "lens")
+    page = _table(head, rows)
+    if report.left_intrinsics_std is not None:
+        deviations = ", ".join(f"{value:.2g}" for value in report.left_intrinsics_std)
+        page += f"<p>Deviations of the first camera's fx, skew, fy, u0, v0: {deviations} px.</p>"
+    test = report.lens
+    page += (
+        f"<p>Lens: {'pinholes were taken' if test.model == 'none' else 'radial distortion was estimated'}; a lens that "
+        f"bends is worth a chi-square of {test.chi2:.1f} for {test.freedom} parameters, pinholes stay below "
+        f"{test.limit:.1f}.</p>"
+    )
+    return page
 
 
 def _outliers(report: CalibrationReport) -> str:
@@ -305,7 +326,7 @@ def draw_tracks(trials: TrialData) -> Figure:
     return figure
 
 
-def draw_levels(model: CellModel, trials: TrialData, rest: Residuals) -> Figure:
+def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) -> Figure:
     """Residual rms of each joint beside its floor, and of each camera."""
     figure = Figure(figsize=(11.0, 3.4), layout="constrained")
     left, right = _axes(figure, 1, 2)
@@ -316,15 +337,15 @@ def draw_levels(model: CellModel, trials: TrialData, rest: Residuals) -> Figure:
     at = np.arange(max(len(levels), len(model.cameras)))
     mine = at[: len(levels)]
     left.bar(mine - 0.2, levels, 0.4, label="residual rms")
-    left.bar(mine + 0.2, floors(model, trials, rest), 0.4, label="floor", color="0.7")
+    left.bar(mine + 0.2, floors(model, rest), 0.4, label="floor", color="0.7")
     left.set(xticks=mine, xticklabels=model.joint_names, ylabel="[px]", title="by joint")
     left.legend(fontsize="small")
     cameras = [kept & (rest.data.camera == c) for c in range(len(model.cameras))]
     right.bar(
         [camera.name for camera in model.cameras], [float(np.sqrt(squares[m].mean())) for m in cameras], 0.5
     )
-    stated = [float(np.sqrt((rest.data.sigmas[m] ** 2).mean())) for m in cameras]
-    right.hlines(stated, at[: len(stated)] - 0.35, at[: len(stated)] + 0.35, color="k", label="stated noise")
+    stated = [camera.expected_px for camera in report.cameras]
+    right.hlines(stated, at[: len(stated)] - 0.35, at[: len(stated)] + 0.35, color="k", label="floor")
     right.set(ylabel="[px]", title="by camera")
     right.legend(fontsize="small")
     return figure

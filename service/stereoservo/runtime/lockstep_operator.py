@@ -5,6 +5,8 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable
 
+from stereoservo.kinematics.calibration.check import check_model_holds
+from stereoservo.kinematics.calibration.check_report import CheckReport
 from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo.kinematics.model import CellModel
@@ -60,11 +62,26 @@ class LockstepOperator:
 
     def calibrate(self, progress: Callable[[str, float], None] | None = None) -> CellModel:
         """Trial motions, fit in this process, model into the core. Raises LockstepRefusalError, CalibrationError."""
+        self.trials, end = self._visit(check=False)
+        self._epoch += 1
+        model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
+        self.cell.update_model(ModelUpdate(model))
+        self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
+        return model
+
+    def check(self, model: CellModel) -> CheckReport:
+        """The check motion, held against ``model``. Raises LockstepRefusalError, CalibrationError."""
+        seen, _ = self._visit(check=True)
+        return check_model_holds(model, seen, limit_px=self.cell.settings.tolerance_px)
+
+    def _visit(self, *, check: bool) -> tuple[TrialData, Event]:
+        """Trial motions, or the check's: what was seen, and the event that ended them."""
         first = len(self.cell.events)
         goal_id = str(next(self._ids))
-        self._submit(Calibrate(goal_id))
+        self._submit(Calibrate(goal_id, check=check))
+        ends = ("calibration_finished", "check_finished", "calibration_aborted")
         end = self.cell.wait_for(
-            lambda e: e.id == goal_id and e.kind in ("calibration_finished", "calibration_aborted"),
+            lambda e: e.id == goal_id and e.kind in ends,
             CALIBRATION_TIMEOUT_S, self.cell.events[first].seq - 1,
         )  # fmt: skip
         if end.kind == "calibration_aborted":
@@ -72,12 +89,7 @@ class LockstepOperator:
         job = CalibrationJob(self.cell.settings)
         for event in self.cell.events[first:]:
             job.add(event)
-        self._epoch += 1
-        self.trials = job.trials()
-        model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
-        self.cell.update_model(ModelUpdate(model))
-        self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
-        return model
+        return job.trials(), end
 
     def teach(self, name: str, frames: int = 20) -> Event:
         """Store what the cameras see now as goal ``name``. Raises LockstepRefusalError."""

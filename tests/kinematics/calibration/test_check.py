@@ -12,6 +12,7 @@ import pytest
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, solve
 from stereoservo.kinematics.calibration.check import check_model_holds
 from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics
 from stereoservo_sim.synthetic import SyntheticCell, pan_tilt, rx90
@@ -284,6 +285,19 @@ def test_residuals_are_told_by_joint_camera_and_marker() -> None:
     assert worst == subject
     assert set(report.per_joint) == set(arm().cell.joint_names)
     assert set(report.per_camera) == {"cam0", "cam1"}
+
+
+def test_a_models_own_covariance_says_the_same_as_its_trials() -> None:
+    cell = rx90()
+    made_from = cell.trials(SIGMA, np.random.default_rng(1))
+    model = fit_model(made_from, epoch=1).model
+    assert model.covariance is not None
+    data = cell.trials(SIGMA, np.random.default_rng(2), positions=(arm().stops(), np.full(7, -1)))
+    own = check_model_holds(model, data)
+    bare = msgspec.structs.replace(model, covariance=None)
+    taken = check_model_holds(bare, data, made_from=made_from)
+    assert own.chi2 == pytest.approx(taken.chi2, rel=1e-4)
+    assert own.chi2 < check_model_holds(bare, data).chi2
 
 
 def test_too_few_pixels_are_no_check() -> None:

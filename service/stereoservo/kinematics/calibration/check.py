@@ -51,9 +51,9 @@ def check_model_holds(
 ) -> CheckReport:
     """Hold a model against the pixels of a check motion.
 
-    ``made_from``: the trial data of its calibration, for the model's own uncertainty. A significant change below
-    ``limit_px`` is reported as ``drifting``, above as ``recalibrate``. Raises CalibrationError (``bad_data``,
-    ``too_few_stops``).
+    ``made_from``: the trial data of its calibration, for the uncertainty of a model that carries no covariance. A
+    significant change below ``limit_px`` is reported as ``drifting``, above as ``recalibrate``. Raises
+    CalibrationError (``bad_data``, ``too_few_stops``).
     """
     factor = 1.0
     if model.statistics is not None and model.statistics.degrees_of_freedom > 0:

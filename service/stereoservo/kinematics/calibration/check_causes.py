@@ -12,11 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.kinematics.calibration.bundle import Measurements, Rig, full_charts, jacobian, residuals
+from stereoservo.kinematics.calibration.bundle import (
+    Charts,
+    Measurements,
+    Rig,
+    full_charts,
+    jacobian,
+    residuals,
+)
 from stereoservo.kinematics.calibration.check_report import CauseKind
 from stereoservo.kinematics.calibration.normal_equations import triangle_of
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
-from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.model import CellModel, ModelCovariance
 
 FloatArray = npt.NDArray[np.float64]
 STEP = 1e-6
@@ -132,16 +139,48 @@ def pixels_of(model: CellModel, trials: TrialData, order: tuple[int, ...]) -> Me
 
 
 def make_bench(model: CellModel, check: TrialData, made_from: TrialData | None, noise_factor: float) -> Bench:
-    """Model and pixels side by side. ``made_from``: the trials of the calibration, which say how well the model is
-    known (None: as if exactly). ``noise_factor`` >= 1 widens every sigma.
+    """Model and pixels side by side. ``noise_factor`` >= 1 widens every sigma.
+
+    How well the model is known it says itself; one that does not is taken from the trials of its calibration,
+    ``made_from``, and without those as if exact.
     """
     rig, order = model_rig(model)
     data = pixels_of(model, check, order)
     data = replace(data, sigmas=data.sigmas * noise_factor)
-    if made_from is None:
-        return Bench(rig, data, np.zeros((2 * len(data.camera), 0)), order)
-    past = pixels_of(model, made_from, order)
-    past = replace(past, sigmas=past.sigmas * noise_factor)
+    if model.covariance is not None:
+        loose = _stated_looseness(model, model.covariance, data, order)
+    elif made_from is not None:
+        past = pixels_of(model, made_from, order)
+        loose = _looseness(model, rig, replace(past, sigmas=past.sigmas * noise_factor), data)
+    else:
+        loose = np.zeros((2 * len(data.camera), 0))
+    return Bench(rig, data, _bound(loose), order)
+
+
+def _stated_looseness(
+    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
+) -> FloatArray:
+    """Root (2 k, p) of what the model's covariance does to the pixels of ``data`` [sigmas²]."""
+    rig = Rig(
+        tuple(model.joint_kinds[j] for j in order),
+        model.generators[list(order)],
+        np.array([camera.matrix for camera in model.cameras]),
+        model.marker_points,
+        np.array([camera.lens for camera in model.cameras]),
+    )
+    charts = Charts(tuple(stated.generators[j] for j in order), stated.cameras, stated.lenses, stated.markers)
+    sizes = [len(basis) for basis in stated.generators]
+    starts = np.cumsum([0, *sizes])
+    columns = np.concatenate([np.arange(starts[j], starts[j + 1]) for j in order])
+    columns = np.append(columns, np.arange(starts[-1], charts.size))
+    values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    slopes: FloatArray = jacobian(rig, charts, np.zeros(charts.size), data) @ root
+    return slopes
+
+
+def _looseness(model: CellModel, rig: Rig, past: Measurements, data: Measurements) -> FloatArray:
+    """The same from the curvature of the calibration's own least squares at the model."""
     bent = bool((rig.lenses[:, 0] != 0.0).any())
     charts = full_charts(rig, model.stratum, lenses="radial_centre" if bent else "none")
     triangle = triangle_of(rig, charts, past)[:-1, :-1]
@@ -150,7 +189,8 @@ def make_bench(model: CellModel, check: TrialData, made_from: TrialData | None, 
     # A direction that the calibration left open has a large finite deviation here instead of none.
     bounded = np.linalg.qr(np.vstack([triangle / sizes, 1e-7 * np.eye(charts.size)]), mode="r")
     slopes = jacobian(rig, charts, np.zeros(charts.size), data) / sizes
-    return Bench(rig, data, _bound(slopes @ np.linalg.inv(np.asarray(bounded))), order)
+    loose: FloatArray = slopes @ np.linalg.inv(np.asarray(bounded))
+    return loose
 
 
 # -- the hypotheses -----------------------------------------------------------------------------------------

@@ -55,6 +55,20 @@ CURES = {
     "too_many_outliers": "look at the tracks of the joint named: reflections, mixed-up markers, another joint moving",
     "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
     "camera, a wrong joint scale, a detector that understates its noise",
+    "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",
+    "wrong_scale": "correct the drive's scale: revolute joints report rad, with the gear taken into account",
+    "joints_exchanged": "two joints answer under each other's names: correct the order in the joint driver's options",
+    "joint_order": "list the joints base first: correct the order in the joint driver's options",
+    "moved_together": "something under all the cameras, or the marker body itself, was moved during the trials: fasten "
+    "it, calibrate again",
+    "camera_moved": "a camera was moved during the trials: fasten it, calibrate again",
+    "marker_slipped": "a marker slipped during the trials: fasten it, calibrate again",
+    "markers_collinear": "put markers off their common line: at least one well beside it",
+    "markers_exchanged": "the detector of one camera takes two markers for each other: correct its pattern or the ids",
+    "views_exchanged": "images of two cameras come under each other's names at times: check their drivers and cables",
+    "views_unrelated": "the cameras do not see the same thing at the same time: check which arm they look at, the "
+    "markers' ids, and that images are not late",
+    "no_baseline": "move the cameras apart, by a tenth of their distance to the markers at least",
     "mixed_mounts": "calibrate cameras that stand and cameras on the tip each on their own",
 }
 """What to do about each cause of a failed calibration, by the code of its CalibrationError."""

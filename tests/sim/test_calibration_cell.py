@@ -1,0 +1,83 @@
+"""A whole cell in lockstep whose cell file states no ranges: it plans its trials, calibrates, and checks itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.cellfile import CellFile, check_cell
+from stereoservo.runtime.lockstep import LockstepCell
+from stereoservo.runtime.lockstep_operator import LockstepOperator
+from stereoservo_sim.world import demo_cell
+
+NAMES = tuple(f"j{k}" for k in range(1, 7))
+
+
+def cell_file(**calibration: Any) -> CellFile:
+    base = demo_cell().base
+    limits = zip(NAMES, (2.7, 2.3, 2.4, 4.7, 1.8, 4.7), strict=True)
+    return check_cell(
+        {
+            "schema": 1,
+            "cell": {"name": "planned"},
+            "joints": {"driver": "fake"},
+            "camera": [{"name": name, "driver": "fake"} for name in ("left", "right")],
+            "safety": {
+                "limit": [
+                    {"joint": n, "min": -m, "max": m, "velocity": 1.0, "acceleration": 4.0} for n, m in limits
+                ]
+            },
+            "calibration": {
+                "base": dict(zip(NAMES, base.tolist(), strict=True)),
+                "stops": 7, "frames": 2, "settle_s": 0.05, "speed_scale": 1.0, **calibration,
+            },
+        }
+    )  # fmt: skip
+
+
+Calibrated = tuple[LockstepOperator, CellModel, TrialData]
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Calibrated]:
+    directory = tmp_path_factory.mktemp("planned")
+    with LockstepCell(cell_file(), cell_dir=directory, runtime_dir=directory) as cell:
+        cell.run_for(0.5)
+        operator = LockstepOperator(cell)
+        operator.enable()
+        model = operator.calibrate()
+        assert operator.trials is not None
+        yield operator, model, operator.trials
+
+
+def test_a_cell_without_ranges_calibrates_to_the_noise_floor(calibrated: Calibrated) -> None:
+    operator, model, trials = calibrated
+    assert model.stratum == "metric"
+    assert model.statistics is not None
+    assert model.statistics.chi2_ok
+    for j in range(6):
+        own = trials.trials == j
+        assert np.ptp(trials.positions[own, j]) > 0.2, NAMES[j]
+        assert own.sum() >= 5
+    warnings = [e.message for e in operator.cell.events if e.kind == "warning"]
+    assert not [message for message in warnings if "loses the markers" in message], warnings
+
+
+def test_an_unchanged_cell_holds_and_a_drifted_joint_is_named(calibrated: Calibrated) -> None:
+    operator, model, _ = calibrated
+    report = operator.check(model)
+    assert report.status == "holds", report.message
+    assert report.stops >= 6
+    zero = model.zero.copy()
+    zero[2] += 0.01
+    drifted = operator.check(msgspec.structs.replace(model, zero=zero))
+    assert [(cause.kind, cause.subject) for cause in drifted.causes] == [("joint", "j3")]
+    assert drifted.causes[0].value == pytest.approx(0.01, abs=5 * drifted.causes[0].deviation)
+    assert drifted.status == "recalibrate"
+    assert "recalibrate because zero of joint j3 drifted by" in drifted.message
