@@ -14,10 +14,12 @@ from stereoservo_sim.rig import PinholeCamera
 FloatArray = npt.NDArray[np.float64]
 ImageArray = npt.NDArray[np.uint8]
 
-CIRCLE_POINTS = 64
+CIRCLE_POINTS = 40
 """Corners of the polygon that stands for a dot: with its area, the centre of its image is right to 1e-4 px."""
-EDGE_POINTS = 16
-"""Pieces of an edge of an outline, each bent as a straight line."""
+PIECE_PX = 20.0
+"""Length up to which a piece of an outline's edge stays straight."""
+MOST_PIECES = 64
+"""Of one edge, which may reach far out of the picture."""
 
 
 def unit_circle() -> FloatArray:
@@ -33,8 +35,10 @@ def bend_outline(camera: PinholeCamera, outline: FloatArray) -> FloatArray:
 
     Corners beyond the lens's fold stay at the rim of what it images: outside of the picture, whose corners it reaches.
     """
-    share = np.linspace(0.0, 1.0, EDGE_POINTS, endpoint=False)[:, None]
-    fine = (outline[:, None] * (1.0 - share) + np.roll(outline, -1, axis=0)[:, None] * share).reshape(-1, 2)
+    ways = np.roll(outline, -1, axis=0) - outline
+    pieces = np.clip(np.ceil(np.linalg.norm(ways, axis=1) / PIECE_PX), 1, MOST_PIECES).astype(int)
+    share = np.concatenate([np.arange(n) / n for n in pieces])[:, None]
+    fine = np.repeat(outline, pieces, axis=0) + share * np.repeat(ways, pieces, axis=0)
     k, centre, r0 = camera.lens[0], camera.lens[1:3], camera.lens[3]
     offset = fine - centre
     if k < 0.0:
