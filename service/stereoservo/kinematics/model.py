@@ -40,12 +40,18 @@ class CameraModel(msgspec.Struct, frozen=True, eq=False):
 
 
 class JointStatistics(msgspec.Struct, frozen=True):
-    """How well one joint's trial motion fits: residual rms [px], number of stops, range driven [rad or m]."""
+    """How well one joint's trial motion fits: residual rms [px], number of stops, range driven [rad or m].
+
+    ``expected_px``: what the rms should be at the stated sigmas, ``σ √(1 - trace(H_j) / n_j)`` with the trial's own
+    share of the hat matrix; ``standard_error_px``: of the rms about it. None in files written before.
+    """
 
     name: str
     rms_px: float
     stops: int
     range: float
+    expected_px: float | None = None
+    standard_error_px: float | None = None
 
 
 class FitStatistics(msgspec.Struct, frozen=True, eq=False):
@@ -64,6 +70,35 @@ class FitStatistics(msgspec.Struct, frozen=True, eq=False):
     outliers: int
     joints: tuple[JointStatistics, ...]
     images: int
+
+
+class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
+    """Covariance of all free parameters of a model and what each of them moves, in the model's projective frame.
+
+    ``covariance`` (p, p), parameters in the order of the fields, joint by joint, camera by camera and so on:
+
+    - ``generators``: for each joint directions D (p_j, 4, 4); a parameter changes the generator by ``[D, G]``, at
+      finite values by ``T G T⁻¹``, ``T = (I - Δ/2)⁻¹ (I + Δ/2)``, ``Δ = Σ x_k D_k``: the algebra stays exact.
+    - ``cameras``: for each camera directions (p_c, 3, 4) of its matrix.
+    - ``lenses``: for each camera directions (p_l, 4) of its lens ``(k, cu, cv, r0)``; none where it is a pinhole.
+    - ``markers``: for each marker directions (p_m, 4) of its point.
+
+    A gauge is fixed: only functions of the model that no change of frame alters, within the group of its stratum,
+    have a covariance that means anything. ``plane_at_infinity`` and ``projective_to_euclidean`` stay as they are.
+    `kinematics.covariance` propagates to any such function. At the larger of the stated and, where the residuals
+    do not agree with it, the estimated noise.
+    """
+
+    generators: tuple[FloatArray, ...]
+    cameras: tuple[FloatArray, ...]
+    lenses: tuple[FloatArray, ...]
+    markers: tuple[FloatArray, ...]
+    covariance: FloatArray
+
+    @property
+    def parts(self) -> tuple[tuple[FloatArray, ...], ...]:
+        """The directions in the order of the parameters."""
+        return self.generators, self.cameras, self.lenses, self.markers
 
 
 class CellModel(msgspec.Struct, frozen=True, eq=False):
@@ -96,6 +131,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     created: str = ""
     source: str = ""
     mount: Mount = "eye_to_hand"
+    covariance: ModelCovariance | None = None
 
     @property
     def tip_first(self) -> bool:
@@ -117,6 +153,8 @@ class ModelFileError(Exception):
         self.key = key
 
 
+SYMMETRY_TOLERANCE = 1e-8
+"""How far a covariance, scaled to correlations, may be from symmetric and from positive semidefinite."""
 ALGEBRA_TOLERANCE = 1e-6
 """Largest relative defect of ``Ĥ³ + Ĥ`` (revolute) or ``Ĥ²`` (prismatic) that a model may have."""
 
@@ -181,6 +219,53 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
                 f"{camera.name!r}: reference radius {camera.lens[3]:g} px is not positive",
             )
     _check_algebra(model, path)
+    if model.covariance is not None:
+        _check_covariance(model, model.covariance, path)
+
+
+def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str) -> None:
+    cameras = len(model.cameras)
+    expected: list[tuple[str, tuple[FloatArray, ...], int, tuple[int, ...]]] = [
+        ("generators", given.generators, len(model.joint_names), (4, 4)),
+        ("cameras", given.cameras, cameras, (3, 4)),
+        ("lenses", given.lenses, cameras, (4,)),
+        ("markers", given.markers, len(model.marker_ids), (4,)),
+    ]
+    p = 0
+    for key, bases, count, shape in expected:
+        if len(bases) != count:
+            raise ModelFileError(
+                path, f"covariance.{key}", f"has {len(bases)} entries; the model has {count} of them"
+            )
+        for i, basis in enumerate(bases):
+            where = f"covariance.{key}[{i}]"
+            if basis.shape[1:] != shape:
+                wanted = ", ".join(str(n) for n in shape)
+                raise ModelFileError(path, where, f"has shape {basis.shape}; (p, {wanted}) is needed")
+            if not np.isfinite(basis).all():
+                raise ModelFileError(path, where, "has entries that are not finite")
+            p += len(basis)
+    matrix, key = given.covariance, "covariance.covariance"
+    if matrix.shape != (p, p):
+        raise ModelFileError(
+            path, key, f"has shape {matrix.shape}; the directions are {p}, ({p}, {p}) is needed"
+        )
+    if not np.isfinite(matrix).all():
+        raise ModelFileError(path, key, "has entries that are not finite")
+    variances = np.diag(matrix)
+    if not (variances > 0.0).all():
+        worst = int(variances.argmin())
+        raise ModelFileError(
+            path, key, f"variance {worst} is {variances[worst]:.3g}; positive ones are needed"
+        )
+    correlation = matrix / np.sqrt(np.outer(variances, variances))
+    if np.abs(correlation - correlation.T).max() > SYMMETRY_TOLERANCE:
+        raise ModelFileError(path, key, "is not symmetric")
+    least = float(np.linalg.eigvalsh(correlation)[0])
+    if least < -SYMMETRY_TOLERANCE:
+        raise ModelFileError(
+            path, key, f"has an eigenvalue of {least:.3g} as a correlation; none may be negative"
+        )
 
 
 def _check_algebra(model: CellModel, path: Path | str) -> None:
@@ -253,8 +338,25 @@ def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
     except (msgspec.ValidationError, TypeError) as error:
         text, _, where = str(error).partition(" - at `")
         raise ModelFileError(path, where.rstrip("`").removeprefix("$").lstrip("."), text) from error
+    if model.covariance is not None:
+        model = msgspec.structs.replace(model, covariance=_shaped(model.covariance))
     check_model(model, path)
     return model
+
+
+def _shaped(given: ModelCovariance) -> ModelCovariance:
+    """Empty lists of directions say nothing of their shape in JSON: give it back to them."""
+
+    def shaped(bases: tuple[FloatArray, ...], *shape: int) -> tuple[FloatArray, ...]:
+        return tuple(basis if basis.size else np.zeros((0, *shape)) for basis in bases)
+
+    return ModelCovariance(
+        shaped(given.generators, 4, 4),
+        shaped(given.cameras, 3, 4),
+        shaped(given.lenses, 4),
+        shaped(given.markers, 4),
+        given.covariance,
+    )
 
 
 def save_model(model: CellModel, path: Path) -> None:

@@ -4,7 +4,8 @@ bundle (5.4).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -12,15 +13,28 @@ import numpy.typing as npt
 
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.displacements import exp_generator
+from stereoservo.geometry.distortion_lines import LensEstimate
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, residuals, solve
+from stereoservo.kinematics.calibration.charts import LensModel
+from stereoservo.kinematics.calibration.diagnosis import diagnosed, reviewed, untested
+from stereoservo.kinematics.calibration.lens_starts import undistorted
+from stereoservo.kinematics.calibration.lenses import (
+    FREE_LENS,
+    lens_test,
+    prior_of_lenses,
+    starting_lenses,
+    straightened,
+)
+from stereoservo.kinematics.calibration.mounts import common_mount, restored, reversed_trials
 from stereoservo.kinematics.calibration.report import CalibrationResult, build_result
 from stereoservo.kinematics.calibration.separate import MIN_MARKERS, JointTrial, measurements, separate_joint
 from stereoservo.kinematics.calibration.statistics import degrees_of_freedom, rank_of, variance_factor
 from stereoservo.kinematics.calibration.strata import DEFAULTS, FitOptions, upgraded
+from stereoservo.kinematics.calibration.tracks import refuse_bad_motions
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, check_trials
 from stereoservo.kinematics.calibration.views import first_views
-from stereoservo.kinematics.model import Mount, Stratum, check_model
+from stereoservo.kinematics.model import Stratum
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -40,8 +54,13 @@ def fit_model(
     created: str = "",
     progress: Progress | None = None,
     options: FitOptions = DEFAULTS,
+    lens_priors: Mapping[str, LensEstimate] | None = None,
 ) -> CalibrationResult:
     """Fit a cell's model to its trial motions.
+
+    Cameras all stand (eye-to-hand) or all ride on the tip (eye-in-hand); the model says which, and counts its
+    joints from the base either way. ``lens_priors``: by camera name, what straight lines say of its lens
+    (`geometry.distortion_lines`).
 
     ``progress(stage, fraction)`` is called as the work goes on. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
@@ -50,44 +69,72 @@ def fit_model(
     """
     check_trials(trials)
     mount = common_mount(trials)
-    chain = trials if mount == "eye_to_hand" else _reversed_trials(trials)
+    chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
+    priors = lens_priors or {}
+
+    def refit(data: TrialData, chosen: FitOptions) -> CalibrationResult:
+        return _fit(data, epoch, created, _silent, chosen, priors)
+
+    refuse_bad_motions(chain)
     try:
-        result = _fit(chain, epoch, created, progress or _silent, options)
-        return result if mount == "eye_to_hand" else _restored(result)
+        result = _fit(chain, epoch, created, progress or _silent, options, priors)
+    except CalibrationError as error:
+        raise diagnosed(chain, error, refit, options) from error
     except (GeometryError, np.linalg.LinAlgError) as error:
-        raise CalibrationError(
+        broken = CalibrationError(
             "no_convergence",
             f"the fit broke down: {error}. Are positions and markers what they are said to be?",
-        ) from error
+        )
+        raise diagnosed(chain, broken, refit, options) from error
+    report = msgspec.structs.replace(
+        result.report,
+        notes=(*result.report.notes, *reviewed(chain, result, refit, options)),
+        untested=untested(chain),
+    )
+    model = result.model if mount == "eye_to_hand" else restored(result.model)
+    return CalibrationResult(model, report)
 
 
 def _fit(
-    trials: TrialData, epoch: int, created: str, tell: Progress, options: FitOptions
+    trials: TrialData,
+    epoch: int,
+    created: str,
+    tell: Progress,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
 ) -> CalibrationResult:
     tell("cameras", 0.0)
-    cameras, points, usable = first_views(trials)
+    lenses, lens_model = starting_lenses(trials, options.lens, priors)
+    cameras, points, usable = first_views(undistorted(trials, lenses))
     trials, points, usable, left_out = _without_rare_markers(trials, points, usable)
+    ideal = undistorted(trials, lenses)
     separate = []
     for j, name in enumerate(trials.joint_names):
         tell(f"joint {name}", 0.1 + 0.4 * j / len(trials.joint_names))
-        separate.append(separate_joint(trials, cameras, points, usable, j))
+        separate.append(separate_joint(ideal, cameras, points, usable, j))
     tell("linked joints", 0.5)
     zero = np.median(trials.positions, axis=0)
-    rig = linked_rig(trials, cameras, separate, zero)
-    every = measurements(trials, trials.visible, trials.positions - zero)
+    rig = replace(linked_rig(trials, cameras, separate, zero), lenses=lenses)
+    every = replace(
+        measurements(trials, trials.visible, trials.positions - zero),
+        lens_priors=prior_of_lenses(trials, priors),
+    )
     clean = every.select(usable[every.camera, every.stop, every.marker])
     linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     tell("rigid bundle", 0.6)
-    robust = solve(linked.rig, clean, "projective", loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
-    # A flat target may leave the projective bundle with open directions that the metric one closes: no need
-    # to walk such a valley to its end here.
-    solution, inliers = settled(robust.rig, every, "projective", options, tolerance=1e-6)
+    decided = options.lens != "auto" or bool(priors)
+    solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
     _refuse_misfit(trials, solution, every, inliers, options)
     tell("metric bundle", 0.8)
-    final, plane, notes = upgraded(solution, every.select(inliers), options)
-    final, inliers = settled(final.rig, every, final.stratum, options)
+    raised = upgraded(solution, every.select(inliers), options)
+    final, inliers = settled(raised.solution.rig, every, raised.solution.stratum, options, solution.lenses)
+    if options.lens == "auto" and final.lenses == "none" and (raised.bent or lens_test(final).distorted):
+        # Only the constraints of the higher stratum have told distortion from kinematics.
+        solution, inliers = settled(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
+        raised = upgraded(solution, every.select(inliers), options)
+        final, inliers = settled(raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS)
     _refuse_misfit(trials, final, every, inliers, options)
-    _refuse_open(final, notes)
+    _refuse_open(final, raised.notes)
     tell("report", 0.95)
     result = build_result(
         trials,
@@ -95,11 +142,11 @@ def _fit(
         every,
         inliers,
         zero,
-        plane,
+        raised.plane,
         pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
         epoch=epoch,
         created=created,
-        notes=notes,
+        notes=raised.notes,
         projective=(solution.cost, degrees_of_freedom(solution)),
         markers_left_out=left_out,
     )
@@ -107,51 +154,25 @@ def _fit(
     return result
 
 
-def common_mount(trials: TrialData) -> Mount:
-    """How all cameras of the trials are mounted. Raises CalibrationError (``mixed_mounts``)."""
-    mounts = {camera.name: camera.mount for camera in trials.cameras}
-    if len(set(mounts.values())) > 1:
-        told = ", ".join(f"{name!r} {mount}" for name, mount in mounts.items())
-        raise CalibrationError(
-            "mixed_mounts",
-            f"the cameras are mounted differently: {told}. One model needs cameras that see one motion: "
-            "calibrate those that stand and those on the tip each on their own",
-            mounts=mounts,
-        )
-    return trials.cameras[0].mount
-
-
-def _reversed_trials(trials: TrialData) -> TrialData:
-    """Trials with the joints counted from the other end: from cameras on the tip, the base's joint is the
-    last before the markers.
-    """
-    last = len(trials.joint_names) - 1
-    return msgspec.structs.replace(
-        trials,
-        joint_names=trials.joint_names[::-1],
-        joint_kinds=trials.joint_kinds[::-1],
-        positions=trials.positions[:, ::-1],
-        trials=np.where(trials.trials >= 0, last - trials.trials, trials.trials),
-    )
-
-
-def _restored(result: CalibrationResult) -> CalibrationResult:
-    """The result of reversed trials with its joints base first again, mounted eye-in-hand."""
-    model = result.model
-    statistics = model.statistics
-    if statistics is not None:
-        statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])
-    model = msgspec.structs.replace(
-        model,
-        joint_names=model.joint_names[::-1],
-        joint_kinds=model.joint_kinds[::-1],
-        zero=model.zero[::-1].copy(),
-        generators=model.generators[::-1].copy(),
-        statistics=statistics,
-        mount="eye_in_hand",
-    )
-    check_model(model)
-    return msgspec.structs.replace(result, model=model)
+def _projective(
+    rig: Rig, clean: Measurements, every: Measurements, lenses: LensModel, options: FitOptions, decided: bool
+) -> tuple[Solution, BoolArray]:
+    """The projective bundle on its inliers; unless ``decided``, with the lenses that the data ask for."""
+    robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
+    if not decided and lenses == "none":
+        # Before anything is called an outlier: distortion makes many of them.
+        inside = every.select(gate(robust.rig, every, options))
+        if lens_test(solve(robust.rig, inside, "projective", max_evaluations=1)).distorted:
+            lenses = FREE_LENS
+            robust = solve(
+                robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
+            )
+    # A flat target may leave the projective bundle with open directions that the metric one closes: no need
+    # to walk such a valley to its end here.
+    solution, inliers = settled(robust.rig, every, "projective", options, lenses, 1e-6)
+    if decided or lenses == "none" or lens_test(solution).distorted:
+        return solution, inliers
+    return settled(straightened(solution.rig, every), every, "projective", options, "none", 1e-6)
 
 
 def _silent(stage: str, fraction: float) -> None:
@@ -218,7 +239,12 @@ def _chain(kinds: tuple[str, ...], generators: FloatArray, offsets: FloatArray) 
 
 
 def settled(
-    rig: Rig, every: Measurements, stratum: Stratum, options: FitOptions, *, tolerance: float = 1e-10
+    rig: Rig,
+    every: Measurements,
+    stratum: Stratum,
+    options: FitOptions,
+    lenses: LensModel,
+    tolerance: float = 1e-10,
 ) -> tuple[Solution, BoolArray]:
     """Plain least squares on the pixels that fit: gate, solve, gate again until the set stays.
 
@@ -227,7 +253,7 @@ def settled(
     """
     inliers = gate(rig, every, options)
     for _ in range(8):
-        solution = solve(rig, every.select(inliers), stratum, tolerance=tolerance)
+        solution = solve(rig, every.select(inliers), stratum, lenses=lenses, tolerance=tolerance)
         again = gate(solution.rig, every, options)
         rig = solution.rig
         if np.array_equal(again, inliers):
@@ -281,13 +307,12 @@ def _refuse_misfit(
                 maximum=options.max_trial_outliers,
             )
     data = every.select(inliers)
-    freedom = 2 * len(data.pixels) - solution.charts.size
-    if freedom <= 0:
+    if degrees_of_freedom(solution) <= 0:
         raise CalibrationError(
             "too_few_stops",
-            f"{2 * len(data.pixels)} measurements for {solution.charts.size} parameters; more stops or "
+            f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or "
             "markers are needed",
-            measurements=2 * len(data.pixels),
+            measurements=solution.rows,
             parameters=solution.charts.size,
         )
     factor = float(np.sqrt(variance_factor(solution)))

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective, upper_triangular
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, predicted
+from stereoservo.kinematics.calibration.charts import LensModel
+from stereoservo.kinematics.calibration.lenses import lens_test
 from stereoservo.kinematics.calibration.statistics import (
+    GroupRms,
     chi2_within,
-    covariance_root,
     degrees_of_freedom,
-    prediction_deviations,
+    group_rms,
+    noise_factor,
+    parameter_covariance,
+    prediction_variances,
     variance_factor,
 )
 from stereoservo.kinematics.calibration.trials import TrialData
@@ -22,6 +29,7 @@ from stereoservo.kinematics.model import (
     CellModel,
     FitStatistics,
     JointStatistics,
+    ModelCovariance,
     Stratum,
     check_model,
 )
@@ -34,7 +42,8 @@ class CameraReport(msgspec.Struct, frozen=True):
     """Fit of one camera: residual rms [px], pixels used, pixels left out; intrinsics [px] in the metric
     stratum.
 
-    ``intrinsics``: fx, skew, fy, u0, v0.
+    ``expected_px``, ``standard_error_px``: of the rms, as in the model's joint statistics. ``intrinsics``: fx, skew,
+    fy, u0, v0. ``lens``: k, cu, cv (`geometry.distortion`) and ``lens_std`` their deviations, None for a pinhole.
     """
 
     name: str
@@ -42,6 +51,24 @@ class CameraReport(msgspec.Struct, frozen=True):
     pixels: int
     outliers: int
     intrinsics: tuple[float, float, float, float, float] | None
+    expected_px: float
+    standard_error_px: float
+    lens: tuple[float, float, float] | None
+    lens_std: tuple[float, ...] | None
+
+
+class LensReport(msgspec.Struct, frozen=True):
+    """Which lens model was taken: ``none`` or ``radial_centre``, and why.
+
+    ``chi2``: what the radial parameters of all cameras (``freedom`` of them) are worth against zero: the gain that
+    freeing them would bring (score test) where they are not free, their own significance (Wald) where they are.
+    Above ``limit`` a lens distorts; pinholes get there once in ten thousand fits.
+    """
+
+    model: LensModel
+    chi2: float
+    freedom: int
+    limit: float
 
 
 class Outlier(msgspec.Struct, frozen=True):
@@ -60,7 +87,8 @@ class CalibrationReport(msgspec.Struct, frozen=True):
     factor). ``prediction_rms_px``, ``prediction_max_px``: standard deviation of the predicted pixels a
     coordinate, ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of
     fx, skew, fy, u0, v0 [px]. ``projective_chi2``, ``projective_degrees_of_freedom``: of the projective
-    bundle, which the stratum's is nested in.
+    bundle, which the stratum's is nested in. ``lens``: the lens model and what speaks for it.
+    ``untested``: what the model takes as stated because the trials cannot tell.
     """
 
     stratum: Stratum
@@ -78,6 +106,8 @@ class CalibrationReport(msgspec.Struct, frozen=True):
     left_intrinsics_std: tuple[float, ...] | None
     markers_left_out: tuple[int, ...]
     notes: tuple[str, ...]
+    lens: LensReport
+    untested: tuple[str, ...] = ()
 
 
 class CalibrationResult(msgspec.Struct, frozen=True, eq=False):
@@ -107,21 +137,26 @@ def build_result(
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
     squares = (errors**2).sum(axis=1) / 2
     freedom = degrees_of_freedom(solution)
+    variances = prediction_variances(solution, every.offsets)
+    own = variances[data.camera, data.stop, data.marker]
+
+    def group(members: BoolArray) -> GroupRms:
+        return group_rms(squares[members], data.sigmas[members], own[members])
+
     statistics = FitStatistics(
-        rms_px=_rms(squares),
+        rms_px=float(np.sqrt(squares.mean())),
         chi2=solution.cost,
         degrees_of_freedom=freedom,
         chi2_ok=chi2_within(solution.cost, freedom),
         measurements=solution.rows,
         parameters=solution.charts.size,
         outliers=int((~inliers).sum()),
-        joints=tuple(_joint_statistics(trials, j, squares, data) for j in range(len(trials.joint_names))),
+        joints=tuple(_joint_statistics(trials, j, group, data) for j in range(len(trials.joint_names))),
         images=trials.images,
     )
     model = build_model(trials, solution, zero, plane, normaliser, statistics, epoch, created)
-    deviations = prediction_deviations(solution, every.offsets)
-    left_out = _outliers(trials, solution.rig, every, inliers)
-    metric = solution.stratum == "metric"
+    shown = variances[np.isfinite(variances)] / 2 * noise_factor(solution)
+    tested = lens_test(solution)
     report = CalibrationReport(
         stratum=solution.stratum,
         rms_px=statistics.rms_px,
@@ -131,24 +166,44 @@ def build_result(
         sigma_factor=float(np.sqrt(variance_factor(solution))),
         projective_chi2=projective[0],
         projective_degrees_of_freedom=projective[1],
-        prediction_rms_px=float(np.sqrt((deviations**2).mean())),
-        prediction_max_px=float(deviations.max()),
+        prediction_rms_px=float(np.sqrt(shown.mean())),
+        prediction_max_px=float(np.sqrt(shown.max())),
         cameras=tuple(
-            CameraReport(
-                camera.name,
-                _rms(squares[data.camera == c]),
-                int((data.camera == c).sum()),
-                int((every.camera[~inliers] == c).sum()),
-                intrinsics(solution.rig.cameras[c]) if metric else None,
-            )
-            for c, camera in enumerate(trials.cameras)
+            _camera_report(trials, c, solution, group(data.camera == c), every, inliers)
+            for c in range(len(trials.cameras))
         ),
-        outliers=left_out,
-        left_intrinsics_std=_left_intrinsics_std(solution) if metric else None,
+        outliers=_outliers(trials, solution.rig, every, inliers),
+        left_intrinsics_std=_left_intrinsics_std(solution) if solution.stratum == "metric" else None,
         markers_left_out=markers_left_out,
         notes=notes,
+        lens=LensReport(solution.lenses, tested.chi2, tested.freedom, tested.limit),
     )
     return CalibrationResult(model, report)
+
+
+def _camera_report(
+    trials: TrialData, c: int, solution: Solution, fit: GroupRms, every: Measurements, inliers: BoolArray
+) -> CameraReport:
+    lens, lens_std = None, None
+    if solution.lenses != "none":
+        k, cu, cv, _ = (float(value) for value in solution.rig.lenses[c])
+        basis = solution.charts.lenses[c]
+        at = solution.charts.start(2) + sum(len(other) for other in solution.charts.lenses[:c])
+        covariance = parameter_covariance(solution)[at : at + len(basis), at : at + len(basis)]
+        lens = k, cu, cv
+        lens_std = tuple(float(value) for value in np.sqrt(np.diag(basis.T @ covariance @ basis))[:3])
+    mine = every.camera == c
+    return CameraReport(
+        trials.cameras[c].name,
+        fit.rms_px,
+        int((mine & inliers).sum()),
+        int((mine & ~inliers).sum()),
+        intrinsics(solution.rig.cameras[c]) if solution.stratum == "metric" else None,
+        fit.expected_px,
+        fit.standard_error_px,
+        lens,
+        lens_std,
+    )
 
 
 def build_model(
@@ -186,8 +241,8 @@ def build_model(
         zero=zero,
         generators=frame @ rig.generators @ back,
         cameras=tuple(
-            CameraModel(camera.name, matrix, camera.width, camera.height)
-            for camera, matrix in zip(trials.cameras, cameras, strict=True)
+            CameraModel(camera.name, matrix, camera.width, camera.height, lens)
+            for camera, matrix, lens in zip(trials.cameras, cameras, rig.lenses, strict=True)
         ),
         marker_ids=trials.marker_ids,
         marker_points=points,
@@ -197,9 +252,31 @@ def build_model(
         statistics=statistics,
         created=created,
         source="trial motions",
+        covariance=_covariance(solution, frame, back, cameras, points),
     )
     check_model(model)
     return model
+
+
+def _covariance(
+    solution: Solution, frame: FloatArray, back: FloatArray, cameras: FloatArray, points: FloatArray
+) -> ModelCovariance:
+    """The bundle's covariance with its directions brought into the model's ``frame`` (4, 4), whose ``cameras`` and
+    ``points`` are scaled as they are there.
+    """
+    rig, charts = solution.rig, solution.charts
+    # Matrices and points are scaled as a whole: their directions with them.
+    matrices = rig.cameras @ back
+    camera_scales = (cameras * matrices).sum(axis=(1, 2)) / (matrices**2).sum(axis=(1, 2))
+    brought = rig.points @ frame.T
+    point_scales = (points * brought).sum(axis=1) / (brought**2).sum(axis=1)
+    return ModelCovariance(
+        tuple(frame @ basis @ back for basis in charts.generators),
+        tuple(scale * (basis @ back) for scale, basis in zip(camera_scales, charts.cameras, strict=True)),
+        charts.lenses,
+        tuple(scale * (basis @ frame.T) for scale, basis in zip(point_scales, charts.points, strict=True)),
+        parameter_covariance(solution),
+    )
 
 
 def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
@@ -209,24 +286,25 @@ def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
 
 
 def _left_intrinsics_std(solution: Solution) -> tuple[float, ...]:
-    at = sum(len(basis) for basis in solution.charts.generators)
-    scale = np.array([np.abs(basis).max() for basis in solution.charts.cameras[0]])
-    variances = (covariance_root(solution)[at : at + 5] ** 2).sum(axis=1) * scale**2
-    variances *= max(1.0, variance_factor(solution))
-    fx, skew, u0, fy, v0 = (float(value) for value in np.sqrt(variances))
+    at = solution.charts.start(1)
+    deviations = np.sqrt(np.diag(parameter_covariance(solution))[at : at + 5])
+    fx, skew, u0, fy, v0 = (float(value) for value in deviations)
     return fx, skew, fy, u0, v0
 
 
 def _joint_statistics(
-    trials: TrialData, joint: int, squares: FloatArray, data: Measurements
+    trials: TrialData, joint: int, group: Callable[[BoolArray], GroupRms], data: Measurements
 ) -> JointStatistics:
     own = np.flatnonzero(trials.trials == joint)
     positions = trials.positions[own, joint]
+    fit = group(np.isin(data.stop, own))
     return JointStatistics(
         trials.joint_names[joint],
-        _rms(squares[np.isin(data.stop, own)]),
+        fit.rms_px,
         len(own),
         float(np.ptp(positions)) if len(own) else 0.0,
+        fit.expected_px,
+        fit.standard_error_px,
     )
 
 
@@ -239,7 +317,3 @@ def _outliers(trials: TrialData, rig: Rig, every: Measurements, inliers: BoolArr
         Outlier(trials.cameras[c].name, int(s), trials.marker_ids[m], float(distance))
         for c, s, m, distance in zip(lost.camera, lost.stop, lost.marker, distances, strict=True)
     )
-
-
-def _rms(squares: FloatArray) -> float:
-    return float(np.sqrt(squares.mean())) if len(squares) else 0.0

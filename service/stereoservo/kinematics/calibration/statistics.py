@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.kinematics.calibration.bundle import Measurements, Solution
+from stereoservo.kinematics.calibration.bundle import Measurements, Solution, predicted
 from stereoservo.kinematics.calibration.normal_equations import leverages
 
 FloatArray = npt.NDArray[np.float64]
@@ -49,18 +51,54 @@ def covariance_root(solution: Solution) -> FloatArray:
     return np.asarray(np.linalg.inv(solution.triangle / solution.sizes) / solution.sizes[:, None])
 
 
-def prediction_deviations(solution: Solution, offsets: FloatArray) -> FloatArray:
-    """Standard deviation (c, s, m) [px, rms of the two coordinates] of pixels predicted at ``offsets`` (s,
-    n).
+def noise_factor(solution: Solution) -> float:
+    """Factor on variances: 1 where the residuals agree with the stated sigmas or are smaller, else what they say."""
+    factor = variance_factor(solution)
+    return factor if factor > 1.0 and not chi2_within(solution.cost, degrees_of_freedom(solution)) else 1.0
 
-    ``J Cov Jᵀ`` with the larger of the stated and the estimated noise.
+
+def parameter_covariance(solution: Solution) -> FloatArray:
+    """Covariance (p, p) of the chart coordinates at the larger of the stated and the estimated noise."""
+    root = covariance_root(solution)
+    return np.asarray(root @ root.T * noise_factor(solution))
+
+
+def prediction_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
+    """Variance (c, s, m) [px², of both coordinates together] of pixels predicted at ``offsets`` (s, n), ``J Cov Jᵀ``
+    at the stated sigmas; NaN where the lens images nothing.
     """
     c, s, m = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
     camera, stop, marker = (index.ravel() for index in np.indices((c, s, m)))
     k = len(camera)
     grid = Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
-    variances = leverages(solution.rig, solution.charts, grid, covariance_root(solution)) / 2
-    return np.sqrt(variances * max(1.0, variance_factor(solution))).reshape(c, s, m)
+    variances = leverages(solution.rig, solution.charts, grid, covariance_root(solution))
+    seen = np.isfinite(predicted(solution.rig, grid)).all(axis=1)
+    return np.where(seen, variances, np.nan).reshape(c, s, m)
+
+
+class GroupRms(NamedTuple):
+    """Residual rms [px] of some pixels, its expected value ``σ √(1 - trace(H_g)/n_g)`` at the stated sigmas, and its
+    standard error about that.
+    """
+
+    rms_px: float
+    expected_px: float
+    standard_error_px: float
+
+
+def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) -> GroupRms:
+    """Of pixels (k,): mean squared residuals of the two coordinates [px²], sigmas [px], and the variance of their
+    prediction [px², both coordinates].
+    """
+    n = 2 * len(squares)
+    if not n:
+        return GroupRms(0.0, 0.0, 0.0)
+    left = np.maximum(2.0 - variances / sigmas**2, 0.0)
+    expected = float((sigmas**2 * left).sum()) / n
+    # Of Gaussian residuals r = (I - H) e: var(rᵀr) <= 2 σ⁴ trace(I - H_g).
+    spread = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
+    error = 0.5 * spread / np.sqrt(expected) if expected > 0.0 else 0.0
+    return GroupRms(float(np.sqrt(squares.mean())), float(np.sqrt(expected)), float(error))
 
 
 def generator_noise(solution: Solution) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,8 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.calibration import upgrade
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, solve
+from stereoservo.kinematics.calibration.charts import LensModel
+from stereoservo.kinematics.calibration.lenses import lens_test
 from stereoservo.kinematics.calibration.statistics import (
     covariance_root,
     generator_noise,
@@ -33,21 +36,27 @@ class FitOptions:
     before the fit is refused; detectors misjudge their noise, a wrong model misses by far more.
     ``metric_loss``: how much worse, in variance, the metric bundle may fit than the projective one where it
     is not certain that the metric is identifiable. ``max_spread``: largest relative standard deviation of
-    focal lengths (metric) and depths (metric, affine) with which a stratum is believed.
+    focal lengths (metric) and depths (metric, affine) with which a stratum is believed. ``lens``: what of the
+    lenses is free; ``auto`` lets the data decide between nothing and the radial parameter with its centre.
     """
 
     outlier_chi2: float = 25.0
-    max_outliers: float = 0.25
+    max_outliers: float = 0.4
     max_trial_outliers: float = 0.5
     max_sigma_factor: float = 3.0
     metric_loss: float = 1.3
     max_spread: float = 0.1
+    lens: Literal["auto"] | LensModel = "auto"
 
 
 DEFAULTS = FitOptions()
 
 NOMINAL_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
 """Infinity of the canonical frame's nominal cameras."""
+FINISHED, FINISH_EVALUATIONS = 2, 400
+"""How many of the bundles that have not converged are solved to their end, and how long."""
+LOOSE_SPREAD = 0.5
+"""Relative deviation of depths and focal lengths beyond which linear statistics say nothing any more."""
 NESTED_TAIL = 1e-6
 """Probability with which a true constraint is taken for a wrong one."""
 
@@ -58,37 +67,76 @@ class Judge:
 
     A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
     is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
-    nearly.
+    nearly. ``bent``: pinholes with free lenses would have met them. ``unfinished``: bundles that may still get
+    there; ``loose``: good fits that say little of the stratum.
     """
 
     projective: Solution
     options: FitOptions
     notes: list[str] = field(default_factory=list)
     reserve: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    unfinished: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    loose: list[tuple[Solution, FloatArray]] = field(default_factory=list)
     hopeless: bool = False
+    bent: bool = False
 
     def passes(self, solution: Solution, plane: FloatArray) -> bool:
         """Whether ``solution`` may be taken as it is. Sets ``hopeless`` where another start will not help."""
         problem = self._unidentified(solution)
         if problem:
             self._note(solution, problem)
-            # A good fit that leaves directions open, converged along them or not: so will any other.
-            self.hopeless = self._close(solution)
+            # A good fit that leaves directions wide open, converged along them or not: so will any other.
+            open_ones = rank_of(solution) < solution.charts.size
+            wide = open_ones or max(_spreads(solution).values()) > LOOSE_SPREAD
+            self.hopeless = self._close(solution) and (wide or solution.converged)
+            (self.loose if self.hopeless else self.unfinished).append((solution, plane))
             return False
         if not solution.converged:
             self._note(solution, f"no convergence in {solution.evaluations} evaluations")
+            self.unfinished.append((solution, plane))
             return False
         fewer = self.projective.charts.size - solution.charts.size
         beside = max(1.0, variance_factor(self.projective))
         allowed = float(chi2_distribution.isf(NESTED_TAIL, max(1, fewer))) * beside
         if solution.cost - self.projective.cost <= allowed:
             return True
+        self.bent = self.bent or (solution.lenses == "none" and lens_test(solution).distorted)
         # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
         self.hopeless = any(
             abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve
         )
         self.reserve.append((solution, plane))
         return False
+
+    def finished(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+        """The best of the unfinished bundles solved to its end, if it passes then."""
+        candidates, self.unfinished = sorted(self.unfinished, key=lambda entry: entry[0].cost)[:FINISHED], []
+        for solution, plane in candidates:
+            if self.hopeless:
+                break
+            final = _to_the_end(solution, data)
+            if self.passes(final, plane):
+                return final, plane
+        return None
+
+    def last_resort(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+        """A good fit that says little of its stratum, where the projective bundle says less: it has open directions.
+
+        Its covariance tells how little; predictions are as good as the trials allow.
+        """
+        projective = solve(self.projective.rig, data, "projective", lenses=self.projective.lenses)
+        if projective.converged and rank_of(projective) == projective.charts.size:
+            return None
+        for solution, plane in self.loose:
+            final = _to_the_end(solution, data)
+            spread = max(_spreads(final).values()) if rank_of(final) == final.charts.size else np.inf
+            if final.converged and self._close(final) and spread <= LOOSE_SPREAD:
+                self.notes.append(
+                    f"the {final.stratum} stratum is taken because the projective bundle leaves directions open; "
+                    f"{self._unidentified(final) or 'its spread is small'}"
+                )
+                return final, plane
+        return None
 
     def second_best(self, certain: bool) -> tuple[Solution, FloatArray] | None:
         """The best of the reserve, with a note of what it costs; None where it must not be taken.
@@ -115,21 +163,10 @@ class Judge:
         rank = rank_of(solution)
         if rank < solution.charts.size:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
-        factor = max(1.0, variance_factor(solution))
-        deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
-        m = len(solution.rig.points)
-        scale = np.array([basis[2, 2] for basis in solution.charts.points])
-        depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
-        spreads = {"depths are": float(depths.max())}
-        if solution.stratum == "metric":
-            at = solution.charts.start(1)
-            scale = np.array([solution.charts.cameras[0][k, i, i] for k, i in ((0, 0), (3, 1))])
-            focal = deviations[[at, at + 3]] * scale / np.abs(np.diag(solution.rig.cameras[0][:2, :2]))
-            spreads["the focal length is"] = float(focal.max())
         limit = self.options.max_spread
         return "; ".join(
             f"{what} known to {spread:.0%} only, {limit:.0%} needed"
-            for what, spread in spreads.items()
+            for what, spread in _spreads(solution).items()
             if spread > limit
         )
 
@@ -139,11 +176,42 @@ class Judge:
             self.notes.append(note)
 
 
-def upgraded(
-    solution: Solution, data: Measurements, options: FitOptions
-) -> tuple[Solution, FloatArray, tuple[str, ...]]:
-    """The highest stratum that the data identify, its plane at infinity in the projective frame (4,), and
-    notes.
+def _to_the_end(solution: Solution, data: Measurements) -> Solution:
+    """The bundle again with many more evaluations."""
+    return solve(
+        solution.rig, data, solution.stratum, lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS
+    )
+
+
+def _spreads(solution: Solution) -> dict[str, float]:
+    """Relative standard deviations of depths and, in the metric stratum, of focal lengths: the largest each."""
+    factor = max(1.0, variance_factor(solution))
+    deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
+    m = len(solution.rig.points)
+    scale = np.array([basis[2, 2] for basis in solution.charts.points])
+    depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
+    spreads = {"depths are": float(depths.max())}
+    if solution.stratum == "metric":
+        at = solution.charts.start(1)
+        scale = np.array([solution.charts.cameras[0][k, i, i] for k, i in ((0, 0), (3, 1))])
+        focal = deviations[[at, at + 3]] * scale / np.abs(np.diag(solution.rig.cameras[0][:2, :2]))
+        spreads["the focal length is"] = float(focal.max())
+    return spreads
+
+
+class Upgraded(NamedTuple):
+    """The bundle of the highest stratum that the data identify, its ``plane`` (4,) at infinity in the projective
+    frame, notes, and whether pinholes are what stands in the way (``bent``).
+    """
+
+    solution: Solution
+    plane: FloatArray
+    notes: tuple[str, ...]
+    bent: bool
+
+
+def upgraded(solution: Solution, data: Measurements, options: FitOptions) -> Upgraded:
+    """The highest stratum that the data identify.
 
     Metric and affine bundles start from the linear estimates and, where those fail, from nominal cameras;
     whether they are believed is judged on the constrained bundle itself, which is far better conditioned than
@@ -173,30 +241,42 @@ def upgraded(
                 max_evaluations=20,
                 tolerance=1e-2,
             )
-            metric = solve(chain.rig, data, "metric", max_evaluations=40)
+            metric = solve(chain.rig, data, "metric", lenses=solution.lenses, max_evaluations=80)
         except np.linalg.LinAlgError as error:
             judge.notes.append(f"no metric start: {error}")
             continue
         if judge.passes(metric, plane):
-            return metric, plane, ()
+            return Upgraded(metric, plane, (), False)
         if judge.hopeless:
             break
+    done = judge.finished(data)
+    if done is not None:
+        return Upgraded(*done, (), False)
     second = judge.second_best(unique and _several_directions(solution.rig, finite[0], noise))
     if second is None:
         judge.hopeless, judge.reserve = False, []
         for plane in finite:
             try:
-                affine = solve(upgrade.affine_rig(solution.rig, plane), data, "affine", max_evaluations=40)
+                affine = solve(
+                    upgrade.affine_rig(solution.rig, plane),
+                    data,
+                    "affine",
+                    lenses=solution.lenses,
+                    max_evaluations=80,
+                )
             except (GeometryError, np.linalg.LinAlgError) as error:
                 judge.notes.append(f"no affine start: {error}")
                 continue
             if judge.passes(affine, plane):
-                return affine, plane, tuple(judge.notes)
+                return Upgraded(affine, plane, tuple(judge.notes), judge.bent)
             if judge.hopeless:
                 break
-        second = judge.second_best(unique)
+        done = judge.finished(data)
+        if done is not None:
+            return Upgraded(*done, tuple(judge.notes), judge.bent)
+        second = judge.second_best(unique) or judge.last_resort(data)
     best, plane = second or (solution, finite[0])
-    return best, plane, tuple(judge.notes)
+    return Upgraded(best, plane, tuple(judge.notes), judge.bent)
 
 
 def _several_directions(rig: Rig, plane: FloatArray, noise: FloatArray) -> bool:

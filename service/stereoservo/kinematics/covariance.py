@@ -1,0 +1,114 @@
+"""Propagation of a model's covariance to anything that no change of its projective frame alters.
+
+A quantity is a function of the model: an angle between axes, an intrinsic parameter through
+``projective_to_euclidean``, a predicted pixel. Its derivative is taken along the principal axes of the covariance, a
+small part of a standard deviation to either side, so that it needs no formula and no step size of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.calibration.charts import conjugation
+from stereoservo.kinematics.model import CellModel, ModelCovariance
+
+FloatArray = npt.NDArray[np.float64]
+
+STEP = 0.01
+"""Standard deviations to either side over which derivatives are taken."""
+
+
+class NoCovarianceError(ValueError):
+    """The model carries no covariance: it was written before, or not by a fit."""
+
+
+def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
+    """The model with its parameters (p,) off by ``x`` along the directions of its covariance.
+
+    Generators are conjugated, so that they keep their algebra; points are scaled back to height 1 over the plane
+    at infinity. Neither statistics nor covariance are carried. Raises NoCovarianceError, ValueError.
+    """
+    given = _covariance_of(model)
+    x = np.asarray(x, dtype=np.float64)
+    if x.shape != (len(given.covariance),):
+        raise ValueError(f"x has shape {x.shape}; ({len(given.covariance)},) is needed")
+    at = 0
+
+    def own(basis: FloatArray) -> FloatArray:
+        nonlocal at
+        at += len(basis)
+        return x[at - len(basis) : at]
+
+    generators = []
+    for generator, basis in zip(model.generators, given.generators, strict=True):
+        frame, _ = conjugation(basis, own(basis))
+        generators.append(frame @ generator @ np.linalg.inv(frame))
+    matrices = [
+        camera.matrix + np.tensordot(own(basis), basis, axes=1)
+        for camera, basis in zip(model.cameras, given.cameras, strict=True)
+    ]
+    lenses = [
+        camera.lens + own(basis) @ basis for camera, basis in zip(model.cameras, given.lenses, strict=True)
+    ]
+    points = np.array(
+        [point + own(basis) @ basis for point, basis in zip(model.marker_points, given.markers, strict=True)]
+    )
+    return msgspec.structs.replace(
+        model,
+        generators=np.array(generators),
+        cameras=tuple(
+            msgspec.structs.replace(camera, matrix=matrix, lens=lens)
+            for camera, matrix, lens in zip(model.cameras, matrices, lenses, strict=True)
+        ),
+        marker_points=points / (points @ model.plane_at_infinity)[:, None],
+        statistics=None,
+        covariance=None,
+    )
+
+
+def propagated(
+    model: CellModel, function: Callable[[CellModel], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Values (r,) of ``function`` at the model and their covariance (r, r), to first order.
+
+    ``function`` must not depend on the frame, nor, in the metric stratum, on the one open length. Raises
+    NoCovarianceError.
+    """
+    root = covariance_axes(model)
+    values = np.atleast_1d(np.asarray(function(model), dtype=np.float64))
+    slopes = np.empty((len(values), root.shape[1]))
+    for k, axis in enumerate(root.T):
+        ahead = np.atleast_1d(function(displaced_model(model, STEP * axis)))
+        behind = np.atleast_1d(function(displaced_model(model, -STEP * axis)))
+        slopes[:, k] = (ahead - behind) / (2.0 * STEP)
+    return values, slopes @ slopes.T
+
+
+def standard_deviations(model: CellModel, function: Callable[[CellModel], FloatArray]) -> FloatArray | None:
+    """Standard deviations (r,) of the values of ``function``; None where the model carries no covariance."""
+    if model.covariance is None:
+        return None
+    return np.asarray(np.sqrt(np.diag(propagated(model, function)[1])))
+
+
+def covariance_axes(model: CellModel) -> FloatArray:
+    """``L`` (p, r) with ``L Lᵀ`` = the covariance: its principal axes as correlations, each one deviation long.
+
+    Raises NoCovarianceError.
+    """
+    matrix = _covariance_of(model).covariance
+    deviations = np.sqrt(np.diag(matrix))
+    values, vectors = np.linalg.eigh(matrix / np.outer(deviations, deviations))
+    kept = values > 0.0
+    axes: FloatArray = deviations[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return axes
+
+
+def _covariance_of(model: CellModel) -> ModelCovariance:
+    if model.covariance is None:
+        raise NoCovarianceError("the model carries no covariance; a fit of this version writes one")
+    return model.covariance
