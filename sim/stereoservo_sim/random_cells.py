@@ -211,8 +211,7 @@ def cube_corner() -> FloatArray:
     z = -np.ones(3) / np.sqrt(3.0)
     x = np.cross([1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
-    turned: FloatArray = corner @ np.array([x, np.cross(z, x), z]).T
-    return turned + [0.0, 0.0, 0.12]
+    return np.asarray(corner @ np.array([x, np.cross(z, x), z]).T + np.array([0.0, 0.0, 0.12]))
 
 
 def seven_dots() -> FloatArray:

@@ -1,0 +1,205 @@
+"""Scales of joints: a revolute one's is told by the images, a prismatic one's only beside another's.
+
+A revolute joint that reports its angle times a factor (counts, degrees, a wrong gear) is no projective rotation by the
+reported positions: the spectrum of its generator is ±i times the factor. The factor is estimated first from the
+joint's own trial, then with the whole model. Signs and the scale of all prismatic joints together are gauge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from stereoservo.geometry.cameras import NOMINAL_FOCAL
+from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, jacobian, residuals, solve
+from stereoservo.kinematics.calibration.report import CalibrationResult
+from stereoservo.kinematics.calibration.separate import (
+    GOOD_FIT,
+    Sights,
+    best_start,
+    trial_stops,
+    virtual_markers,
+)
+from stereoservo.kinematics.calibration.statistics import variance_factor
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, finite_rows
+
+FloatArray = npt.NDArray[np.float64]
+
+COARSE = tuple(float(2.0 ** (k / 4)) for k in range(-5, 6))
+"""Factors about the rigid estimate that a search begins with: nominal cameras misjudge angles."""
+WORTH = 40.0
+"""Chi-square by which a factor must improve a joint's own trial."""
+SIGNIFICANT = 5.0
+"""Deviations from 1 at which a factor is one."""
+LEAST_FACTOR = 2e-3
+"""Relative error of a scale below which it is not worth a refusal."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Reported over true motion of a joint, and its standard deviation."""
+
+    joint: int
+    factor: float
+    deviation: float
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the factor is not 1, by its own deviation."""
+        off = abs(self.factor - 1.0)
+        return off > SIGNIFICANT * self.deviation and off > LEAST_FACTOR
+
+
+def trial_scales(
+    trials: TrialData, cameras: FloatArray, points: FloatArray, usable: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """Factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where the trial
+    shows no other, for prismatic joints, and where the trial is of no use.
+    """
+    factors = np.ones(len(trials.joint_names))
+    for joint, kind in enumerate(trials.joint_kinds):
+        if kind != "revolute":
+            continue
+        try:
+            stops, groups, base = trial_stops(trials, points, joint)
+        except CalibrationError:
+            continue  # too few stops to tell a scale by
+        sights = virtual_markers(trials, points, usable, stops, groups)
+        factors[joint] = _best_factor(cameras, sights, trials.positions[stops, joint] - base[joint])
+    return factors
+
+
+def corrected(trials: TrialData, factors: FloatArray) -> TrialData:
+    """The trials with positions divided by ``factors`` (n,) about their medians."""
+    middle = np.median(trials.positions, axis=0)
+    return msgspec.structs.replace(trials, positions=middle + (trials.positions - middle) / factors)
+
+
+def _best_factor(cameras: FloatArray, sights: Sights, reported: FloatArray) -> float:
+    """The factor of one joint's ``reported`` angles (k,); 1 where none is worth more."""
+    rough = _rigid_factor(sights, reported)
+    rigs: dict[float, tuple[Rig, float]] = {}
+    for factor in {1.0, *(rough * step for step in COARSE)}:
+        rig, typical = best_start("revolute", cameras, sights, reported / factor)
+        if rig is not None and np.isfinite(typical):
+            rigs[factor] = rig, typical
+    if not rigs:
+        return 1.0
+    start = min(rigs, key=lambda factor: rigs[factor][1])
+    if 1.0 in rigs and rigs[1.0][1] < GOOD_FIT and rigs[start][1] > 0.5 * rigs[1.0][1]:
+        start = 1.0
+    camera, stop, marker = np.nonzero(sights.usable)
+    rig = rigs[start][0]
+    noise = max(1.0, min(typical for _, typical in rigs.values()))
+
+    def cost(log_factor: float) -> float:
+        data = Measurements(
+            reported[:, None] / np.exp(log_factor),
+            camera,
+            stop,
+            marker,
+            sights.pixels[sights.usable].reshape(-1, 2),
+            noise * sights.sigmas[sights.usable].ravel(),
+        )
+        fit = solve(
+            rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, max_evaluations=40
+        )
+        return float(8.0 * (np.sqrt(1.0 + fit.residuals**2 / 4.0) - 1.0).sum())
+
+    log = float(np.log(start))
+    found = minimize_scalar(
+        cost, bounds=(log - 0.2, log + 0.2), method="bounded", options={"xatol": 1e-4, "maxiter": 25}
+    )
+    without = cost(0.0) if 1.0 in rigs else np.inf
+    return float(np.exp(found.x)) if without - found.fun > WORTH else 1.0
+
+
+def _rigid_factor(sights: Sights, reported: FloatArray) -> float:
+    """Reported over turned angle between stops far apart, as if the cameras were nominal ones: coarse."""
+    scale = np.array([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        euclidean = sights.points[..., :3] * scale / sights.points[..., 3:]
+    valid = finite_rows(euclidean)
+    far = np.abs(reported[:, None] - reported[None, :]) > 0.4 * np.ptp(reported)
+    ratios = []
+    for k, n in np.argwhere(np.triu(far)):
+        both = valid[k] & valid[n]
+        if int(both.sum()) < 3:
+            continue
+        before, after = euclidean[k, both], euclidean[n, both]
+        turn, _ = Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))
+        angle = float(turn.magnitude())
+        if angle > 0.0:
+            ratios.append(abs(reported[k] - reported[n]) / angle)
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def model_scales(solution: Solution) -> tuple[Scale, ...]:
+    """Factors of all revolute joints' positions and their deviations, estimated together with everything else.
+
+    One Gauss-Newton step from a converged bundle: exact for factors near 1.
+    """
+    joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
+    if not joints:
+        return ()
+    slope = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), solution.data)
+    step = 1e-5
+    columns = []
+    for joint in joints:
+        ends = []
+        for sign in (-1.0, 1.0):
+            offsets = solution.data.offsets.copy()
+            offsets[:, joint] *= np.exp(-sign * step)
+            ends.append(residuals(solution.rig, replace(solution.data, offsets=offsets)))
+        columns.append((ends[1] - ends[0]) / (2.0 * step))
+    moments = np.stack(columns, axis=1)
+    # What the other parameters can imitate of a factor is theirs.
+    q, _ = np.linalg.qr(slope / solution.sizes)
+    moments = moments - q @ (q.T @ moments)
+    rest = solution.residuals - q @ (q.T @ solution.residuals)
+    information = moments.T @ moments
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-10) / np.outer(size, size)
+    logs = -covariance @ (moments.T @ rest)
+    deviations = np.sqrt(np.diag(covariance) * max(1.0, variance_factor(solution)))
+    return tuple(
+        Scale(joint, float(np.exp(log)), float(np.exp(log) * deviation))
+        for joint, log, deviation in zip(joints, logs, deviations, strict=True)
+    )
+
+
+def prismatic_ratios(result: CalibrationResult, solution: Solution) -> tuple[Scale, ...]:
+    """Reported motion per length of each prismatic joint over that of the first one, with deviations; () below the
+    metric stratum and with fewer than two.
+
+    One scale for all of them is gauge; their ratios are not, and are 1 where every drive states the truth.
+    """
+    joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "prismatic"]
+    if result.model.stratum != "metric" or len(joints) < 2:
+        return ()
+    lengths = np.linalg.norm(solution.rig.generators[:, :3, 3], axis=1)
+    roots = np.linalg.inv(solution.triangle / solution.sizes) / solution.sizes[:, None]
+    roots = roots * np.sqrt(max(1.0, variance_factor(solution)))
+    starts = np.cumsum([0, *(len(basis) for basis in solution.charts.generators)])
+
+    def log_slope(joint: int) -> FloatArray:
+        """Change of the logarithm of a joint's length with the parameters, in their independent directions."""
+        generator, basis = solution.rig.generators[joint], solution.charts.generators[joint]
+        changes = (basis @ generator - generator @ basis)[:, :3, 3]
+        relative = changes @ generator[:3, 3] / lengths[joint] ** 2
+        return np.asarray(relative @ roots[starts[joint] : starts[joint + 1]])
+
+    first = joints[0]
+    return tuple(
+        Scale(
+            joint,
+            float(lengths[first] / lengths[joint]),
+            float(lengths[first] / lengths[joint] * np.linalg.norm(log_slope(joint) - log_slope(first))),
+        )
+        for joint in joints[1:]
+    )

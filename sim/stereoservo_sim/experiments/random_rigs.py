@@ -1,0 +1,147 @@
+"""Self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds, and that it never lies.
+
+Each case is judged by the truth that only the judge knows. *Success*: a model whose predictions of held-out
+configurations are as far from the exact pixels as its own covariance says, and whose stated focal lengths and
+principal point are true within their deviations. *Failure*: a CalibrationError. *Wrong*: a model that fails the judge.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import norm
+
+from stereoservo.kinematics.calibration.bundle import Measurements, jacobian, residuals
+from stereoservo.kinematics.calibration.diagnosis import solution_of
+from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.kinematics.calibration.report import CalibrationResult
+from stereoservo.kinematics.calibration.statistics import covariance_root, variance_factor
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
+from stereoservo_sim.random_cells import RandomCase, random_case
+from stereoservo_sim.synthetic import FIRST_MARKER
+
+FloatArray = npt.NDArray[np.float64]
+Outcome = Literal["success", "failure", "wrong"]
+ProgressCall = Callable[[str, int, int], None]
+
+TAIL = 1e-6
+"""Probability with which a true model is called wrong, for each of the judge's two questions."""
+SEEDS = 12
+"""Cases of the command by default."""
+PROMISED = 0.995
+"""Share of successes that is asked for."""
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What became of a case.
+
+    ``error_ratio``: squared errors of held-out pixels over those that the model's covariance states; with
+    ``freedom`` effective degrees of freedom it must not exceed ``limit``. ``intrinsics_sigmas``: largest error of the
+    left camera's intrinsics in stated deviations (0 below the metric stratum).
+    """
+
+    seed: int
+    outcome: Outcome
+    arm: str
+    body: str
+    sigma_px: float
+    stratum: str = ""
+    code: str = ""
+    message: str = ""
+    error_ratio: float = 0.0
+    freedom: float = 0.0
+    limit: float = 0.0
+    rms_px: float = 0.0
+    intrinsics_sigmas: float = 0.0
+    seconds: float = 0.0
+
+
+def judged(seed: int) -> Verdict:
+    """The verdict on the case of ``seed``, fitted from nothing."""
+    case = random_case(seed)
+    trials = case.trials()
+    begin = time.process_time()
+    try:
+        result = fit_model(trials, epoch=1)
+    except CalibrationError as error:
+        return Verdict(
+            seed,
+            "failure",
+            case.arm,
+            case.body,
+            case.sigma,
+            code=error.code,
+            message=error.message,
+            seconds=time.process_time() - begin,
+        )
+    seconds = time.process_time() - begin
+    ratio, freedom, rms = held_out_ratio(case, trials, result)
+    limit = float(chi2_distribution.isf(TAIL, freedom)) / freedom
+    intrinsics = intrinsics_sigmas(case, result)
+    true = ratio <= limit and intrinsics <= float(norm.isf(0.5 * TAIL))
+    return Verdict(
+        seed,
+        "success" if true else "wrong",
+        case.arm,
+        case.body,
+        case.sigma,
+        stratum=result.model.stratum,
+        error_ratio=ratio,
+        freedom=freedom,
+        limit=limit,
+        rms_px=rms,
+        intrinsics_sigmas=intrinsics,
+        seconds=seconds,
+    )
+
+
+def held_out_ratio(
+    case: RandomCase, trials: TrialData, result: CalibrationResult
+) -> tuple[float, float, float]:
+    """Squared errors of held-out pixels over their stated sum, its effective degrees of freedom, and the rms error [px].
+
+    With the errors ``L z``, ``z`` standard normal, the sum of squares has mean ``tr LᵀL`` and is taken for a
+    chi-square of ``(tr LᵀL)² / tr (LᵀL)²`` degrees of freedom of the same mean (Satterthwaite).
+    """
+    solution = solution_of(trials, result)
+    positions = case.held_out()
+    kept = [i - FIRST_MARKER for i in result.model.marker_ids]
+    seen = case.cell.in_view(positions)[:, :, kept]
+    camera, stop, marker = np.nonzero(seen)
+    exact = case.cell.pixels(positions)[:, :, kept][seen]
+    data = Measurements(positions - result.model.zero, camera, stop, marker, exact, np.ones(len(exact)))
+    errors = residuals(solution.rig, data)
+    roots = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data) @ covariance_root(
+        solution
+    )
+    moments = roots.T @ roots * max(1.0, variance_factor(solution))
+    mean = float(np.trace(moments))
+    freedom = mean**2 / float((moments**2).sum())
+    return float(errors @ errors) / mean, freedom, float(np.sqrt((errors**2).mean()))
+
+
+def intrinsics_sigmas(case: RandomCase, result: CalibrationResult) -> float:
+    """Largest error of the left camera's fx, skew, fy, u0, v0 in stated deviations; 0 below the metric stratum."""
+    stated, deviations = result.report.cameras[0].intrinsics, result.report.left_intrinsics_std
+    if stated is None or deviations is None:
+        return 0.0
+    K = case.cell.intrinsics[0]
+    true = np.array([K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2]])
+    return float(np.max(np.abs(np.array(stated) - true) / np.array(deviations)))
+
+
+def wilson(successes: int, cases: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's interval of a share."""
+    z = float(norm.isf(0.5 * (1.0 - confidence)))
+    share = successes / cases
+    middle = (share + z**2 / (2 * cases)) / (1 + z**2 / cases)
+    half = z / (1 + z**2 / cases) * float(np.sqrt(share * (1 - share) / cases + z**2 / (4 * cases**2)))
+    return max(0.0, middle - half), min(1.0, middle + half)
