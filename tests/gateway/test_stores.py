@@ -71,8 +71,10 @@ def test_a_model_of_another_camera_or_marker_does_not_fit(tmp_path: Path) -> Non
     camera = msgspec.structs.replace(model.cameras[0], width=1280)
     save_model(msgspec.structs.replace(model, cameras=(camera, model.cameras[1])), store.path(1))
     save_model(msgspec.structs.replace(model, marker_ids=(0, 1, 2, 3, 4, 77)), store.path(2))
+    save_model(msgspec.structs.replace(model, mount="eye_in_hand"), store.path(3))
     found, passed = store.newest_fitting(_settings())
     assert found is None
+    assert "mounted eye_in_hand; the cell's are eye_to_hand" in passed.pop(0)
     assert "has markers [77]" in passed[0]
     assert "('left', 1280, 480)" in passed[1]
 

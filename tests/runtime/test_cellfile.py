@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stereoservo.runtime.cellfile import CellFileError, load_cell_file
 from stereoservo.runtime.ports import CameraDescription, JointDriverDescription, JointSpec
-from stereoservo.runtime.settings import core_settings
+from stereoservo.runtime.settings import CoreSettings, core_settings
 
 GOOD = """
 schema = 1
@@ -36,17 +37,32 @@ DRIVE = JointDriverDescription(
 CAMERA = CameraDescription("fake", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2, 3))
 
 
-def settings(tmp_path: Path, text: str) -> None:
+def settings(tmp_path: Path, text: str) -> CoreSettings:
     path = tmp_path / "cell.toml"
     path.write_text(text)
     try:
-        core_settings(load_cell_file(path), DRIVE, (CAMERA,))
+        return core_settings(load_cell_file(path), DRIVE, (CAMERA,))
     finally:
         assert path.read_text() == text
 
 
 def test_good_cell_file_loads(tmp_path: Path) -> None:
     settings(tmp_path, GOOD)
+
+
+def test_a_range_may_be_left_out_and_a_spread_stays_inside_the_limits(tmp_path: Path) -> None:
+    planned = settings(tmp_path, GOOD.replace("range = { j1 = 0.3 }", "")).trials
+    assert planned is not None
+    assert np.isnan(planned.range).all()
+    assert planned.spread_joint == -1
+    spread = settings(
+        tmp_path, GOOD.replace("range =", 'spread = { joint = "j1", positions = 3 }\nrange =')
+    ).trials
+    assert spread is not None
+    assert spread.spread_offsets == pytest.approx([-0.3, 0.0, 0.3])
+    alone = settings(tmp_path, GOOD.replace("range = { j1 = 0.3 }", 'spread = { joint = "j1" }')).trials
+    assert alone is not None
+    assert alone.spread_offsets == pytest.approx([-0.6, -0.2, 0.2, 0.6])
 
 
 CASES = {
@@ -86,6 +102,26 @@ CASES = {
         ["0.5", "below"],
     ),
     "unknown law": ("schema = 1", 'schema = 1\n[servo]\nlaw = "magic"', ["magic"]),
+    "spread of nothing": (
+        "range = { j1 = 0.3 }",
+        'spread = { joint = "j7" }',
+        ["calibration.spread.joint", "j7", "joints with limits: j1"],
+    ),
+    "spread over limits": (
+        "range = { j1 = 0.3 }",
+        'spread = { joint = "j1", range = 1.5 }',
+        ["calibration.spread.range", "1.5", "0.889"],
+    ),
+    "spread at one place": (
+        "range = { j1 = 0.3 }",
+        'spread = { joint = "j1", positions = 1 }',
+        ["calibration.spread.positions", "2"],
+    ),
+    "unknown key of spread": (
+        "range = { j1 = 0.3 }",
+        'spread = { joint = "j1", count = 3 }',
+        ["calibration.spread", "count", "positions"],
+    ),
     "not TOML": ("schema = 1", "schema = = 1", ["TOML"]),
 }
 

@@ -102,9 +102,8 @@ def _text(
             "",
         ]
     lines += [
-        "# Trial motions: each joint moves alone from base over base ± range. Choose base such that "
-        "every camera",
-        "# sees the markers there, and ranges as large as the markers stay in view.",
+        "# Trial motions: each joint moves alone from base, as far as the markers stay in view (see",
+        "# docs/calibration.md). Choose base such that every camera sees the markers there.",
         "[calibration]",
         "stops = 9",
         "frames = 5",
@@ -113,8 +112,10 @@ def _text(
     ]
     base = joints.home or [_base(joint.position_min, joint.position_max) for joint in joints.joints]
     lines += [f"{joint.name} = {round(q, 4)!r}" for joint, q in zip(joints.joints, base, strict=True)]
-    lines += ["", "[calibration.range]"]
-    lines += [f"{joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints]
+    lines += ["", "# [calibration.range]           # state it where something stands in the way [rad or m]"]
+    lines += [
+        f"# {joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints
+    ]
     return "\n".join(lines) + "\n"
 
 
