@@ -2,7 +2,8 @@
 
 All stamps are ``CLOCK_MONOTONIC`` nanoseconds of this host (in lockstep: the virtual clock), taken from
 ``DriverContext.clock``. Every sample carries a stamp and a sequence number. Joint quantities are [rad], [rad/s]
-for revolute and [m], [m/s] for prismatic joints. Pixels: integer = pixel centre.
+for revolute and [m], [m/s] for prismatic joints. Pixels: raw ones, those of the
+image; integer = pixel centre.
 
 Calls are non-blocking within ``call_budget_us`` of the description. ``describe()`` works before anything is
 connected. Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close``.
