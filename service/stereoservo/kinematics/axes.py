@@ -34,7 +34,7 @@ class FramedModel:
 def framed(model: CellModel) -> FramedModel:
     """The parts of ``model`` in the frame of its stratum."""
     frame = stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean)
-    back: FloatArray = np.linalg.inv(frame)
+    back = np.asarray(np.linalg.inv(frame), dtype=np.float64)
     points = model.marker_points @ frame.T
     sense = -1.0 if model.tip_first else 1.0
     return FramedModel(
@@ -112,8 +112,7 @@ def common_normal(
 
 def euclidean_centres(cameras: FloatArray) -> FloatArray:
     """Centres (c, 3) of finite cameras (c, 3, 4)."""
-    centres: FloatArray = -np.linalg.solve(cameras[:, :, :3], cameras[:, :, 3:])[..., 0]
-    return centres
+    return np.asarray(-np.linalg.solve(cameras[:, :, :3], cameras[:, :, 3:])[..., 0], dtype=np.float64)
 
 
 def camera_intrinsics(matrix: FloatArray) -> FloatArray:
