@@ -140,6 +140,22 @@ def run_house_command(options: Options, progress: ProgressCall) -> dict[str, Any
     return _with_plots(answer, draw_house, options.plot)
 
 
+def run_robot_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``robot`` from its options; 30 seeds by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.robot_report import draw_robot, run_robot
+
+    answer = run_robot(seeds=options.seeds or 30, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_robot, options.plot)
+
+
+def show_robot_tables(answer: dict[str, Any], console: Console) -> None:
+    """Tables 5.1 to 5.4."""
+    from stereoservo_sim.experiments.robot_report import show_robot
+
+    show_robot(answer, console)
+
+
 def _with_plots(
     answer: dict[str, Any], draw: Callable[[dict[str, Any], Path], list[Path]], folder: Path | None
 ) -> dict[str, Any]:
@@ -254,6 +270,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         frozenset({"seeds"}),
         run_house_command,
         show_rows,
+    ),
+    "robot": Experiment(
+        "tables 5.1 to 5.4: self-calibration of a 6R arm from a turned plate; images, axes, links, intrinsics",
+        frozenset({"seeds"}),
+        run_robot_command,
+        show_robot_tables,
     ),
 }
 """By the name given on the command line."""
