@@ -206,8 +206,9 @@ def fit_again(
     try:
         result, said = fit_trials(data, output, epoch, lens_priors=priors)
     except CalibrationError as error:
-        kept = report_fit(data, path, output, None, failed(error.code, error.message))
-        raise CommandError(error.code, f"{error}. A report is in {kept}", report=str(kept)) from error
+        told = failed(error.code, error.message)
+        kept = report_fit(data, path, output, None, told)
+        raise CommandError(error.code, f"{told.text} A report is in {kept}", report=str(kept)) from error
     try:
         page: Path | None = report_fit(data, path, output, result, said)
     except OSError as error:

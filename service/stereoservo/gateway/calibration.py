@@ -12,6 +12,7 @@ from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.stores import ModelStore
 from stereoservo.kinematics.calibration.trials import CalibrationError
+from stereoservo.kinematics.calibration.verdict import failed
 from stereoservo.kinematics.model import CellModel, ModelFileError
 from stereoservo.runtime.calibration_job import CalibrationJob
 from stereoservo.runtime.cycle import Event
@@ -148,8 +149,9 @@ class Calibration:
                 model, fit.model_path, verdict, fit.report_path, fit.trials_path, seconds
             )
         except (FitFailedError, ModelFileError) as error:
+            code = getattr(error, "code", "")
             kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
-            self._failed(self._fit_id, f"{error}. {kept}", getattr(error, "code", ""))
+            self._failed(self._fit_id, f"{failed(code, str(error)).text} {kept}", code)
             return
         if not self._link.give_model(model):
             self._failed(

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import time
 
+import msgspec
+
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.channel import Channel, ChannelError
 from stereoservo.runtime.commands import Command, Request
@@ -77,8 +79,9 @@ class ServoLink:
         return number
 
     def give_model(self, model: CellModel) -> bool:
-        """Hand a model to the core."""
-        return self._control is not None and self._control.send(encode(NewModel(model)))
+        """Hand a model to the core, without its covariance: the loop has no use for it, and a message has a limit."""
+        bare = msgspec.structs.replace(model, covariance=None)
+        return self._control is not None and self._control.send(encode(NewModel(bare)))
 
     def events(self) -> list[Event]:
         """Core events since the last call, in order."""
