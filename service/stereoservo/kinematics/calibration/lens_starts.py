@@ -28,6 +28,10 @@ PINHOLE_AGREEMENT = 0.95
 """Share of matches within 3.29 sigmas of one epipolar geometry at which no lens is searched for."""
 COARSE_PX = 1.5
 """Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
+MOST_BEND = 0.6
+"""Largest radial parameter of a lens to start from, either way."""
+WORTH_SHARE = 0.03
+"""By how much a lens must raise the share of matches that fit: misfit that it does not cure is not the lens's."""
 CENTRE_SHARE = 0.1
 """Standard deviation of a lens's centre about the middle of the image, beforehand [image widths]."""
 NORMAL_MEDIAN = 0.6745
@@ -35,7 +39,7 @@ NORMAL_MEDIAN = 0.6745
 CENTRE_BOUND = 2.0
 """Largest offset of a centre in the search, in those standard deviations."""
 START_GAIN = 100.0
-"""Epipolar chi-square that a lens must gain to be started from. The bundle, which sees more, decides on smaller ones."""
+"""Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
 
 
 def straight_lenses(trials: TrialData) -> FloatArray:
@@ -72,7 +76,7 @@ def epipolar_lenses(trials: TrialData) -> FloatArray:
     lenses = straight_lenses(trials)
     for k in range(1, len(trials.cameras)):
         match = _matches(trials, k)
-        if match is None or _fit_pinholes(*match, undistort_by=lenses[[0, k]]):
+        if match is None or _agreement(*match, lenses[[0, k]]) >= PINHOLE_AGREEMENT:
             continue
         # The first camera's lens is settled by the first pair that asks for one.
         free = (0, 1) if not lenses[0, 0] else (1,)
@@ -91,15 +95,20 @@ def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
     return pixels[:, seen], trials.sigmas[[0, k]].reshape(2, -1)[:, seen]
 
 
-def _fit_pinholes(raw: FloatArray, sigmas: FloatArray, undistort_by: FloatArray) -> bool:
-    """Whether nearly all matches fit one epipolar geometry as they are, or lie on one plane, which tells nothing."""
-    ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(undistort_by, raw, strict=True)])
+def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float:
+    """Share of matches that one epipolar geometry fits behind ``lenses``; 1 where they lie on one plane, which tells
+    nothing.
+    """
+    ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
+    known = np.asarray(finite_rows(ideal).all(axis=0))
+    if int(known.sum()) < MIN_MATCHES:
+        return 0.0
     sigma = float(np.sqrt(np.median((sigmas**2).sum(axis=0)) / 2))
     try:
-        _, inliers = fundamental_robust(ideal[0], ideal[1], sigma)
+        _, inliers = fundamental_robust(ideal[0, known], ideal[1, known], sigma)
     except GeometryError as error:
-        return error.code == "degenerate"
-    return float(inliers.mean()) >= PINHOLE_AGREEMENT
+        return float(error.code == "degenerate")
+    return float(inliers.sum()) / len(known)
 
 
 def _pair_lenses(
@@ -125,7 +134,10 @@ def _pair_lenses(
     noise = sigmas * max(1.0, typical)
     bent, cost, _ = _refined(raw, noise, started, F, free, bound=max(least, 1.0))
     _, without, _ = _refined(raw, noise, lenses, straight[0], (), bound=max(least, 1.0))
-    return bent if without - cost > START_GAIN else None
+    if not without - cost > START_GAIN or np.abs(bent[:, 0]).max() > MOST_BEND:
+        return None
+    # Wrong matches stay wrong behind any lens.
+    return bent if _agreement(raw, noise, bent) > _agreement(raw, noise, lenses) + WORTH_SHARE else None
 
 
 def _coarse_fundamental(

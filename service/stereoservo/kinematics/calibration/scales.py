@@ -19,7 +19,6 @@ from stereoservo.geometry.cameras import NOMINAL_FOCAL
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, jacobian, residuals, solve
 from stereoservo.kinematics.calibration.report import CalibrationResult
 from stereoservo.kinematics.calibration.separate import (
-    GOOD_FIT,
     Sights,
     best_start,
     trial_stops,
@@ -91,8 +90,6 @@ def _best_factor(cameras: FloatArray, sights: Sights, reported: FloatArray) -> f
     if not rigs:
         return 1.0
     start = min(rigs, key=lambda factor: rigs[factor][1])
-    if 1.0 in rigs and rigs[1.0][1] < GOOD_FIT and rigs[start][1] > 0.5 * rigs[1.0][1]:
-        start = 1.0
     camera, stop, marker = np.nonzero(sights.usable)
     rig = rigs[start][0]
     noise = max(1.0, min(typical for _, typical in rigs.values()))
@@ -113,7 +110,7 @@ def _best_factor(cameras: FloatArray, sights: Sights, reported: FloatArray) -> f
 
     log = float(np.log(start))
     found = minimize_scalar(
-        cost, bounds=(log - 0.2, log + 0.2), method="bounded", options={"xatol": 1e-4, "maxiter": 25}
+        cost, bounds=(log - 0.25, log + 0.25), method="bounded", options={"xatol": 1e-4, "maxiter": 25}
     )
     without = cost(0.0) if 1.0 in rigs else np.inf
     return float(np.exp(found.x)) if without - found.fun > WORTH else 1.0

@@ -22,7 +22,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 MIN_MATCHES = 16
 """Matches between two cameras below which the epipolar geometry is not worth a robust search."""
-MIN_AGREEMENT = 0.6
+MIN_AGREEMENT = 0.4
 """Share of matches that must fit one epipolar geometry; below it the stated sigmas are widened once or
 twice.
 """
