@@ -124,6 +124,21 @@ def test_a_spread_joint_visits_its_positions_at_every_stop_of_the_joints_before_
     assert travel < 1.6 * 5 * 4 * 0.3  # there and back, not back to the first each time
 
 
+def test_a_keep_out_on_the_way_ends_a_side_before_it(bench: Any) -> None:
+    base = bench.settings.trials.base
+    box = np.tile([-np.inf, np.inf], (6, 1))[None]
+    box[0, 3] = base[3] + 0.075, base[3] + 0.08  # thinner than a step of 0.05
+    limits = msgspec.structs.replace(bench.settings.limits, keep_outs=box, keep_out_names=("post",))
+    bench.settings = msgspec.structs.replace(bench.settings, limits=limits)
+    bench.core = ServoCore(bench.settings)
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    assert moved(samples, 3, base).max() == pytest.approx(0.05, abs=2e-3)
+    assert [
+        e for e in bench.events if e.kind == "warning" and "j4" in e.message and "keep-out post" in e.message
+    ]
+
+
 def test_state_in_mid_calibration_survives_serialisation(bench: Any) -> None:
     with_trials(bench, range=np.full(6, np.nan))
     bench.run(0.1)

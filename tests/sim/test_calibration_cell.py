@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -67,6 +68,26 @@ def test_a_cell_without_ranges_calibrates_to_the_noise_floor(calibrated: Calibra
         assert own.sum() >= 5
     warnings = [e.message for e in operator.cell.events if e.kind == "warning"]
     assert not [message for message in warnings if "loses the markers" in message], warnings
+
+
+def test_a_spread_joint_gives_every_trial_several_positions_of_the_body(tmp_path: Path) -> None:
+    spread = {"joint": "j6", "positions": 3, "range": 0.5}
+    ranges = dict(zip(NAMES, (0.2, 0.2, 0.2, 0.5, 0.4, 0.6), strict=True))
+    with LockstepCell(
+        cell_file(range=ranges, spread=spread, stops=5), cell_dir=tmp_path, runtime_dir=tmp_path
+    ) as cell:
+        cell.run_for(0.5)
+        operator = LockstepOperator(cell)
+        operator.enable()
+        model = operator.calibrate()
+    trials = operator.trials
+    assert trials is not None
+    for j in range(5):
+        turned = trials.positions[trials.trials == j, 5]
+        assert len(np.unique(turned.round(2))) == 3, NAMES[j]
+    assert model.statistics is not None
+    assert model.statistics.chi2_ok
+    assert model.stratum == "metric"
 
 
 def test_an_unchanged_cell_holds_and_a_drifted_joint_is_named(calibrated: Calibrated) -> None:

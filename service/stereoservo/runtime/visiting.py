@@ -143,8 +143,8 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings) -> Reason:
 def blocked(target: FloatArray, moving: list[int], present: Present) -> str:
     """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty where it may.
 
-    The programme never leans on the safety stage. A keep-out is looked for at the stop only: it is convex, and a
-    path into it from outside ends there or crosses it, which the safety stage then prevents.
+    The programme never leans on the safety stage: a keep-out blocks where it meets the box that the way from here
+    to the stop spans.
     """
     limits = present.settings.limits
     margin = limits.position_margin + 2.0 * ARRIVED
@@ -153,6 +153,7 @@ def blocked(target: FloatArray, moving: list[int], present: Present) -> str:
         if not low <= target[joint] <= high:
             return "(joint limit)"
     for name, box in zip(limits.keep_out_names, limits.keep_outs, strict=True):
-        if bool(((box[:, 0] - margin <= target) & (target <= box[:, 1] + margin)).all()):
+        low, high = np.minimum(present.q, target), np.maximum(present.q, target)
+        if bool(((box[:, 0] - margin <= high) & (low <= box[:, 1] + margin)).all()):
             return f"(keep-out {name})"
     return ""
