@@ -46,14 +46,20 @@ def fundamental_linear(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def fundamental_robust(
-    left: FloatArray, right: FloatArray, sigma_px: float, *, max_iterations: int = 10_000
+    left: FloatArray,
+    right: FloatArray,
+    sigma_px: float,
+    *,
+    max_iterations: int = 10_000,
+    refuse_plane: bool = True,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """``F`` (3, 3) and inliers ``(n,)`` of matches ``(n, 2)`` [px] with outliers; noise ``sigma_px`` [px] a
     coordinate.
 
     MAGSAC with a fixed seed, then refinement on the matches within 3.29 sigmas, until they stay the same:
     the same input gives the same output. Raises GeometryError where no F has eight inliers, or where a
-    homography explains the inliers as well (points of one plane leave F undetermined).
+    homography explains the inliers as well (points of one plane leave F undetermined), unless ``refuse_plane`` is
+    false: then ask :func:`parallax_ratio`.
     """
     if not sigma_px > 0:
         raise GeometryError("shape", f"sigma_px is {sigma_px}; it must be positive", sigma_px=sigma_px)
@@ -80,13 +86,12 @@ def fundamental_robust(
         if np.array_equal(again, inliers):
             break
         inliers = again
-    _refuse_plane(left[inliers], right[inliers], sigma_px)
+    if refuse_plane:
+        _refuse_plane(left[inliers], right[inliers], sigma_px)
     return F, inliers
 
 
-def _sampled(
-    left: FloatArray, right: FloatArray, threshold: float, max_iterations: int
-) -> FloatArray | None:
+def _sampled(left: FloatArray, right: FloatArray, threshold: float, max_iterations: int) -> FloatArray | None:
     """``F`` (3, 3) by MAGSAC, where its search ends without a model by least median of squares; None where neither
     finds one.
     """
@@ -209,6 +214,24 @@ def epipolar_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> Fl
     )
     distances: FloatArray = value[:, None] / lengths
     return distances
+
+
+def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
+    """How many times larger, in variance, the misfit of one homography to matches (n, 2) [px] is than that of ``F``.
+
+    About 1 where the points lie on one plane or the cameras share a centre; each with its own degrees of freedom.
+    Infinite where no homography is found.
+    """
+    left, right = _matches(left, right)
+    H, _ = cv2.findHomography(left, right, 0)
+    if H is None:
+        return float("inf")
+    mapped = to_homogeneous(left) @ np.asarray(H).T
+    transfer = right - mapped[:, :2] / mapped[:, 2:]
+    # A transfer carries the left image's noise, too, stretched by the map.
+    of_plane = (transfer**2).sum() / (2 * len(left) - 8) / (1.0 + abs(np.linalg.det(H[:2, :2])))
+    of_pair = (sampson_distances(F, left, right) ** 2).sum() / max(1, len(left) - 7)
+    return float(of_plane / of_pair)
 
 
 def _refuse_plane(left: FloatArray, right: FloatArray, sigma_px: float) -> None:

@@ -70,8 +70,8 @@ FEW_OUTLIERS = 0.1
 """Share of pixels that a fit may leave out for its hypothesis to count."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 """Shares of outliers with which a fit serves to explain them."""
-KIND_BETTER = 3.0
-"""How many times better a joint's trial must fit the other kind."""
+KIND_BETTER = 1.25
+"""How many times better a joint's trial must fit the other kind; the fit of all joints decides then."""
 SUSPICIOUS_OUTLIERS = 0.01
 """Share of outliers from which a fit above the noise floor is looked into."""
 PLANAR_MODULI = 0.1
@@ -247,7 +247,7 @@ def _kind_hypotheses(trials: TrialData, views: Views) -> Iterator[Hypothesis]:
         way = trials.positions[stops, joint] - base[joint]
         other: Kind = "prismatic" if said == "revolute" else "revolute"
         least, instead = (best_start(kind, cameras, sights, way)[1] for kind in (said, other))
-        if not (least > GOOD_FIT and instead < least / KIND_BETTER):
+        if not instead < min(GOOD_FIT, least / KIND_BETTER):
             continue
         kinds = tuple(other if j == joint else kind for j, kind in enumerate(trials.joint_kinds))
         yield Hypothesis(
