@@ -226,18 +226,22 @@ def _joints(model: CellModel, rest: Residuals) -> str:
 
 
 def _quantities(model: CellModel) -> str:
-    rows: list[tuple[object, ...]] = []
-    open_: list[str] = []
+    """What no frame changes, with deviations; what only the images show is folded away, what is open is named."""
+    inner: list[tuple[object, ...]] = []
+    seen: list[tuple[object, ...]] = []
+    unknown: list[str] = []
     for quantity in gauge_free_quantities(model):
         if quantity.value is None:
-            open_.append(f"{quantity.name}: {quantity.reason}")
+            unknown.append(f"{quantity.name}: {quantity.reason}")
             continue
         deviation = "" if quantity.std is None else f"{quantity.std:.2g}"
-        rows.append((quantity.name, f"{quantity.value:.6g}", deviation, quantity.unit))
-    page = _table(("quantity", "value", "deviation", "unit"), rows)
-    if open_:
-        page += "<p>Not determined:</p><ul>" + "".join(f"<li>{_e(line)}</li>" for line in open_) + "</ul>"
-    return page
+        row = (quantity.name, f"{quantity.value:.6g}", deviation, quantity.unit)
+        (seen if " in " in quantity.name else inner).append(row)
+    head = ("quantity", "value", "deviation", "unit")
+    page = _table(head, inner) if inner else ""
+    if unknown:
+        page += "<p>Not determined:</p><ul>" + "".join(f"<li>{_e(line)}</li>" for line in unknown) + "</ul>"
+    return f"{page}<details><summary>As seen in the images</summary>{_table(head, seen)}</details>"
 
 
 def _cameras(report: CalibrationReport) -> str:
