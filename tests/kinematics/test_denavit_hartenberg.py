@@ -4,7 +4,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, ReadOutError, denavit_hartenberg
 from stereoservo_sim import synthetic
 from stereoservo_sim.exact_model import exact_model
@@ -57,18 +59,21 @@ def assert_rows_are_the_arm(cell, rows, rng):
         )
 
 
+def assert_zero_does_not_matter(cell, rows, rng):
+    elsewhere = cell.home + rng.uniform(-0.5, 0.5, len(cell.home))
+    again = numbers(denavit_hartenberg(exact_model(cell, zero=elsewhere), baseline(cell)))
+    difference = again - numbers(rows)
+    difference[:, [1, 2, 4]] = np.remainder(difference[:, [1, 2, 4]] + np.pi, 2 * np.pi) - np.pi
+    np.testing.assert_allclose(difference, 0, atol=1e-8)
+
+
 @pytest.mark.parametrize("maker", METRIC_ARMS)
 def test_rows_of_exact_models_are_the_arm(maker):
     rng = np.random.default_rng(1)
     cell = maker()
     rows = denavit_hartenberg(exact_model(cell), baseline(cell))
     assert_rows_are_the_arm(cell, rows, rng)
-    # The rows do not depend on where the model has its zero.
-    elsewhere = cell.home + rng.uniform(-0.5, 0.5, len(cell.home))
-    again = numbers(denavit_hartenberg(exact_model(cell, zero=elsewhere), baseline(cell)))
-    difference = again - numbers(rows)
-    difference[:, [1, 2, 4]] = np.sin(difference[:, [1, 2, 4]])
-    np.testing.assert_allclose(difference, 0, atol=1e-9)
+    assert_zero_does_not_matter(cell, rows, rng)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -93,6 +98,7 @@ def test_rows_of_random_chains(seed):
     )
     rows = denavit_hartenberg(exact_model(cell), baseline(cell))
     assert_rows_are_the_arm(cell, rows, rng)
+    assert_zero_does_not_matter(cell, rows, rng)
 
 
 @pytest.mark.parametrize(
@@ -169,3 +175,27 @@ def test_what_gives_no_rows_is_refused():
     with pytest.raises(ReadOutError, match="'affine'") as caught:
         denavit_hartenberg(exact_model(cell, stratum="affine"), baseline(cell))
     assert caught.value.code == "stratum"
+
+
+@pytest.mark.parametrize("maker", [synthetic.mixed, synthetic.rx90])
+def test_errors_over_seeds_are_as_large_as_stated(maker):
+    """Squared errors over the stated variances, entry by entry: chi-square over the seeds."""
+    cell, seeds = maker(), 8
+    known = KnownLength("markers", (10, 17), float(np.linalg.norm(cell.body[0] - cell.body[7])))
+    squares = []
+    for seed in range(seeds):
+        model = fit_model(cell.trials(0.1, np.random.default_rng([seed, 7])), epoch=1).model
+        rows = denavit_hartenberg(model, known)
+        errors = numbers(rows) - numbers(denavit_hartenberg(exact_model(cell), known))
+        errors[:, [1, 4]] = np.remainder(errors[:, [1, 4]] + np.pi, 2 * np.pi) - np.pi
+        stds = np.array([[getattr(row, f"{column}_std") for column in COLUMNS] for row in rows])
+        measured = np.array([[column not in row.chosen for column in COLUMNS] for row in rows])
+        assert (stds[~measured] == 0).all()
+        np.testing.assert_allclose(errors[~measured], 0, atol=1e-9)
+        squares.append((errors[measured] / stds[measured]) ** 2)
+        # Beyond 4.5 sigmas: seven in a million.
+        assert squares[-1].max() < 4.5**2
+    single = np.sum(squares, axis=0)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], seeds)
+    assert (single > low).all()
+    assert (single < high).all()

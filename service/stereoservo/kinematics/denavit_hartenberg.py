@@ -13,7 +13,7 @@ Conventions, where the classical ones leave a choice or fail:
   a small second angle β takes its place (Hayati): x goes from the end of the row before, square to axis j, to axis
   j+1;
 - prismatic joints have no place: their axis is led through the end of the row before (``a = 0``), and through the
-  first revolute axis where they begin the chain;
+  first revolute axis where they begin the chain; where it is parallel to its neighbour, x goes on as it was;
 - the base's frame is free: theta and d of row 1 are 0, and so is the d with which the first axis of another direction
   leaves those parallel to the first. What is behind the last axis is the tool's: that row is 0.
 
@@ -40,6 +40,7 @@ from stereoservo.kinematics.axes import (
     joint_axes,
     unit,
 )
+from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import standard_deviations
 from stereoservo.kinematics.model import CellModel
 
@@ -112,7 +113,7 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
     """
     _check_known(model, known)
     parts = framed(model)
-    axes = joint_axes(parts.kinds, parts.generators)
+    axes = axes_at_origin(parts)
     links = conventions(parts)
 
     def read(candidate: CellModel) -> FloatArray:
@@ -176,8 +177,10 @@ def chosen_columns(axes: Axes, links: tuple[Convention, ...]) -> tuple[tuple[str
     rows = []
     for j, convention in enumerate(links):
         names = set(by_link[convention.link])
-        if convention.link == "to_prismatic" and not _parallel(*axes.directions[j : j + 2]):
-            names.add("beta")
+        if convention.link == "to_prismatic":
+            names.add("theta" if _parallel(*axes.directions[j : j + 2]) else "beta")
+        if j < first and convention.link == "parallel":
+            names.add("theta")
         if j == 0:
             names |= {"d", "theta"}
         if j < first:
@@ -192,8 +195,8 @@ def dh_values(
     parts: FramedModel, links: tuple[Convention, ...], known: KnownLength, names: CellModel
 ) -> FloatArray:
     """``a, α, β, d, θ`` and the prismatic scale (n, 6) in metres; ``names``: a model with the names of ``known``."""
-    axes = joint_axes(parts.kinds, parts.generators)
-    table = dh_table(axes, parts.zero, links)
+    axes = axes_at_origin(parts)
+    table = dh_table(axes, links)
     with np.errstate(divide="ignore", invalid="ignore"):
         metres = np.float64(known.metres) / _length(parts, axes, table, known, names)
         table[:, [0, 3]] *= metres
@@ -263,9 +266,9 @@ class Convention:
 
 def conventions(parts: FramedModel) -> tuple[Convention, ...]:
     """How each link of a mechanism is told, by the module's conventions."""
-    axes = joint_axes(parts.kinds, parts.generators)
+    axes = axes_at_origin(parts)
     plain = tuple(Convention(_link_kind(axes, j)) for j in range(len(axes.kinds)))
-    table = dh_table(axes, parts.zero, plain)
+    table = dh_table(axes, plain)
     # An arm whose axes all meet has no size of its own: then that of the body that it carries.
     body = float(np.linalg.norm(np.ptp(parts.points[:, :3], axis=0)))
     size = max(body, float(np.abs(table[:, [0, 3]]).max()))
@@ -293,24 +296,26 @@ def _parallel(u: FloatArray, v: FloatArray) -> bool:
     return bool(min(angle, float(np.pi) - angle) < PARALLEL)
 
 
-def dh_table(axes: Axes, zero: FloatArray, links: tuple[Convention, ...]) -> FloatArray:
-    """Rows (n, 5) ``a, α, β, d, θ`` in the lengths of the frame; offsets of row j's joint at position 0."""
+def axes_at_origin(parts: FramedModel) -> Axes:
+    """The axes with all joints at position 0, wherever the model has its zero (5.21)."""
+    chain = ProjectiveChain(parts.kinds, parts.generators, parts.zero)
+    return joint_axes(parts.kinds, chain.operators_at(np.zeros(len(parts.kinds))))
+
+
+def dh_table(axes: Axes, links: tuple[Convention, ...]) -> FloatArray:
+    """Rows (n, 5) ``a, α, β, d, θ`` in the lengths of the frame, of `axes_at_origin`."""
     n = len(axes.kinds)
     table = np.zeros((n, 5))
-    origin = _base_origin(axes, zero)
+    origin = _base_origin(axes)
     x: FloatArray | None = None
     for j in range(n):
         z = axes.directions[j]
-        # Where joint j takes the end of the row before at the zero.
-        shift = 0.0 if axes.kinds[j] == "revolute" else float(axes.scales[j] * zero[j])
-        start = origin + shift * z
-        foot, along, after = _link(axes, j, links[j], start, x)
-        if j > 0 and links[j].link != "last":
-            before = _square_to(z, x)
-            table[j, 3] = float((foot - start) @ z)
-            angle = float(np.arctan2(np.cross(before, along) @ z, before @ along))
-            table[j, 4] = angle if axes.kinds[j] == "prismatic" else _wrapped(angle - zero[j])
+        before = _square_to(z, x)
+        foot, along, after = _link(axes, j, links[j], origin, before)
         table[j, :3] = after
+        if j > 0:
+            table[j, 3] = float((foot - origin) @ z)
+            table[j, 4] = float(np.arctan2(np.cross(before, along) @ z, before @ along))
         y = np.cross(z, along)
         ca, sa, cb, sb = np.cos(after[1]), np.sin(after[1]), np.cos(after[2]), np.sin(after[2])
         # First column of Rx(α) Ry(β) in the frame (along, y, z).
@@ -320,24 +325,26 @@ def dh_table(axes: Axes, zero: FloatArray, links: tuple[Convention, ...]) -> Flo
 
 
 def _link(
-    axes: Axes, j: int, convention: Convention, start: FloatArray, x: FloatArray | None
+    axes: Axes, j: int, convention: Convention, start: FloatArray, before: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where link j leaves its axis (3,), its x (3,), and ``a, α, β`` (3,)."""
+    """Where link j leaves its axis (3,), its x (3,), and ``a, α, β`` (3,).
+
+    ``start``, ``before`` (3,): the end of the row before and its x.
+    """
     z = axes.directions[j]
     if convention.link == "last":
-        return start, _square_to(z, x), np.zeros(3)
+        return start, before, np.zeros(3)
     z_next, c_next = axes.directions[j + 1], axes.points[j + 1]
     if convention.link == "to_prismatic":
         if _parallel(z, z_next):
-            along = _square_to(z, x)
-            return start, along, np.array([0.0, *_two_angles(z, along, z_next)])
+            return start, before, np.array([0.0, *_two_angles(z, before, z_next)])
         return start, unit(np.cross(z, z_next)), np.array([0.0, axis_angle(z, z_next), 0.0])
     if convention.link == "parallel":
         # Where the next axis meets the plane through the start square to this one.
         arm = c_next + z_next * ((start - c_next) @ z / (z_next @ z)) - start
         length = float(np.linalg.norm(arm))
         # A slide led through the axis that it carries: nothing to point at.
-        along = unit(arm) if length > 1e-9 * float(np.linalg.norm(start) + 1.0) else _square_to(z, x)
+        along = unit(arm) if length > 1e-9 * float(np.linalg.norm(start) + 1.0) else before
         return start, along, np.array([length, *_two_angles(z, along, z_next)])
     own = start if axes.kinds[j] == "prismatic" else axes.points[j]
     foot, foot_next = common_normal(own, z, c_next, z_next)
@@ -352,11 +359,6 @@ def _two_angles(z: FloatArray, x: FloatArray, z_next: FloatArray) -> tuple[float
     beta = float(np.arcsin(np.clip(z_next @ x, -1.0, 1.0)))
     alpha = float(np.arctan2(-(z_next @ y), z_next @ z))
     return float(np.remainder(alpha + 0.5 * np.pi, 2 * np.pi) - 0.5 * np.pi), beta
-
-
-def _wrapped(angle: float) -> float:
-    """``angle`` [rad] in [-π, π)."""
-    return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi)
 
 
 def _square_to(z: FloatArray, x: FloatArray | None) -> FloatArray:
@@ -381,11 +383,10 @@ def base_leaves(axes: Axes) -> tuple[int, int]:
     return placed[0], n
 
 
-def _base_origin(axes: Axes, zero: FloatArray) -> FloatArray:
+def _base_origin(axes: Axes) -> FloatArray:
     """The base's origin (3,), free by nature: chosen so that no row tells a length that is only its choice.
 
-    On the first revolute axis, at the height at which the first axis of another direction leaves those parallel to
-    it; with leading prismatic joints, so that these bring it there.
+    On the first revolute axis, at the height at which the first axis of another direction leaves those parallel to it.
     """
     first, last = base_leaves(axes)
     if first == len(axes.kinds):
@@ -398,6 +399,4 @@ def _base_origin(axes: Axes, zero: FloatArray) -> FloatArray:
         )
         z = axes.directions[first]
         anchor = anchor + z * ((foot - anchor) @ z)
-    slides = (axes.scales[:first] * zero[:first]) @ axes.directions[:first]
-    result: FloatArray = anchor - slides
-    return result
+    return np.asarray(anchor, dtype=np.float64)

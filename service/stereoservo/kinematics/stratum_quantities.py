@@ -12,9 +12,14 @@ from stereoservo.kinematics.axes import (
     axis_angle,
     camera_intrinsics,
     euclidean_centres,
-    joint_axes,
 )
-from stereoservo.kinematics.denavit_hartenberg import Convention, chosen_columns, conventions, dh_table
+from stereoservo.kinematics.denavit_hartenberg import (
+    Convention,
+    axes_at_origin,
+    chosen_columns,
+    conventions,
+    dh_table,
+)
 from stereoservo.kinematics.image_quantities import Group
 from stereoservo.kinematics.model import CellModel
 
@@ -25,8 +30,8 @@ INDEPENDENT = 1e-3
 PARALLEL = 1e-2
 """Sine of the angle [affine frame] up to which axes of an affine model count as parallel."""
 
-LEAST = 1e-2
-"""Smallest length of the arm, as a share of the cell's largest, that may serve as the unit of ratios."""
+LEAST = 0.1
+"""Smallest length of the arm, as a share of the cell's largest, that may be the unit of ratios: noise must not be."""
 
 
 def affine_quantities(model: CellModel, parts: FramedModel) -> list[Group]:
@@ -197,8 +202,8 @@ def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]
         names += [(label + part, "°") for part in parts_of]
 
     def values(parts: FramedModel) -> FloatArray:
-        axes = joint_axes(parts.kinds, parts.generators)
-        table = dh_table(axes, parts.zero, links)
+        axes = axes_at_origin(parts)
+        table = dh_table(axes, links)
         out: list[float] = []
         for j, (u, v) in enumerate(pairwise(axes.directions)):
             out += list(table[j, 1:3]) if two[j] else [axis_angle(u, v)]
@@ -231,7 +236,7 @@ def _named_lengths(
     model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
 ) -> list[tuple[str, bool]]:
     """Name of each measured length and whether it is the arm's; an empty name: set by convention."""
-    chosen_of = chosen_columns(joint_axes(parts.kinds, parts.generators), links)
+    chosen_of = chosen_columns(axes_at_origin(parts), links)
     names: list[tuple[str, bool]] = []
     for j, joint in enumerate(model.joint_names):
         chosen = chosen_of[j]
@@ -247,8 +252,8 @@ def _named_lengths(
 
 
 def _measured_lengths(parts: FramedModel, links: tuple[Convention, ...]) -> FloatArray:
-    axes = joint_axes(parts.kinds, parts.generators)
-    table = dh_table(axes, parts.zero, links)
+    axes = axes_at_origin(parts)
+    table = dh_table(axes, links)
     arm = np.column_stack([table[:, 0], table[:, 3], np.nan_to_num(axes.scales)]).ravel()
     centres = euclidean_centres(parts.cameras)
     points = parts.points[:, :3]
