@@ -132,7 +132,7 @@ def _pair_lenses(
         return bent
     # Detectors misjudge their noise: what is left beside the lens counts as noise.
     noise = sigmas * max(1.0, typical)
-    bent, cost, _ = _refined(raw, noise, started, F, free, bound=max(least, 1.0))
+    _, cost, _ = _refined(raw, noise, bent, F, (), bound=max(least, 1.0))
     _, without, _ = _refined(raw, noise, lenses, straight[0], (), bound=max(least, 1.0))
     if not without - cost > START_GAIN or np.abs(bent[:, 0]).max() > MOST_BEND:
         return None

@@ -109,17 +109,15 @@ def lens_test(solution: Solution) -> LensTest:
     """Chi-square of the radial parameters of all cameras against zero.
 
     With pinholes the score test: what freeing them would gain, to first order. With free lenses Wald's: the
-    estimates against their covariance. Both relative to the noise left, where that is above the stated one.
+    estimates against their covariance, centres fixed, for without a radial parameter a centre explains nothing. Both
+    relative to the noise left, where that is above the stated one.
     """
     c = len(solution.rig.lenses)
-    radial = solution.lenses if solution.lenses != "none" else "radial"
     charts = replace(
-        solution.charts,
-        lenses=full_charts(solution.rig, solution.stratum, lenses=radial).lenses,
+        solution.charts, lenses=full_charts(solution.rig, solution.stratum, lenses="radial").lenses
     )
     whole = triangle_of(solution.rig, charts, solution.data)
-    each = len(charts.lenses[0])
-    own = charts.start(2) + each * np.arange(c)
+    own = charts.start(2) + np.arange(c)
     others = np.setdiff1d(np.arange(charts.size), own)
     last = np.asarray(np.linalg.qr(whole[:, [*others, *own, charts.size]], mode="r"))[
         len(others) :, len(others) :
