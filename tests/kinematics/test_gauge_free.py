@@ -103,7 +103,7 @@ def test_nearly_parallel_axes_are_told_by_two_angles_with_signs():
     cell = synthetic.rx90()
     found = values(exact_model(cell))
     assert found["angle of axes j2 j3 about their normal"] == pytest.approx(0.0, abs=1e-9)
-    assert found["angle of axes j2 j3 in their plane"] == pytest.approx(0.0, abs=1e-9)
+    assert found["angle of axes j2 j3 within their plane"] == pytest.approx(0.0, abs=1e-9)
     assert "angle of axes j2 j3" not in found
     assert found["a of j2 over d of j4"] == pytest.approx(0.5)
 

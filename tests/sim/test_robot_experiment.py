@@ -9,7 +9,7 @@ import pytest
 from stereoservo.cli import main as cli
 from stereoservo.kinematics.axes import framed
 from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.experiments.robot import QUANTITIES, _mean_length, cramer_rao, tables, tables_of
+from stereoservo_sim.experiments.robot import QUANTITIES, mean_length, cramer_rao, tables, tables_of
 from stereoservo_sim.experiments.robot_report import draw_robot, run_robot
 from stereoservo_sim.experiments.thesis_robot import (
     LARGEST_ANGLE_ERROR,
@@ -67,13 +67,13 @@ def test_tables_do_not_depend_on_the_scale():
     np.testing.assert_allclose(tables_of(larger, exact), tables_of(parts, exact), rtol=1e-12, atol=1e-9)
 
 
-def test_mean_length_of_gaussian_vectors():
+def testmean_length_of_gaussian_vectors():
     rng = np.random.default_rng(1)
     covariances = np.array([np.diag([4.0, 1.0]), np.eye(2), [[2.0, 1.2], [1.2, 1.0]]])
     samples = np.array([rng.multivariate_normal([0, 0], C, 200_000) for C in covariances])
     lengths = np.linalg.norm(samples, axis=2)
     expected = lengths.mean(axis=1)
-    assert _mean_length(covariances) == pytest.approx(expected, abs=4 * lengths.std() / np.sqrt(200_000))
+    assert mean_length(covariances) == pytest.approx(expected, abs=4 * lengths.std() / np.sqrt(200_000))
 
 
 def test_bound_halves_with_the_noise_and_falls_with_the_stops():

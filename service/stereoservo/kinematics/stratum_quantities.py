@@ -198,7 +198,7 @@ def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]
     names: list[tuple[str, str]] = []
     for (a, b), signed in zip(pairwise(model.joint_names), two, strict=False):
         label = f"angle of axes {a} {b}"
-        parts_of = (" about their normal", " in their plane") if signed else ("",)
+        parts_of = (" about their normal", " within their plane") if signed else ("",)
         names += [(label + part, "°") for part in parts_of]
 
     def values(parts: FramedModel) -> FloatArray:

@@ -149,9 +149,9 @@ def image_errors(
     n = len(trials.joint_names)
     return ImageErrors(
         _means(np.linalg.norm(fixed.residuals.reshape(-1, 2), axis=1) * data.sigmas, of_joint, n),
-        _means(_mean_length(fixed_spread) * data.sigmas, of_joint, n),
+        _means(mean_length(fixed_spread) * data.sigmas, of_joint, n),
         _means(np.linalg.norm(free, axis=1) * data.sigmas, of_joint, n),
-        _means(_mean_length(free_spread) * data.sigmas, of_joint, n),
+        _means(mean_length(free_spread) * data.sigmas, of_joint, n),
         free,
         of_joint,
     )
@@ -194,7 +194,7 @@ def _remaining(jacobian: FloatArray, disturbance: FloatArray | None = None) -> F
     return result
 
 
-def _mean_length(covariances: FloatArray) -> FloatArray:
+def mean_length(covariances: FloatArray) -> FloatArray:
     """Mean length (k,) of Gaussian vectors with covariances (k, 2, 2): ``√(2 λ₁/π) E(1 - λ₂/λ₁)``."""
     values = np.maximum(np.linalg.eigvalsh(covariances), 0.0)
     return np.asarray(np.sqrt(2 * values[:, 1] / np.pi) * ellipe(1.0 - values[:, 0] / values[:, 1]))

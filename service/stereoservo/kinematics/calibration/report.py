@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective, upper_triangular
+from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
+from stereoservo.kinematics.axes import camera_intrinsics
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, predicted
 from stereoservo.kinematics.calibration.charts import LensModel
 from stereoservo.kinematics.calibration.lenses import lens_test
@@ -281,8 +282,8 @@ def _covariance(
 
 def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
     """fx, skew, fy, u0, v0 [px] of a camera (3, 4) in a Euclidean frame."""
-    K, _ = upper_triangular(matrix[:, :3])
-    return float(K[0, 0]), float(K[0, 1]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    fx, skew, fy, u0, v0 = (float(value) for value in camera_intrinsics(matrix))
+    return fx, skew, fy, u0, v0
 
 
 def _left_intrinsics_std(solution: Solution) -> tuple[float, ...]:
