@@ -141,6 +141,7 @@ def test_command(capfd):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_efficiency_over_two_hundred_seeds():
     """Errors against the bound, pooled over 4200 numbers: chi-square at 1 %."""
     found = run_robot(seeds=200, seed=11)
