@@ -15,6 +15,7 @@ from stereoservo.kinematics.calibration import upgrade
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, solve
 from stereoservo.kinematics.calibration.charts import LensModel
 from stereoservo.kinematics.calibration.lenses import lens_test
+from stereoservo.kinematics.calibration.other_axes import with_other_axes
 from stereoservo.kinematics.calibration.statistics import (
     covariance_root,
     generator_noise,
@@ -53,12 +54,13 @@ DEFAULTS = FitOptions()
 
 NOMINAL_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
 """Infinity of the canonical frame's nominal cameras."""
-FINISHED, FINISH_EVALUATIONS = 2, 400
+FINISHED, FINISH_EVALUATIONS = 4, 400
 """How many of the bundles that have not converged are solved to their end, and how long."""
-LOOSE_SPREAD = 0.5
+LOOSE_SPREAD = 0.75
 """Relative deviation of depths and focal lengths beyond which linear statistics say nothing any more."""
-NESTED_TAIL = 1e-6
-"""Probability with which a true constraint is taken for a wrong one."""
+PLAUSIBLE_TAIL, NESTED_TAIL = 1e-3, 1e-6
+"""Probabilities with which a true constraint costs so much that other starts are tried, and that it is taken for a
+wrong one."""
 
 
 @dataclass
@@ -67,14 +69,16 @@ class Judge:
 
     A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
     is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
-    nearly. ``bent``: pinholes with free lenses would have met them. ``unfinished``: bundles that may still get
-    there; ``loose``: good fits that say little of the stratum.
+    nearly. ``bent``: pinholes with free lenses would have met them. ``tolerable``: dear
+    ones, taken if no start finds a better; ``unfinished``: bundles that may still get there; ``loose``: good fits
+    that say little of the stratum.
     """
 
     projective: Solution
     options: FitOptions
     notes: list[str] = field(default_factory=list)
     reserve: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    tolerable: list[tuple[Solution, FloatArray]] = field(default_factory=list)
     unfinished: list[tuple[Solution, FloatArray]] = field(default_factory=list)
     loose: list[tuple[Solution, FloatArray]] = field(default_factory=list)
     hopeless: bool = False
@@ -88,18 +92,20 @@ class Judge:
             # A good fit that leaves directions wide open, converged along them or not: so will any other.
             open_ones = rank_of(solution) < solution.charts.size
             wide = open_ones or max(_spreads(solution).values()) > LOOSE_SPREAD
-            self.hopeless = self._close(solution) and (wide or solution.converged)
-            (self.loose if self.hopeless else self.unfinished).append((solution, plane))
+            done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
+            self.hopeless = self._close(solution) and (wide or done)
+            kept = self.loose if self.hopeless or solution.converged else self.unfinished
+            kept.append((solution, plane))
             return False
         if not solution.converged:
             self._note(solution, f"no convergence in {solution.evaluations} evaluations")
             self.unfinished.append((solution, plane))
             return False
-        fewer = self.projective.charts.size - solution.charts.size
-        beside = max(1.0, variance_factor(self.projective))
-        allowed = float(chi2_distribution.isf(NESTED_TAIL, max(1, fewer))) * beside
-        if solution.cost - self.projective.cost <= allowed:
+        if not self._worse(solution, PLAUSIBLE_TAIL):
             return True
+        if not self._worse(solution, NESTED_TAIL):
+            self.tolerable.append((solution, plane))
+            return False
         self.bent = self.bent or (solution.lenses == "none" and lens_test(solution).distorted)
         # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
         self.hopeless = any(
@@ -109,7 +115,7 @@ class Judge:
         return False
 
     def finished(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
-        """The best of the unfinished bundles solved to its end, if it passes then."""
+        """The first of the unfinished bundles, solved to their ends, that passes."""
         candidates, self.unfinished = sorted(self.unfinished, key=lambda entry: entry[0].cost)[:FINISHED], []
         for solution, plane in candidates:
             if self.hopeless:
@@ -117,6 +123,28 @@ class Judge:
             final = _to_the_end(solution, data)
             if self.passes(final, plane):
                 return final, plane
+        return None
+
+    def best_tolerable(self) -> tuple[Solution, FloatArray] | None:
+        """The best of those whose constraints cost much, but not too much."""
+        tolerable, self.tolerable = self.tolerable, []
+        return min(tolerable, key=lambda entry: entry[0].cost) if tolerable else None
+
+    def turned(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+        """The best bundle so far with other axes for single joints, if one passes then."""
+        reached = [entry for entry in (*self.reserve, *self.loose, *self.tolerable) if entry[0].converged]
+        if not reached:
+            return None
+        solution, plane = min(reached, key=lambda entry: entry[0].cost)
+        if not self._worse(solution, PLAUSIBLE_TAIL) or not self._close(solution):
+            return None
+        for rig in with_other_axes(solution):
+            try:
+                again = solve(rig, data, "metric", lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS)
+            except np.linalg.LinAlgError:
+                continue  # the new axis takes a marker into a focal plane
+            if self.passes(again, plane):
+                return again, plane
         return None
 
     def last_resort(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
@@ -127,10 +155,14 @@ class Judge:
         projective = solve(self.projective.rig, data, "projective", lenses=self.projective.lenses)
         if projective.converged and rank_of(projective) == projective.charts.size:
             return None
-        for solution, plane in self.loose:
+        for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _to_the_end(solution, data)
             spread = max(_spreads(final).values()) if rank_of(final) == final.charts.size else np.inf
-            if final.converged and self._close(final) and spread <= LOOSE_SPREAD:
+            if (
+                final.converged
+                and spread <= LOOSE_SPREAD
+                and not self._worse(final, PLAUSIBLE_TAIL, projective)
+            ):
                 self.notes.append(
                     f"the {final.stratum} stratum is taken because the projective bundle leaves directions open; "
                     f"{self._unidentified(final) or 'its spread is small'}"
@@ -154,6 +186,13 @@ class Judge:
             "the model only nearly (lens distortion, play, positions)"
         )
         return (solution, plane) if certain or self._close(solution) else None
+
+    def _worse(self, solution: Solution, tail: float, projective: Solution | None = None) -> bool:
+        """Whether the constraints cost more chi-square than true ones do but for ``tail`` of cases."""
+        beside = projective or self.projective
+        fewer = max(1, beside.charts.size - solution.charts.size)
+        allowed = float(chi2_distribution.isf(tail, fewer)) * max(1.0, variance_factor(beside))
+        return solution.cost - beside.cost > allowed
 
     def _close(self, solution: Solution) -> bool:
         beside = max(1.0, variance_factor(self.projective))
@@ -249,7 +288,7 @@ def upgraded(solution: Solution, data: Measurements, options: FitOptions) -> Upg
             return Upgraded(metric, plane, (), False)
         if judge.hopeless:
             break
-    done = judge.finished(data)
+    done = judge.finished(data) or judge.turned(data) or judge.best_tolerable()
     if done is not None:
         return Upgraded(*done, (), False)
     second = judge.second_best(unique and _several_directions(solution.rig, finite[0], noise))
@@ -271,7 +310,7 @@ def upgraded(solution: Solution, data: Measurements, options: FitOptions) -> Upg
                 return Upgraded(affine, plane, tuple(judge.notes), judge.bent)
             if judge.hopeless:
                 break
-        done = judge.finished(data)
+        done = judge.finished(data) or judge.best_tolerable()
         if done is not None:
             return Upgraded(*done, tuple(judge.notes), judge.bent)
         second = judge.second_best(unique) or judge.last_resort(data)

@@ -1,0 +1,109 @@
+"""Other axes for the joints of a metric bundle: a flat target may have led one into a minimum of its own.
+
+A plate that turns nearly in its own plane tells its axis by small perspective effects only, and two axes may explain
+it almost alike. With cameras and markers known, each joint's trial is searched over all directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, solve
+from stereoservo.kinematics.calibration.rig import partial_products
+
+FloatArray = npt.NDArray[np.float64]
+
+STILL = 2e-3
+"""How far other joints may stray [rad or m] at the stops of a joint's own trial."""
+GAIN = 8.0
+"""Chi-square by which another axis must explain a joint's trial better to be tried in the whole bundle."""
+DIRECTIONS = np.array(
+    [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
+)
+"""26 directions (26, 3) to start from: faces, edges and corners of a cube."""
+
+
+def with_other_axes(solution: Solution) -> list[Rig]:
+    """Metric rigs in which revolute joints turn about axes that explain their own trials better, most joints first.
+
+    Empty where no joint has a better one.
+    """
+    better: dict[int, FloatArray] = {}
+    for joint, kind in enumerate(solution.rig.kinds):
+        if kind == "revolute":
+            generator = _better_generator(solution, joint)
+            if generator is not None:
+                better[joint] = generator
+    rigs = []
+    for joints in [tuple(better), *([(joint,) for joint in better] if len(better) > 1 else [])]:
+        if joints:
+            generators = solution.rig.generators.copy()
+            for joint in joints:
+                generators[joint] = better[joint]
+            rigs.append(replace(solution.rig, generators=generators))
+    return rigs
+
+
+def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
+    """A generator (4, 4) that explains a joint's trial better, cameras and markers as they are; or None."""
+    rig, data = solution.rig, solution.data
+    used = np.unique(data.stop)
+    base = np.median(data.offsets[used], axis=0)
+    still = (np.delete(np.abs(data.offsets - base), joint, axis=1) <= STILL).all(axis=1)
+    own = data.select(still[data.stop])
+    way = data.offsets[:, joint]
+    span = float(np.ptp(way[still])) if still.any() else 0.0
+    if span == 0.0:
+        return None
+    base[joint] = 0.0
+    before, after = partial_products(rig, base[None])
+    single = Rig(
+        ("revolute",),
+        rig.generators[joint : joint + 1],
+        rig.cameras @ before[joint, 0],
+        rig.points @ after[joint + 1, 0].T,
+        rig.lenses,
+    )
+    own = replace(own, offsets=data.offsets[:, joint : joint + 1], lens_priors=None)
+    now = _solved(single, own)
+    middles = [_middle(single, float(end)) for end in (way[still].min(), way[still].max())]
+    best: Solution | None = None
+    for direction in DIRECTIONS:
+        start = replace(single, generators=_twist(direction, middles, span)[None])
+        try:
+            fit = _solved(start, own)
+        except np.linalg.LinAlgError:
+            continue  # the axis takes a marker into a focal plane
+        if best is None or fit.cost < best.cost:
+            best = fit
+    return best.rig.generators[0] if best is not None and best.cost < now.cost - GAIN else None
+
+
+def _solved(rig: Rig, data: Measurements) -> Solution:
+    return solve(rig, data, "metric", cameras=False, points=False, max_evaluations=40, tolerance=1e-4)
+
+
+def _middle(rig: Rig, angle: float) -> FloatArray:
+    """Middle (3,) of a single joint's markers at ``angle``."""
+    _, after = partial_products(rig, np.array([[angle]]))
+    points = rig.points @ after[0, 0].T
+    return np.asarray((points[:, :3] / points[:, 3:]).mean(axis=0))
+
+
+def _twist(direction: FloatArray, middles: list[FloatArray], span: float) -> FloatArray:
+    """Unit twist (4, 4) about a ``direction`` (3,) that takes the markers' middle over the trial as seen.
+
+    The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
+    """
+    axis = direction / np.linalg.norm(direction)
+    chord = middles[1] - middles[0]
+    chord = chord - axis * (axis @ chord)
+    centre = 0.5 * (middles[0] + middles[1]) + 0.5 * np.cross(axis, chord) / np.tan(0.5 * span)
+    x, y, z = axis
+    twist = np.zeros((4, 4))
+    twist[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    twist[:3, 3] = -np.cross(axis, centre)
+    return twist
