@@ -43,6 +43,8 @@ Progress = Callable[[str, float], None]
 
 FLOOR = 1.5
 """Variance factor up to which a bundle that has not converged walks along an open valley, not towards a fit."""
+FEW_OUTLIERS = 0.05
+"""Share of outliers that may still change in a bundle that has not converged."""
 MIN_SIGHTINGS = 2
 """Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 
@@ -170,8 +172,10 @@ def _projective(
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.
     solution, inliers = settled(robust.rig, every, "projective", options, lenses, 1e-6)
-    if decided or lenses == "none" or lens_test(solution).distorted:
+    if decided or lens_test(solution).distorted == (lenses == FREE_LENS):
         return solution, inliers
+    if lenses == "none":
+        return settled(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
     return settled(straightened(solution.rig, every), every, "projective", options, "none", 1e-6)
 
 
@@ -260,6 +264,10 @@ def settled(
             break
         inliers = again
     else:
+        if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
+            # A projective bundle on its way along an open valley: a higher stratum may close it. Whether the last
+            # solution has converged is asked at the end.
+            return solution, inliers
         raise CalibrationError(
             "no_convergence",
             f"the set of outliers does not settle: {int((~inliers).sum())} of {len(inliers)} pixels in the "
