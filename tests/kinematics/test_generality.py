@@ -11,7 +11,7 @@ from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import propagated
-from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, denavit_hartenberg
+from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, ReadOutError, denavit_hartenberg
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo_sim import synthetic
 from stereoservo_sim.exact_model import exact_model
@@ -140,11 +140,14 @@ def test_gauge_free_quantities_are_the_truth_within_their_deviations(fitted):
     assert (None in truth.values()) == (len(truth) > len(errors))
 
 
-def test_rows_are_the_truth_within_their_deviations(fitted):
-    if fitted.stratum != "metric":
-        pytest.skip("Denavit-Hartenberg rows need the metric stratum")
+def test_rows_are_the_truth_within_their_deviations_or_refused(fitted):
     cell = fitted.cell
     known = KnownLength("markers", (10, 17), float(np.linalg.norm(cell.body[0] - cell.body[7])))
+    if fitted.stratum != "metric":
+        with pytest.raises(ReadOutError) as caught:
+            denavit_hartenberg(fitted.model, known)
+        assert caught.value.code == "stratum"
+        return
     rows = denavit_hartenberg(fitted.model, known)
     truth = denavit_hartenberg(exact_model(cell, zero=fitted.model.zero), known)
     for row, exact in zip(rows, truth, strict=True):
