@@ -106,7 +106,7 @@ def assert_efficient(found, share=0.01):
 
 
 def test_estimates_are_efficient_and_say_so():
-    assert_efficient([assess(name, SIGMAS[k % 4], 300 + k) for k, name in enumerate(2 * ARMS)], share=0.001)
+    assert_efficient([assess(name, SIGMAS[k % 4], 300 + k) for k, name in enumerate(ARMS)], share=0.001)
 
 
 @pytest.mark.slow
@@ -137,20 +137,20 @@ def metric_quantities(model):
 
 
 def test_propagated_is_the_sample_covariance():
-    """50 fits of one cell: the spread of metric quantities is the one each fit reports."""
+    """30 fits of one cell: the spread of metric quantities is the one each fit reports."""
     cell = synthetic.mixed()
     values, reported = [], []
-    for seed in range(50):
+    for seed in range(30):
         model = fit_model(cell.trials(0.1, np.random.default_rng(700 + seed), stops=6), epoch=1).model
         found, covariance = propagated(model, metric_quantities)
         assert np.allclose(standard_deviations(model, metric_quantities) ** 2, np.diag(covariance))
         values.append(found)
         reported.append(covariance)
     spread, mean = np.cov(np.array(values).T), np.mean(reported, axis=0)
-    # 49 freedoms: a sample variance has a relative deviation of 20 %.
-    assert np.diag(spread) == pytest.approx(np.diag(mean), rel=0.8)
+    # 29 freedoms: a sample variance has a relative deviation of 26 %.
+    assert np.diag(spread) == pytest.approx(np.diag(mean), rel=1.0)
     whitened = np.linalg.solve(np.linalg.cholesky(mean), (np.array(values) - np.mean(values, axis=0)).T)
-    total, freedom = float((whitened**2).sum()), 49 * len(mean)
+    total, freedom = float((whitened**2).sum()), 29 * len(mean)
     low, high = chi2_distribution.ppf([0.0005, 0.9995], freedom)
     assert low < total < high
 

@@ -334,7 +334,7 @@ def damaged(case, cell, trials, rng):
         ("blind camera", {"too_few_markers"}),
         ("two markers", {"too_few_markers"}),
         ("one view twice", {"no_baseline"}),
-        ("noise", {"views_unrelated"}),
+        ("noise", {"views_unrelated", "views_degenerate"}),
         ("camera bumped", {"camera_moved"}),
         ("wrong positions", {"too_many_outliers", "residual_above_floor", "no_convergence"}),
         ("wrong kind", {"joint_kind", "too_many_outliers", "residual_above_floor"}),

@@ -92,6 +92,7 @@ def test_strong_distortion_over_many_seeds(name):
     assert chi2_within(*check_seeds(name, range(1000, 1030)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rx90", "wide"])
 def test_strong_distortion_left_out_gives_no_model(name):
     cell = wide_angle(-0.3) if name == "wide" else synthetic.rx90().with_k1(-0.3)
@@ -99,7 +100,7 @@ def test_strong_distortion_left_out_gives_no_model(name):
         fit_model(cell.trials(0.05, np.random.default_rng(51)), epoch=1, options=FitOptions(lens="none"))
 
 
-@pytest.mark.parametrize("name", ["gantry_with_wrist", "offset_wrist"])
+@pytest.mark.parametrize("name", ["gantry_with_wrist", pytest.param("offset_wrist", marks=pytest.mark.slow)])
 def test_distortion_that_kinematics_absorb_spoils_the_cameras_and_is_flagged(name):
     """A residual below a tenth of a pixel, principal points 60 px off by dozens of stated deviations: flagged."""
     cell = getattr(synthetic, name)().with_k1(-0.3)
