@@ -10,16 +10,9 @@ from scipy.stats import binom, chi2
 from stereoservo.geometry.cameras import triangulate, triangulation_covariance
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import from_homogeneous, to_homogeneous
+from stereoservo.geometry.reprojection_fit import linearise, point_charts, read_images, with_rest
 from stereoservo.geometry.translation_consensus import estimate_translations
-from stereoservo.geometry.translation_fit import (
-    bundle_translations,
-    linearise,
-    point_charts,
-    read_images,
-    refine_translations,
-    shared_plane,
-    with_rest,
-)
+from stereoservo.geometry.translation_fit import bundle_translations, refine_translations, shared_plane
 from stereoservo.geometry.translation_planar import planar_start
 from stereoservo.geometry.translations import (
     JORDAN_TRANSLATION,

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from stereoservo.geometry.displacements import conjugate, exp_rotation
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray, whitener
+from stereoservo.geometry.reprojection_fit import Images, Motion, covariance_of, minimise, read_images
 from stereoservo.geometry.rotations import (
     RotationChart,
     check_rotation_generator,
@@ -22,7 +23,6 @@ from stereoservo.geometry.rotations import (
     rotation_parameter_derivatives,
     rotation_parameters,
 )
-from stereoservo.geometry.translation_fit import Images, Motion, covariance_of, minimise, read_images
 
 BoolArray = npt.NDArray[np.bool_]
 

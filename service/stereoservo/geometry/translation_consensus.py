@@ -17,17 +17,9 @@ from stereoservo.geometry.cameras import triangulate, triangulation_covariance
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.reprojection_fit import Images, covariance_of, minimise, read_images, with_rest
 from stereoservo.geometry.strata import heights_of_one_side
-from stereoservo.geometry.translation_fit import (
-    Images,
-    TranslationFit,
-    bundle_translations,
-    covariance_of,
-    homography_motion,
-    minimise,
-    read_images,
-    with_rest,
-)
+from stereoservo.geometry.translation_fit import TranslationFit, bundle_translations, homography_motion
 from stereoservo.geometry.translation_planar import planar_start, plane_basis
 from stereoservo.geometry.translations import (
     Weighting,

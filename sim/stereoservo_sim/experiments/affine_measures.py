@@ -15,8 +15,9 @@ import numpy.typing as npt
 from stereoservo.geometry.cameras import camera_centre, canonical_pair
 from stereoservo.geometry.homogeneous import from_homogeneous, move_points, to_homogeneous
 from stereoservo.geometry.homography import homography_from_points
+from stereoservo.geometry.reprojection_fit import linearise, read_images, with_rest
 from stereoservo.geometry.strata import projective_to_affine
-from stereoservo.geometry.translation_fit import linearise, read_images, shared_plane, with_rest
+from stereoservo.geometry.translation_fit import shared_plane
 from stereoservo_sim.rig import StereoRig, project, stereo_rig
 
 FloatArray = npt.NDArray[np.float64]
