@@ -102,12 +102,10 @@ def _sampled(left: FloatArray, right: FloatArray, threshold: float, max_iteratio
     parameters.randomGeneratorState = 20010701
     parameters.score = cv2.SCORE_METHOD_MAGSAC
     parameters.threshold = threshold
-    for search in (
-        lambda: cv2.findFundamentalMat(left, right, parameters),
-        lambda: cv2.findFundamentalMat(left, right, cv2.FM_LMEDS, threshold, 0.9999, max_iterations),
-    ):
+    by_median = (cv2.FM_LMEDS, threshold, 0.9999, max_iterations)
+    for arguments in ((parameters,), by_median):
         try:
-            found, _ = search()
+            found, _ = cv2.findFundamentalMat(left, right, *arguments)
         except cv2.error:
             continue  # OpenCV's searches assert on some inputs, good ones among them
         if found is not None and np.shape(found) == (3, 3) and np.isfinite(found).all():

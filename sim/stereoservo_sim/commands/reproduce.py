@@ -234,6 +234,29 @@ def _cell(value: Any) -> str:
     return "-" if value is None else str(value)
 
 
+def run_random_rigs_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``random-rigs`` from its options; 12 cases by default, the first one's number is the seed."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.random_rigs import SEEDS, draw_random_rigs, run_random_rigs
+
+    answer = run_random_rigs(seeds=options.seeds or SEEDS, seed=options.seed, progress=progress)
+    if options.plot is not None:
+        answer["plots"] = [str(path) for path in draw_random_rigs(answer, options.plot)]
+    return answer
+
+
+def show_random_rigs(answer: dict[str, Any], console: Console) -> None:
+    """The rate with its interval, rows, and what did not succeed."""
+    show_rows(answer, console)
+    low, high = answer["wilson_95"]
+    console.print(
+        f"{answer['success']} of {answer['seeds']} succeeded ({answer['success_rate']:.2%}; Wilson 95 %: {low:.2%} to "
+        f"{high:.2%}; promised {answer['promised']:.1%}), {answer['failure']} refused, {answer['wrong']} wrong"
+    )
+    for case in answer["not_successes"]:
+        console.print(f"case {case['seed']}: {case['outcome']} {case['code']} {case['message']}")
+
+
 EXPERIMENTS: dict[str, Experiment] = {
     "real-franka": Experiment(
         "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
@@ -276,6 +299,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         frozenset({"seeds"}),
         run_robot_command,
         show_robot_tables,
+    ),
+    "random-rigs": Experiment(
+        "self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds",
+        frozenset({"seeds"}),
+        run_random_rigs_command,
+        show_random_rigs,
     ),
 }
 """By the name given on the command line."""

@@ -25,7 +25,7 @@ from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.report import CalibrationResult
 from stereoservo.kinematics.calibration.statistics import covariance_root, variance_factor
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
-from stereoservo_sim.random_cells import RandomCase, random_case
+from stereoservo_sim.random_cells import BODIES, RandomCase, random_case
 from stereoservo_sim.synthetic import FIRST_MARKER
 
 FloatArray = npt.NDArray[np.float64]
@@ -106,7 +106,7 @@ def judged(seed: int) -> Verdict:
 def held_out_ratio(
     case: RandomCase, trials: TrialData, result: CalibrationResult
 ) -> tuple[float, float, float]:
-    """Squared errors of held-out pixels over their stated sum, its effective degrees of freedom, and the rms error [px].
+    """Squared errors of held-out pixels over their stated sum, its effective degrees of freedom, the rms error [px].
 
     With the errors ``L z``, ``z`` standard normal, the sum of squares has mean ``tr LᵀL`` and is taken for a
     chi-square of ``(tr LᵀL)² / tr (LᵀL)²`` degrees of freedom of the same mean (Satterthwaite).
@@ -145,3 +145,91 @@ def wilson(successes: int, cases: int, confidence: float = 0.95) -> tuple[float,
     middle = (share + z**2 / (2 * cases)) / (1 + z**2 / cases)
     half = z / (1 + z**2 / cases) * float(np.sqrt(share * (1 - share) / cases + z**2 / (4 * cases**2)))
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def run_random_rigs(
+    seeds: int = SEEDS, seed: int = 0, progress: ProgressCall | None = None
+) -> dict[str, Any]:
+    """Cases ``seed`` to ``seed + seeds - 1``: counts, Wilson's 95 % interval of the success rate, rows over noise, and
+    every case that is not a success.
+
+    Raises ValueError for fewer than one case.
+    """
+    if seeds < 1:
+        raise ValueError(f"{seeds} cases; at least 1 is needed")
+    verdicts = []
+    for k in range(seeds):
+        verdicts.append(judged(seed + k))
+        if progress is not None:
+            progress("cases", k + 1, seeds)
+    counts = Counter(verdict.outcome for verdict in verdicts)
+    low, high = wilson(counts["success"], seeds)
+    return {
+        "experiment": "random-rigs",
+        "seed": seed,
+        "seeds": seeds,
+        "success": counts["success"],
+        "failure": counts["failure"],
+        "wrong": counts["wrong"],
+        "success_rate": counts["success"] / seeds,
+        "wilson_95": [low, high],
+        "promised": PROMISED,
+        "strata": dict(Counter(verdict.stratum for verdict in verdicts if verdict.stratum)),
+        "seconds_median": float(np.median([verdict.seconds for verdict in verdicts])),
+        "rows": _rows(verdicts),
+        "failures_by_cause": dict(Counter(v.code for v in verdicts if v.outcome == "failure")),
+        "not_successes": [msgspec.structs.asdict(v) for v in verdicts if v.outcome != "success"],
+        "thesis": {
+            "note": "none: the thesis starts from a good guess (5.4.4) and calibrates one robot (5.5)"
+        },
+    }
+
+
+def _rows(verdicts: list[Verdict]) -> list[dict[str, Any]]:
+    """One object for each decade of noise and each body: successes, and the errors of held-out pixels in sigmas."""
+    rows = []
+    for low, high in ((0.01, 0.1), (0.1, 1.0)):
+        for body in BODIES:
+            own = [v for v in verdicts if low <= v.sigma_px < high and v.body == body]
+            good = [v for v in own if v.outcome == "success"]
+            if not own:
+                continue
+            errors = [v.rms_px / v.sigma_px for v in good]
+            low_error, median, high_error = np.quantile(errors, [0.16, 0.5, 0.84]) if good else [np.nan] * 3
+            rows.append(
+                {
+                    "condition": f"{body}, {low:g} to {high:g} px",
+                    "cases": len(own),
+                    "success": len(good),
+                    "held_out_error_sigmas": float(median) if good else None,
+                    "spread": [float(low_error), float(high_error)] if good else None,
+                }
+            )
+    return rows
+
+
+def draw_random_rigs(answer: dict[str, Any], folder: Path) -> list[Path]:
+    """Successes by body and noise, as bars with the number of cases. Raises OSError."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = answer["rows"]
+    figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
+    places = np.arange(len(rows))
+    axes.barh(places, [row["cases"] for row in rows], color="0.85", label="cases")
+    axes.barh(places, [row["success"] for row in rows], height=0.5, label="model true within its covariance")
+    axes.set_yticks(places, [row["condition"] for row in rows])
+    axes.invert_yaxis()
+    low, high = answer["wilson_95"]
+    axes.set_title(
+        f"{answer['success']} of {answer['seeds']} random rigs calibrated, {answer['wrong']} wrong "
+        f"(95 %: {low:.2%} to {high:.2%})"
+    )
+    axes.legend()
+    path = folder / "random_rigs.png"
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+    return [path]

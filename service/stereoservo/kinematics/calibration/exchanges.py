@@ -67,8 +67,8 @@ def exchanged_ids(trials: TrialData, k: int) -> tuple[int, int] | None:
         if F is None or len(suspects) < 2:
             return None
         for a, b in combinations(suspects, 2):
-            mended = _marker_shares(with_ids_exchanged(trials, k, a, b), F, k)
-            if min(mended[a], mended[b]) >= AGREES:
+            again = _marker_shares(with_ids_exchanged(trials, k, a, b), F, k)
+            if min(again[a], again[b]) >= AGREES:
                 return a, b
         return None
     best, least = None, AGREES

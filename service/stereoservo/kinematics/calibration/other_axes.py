@@ -52,7 +52,7 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
     rig, data = solution.rig, solution.data
     used = np.unique(data.stop)
     base = np.median(data.offsets[used], axis=0)
-    still = (np.delete(np.abs(data.offsets - base), joint, axis=1) <= STILL).all(axis=1)
+    still = np.asarray((np.delete(np.abs(data.offsets - base), joint, axis=1) <= STILL).all(axis=1))
     own = data.select(still[data.stop])
     way = data.offsets[:, joint]
     span = float(np.ptp(way[still])) if still.any() else 0.0

@@ -181,7 +181,7 @@ def _lasting(outliers: BoolArray, seen: BoolArray) -> int | None:
 
 
 def _begun(outliers: BoolArray, seen: BoolArray) -> int | None:
-    """The stop from which on most of the pixels (s, ...) are outliers while few before are; None where there is none."""
+    """The stop from which on most of the pixels (s, ...) are outliers while few before are, or None."""
     s = len(outliers)
     bad = outliers.reshape(s, -1).sum(axis=1)
     shown = seen.reshape(s, -1).sum(axis=1)

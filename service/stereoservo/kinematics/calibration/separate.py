@@ -128,16 +128,16 @@ def _distal_groups(positions: FloatArray, own: BoolArray, joint: int) -> tuple[F
     A configuration counts with two of the trial's stops: one shows no motion.
     """
     base = np.median(positions[own], axis=0)
-    still = (np.abs(positions[:, :joint] - base[:joint]) <= STILL).all(axis=1)
+    still = np.asarray((np.abs(positions[:, :joint] - base[:joint]) <= STILL).all(axis=1))
     distal = positions[:, joint + 1 :]
     groups = np.full(len(positions), -1)
-    count, left = 0, own & still
+    count, left = 0, np.asarray(own & still)
     # The configuration nearest to the middle comes first, and is the base's.
     order = np.argsort(np.abs(distal - base[joint + 1 :]).sum(axis=1), kind="stable")
     for k in order[left[order]]:
         if not left[k]:
             continue
-        here = (np.abs(distal - distal[k]) <= STILL).all(axis=1) & still
+        here = np.asarray((np.abs(distal - distal[k]) <= STILL).all(axis=1) & still)
         left &= ~here
         if int((here & own).sum()) >= 2:
             groups[here] = count
@@ -183,7 +183,7 @@ def separate_joint(
             residual_sigmas=least,
             maximum=MISFIT,
         )
-    shown = sights.usable[:, :, :m].any(axis=(0, 1))
+    shown = np.asarray(sights.usable[:, :, :m].any(axis=(0, 1)))
     return JointTrial(
         joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan)
     )

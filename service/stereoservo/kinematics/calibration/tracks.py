@@ -61,12 +61,12 @@ def frozen_stops(trials: TrialData, joint: int) -> IntArray:
     """The longest run of a joint's trial stops (k,) at which all positions are reported the same and images move."""
     own = np.flatnonzero(trials.trials == joint)
     longest: list[int] = []
-    run = list(own[:1])
-    for before, stop in pairwise(own):
+    run: list[int] = own[:1].tolist()
+    for before, stop in pairwise(own.tolist()):
         same = float(np.abs(trials.positions[stop] - trials.positions[before]).max()) <= SAME_POSITION
         if not (same and image_motion(trials, before, stop) > MIN_IMAGE_MOTION):
             run = []
-        run.append(int(stop))
+        run.append(stop)
         if len(run) > len(longest):
             longest = list(run)
     return np.array(longest, dtype=np.int64) if len(longest) >= FROZEN_STOPS else np.zeros(0, dtype=np.int64)
@@ -173,7 +173,9 @@ def find_step(trials: TrialData) -> Step | None:
     gains, sizes = _step_gains(trials)
     c, m = gains.shape[:2]
     found: list[tuple[float, Step]] = []
-    candidates = [((camera,), tuple(range(m))) for camera in range(c)]
+    candidates: list[tuple[tuple[int, ...], tuple[int, ...]]] = [
+        ((camera,), tuple(range(m))) for camera in range(c)
+    ]
     candidates += [(tuple(range(c)), (marker,)) for marker in range(m)]
     candidates.append((tuple(range(c)), tuple(range(m))))
     for cameras, markers in candidates:

@@ -100,8 +100,8 @@ def _epipolar(
             F, _ = fundamental_robust(flat[0, seen], flat[k, seen], scale * sigma)
         except GeometryError as error:
             if scale == NARROW and error.code == "degenerate":
-                F = _weak_parallax(flat[0, seen], flat[k, seen], sigma)
-                if F is None:
+                weak = _weak_parallax(flat[0, seen], flat[k, seen], sigma)
+                if weak is None:
                     rms = float(error.data.get("rms_px", np.nan))
                     raise CalibrationError(
                         "views_degenerate",
@@ -111,8 +111,8 @@ def _epipolar(
                         rms_px=rms,
                         sigma_px=sigma,
                     ) from error
-                fits = np.abs(sampson_distances(F, flat[0, seen], flat[k, seen])) <= INLIER_SIGMAS * sigma
-                return F, fits, seen
+                fits = np.abs(sampson_distances(weak, flat[0, seen], flat[k, seen])) <= INLIER_SIGMAS * sigma
+                return weak, fits, seen
             continue
         fits = (
             np.abs(sampson_distances(F, flat[0, seen], flat[k, seen]))
