@@ -46,7 +46,7 @@ from stereoservo.kinematics.calibration.scales import (
     prismatic_ratios,
     trial_scales,
 )
-from stereoservo.kinematics.calibration.separate import GOOD_FIT, best_start, trial_stops, virtual_markers
+from stereoservo.kinematics.calibration.separate import best_start, trial_stops, virtual_markers
 from stereoservo.kinematics.calibration.strata import FitOptions
 from stereoservo.kinematics.calibration.tracks import find_step, paths_are_smooth
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
@@ -238,7 +238,8 @@ def _views(trials: TrialData) -> Views:
 def _kind_hypotheses(trials: TrialData, views: Views) -> Iterator[Hypothesis]:
     """The other kind for a joint whose own trial fits it much better."""
     cameras, points, usable = views
-    for joint, (name, said) in enumerate(zip(trials.joint_names, trials.joint_kinds, strict=True)):
+    fits: dict[int, tuple[float, float, Kind]] = {}
+    for joint, said in enumerate(trials.joint_kinds):
         try:
             stops, groups, base = trial_stops(trials, points, joint)
         except CalibrationError:
@@ -246,9 +247,14 @@ def _kind_hypotheses(trials: TrialData, views: Views) -> Iterator[Hypothesis]:
         sights = virtual_markers(trials, points, usable, stops, groups)
         way = trials.positions[stops, joint] - base[joint]
         other: Kind = "prismatic" if said == "revolute" else "revolute"
-        least, instead = (best_start(kind, cameras, sights, way)[1] for kind in (said, other))
-        if not instead < min(GOOD_FIT, least / KIND_BETTER):
+        as_said, as_other = (best_start(kind, cameras, sights, way)[1] for kind in (said, other))
+        fits[joint] = as_said, as_other, other
+    # The other kind must reach what the other joints do; a joint that fits neither way is no case of this.
+    floor = float(np.median([min(least, instead) for least, instead, _ in fits.values()])) if fits else 0.0
+    for joint, (least, instead, other) in fits.items():
+        if not instead < min(KIND_BETTER * floor, least / KIND_BETTER):
             continue
+        name, said = trials.joint_names[joint], trials.joint_kinds[joint]
         kinds = tuple(other if j == joint else kind for j, kind in enumerate(trials.joint_kinds))
         yield Hypothesis(
             "joint_kind",

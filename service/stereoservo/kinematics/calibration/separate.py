@@ -33,7 +33,7 @@ MIN_IMAGE_MOTION = 10.0
 """Smallest motion of the markers over a trial [sigmas]."""
 STILL = 2e-3
 """How far other joints may stray during a trial [rad or m] and still count as locked."""
-GOOD_FIT = 3.0
+GOOD_FIT = 1.3
 """Median residual [sigmas] of a joint's own trial at which no other start is tried."""
 MISFIT = 20.0
 """Median residual [sigmas] of a joint's own trial above which the joint is not what it is said to be."""
