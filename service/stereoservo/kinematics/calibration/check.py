@@ -7,6 +7,8 @@ test says whether they are, likelihood ratios between what may have changed say 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +26,8 @@ from stereoservo.kinematics.calibration.check_causes import (
 )
 from stereoservo.kinematics.calibration.check_report import CheckReport, Drift, FoundCause, Status
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
+from stereoservo.kinematics.joint_angles import joint_zeros
+from stereoservo.kinematics.joint_sights import JointAnglesError, seen_chain
 from stereoservo.kinematics.model import CellModel
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,6 +43,22 @@ GROSS = 6.0, 12.0
 """A pixel is left out that differs from its marker's median over the stops by more than so many sigmas, and so many
 times what that marker's other pixels do in that camera."""
 MIN_MEASUREMENTS = 40
+SEARCHED = 3
+"""Stops over which far joint zeros are searched for."""
+
+
+@dataclass(frozen=True)
+class Examination:
+    """A ``model`` before the pixels of a ``check``: what was ``thought`` of, what was ``found``, and how many pixels
+    were ``left_out`` as wrong by themselves.
+    """
+
+    model: CellModel
+    check: TrialData
+    bench: Bench
+    thought: list[Cause]
+    found: Estimate
+    left_out: int
 
 
 def check_model_holds(
@@ -49,11 +69,19 @@ def check_model_holds(
     limit_px: float = 0.25,
     created: str = "",
 ) -> CheckReport:
-    """Hold a model against the pixels of a check motion.
+    """Hold a model against the pixels of a check motion: `examine` and `report_of` in one.
 
-    ``made_from``: the trial data of its calibration, for the uncertainty of a model that carries no covariance. A
-    significant change below ``limit_px`` is reported as ``drifting``, above as ``recalibrate``. Raises
+    A significant change below ``limit_px`` is reported as ``drifting``, above as ``recalibrate``. Raises
     CalibrationError (``bad_data``, ``too_few_stops``).
+    """
+    return report_of(examine(model, check, made_from=made_from), limit_px=limit_px, created=created)
+
+
+def examine(model: CellModel, check: TrialData, *, made_from: TrialData | None = None) -> Examination:
+    """What the pixels of a check motion say of a model.
+
+    ``made_from``: the trial data of its calibration, for the uncertainty of a model that carries no covariance.
+    Raises CalibrationError (``bad_data``, ``too_few_stops``).
     """
     factor = 1.0
     if model.statistics is not None and model.statistics.degrees_of_freedom > 0:
@@ -71,7 +99,77 @@ def check_model_holds(
         bench = bench.select(~gross)
     thought = causes(model, bench)
     found = explain(bench, thought)
-    return _report(model, check, bench, thought, found, limit_px, created, int(gross.sum()))
+    if found.found and (len(found.found) > 1 or not _explains(bench, found)):
+        lost = drifted_zeros(model, bench, thought)
+        if lost is not None and _schwarz(bench, lost, found) < _schwarz(bench, found, lost):
+            found = lost
+    return Examination(model, check, bench, thought, found, int(gross.sum()))
+
+
+def _explains(bench: Bench, found: Estimate) -> bool:
+    """Whether what an explanation leaves is noise."""
+    return bool(chi2_distribution.sf(found.chi2, 2 * len(bench.data.camera) - found.x.size) >= ALPHA)
+
+
+def _schwarz(bench: Bench, found: Estimate, other: Estimate) -> float:
+    """Chi-square of an explanation, in the noise that the better of two leaves, plus the price of its parameters."""
+    count = 2.0 * len(bench.data.camera)
+    noise = max(1.0, min(one.chi2 / max(1.0, count - one.x.size) for one in (found, other)))
+    return found.chi2 / noise + found.x.size * float(np.log(count))
+
+
+def drifted_zeros(model: CellModel, bench: Bench, thought: list[Cause]) -> Estimate | None:
+    """The drifts of all joints' zeros at once, those left out that are not significant: an arm that was turned on
+    anew, or has changed its encoders, may have lost several by far.
+
+    None where the images do not tell the joints, or no drift is significant.
+    """
+    by_name = {cause.subject: cause for cause in thought if cause.kind == "joint"}
+    named = tuple(by_name[name] for name in model.joint_names)
+    found = estimate(bench, named)
+    if not _explains(bench, found):
+        start = _zeros_anywhere(model, bench)
+        if start is None:
+            return None
+        found = estimate(bench, named, start=start)
+    significant = float(chi2_distribution.isf(ALPHA / len(thought), 1))
+    kept = _telling(found, max(significant, float(np.log(2.0 * len(bench.data.camera)))))
+    return estimate(bench, tuple(named[k] for k in kept), start=found.x[kept]) if kept else None
+
+
+def _telling(found: Estimate, price: float) -> list[int]:
+    """Which parameters explain best together when each one costs ``price``, to first order around an estimate: all
+    subsets are compared, since joints with like axes stand in for each other one at a time.
+    """
+    information, q = found.information, found.x.size
+    best: tuple[float, list[int]] = (np.inf, [])
+    for kept in (list(s) for size in range(q + 1) for s in combinations(range(q), size)):
+        idle = [k for k in range(q) if k not in kept]
+        across = information[np.ix_(kept, idle)]
+        inner = np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True)
+        lost = information[np.ix_(idle, idle)] - across.T @ inner @ across
+        best = min(best, (float(found.x[idle] @ lost @ found.x[idle]) + price * len(kept), kept))
+    return best[1]
+
+
+def _zeros_anywhere(model: CellModel, bench: Bench) -> FloatArray | None:
+    """Drifts (n,) of all joints' zeros by a search without a start (4.45) over a few stops; None where those do not
+    tell them.
+    """
+    data = bench.data
+    stops = np.unique(data.stop)[:SEARCHED]
+    pixels = np.full((len(data.offsets), len(model.cameras), len(model.marker_ids), 2), np.nan)
+    sigmas = np.full(pixels.shape[:3], np.nan)
+    where = data.stop, data.camera, data.marker
+    pixels[where], sigmas[where] = data.pixels, data.sigmas
+    encoders = np.empty_like(data.offsets)
+    encoders[:, list(bench.order)] = data.offsets
+    encoders += model.zero
+    seen = seen_chain(model)
+    try:
+        return joint_zeros(seen, model.marker_points, pixels[stops], sigmas[stops], encoders[stops]).offset
+    except JointAnglesError:
+        return None
 
 
 def explain(bench: Bench, thought: list[Cause]) -> Estimate:
@@ -125,10 +223,9 @@ def isolated(bench: Bench) -> npt.NDArray[np.bool_]:
     return gross
 
 
-def _report(
-    model: CellModel, check: TrialData, bench: Bench, thought: list[Cause], found: Estimate, limit_px: float,
-    created: str, left_out: int,
-) -> CheckReport:  # fmt: skip
+def report_of(examined: Examination, *, limit_px: float = 0.25, created: str = "") -> CheckReport:
+    """An examination as it is told; ``limit_px``: change of the pixels [px] that the cell can live with."""
+    model, check, bench, found = examined.model, examined.check, examined.bench, examined.found
     here = bench.residuals_at(start_state(bench))
     chi2 = float(here @ bench.whitened(here))
     count = here.size
@@ -166,8 +263,8 @@ def _report(
         per_camera={camera.name: rms(bench.data.camera == c) for c, camera in enumerate(model.cameras)},
         per_marker={str(marker): rms(bench.data.marker == k) for k, marker in enumerate(model.marker_ids)},
         causes=tuple(named),
-        drifts=tuple(_drift(bench, cause) for cause in thought if cause.kind != "marker"),
-        left_out=left_out,
+        drifts=tuple(_drift(bench, cause) for cause in examined.thought if cause.kind != "marker"),
+        left_out=examined.left_out,
         created=created,
     )
 

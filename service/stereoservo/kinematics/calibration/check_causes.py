@@ -157,10 +157,32 @@ def make_bench(model: CellModel, check: TrialData, made_from: TrialData | None, 
     return Bench(rig, data, _bound(loose), order)
 
 
+def rezeroed(bench: Bench, model: CellModel, drift: FloatArray) -> Bench:
+    """The bench with the joints' readings corrected by ``drift`` (n,), in the rig's order."""
+    data = replace(bench.data, offsets=bench.data.offsets + drift)
+    if model.covariance is None:
+        return replace(bench, data=data)
+    return replace(
+        bench, data=data, loose=_bound(_stated_looseness(model, model.covariance, data, bench.order))
+    )
+
+
 def _stated_looseness(
     model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
 ) -> FloatArray:
     """Root (2 k, p) of what the model's covariance does to the pixels of ``data`` [sigmas²]."""
+    slopes, columns = stated_slopes(model, stated, data, order)
+    values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
+    root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return root
+
+
+def stated_slopes(
+    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and which of them (p,) each
+    column stands for.
+    """
     rig = Rig(
         tuple(model.joint_kinds[j] for j in order),
         model.generators[list(order)],
@@ -173,10 +195,7 @@ def _stated_looseness(
     starts = np.cumsum([0, *sizes])
     columns = np.concatenate([np.arange(starts[j], starts[j + 1]) for j in order])
     columns = np.append(columns, np.arange(starts[-1], charts.size))
-    values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    slopes: FloatArray = jacobian(rig, charts, np.zeros(charts.size), data) @ root
-    return slopes
+    return jacobian(rig, charts, np.zeros(charts.size), data), columns
 
 
 def _looseness(model: CellModel, rig: Rig, past: Measurements, data: Measurements) -> FloatArray:
@@ -328,10 +347,12 @@ def linear_gain(bench: Bench, cause: Cause, here: FloatArray) -> float:
     return float(moment @ np.linalg.lstsq(information, moment, rcond=None)[0])
 
 
-def estimate(bench: Bench, found: tuple[Cause, ...]) -> Estimate:
-    """Least squares over the parameters of the causes, with the model's own uncertainty in the weights."""
-    x = np.zeros(sum(cause.size for cause in found))
-    here = bench.residuals_at(start_state(bench))
+def estimate(bench: Bench, found: tuple[Cause, ...], start: FloatArray | None = None) -> Estimate:
+    """Least squares over the parameters of the causes from ``start`` (q,) on, default nothing changed, with the model's
+    own uncertainty in the weights.
+    """
+    x = np.zeros(sum(cause.size for cause in found)) if start is None else start
+    here = bench.residuals_at(changed(bench, found, x))
     chi2 = float(here @ bench.whitened(here))
     slopes = slopes_of(bench, found, x, here)
     for _ in range(ROUNDS):

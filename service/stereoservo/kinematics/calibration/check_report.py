@@ -62,3 +62,30 @@ class CheckReport(msgspec.Struct, frozen=True):
     left_out: int
     created: str = ""
     trend: str = ""
+
+
+class JointReset(msgspec.Struct, frozen=True):
+    """A joint whose zero was moved: its encoder was off by ``drift``, known to ``deviation``; the model's zero before
+    and after [rad or m].
+    """
+
+    joint: str
+    kind: Literal["revolute", "prismatic"]
+    drift: float
+    deviation: float
+    zero_before: float
+    zero_after: float
+
+
+class ZeroReset(msgspec.Struct, frozen=True):
+    """Zeros of joints moved in a new model: ``epoch``, from model ``from_epoch``. Residuals of the check rms in
+    expected sigmas before and after. ``model``: the new file.
+    """
+
+    epoch: int
+    from_epoch: int
+    joints: tuple[JointReset, ...]
+    sigmas_before: float
+    sigmas_after: float
+    message: str
+    model: str = ""
