@@ -329,7 +329,7 @@ def _explained(
         result = refit(trials, lenient)
         notes = explain_outliers(trials, result)
     except CalibrationError as other:
-        if other.code in ("camera_moved", "marker_slipped", "moved_together"):
+        if other.code in ("camera_moved", "marker_slipped", "moved_together", "markers_disagree"):
             return other
         notes = ()
     except (GeometryError, np.linalg.LinAlgError):

@@ -130,10 +130,22 @@ def refuse_lasting(trials: TrialData, found: Predictions) -> None:
         raise moved_together(min(stop for _, stop in moved))
     if moved:
         raise camera_moved(trials, *moved[0])
+    slipped = {}
     for marker in range(m):
         stop = _lasting(found.outliers[:, :, marker].T, found.seen[:, :, marker].T)
         if stop is not None:
-            raise marker_slipped(found.marker_ids[marker], stop)
+            slipped[found.marker_ids[marker]] = stop
+    if len(slipped) > max(1, m // 4):
+        raise CalibrationError(
+            "markers_disagree",
+            f"markers {sorted(slipped)} do not fit before or after stop {min(slipped.values())}, the others do: they "
+            "are not one rigid body, or the images of that stretch lead a joint's axis astray. Run the trials again, with "
+            "larger motions or less noise",
+            markers=sorted(slipped),
+            stop=min(slipped.values()),
+        )
+    if slipped:
+        raise marker_slipped(*next(iter(slipped.items())))
 
 
 def camera_moved(trials: TrialData, camera: int, stop: int) -> CalibrationError:

@@ -35,6 +35,8 @@ STILL = 2e-3
 """How far other joints may stray during a trial [rad or m] and still count as locked."""
 GOOD_FIT = 1.3
 """Median residual [sigmas] of a joint's own trial at which no other start is tried."""
+WRONG_SQUARE = 100.0
+"""Squared residual [sigmas] at which a pixel is as wrong as can be."""
 MISFIT = 20.0
 """Median residual [sigmas] of a joint's own trial above which the joint is not what it is said to be."""
 
@@ -241,7 +243,7 @@ def best_start(
         sights.sigmas[sights.usable].ravel(),
     )
     shown = sights.usable.any(axis=(0, 1))
-    best, least = None, np.inf
+    best, least, lowest = None, np.inf, np.inf
     for start in (linear_generator, nominal_generator):
         generator = start(kind, cameras, sights.points, sights.usable, sights.pixels, sights.sigmas, angles)
         if generator is None:
@@ -264,9 +266,11 @@ def best_start(
         # The median of a chi-square with two degrees of freedom is ln 4.
         squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
         typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
-        if typical < least:
-            best, least = fit.rig, typical
-        if least < GOOD_FIT:
+        # A wrong axis may fit the half of the markers that hardly move.
+        score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE).mean() / 2.0))
+        if score < lowest:
+            best, least, lowest = fit.rig, typical, score
+        if typical < GOOD_FIT and score < GOOD_FIT:
             break
     return best, least
 
