@@ -28,7 +28,10 @@ class CalibrationError(Exception):
         code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
             ``too_few_stops``,
             ``joint_did_not_move``, ``joint_without_effect``, ``joint_kind``, ``views_degenerate``,
-            ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``.
+            ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``;
+            of the diagnosis ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``, ``joint_order``,
+            ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
+            ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``.
         data: the values the message speaks of.
     """
 
