@@ -359,7 +359,17 @@ def test_trial_motions_without_markers_name_the_camera(bench: Any, silent: bool,
     assert np.abs(bench.run(1.0).command).max() == 0.0
 
 
-def test_trial_motions_wait_for_a_camera_that_is_still_starting(bench: Any) -> None:
+def averaging(bench: Any, frames: int) -> Any:
+    """``bench`` with so many frames averaged at each stop."""
+    trials = msgspec.structs.replace(bench.settings.trials, frames=frames)
+    bench.settings = msgspec.structs.replace(bench.settings, trials=trials)
+    bench.core = ServoCore(bench.settings)
+    return bench
+
+
+def test_trial_motions_wait_for_a_camera_that_is_still_starting(benches: Any) -> None:
+    frames = 4
+    bench = averaging(benches(1), frames)
     bench.cameras_on[1] = False
     bench.run(0.1)
     bench.step(Enable())
@@ -369,7 +379,24 @@ def test_trial_motions_wait_for_a_camera_that_is_still_starting(bench: Any) -> N
         e for e in bench.events if e.kind.startswith("calibration_") and e.kind != "calibration_progress"
     ]
     bench.cameras_on[1] = True
-    assert bench.until(lambda e: e.kind == "calibration_sample", 5.0).trial == -1
+    sample = bench.until(lambda e: e.kind == "calibration_sample", 5.0)
+    assert sample.trial == -1
+    assert [s.frames for s in sample.samples] == [frames, frames]
+
+
+def test_trial_motions_tell_a_camera_of_too_few_frames_from_one_without_markers(benches: Any) -> None:
+    bench = averaging(benches(1), 4)
+    bench.run(0.1)
+    bench.step(Enable())
+    bench.reply(Calibrate("00000011"))
+    while bench.core.state.source.phase != "collect":
+        bench.step()
+    while bench.core.state.source.sums.frames[1] < 1:
+        bench.step()
+    bench.cameras_on[1] = False
+    reason = bench.until(lambda e: e.kind == "calibration_aborted", 10.0).reasons[0]
+    assert (reason.code, reason.subject) == ("CAMERA_SILENT", "right")
+    assert (reason.value, reason.threshold) == (1.0, 4.0)
 
 
 def test_trial_motions_back_off_when_markers_leave_the_view(bench: Any) -> None:

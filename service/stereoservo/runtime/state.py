@@ -144,6 +144,8 @@ class Visiting(Leased, eq=False, kw_only=True):
     joint_sum: FloatArray
     joint_frames: int = 0
     lost_ns: int = 0
+    silent_ns: int = 0
+    """When some camera was last known never to have delivered."""
 
 
 class Trials(Visiting, tag="trials", eq=False, kw_only=True):
@@ -188,6 +190,7 @@ class Checking(Visiting, tag="checking", eq=False, kw_only=True):
     index: int
     seen: int = 0
     """Stops at which every camera saw enough."""
+    reset_zeros: bool = False
 
 
 class Teaching(Sums, eq=False):

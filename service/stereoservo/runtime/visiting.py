@@ -104,8 +104,12 @@ def look(visit: Visiting, present: Present, trial: TrialSettings) -> tuple[Sampl
         if add_observation(visit.sums, present.settings, observation, trial.frames, visit.phase_ns):
             visit.joint_sum += at_shutter
             visit.joint_frames += 1
-    waited_s = (present.now_ns - visit.phase_ns) * 1e-9
     silent = min(estimate.last_seq for estimate in present.state.cameras) < 0
+    if silent:
+        visit.silent_ns = present.now_ns
+    # A camera that has begun at last gets the whole of wait_s for its frames.
+    begin_ns = visit.phase_ns if silent else max(visit.phase_ns, visit.silent_ns)
+    waited_s = (present.now_ns - begin_ns) * 1e-9
     limit_s = max(trial.wait_s, FIRST_FRAME_S) if silent else trial.wait_s
     if bool((visit.sums.frames >= trial.frames).all()) or waited_s > limit_s:
         return averages(visit.sums, present.settings)
@@ -120,9 +124,9 @@ def mean_joints(visit: Visiting) -> FloatArray:
 
 def too_few_seen(samples: tuple[Sample, ...], trial: TrialSettings) -> Sample | None:
     """The camera that saw too few markers, or too few frames, at a stop."""
-    poorest = min(samples, key=lambda sample: sample.ids.size)
-    if poorest.ids.size < trial.min_markers or poorest.frames < max(1, trial.frames // 2):
-        return poorest
+    for sample in sorted(samples, key=lambda sample: sample.ids.size):
+        if sample.ids.size < trial.min_markers or sample.frames < max(1, trial.frames // 2):
+            return sample
     return None
 
 
@@ -132,6 +136,12 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings) -> Reason:
         return Reason(
             "CAMERA_SILENT", "hold", poorest.camera, 0.0, float(trial.frames), "frames",
             f"camera {poorest.camera} delivers no frames: is it connected? See the daemon's log",
+        )  # fmt: skip
+    if poorest.ids.size >= trial.min_markers:
+        return Reason(
+            "CAMERA_SILENT", "hold", poorest.camera, float(poorest.frames), float(trial.frames), "frames",
+            f"camera {poorest.camera} delivered {poorest.frames} of {trial.frames} frames at the base in "
+            f"{trial.wait_s:g} s: a slow or interrupted camera; see the daemon's log, or raise calibration.wait_s",
         )  # fmt: skip
     return Reason(
         "MARKERS_NOT_SEEN", "hold", poorest.camera, float(poorest.ids.size), float(trial.min_markers), "markers",
