@@ -8,11 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.gateway.client import Client
 from stereoservo.gateway.following import EventWatch
+from stereoservo.gateway.stores import ModelStore
+from stereoservo.kinematics.model import load_model, save_model
 from stereoservo.runtime.check_history import load_checks
 from stereoservo.runtime.commands import Calibrate
 from stereoservo.runtime.daemon import DaemonProcess
@@ -89,3 +92,40 @@ def test_check_report_and_damaged_models(
     for path in directories.models.glob("model-00009?*"):
         if path.is_file():
             path.unlink()
+
+
+def test_joint_zeros_are_reset_by_a_check(
+    calibrated: Path,
+    start: Callable[..., DaemonProcess],
+    directories: CellDirectories,
+    run: Callable[..., tuple[int, Any]],
+) -> None:
+    """A model whose zero of j3 is off stands for an encoder that is."""
+    store = ModelStore(directories.models)
+    good = load_model(store.path(store.epochs()[-1]))
+    zero = good.zero.copy()
+    zero[2] += 0.01
+    off = msgspec.structs.replace(good, epoch=80, zero=zero)
+    save_model(off, store.path(80))
+    start(calibrated)
+    with Client(CELL) as client:
+        client.enable()
+        code, result = run("calibrate", CELL, "--check", "--reset-zeros")
+        assert code == 0
+        (joint,) = result["reset"]["joints"]
+        assert joint["joint"] == "j3"
+        assert abs(joint["drift"] - 0.01) < 5 * joint["deviation"]
+        assert result["check"]["status"] == "recalibrate"
+        assert result["reset"]["epoch"] == client.status().model_epoch == 81
+        cured = load_model(Path(result["reset"]["model"]))
+        assert cured.epoch == 81
+        assert "j3 by +0.57" in cured.source
+        assert cured.zero[2] == pytest.approx(good.zero[2], abs=5 * joint["deviation"])
+        # Nothing is left to be reset.
+        code, result = run("calibrate", CELL, "--check", "--reset-zeros")
+        assert (code, result["error"]["code"]) == (1, "check_holds")
+        assert result["error"]["check"]["status"] == "holds"
+        assert client.status().model_epoch == 81
+        assert store.epochs()[-1] == 81
+    for epoch in (80, 81):
+        store.path(epoch).unlink()

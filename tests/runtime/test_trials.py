@@ -185,6 +185,8 @@ def test_check_motion_takes_less_than_a_quarter_of_the_time(benches: Any) -> Non
 def test_check_needs_a_model_and_keeps_inside_the_limits(bench: Any) -> None:
     bench.run(0.1)
     bench.step(Enable())
+    refused = bench.reply(Calibrate(GOAL, reset_zeros=True))
+    assert (refused.accepted, refused.reasons[0].code) == (False, "RESET_WITHOUT_CHECK")
     refused = bench.reply(Calibrate(GOAL, check=True))
     assert refused.reasons[0].code == "NO_MODEL"
     limits = msgspec.structs.replace(bench.settings.limits, position_max=bench.settings.trials.base + 0.02)

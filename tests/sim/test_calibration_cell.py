@@ -10,11 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.cellfile import CellFile, check_cell
 from stereoservo.runtime.lockstep import LockstepCell
-from stereoservo.runtime.lockstep_operator import LockstepOperator
+from stereoservo.runtime.lockstep_operator import LockstepOperator, LockstepRefusalError
+from stereoservo.runtime.ports import JointState
 from stereoservo_sim.world import demo_cell
 
 NAMES = tuple(f"j{k}" for k in range(1, 7))
@@ -102,3 +103,38 @@ def test_an_unchanged_cell_holds_and_a_drifted_joint_is_named(calibrated: Calibr
     assert drifted.causes[0].value == pytest.approx(0.01, abs=5 * drifted.causes[0].deviation)
     assert drifted.status == "recalibrate"
     assert "recalibrate because zero of joint j3 drifted by" in drifted.message
+
+
+def test_an_encoder_that_lost_its_zero_is_found_and_cured(
+    calibrated: Calibrated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operator, model, _ = calibrated
+    with pytest.raises(CalibrationError) as caught:
+        operator.reset_zeros(model)
+    assert caught.value.code == "check_holds"
+    cell = operator.cell
+    operator.teach("before")
+    read = cell.joints.read_state
+
+    def offset() -> JointState:
+        state = read()
+        return msgspec.structs.replace(state, positions=state.positions - 0.02 * np.eye(6)[3])
+
+    monkeypatch.setattr(cell.joints, "read_state", offset)
+    cured, told = operator.reset_zeros(model)
+    (joint,) = told.joints
+    assert joint.joint == "j4"
+    assert joint.drift == pytest.approx(0.02, abs=5 * joint.deviation)
+    assert told.sigmas_before > 5
+    assert told.sigmas_after < 1.2
+    assert cell.status is not None
+    assert cell.status.model_epoch == cured.epoch == told.epoch > told.from_epoch == model.epoch
+    report = operator.check(cured)
+    assert report.status == "holds", report.message
+    # The loop's own predictions are back at the noise, and a goal of the old epoch is refused as after a calibration.
+    cell.run_for(0.5)
+    assert cell.status.model == "valid"
+    with pytest.raises(LockstepRefusalError, match="teach it again"):
+        operator.goal("before")
+    operator.teach("after")
+    assert operator.goal("after").kind == "goal_reached"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import sys
 from collections import defaultdict
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,7 +30,7 @@ from stereoservo.gateway.errors import FailedError
 from stereoservo.gateway.fitting import calibration_result
 from stereoservo.gateway.messages import CalibrationResult, EventMessage
 from stereoservo.gateway.stores import ModelStore
-from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.runtime.calibration_files import report_folder
 from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo.runtime.check_history import load_checks
@@ -44,6 +45,13 @@ def calibrate(
     cell: CellArgument,
     check: Annotated[
         bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")
+    ] = False,
+    reset_zeros: Annotated[
+        bool,
+        typer.Option(
+            "--reset-zeros",
+            help="With --check: where joint zeros have drifted, and nothing else, a new model with moved zeros.",
+        ),
     ] = False,
     trials: Annotated[
         Path | None,
@@ -70,6 +78,8 @@ def calibrate(
 
     With the path of a cell file and no daemon running, one is started for the time of it.
     """
+    if reset_zeros and not check:
+        raise CommandError("argument", "--reset-zeros goes with --check")
     if trials is not None:
         if check:
             raise CommandError("argument", "--check moves the arm, --trials does not: give one of them")
@@ -89,6 +99,9 @@ def calibrate(
         if client.status().lifecycle == "inactive":
             client.enable()
         try:
+            if reset_zeros:
+                _reset_zeros(client, json)
+                return
             if check:
                 report = _with_bar(client, "check motion", client.check_model)
                 _tell_check(report, client.cell, endpoint, json)
@@ -172,6 +185,27 @@ def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool
             for one in past
         ]
     emit(tree, "\n".join(lines), json)
+
+
+def _reset_zeros(client: Client, json: bool) -> None:
+    """Check and reset; the check is told in either case. Raises CommandError with the code of the refusal."""
+    checks: list[CheckReport] = []
+
+    def reset(progress: Callable[[EventMessage], None]) -> ZeroReset:
+        def heard(event: EventMessage) -> None:
+            if event.check is not None:
+                checks.append(event.check)
+            progress(event)
+
+        return client.reset_zeros(heard)
+
+    try:
+        done: ZeroReset = _with_bar(client, "check motion", reset)
+    except FailedError as error:
+        said = {"check": msgspec.to_builtins(checks[-1])} if checks else {}
+        raise CommandError(error.event.name or "failed", str(error), **said) from error
+    tree = {"check": msgspec.to_builtins(checks[-1]), "reset": msgspec.to_builtins(done)}
+    emit(tree, f"{checks[-1].message}\n{done.message}\n  model {done.model}", json)
 
 
 # -- stored trials ------------------------------------------------------------------------------------------

@@ -11,10 +11,12 @@ from stereoservo.gateway.messages import CalibrationResult
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.stores import ModelStore
+from stereoservo.kinematics.calibration.check_report import ZeroReset
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo.kinematics.calibration.verdict import failed
 from stereoservo.kinematics.model import CellModel, ModelFileError
 from stereoservo.runtime.calibration_job import CalibrationJob
+from stereoservo.runtime.check import RESET_ZEROS
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.settings import CoreSettings
 
@@ -39,7 +41,7 @@ class Calibration:
         self._told = False
         self._check: Check | None = None
         self._check_id = ""
-        self._result: CalibrationResult | None = None
+        self._handed: tuple[str, CalibrationResult | ZeroReset] | None = None
         self.model: CellModel | None = None
         self.notes: tuple[str, ...] = ()
 
@@ -60,20 +62,28 @@ class Calibration:
         if event.kind == "calibration_finished" and fresh:
             self._start_fit()
         elif event.kind == "check_finished" and fresh:
-            self._start_check()
-        elif event.kind == "model" and self._result is not None:
-            result, self._result = self._result, None
+            self._start_check(reset=event.name == RESET_ZEROS)
+        elif event.kind == "model" and self._handed is not None:
+            handed, self._handed = self._handed, None
             self.notes = ()
-            self._log.add(
-                "calibrated",
-                message=f"model epoch {result.epoch}: {result.rms_px:.4f} px rms. {result.verdict}",
-                id=self._fit_id,
-                calibration=result,
-                origin="gateway",
-            )
+            self._tell_taken(*handed)
         elif event.kind == "warning" and event.message.startswith("model refused"):
-            self._result = None
-            self._failed(self._fit_id, event.message)
+            goal_id = self._fit_id if self._handed is None else self._handed[0]
+            self._handed = None
+            self._failed(goal_id, event.message)
+
+    def _tell_taken(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
+        """The core works with the model that was handed over."""
+        if isinstance(what, ZeroReset):
+            self._log.add("zeros_reset", message=what.message, id=goal_id, reset=what, origin="gateway")
+            return
+        self._log.add(
+            "calibrated",
+            message=f"model epoch {what.epoch}: {what.rms_px:.4f} px rms. {what.verdict}",
+            id=goal_id,
+            calibration=what,
+            origin="gateway",
+        )
 
     def _start_fit(self) -> None:
         self.cancel()
@@ -88,7 +98,7 @@ class Calibration:
             "fit_started", message=f"{self._job.stops} stops", id=self._fit_id, progress=0.0, origin="gateway"
         )
 
-    def _start_check(self) -> None:
+    def _start_check(self, *, reset: bool) -> None:
         if self._check is not None:
             self._check.close()
             self._check = None
@@ -98,7 +108,11 @@ class Calibration:
             return
         path = self._models.path(self.model.epoch)
         try:
-            self._check = Check(self._job.trials(), path, self._history, self._settings.tolerance_px)
+            epoch = self._models.next_epoch()
+            self._check = Check(
+                self._job.trials(), path, self._history, self._settings.tolerance_px,
+                reset_to=self._models.path(epoch) if reset else None, epoch=epoch,
+            )  # fmt: skip
         except (CalibrationError, OSError) as error:
             self._failed(self._check_id, str(error))
 
@@ -153,12 +167,16 @@ class Calibration:
             kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
             self._failed(self._fit_id, f"{failed(code, str(error)).text} {kept}", code)
             return
+        self._hand_over(model, self._fit_id, result, fit.model_path)
+
+    def _hand_over(
+        self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path
+    ) -> None:
+        """Give a model to the core, which takes it once the arm rests; ``what`` is told then."""
         if not self._link.give_model(model):
-            self._failed(
-                self._fit_id, f"the servo process does not take the model; it is saved as {fit.model_path}"
-            )
+            self._failed(goal_id, f"the servo process does not take the model; it is saved as {path}")
             return
-        self.model, self._result = model, result
+        self.model, self._handed = model, (goal_id, what)
 
     def _follow_check(self, check: Check) -> None:
         ended = check.ended
@@ -173,8 +191,20 @@ class Calibration:
         else:
             text = "; ".join(part for part in (report.message, report.trend) if part)
             self._log.add("checked", message=text, id=self._check_id, check=report, origin="gateway")
+            if check.reset_to is not None:
+                self._take_zeros(check, check.reset_to)
         check.close()
         self._check = None
+
+    def _take_zeros(self, check: Check, path: Path) -> None:
+        try:
+            model, reset = check.reset()
+        except FitFailedError as error:
+            self._failed(self._check_id, str(error), error.code)
+        except ModelFileError as error:
+            self._failed(self._check_id, str(error))
+        else:
+            self._hand_over(model, self._check_id, reset, path)
 
     def _failed(self, goal_id: str, message: str, code: str = "") -> None:
         self._log.add("calibration_failed", message=message, id=goal_id, name=code, origin="gateway")

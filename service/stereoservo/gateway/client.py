@@ -41,7 +41,7 @@ from stereoservo.gateway.messages import (
     encode,
 )
 from stereoservo.gateway.session import client_config, close_session, open_session
-from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.runtime.commands import (
     Calibrate,
     CancelGoal,
@@ -308,6 +308,24 @@ class Client:
             raise FailedError("check", event)
         return event.check
 
+    def reset_zeros(
+        self,
+        progress: Callable[[EventMessage], None] | None = None,
+        timeout_s: float = 600.0,
+        *,
+        lease_s: float | None = 5.0,
+    ) -> ZeroReset:
+        """A check motion; where joint zeros have drifted, and nothing else, a new model with moved zeros.
+
+        ``progress`` hears the ``checked`` event, too. Raises RefusedError, FailedError (its event's ``name``:
+        ``check_holds``, ``other_cause``, ``not_observable`` or the code of a check that failed).
+        """
+        command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s, reset_zeros=True)
+        event = self._calibration(command, "zeros_reset", progress, timeout_s, False)
+        if event.reset is None:
+            raise FailedError("reset of joint zeros", event)
+        return event.reset
+
     def _calibration(
         self,
         command: Calibrate,
@@ -339,7 +357,7 @@ class Client:
                 )
             finally:
                 lease.end()
-            if report and end.kind != "calibration_aborted" and end.kind != "checked":
+            if report and end.kind != "calibration_aborted":
                 with suppress(
                     TimedOutError
                 ):  # the model is there; its report is told by an event, if it comes

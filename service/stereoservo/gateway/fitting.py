@@ -14,7 +14,7 @@ from typing import IO, Any
 import msgspec
 
 from stereoservo.gateway.messages import CalibrationResult
-from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.kinematics.calibration.trials import TrialData, save_trials
 from stereoservo.kinematics.calibration.verdict import Verdict
 from stereoservo.kinematics.model import CellModel, load_model
@@ -131,19 +131,29 @@ class Fit(ChildJob):
 
 
 class Check(ChildJob):
-    """One running check of a model."""
+    """One running check of a model. ``reset_to``: file of a model with drifted joint zeros reset, of epoch ``epoch``."""
 
-    def __init__(self, check: TrialData, model_path: Path, history: Path, limit_px: float) -> None:
+    def __init__(
+        self, check: TrialData, model_path: Path, history: Path, limit_px: float, *,
+        reset_to: Path | None = None, epoch: int = 0,
+    ) -> None:  # fmt: skip
         path = model_path.with_name("check.npz")
         save_trials(check, path)
+        self.reset_to = reset_to
+        wanted = [] if reset_to is None else ["--reset-to", str(reset_to), "--epoch", str(epoch)]
         super().__init__(
             "stereoservo.runtime.check_process", str(path), str(model_path), str(history), "--limit-px",
-            repr(limit_px),
+            repr(limit_px), *wanted,
         )  # fmt: skip
 
     def report(self) -> CheckReport:
         """What the check says. Raises FitFailedError."""
         return msgspec.convert(self.require("check"), CheckReport)
+
+    def reset(self) -> tuple[CellModel, ZeroReset]:
+        """The model with moved zeros, and what was moved. Raises FitFailedError, ModelFileError."""
+        reset = msgspec.convert(self.require("reset"), ZeroReset)
+        return load_model(Path(reset.model)), reset
 
 
 def calibration_result(

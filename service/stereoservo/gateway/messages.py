@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args
 import msgspec
 
 from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.runtime.commands import (
     Calibrate,
     CancelGoal,
@@ -225,6 +225,7 @@ class EventMessage(msgspec.Struct, frozen=True):
     origin: str = "core"
     calibration: CalibrationResult | None = None
     check: CheckReport | None = None
+    reset: ZeroReset | None = None
 
 
 class EventList(msgspec.Struct, frozen=True):

@@ -31,6 +31,8 @@ from stereoservo.runtime.visiting import (
 
 SHARE = 0.5
 """Of what a joint was driven to one side of its base for the model's calibration."""
+RESET_ZEROS = "reset_zeros"
+"""Name of a ``check_finished`` event after which drifted joint zeros are to be reset."""
 
 
 def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
@@ -57,12 +59,13 @@ def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
     return np.array([*stops, trial.base])
 
 
-def start_check(goal_id: str, present: Present, model: CellModel) -> Checking:
-    """The check motion before its first move: to the base."""
+def start_check(goal_id: str, present: Present, model: CellModel, reset_zeros: bool = False) -> Checking:
+    """The check motion before its first move: to the base. ``reset_zeros`` is told when it has finished."""
     targets = check_targets(present.settings, model)
     fields = first_visit(targets[0], present.q, present.now_ns, present.settings)
     return Checking(
         id=goal_id, lease_s=None, lease_until_ns=0, targets=targets, index=0,
+        reset_zeros=reset_zeros,
         **fields,  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -88,7 +91,10 @@ def check_step(checking: Checking, present: Present) -> Motion:
         return _next(checking, present)
     if there(checking, present):
         if checking.index == last:
-            present.emit("check_finished", id=checking.id, message="check motion done", progress=1.0)
+            present.emit(
+                "check_finished", id=checking.id, message="check motion done", progress=1.0,
+                name=RESET_ZEROS if checking.reset_zeros else "",
+            )  # fmt: skip
             return Motion(rest.velocity, finished=True)
         enter(checking, "settle", present)
         return rest

@@ -128,12 +128,14 @@ class Calibrate(
     """Run the trial motions of the cell file and fit a model.
 
     ``check``: run the short check motion instead, and say whether the model still holds. ``lease_s``: the motion ends
-    when no renewal arrives for so long (None: no lease); the fit that follows it needs no client.
+    when no renewal arrives for so long (None: no lease); the fit that follows it needs no client. ``reset_zeros``, with
+    ``check``: where the zeros of joints have drifted, and nothing else, make a model with moved zeros.
     """
 
     id: GoalId
     check: bool = False
     lease_s: Lease | None = None
+    reset_zeros: bool = False
 
 
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbid_unknown_fields=True):

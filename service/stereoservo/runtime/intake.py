@@ -170,10 +170,14 @@ def _calibrate(command: Calibrate, present: Present) -> str:
     state = present.state
     if present.settings.trials is None:
         raise RefusalError("NO_TRIALS", "the cell file has no [calibration] section")
+    if command.reset_zeros and not command.check:
+        raise RefusalError(
+            "RESET_WITHOUT_CHECK", "joint zeros are reset by a check: give check as well as reset_zeros"
+        )
     if command.check and state.model is None:
         raise RefusalError("NO_MODEL", "the cell has no model to check: calibrate first")
     if command.check and state.model is not None:
-        checking = start_check(command.id, present, state.model)
+        checking = start_check(command.id, present, state.model, command.reset_zeros)
         state.source, what = checking, "check motion begins"
     else:
         state.source = start_trials(command.id, present.q, present.now_ns, present.settings)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable
 
-from stereoservo.kinematics.calibration.check import check_model_holds
-from stereoservo.kinematics.calibration.check_report import CheckReport
+from stereoservo.kinematics.calibration.check import check_model_holds, examine, report_of
+from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.kinematics.calibration.zero_reset import reset_zeros
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.calibration_job import CalibrationJob
 from stereoservo.runtime.commands import (
@@ -65,14 +66,29 @@ class LockstepOperator:
         self.trials, end = self._visit(check=False)
         self._epoch += 1
         model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
-        self.cell.update_model(ModelUpdate(model))
-        self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
+        self._hand_over(model, end)
         return model
 
     def check(self, model: CellModel) -> CheckReport:
         """The check motion, held against ``model``. Raises LockstepRefusalError, CalibrationError."""
         seen, _ = self._visit(check=True)
         return check_model_holds(model, seen, limit_px=self.cell.settings.tolerance_px)
+
+    def reset_zeros(self, model: CellModel) -> tuple[CellModel, ZeroReset]:
+        """The check motion, and a model with moved joint zeros into the core. Raises LockstepRefusalError,
+        CalibrationError.
+        """
+        seen, end = self._visit(check=True)
+        examined = examine(model, seen)
+        report = report_of(examined, limit_px=self.cell.settings.tolerance_px)
+        self._epoch += 1
+        cured, reset = reset_zeros(examined, report, epoch=self._epoch)
+        self._hand_over(cured, end)
+        return cured, reset
+
+    def _hand_over(self, model: CellModel, end: Event) -> None:
+        self.cell.update_model(ModelUpdate(model))
+        self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
 
     def _visit(self, *, check: bool) -> tuple[TrialData, Event]:
         """Trial motions, or the check's: what was seen, and the event that ended them."""

@@ -89,7 +89,8 @@ class Servoing(Leased, tag="law", eq=False, kw_only=True):
     """A law drives the arm to set-points.
 
     ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the
-    goal, where ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): three that span it.
+    goal, where ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): three that
+    span it.
     """
 
     goal: Goal
