@@ -139,8 +139,8 @@ def refuse_lasting(trials: TrialData, found: Predictions) -> None:
         raise CalibrationError(
             "markers_disagree",
             f"markers {sorted(slipped)} do not fit before or after stop {min(slipped.values())}, the others do: "
-            "they are not one rigid body, or the images of that stretch lead a joint's axis astray. Run the trials again, "
-            "with larger motions or less noise",
+            "they are not one rigid body, or the images of that stretch lead a joint's axis astray. Run the trials "
+            "again, with larger motions or less noise",
             markers=sorted(slipped),
             stop=min(slipped.values()),
         )
