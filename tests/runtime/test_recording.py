@@ -14,7 +14,7 @@ from stereoservo.runtime.commands import FeatureTarget, Goal, RunGoal
 from stereoservo.runtime.record import encode_step, fingerprint
 from stereoservo.runtime.recorder import FlightRecorder
 from stereoservo.runtime.replay import RecordingError, replay
-from stereoservo.runtime.state import encode_state
+from stereoservo.runtime.state import STATE_VERSION, StateVersionError, decode_state, encode_state
 
 
 def record(
@@ -115,3 +115,37 @@ def test_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
         replay(tmp_path / "x.mcap")
     with pytest.raises(RecordingError, match="cannot be read"):
         replay(tmp_path / "missing.mcap")
+
+
+def of_version(version: int) -> bytes:
+    """A state of another version, which holds other fields, too."""
+    return msgspec.msgpack.encode({"version": version, "step": 3, "something_else": [1, 2]})
+
+
+def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    older = msgspec.structs.replace(fingerprint(), stereoservo="0.0.1")
+    with FlightRecorder(path, bench.settings, older) as recorder:
+        recorder.checkpoint(3, of_version(STATE_VERSION - 1), 1)
+    with pytest.raises(RecordingError) as caught:
+        replay(path)
+    said = str(caught.value)
+    assert f"state is of version {STATE_VERSION - 1}, this program works with version {STATE_VERSION}" in said
+    assert "written by stereoservo 0.0.1" in said
+    assert "Replay it with the version that wrote it, or record anew" in said
+    assert "not damaged" in said
+    with pytest.raises(StateVersionError) as error:
+        decode_state(of_version(STATE_VERSION + 1))
+    assert error.value.version == STATE_VERSION + 1
+
+
+def test_settings_of_another_version_are_told_from_damage(bench: Any, tmp_path: Path) -> None:
+    for version, said in (("0.0.1", "written by stereoservo 0.0.1"), (None, "damaged")):
+        print_of = fingerprint()
+        if version is not None:
+            print_of = msgspec.structs.replace(print_of, stereoservo=version)
+        path = tmp_path / f"{version}.mcap"
+        with FlightRecorder(path, {"rate": 1}, print_of):  # type: ignore[arg-type]
+            pass
+        with pytest.raises(RecordingError, match=said):
+            replay(path)

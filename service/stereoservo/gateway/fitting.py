@@ -131,7 +131,7 @@ class Fit(ChildJob):
 
 
 class Check(ChildJob):
-    """One running check of a model. ``reset_to``: file of a model with drifted joint zeros reset, of epoch ``epoch``."""
+    """One running check of a model. ``reset_to``: file for a model, of ``epoch``, with drifted joint zeros reset."""
 
     def __init__(
         self, check: TrialData, model_path: Path, history: Path, limit_px: float, *,

@@ -13,12 +13,13 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Header, Message
 from mcap.stream_reader import StreamReader
 
+import stereoservo
 from stereoservo.runtime.core import ServoCore
 from stereoservo.runtime.cycle import StepInputs, StepOutputs, decode_array
 from stereoservo.runtime.record import Fingerprint, StepRecord, decode_step, encode_step, fingerprint
 from stereoservo.runtime.recorder import FORMAT
 from stereoservo.runtime.settings import CoreSettings
-from stereoservo.runtime.state import decode_state, encode_state
+from stereoservo.runtime.state import StateVersionError, decode_state, encode_state
 
 
 class RecordingError(Exception):
@@ -91,7 +92,12 @@ def replay(
                 steps += 1
                 if progress is not None and steps % 1000 == 0:
                     progress(steps)
+        except StateVersionError as error:
+            raise RecordingError(path, steps, _of_another_version(str(error), recorded)) from error
         except (msgspec.MsgspecError, ValueError, KeyError, TypeError) as error:
+            if recorded is not None and recorded.stereoservo != stereoservo.__version__:
+                cause = f"the {topic} does not fit this program ({error})"
+                raise RecordingError(path, steps, _of_another_version(cause, recorded)) from error
             raise RecordingError(path, steps, f"step record is damaged ({error})") from error
     if settings is None or recorded is None:
         raise RecordingError(path, steps, "holds no header; is it a flight recording?")
@@ -106,6 +112,16 @@ def replay(
         checkpoints=checkpoints,
         gaps=gaps,
         fingerprint=recorded,
+    )
+
+
+def _of_another_version(cause: str, recorded: Fingerprint | None) -> str:
+    """What happened to a recording of another version, and what to do."""
+    now = f"stereoservo {stereoservo.__version__}"
+    by = "an unknown version" if recorded is None else f"stereoservo {recorded.stereoservo}"
+    return (
+        f"cannot be replayed by {now}: {cause}. The file is not damaged; it was written by "
+        f"{'another build of ' if by == now else ''}{by}. Replay it with the version that wrote it, or record anew"
     )
 
 

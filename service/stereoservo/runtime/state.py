@@ -278,6 +278,23 @@ def camera_estimate(markers: int) -> CameraEstimate:
     )
 
 
+class StateVersionError(ValueError):
+    """A state of another version of this program; ``version`` is its own."""
+
+    def __init__(self, version: int) -> None:
+        super().__init__(
+            f"its state is of version {version}, this program works with version {STATE_VERSION}: what the core "
+            "remembers has changed in between"
+        )
+        self.version = version
+
+
+class _Versioned(msgspec.Struct):
+    """What every state says of itself, whatever else it holds."""
+
+    version: int
+
+
 _encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
 _decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
 
@@ -288,8 +305,10 @@ def encode_state(state: CoreState) -> bytes:
 
 
 def decode_state(data: bytes) -> CoreState:
-    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, ValueError on another version."""
+    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
+    # Asked first: a state of another version may hold other fields, too.
+    version = msgspec.msgpack.decode(data, type=_Versioned).version
+    if version != STATE_VERSION:
+        raise StateVersionError(version)
     state: CoreState = _decoder.decode(data)
-    if state.version != STATE_VERSION:
-        raise ValueError(f"state version {state.version}; this program reads {STATE_VERSION}")
     return state
