@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import math
 import os
 import shutil
 import tempfile
@@ -235,13 +236,26 @@ def _quantities(model: CellModel) -> str:
             unknown.append(f"{quantity.name}: {quantity.reason}")
             continue
         deviation = "" if quantity.std is None else f"{quantity.std:.2g}"
-        row = (quantity.name, f"{quantity.value:.6g}", deviation, quantity.unit)
+        row = (quantity.name, _to_deviation(quantity.value, quantity.std), deviation, quantity.unit)
         (seen if " in " in quantity.name else inner).append(row)
     head = ("quantity", "value", "deviation", "unit")
-    page = _table(head, inner) if inner else ""
+    page = ""
+    if inner:
+        page = _table(head, inner) + (
+            "<p>a and d are link dimensions after Denavit and Hartenberg: a of a joint is the common normal from its "
+            "axis to the next, d the offset along its axis. Lengths are ratios to the one named after 'over': "
+            "multiply by its true length.</p>"
+        )
     if unknown:
         page += "<p>Not determined:</p><ul>" + "".join(f"<li>{_e(line)}</li>" for line in unknown) + "</ul>"
     return f"{page}<details><summary>As seen in the images</summary>{_table(head, seen)}</details>"
+
+
+def _to_deviation(value: float, std: float | None) -> str:
+    """``value`` with the digits that its deviation leaves meaning."""
+    if not std:
+        return f"{value:.6g}"
+    return f"{value:.{max(0, 1 - math.floor(math.log10(std)))}f}"
 
 
 def _cameras(report: CalibrationReport) -> str:
@@ -343,7 +357,8 @@ def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) ->
     left.bar(mine - 0.2, levels, 0.4, label="residual rms")
     left.bar(mine + 0.2, floors(model, rest), 0.4, label="floor", color="0.7")
     left.set(xticks=mine, xticklabels=model.joint_names, ylabel="[px]", title="by joint")
-    left.legend(fontsize="small")
+    left.margins(y=0.25)  # room for the legend above the bars
+    left.legend(fontsize="small", loc="upper right", ncols=2)
     cameras = [kept & (rest.data.camera == c) for c in range(len(model.cameras))]
     right.bar(
         [camera.name for camera in model.cameras], [float(np.sqrt(squares[m].mean())) for m in cameras], 0.5

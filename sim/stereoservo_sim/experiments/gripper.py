@@ -285,7 +285,9 @@ def draw_gripper(answer: dict[str, Any], folder: Path) -> list[Path]:
                 axis.set_ylabel(f"{name} [mm]", fontsize=8)
         for axis in axes[-1]:
             axis.set_xlabel("noise [px]", fontsize=8)
-        axes[0, 0].legend(fontsize=7)
+        axes[0, 0].legend(
+            fontsize=6, title="median; band: 16 % to 84 %\ndashed: Cramer-Rao bound", title_fontsize=6
+        )
         path = folder / f"gripper-{name}.png"
         figure.savefig(path, dpi=110)
         paths.append(path)
@@ -310,7 +312,7 @@ def _draw_panel(axis: Any, rows: list[dict[str, Any]], structure: str, method: s
             [r[measure]["median"] for r in mine],
             "o-",
             color=colour,
-            label=f"{m} motions",
+            label=f"{m} motion{'s' if m > 1 else ''}",
             markersize=3,
         )
         axis.fill_between(

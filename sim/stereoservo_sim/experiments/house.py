@@ -172,7 +172,7 @@ def draw_house(answer: dict[str, Any], folder: Path) -> list[Path]:
         axis.set_xlabel("motions", fontsize=8)
         axis.set_ylabel("e_D [mm]", fontsize=8)
         axis.tick_params(labelsize=7)
-    axes[0].legend(fontsize=7)
+    axes[1].legend(fontsize=7, loc="lower right", title="median; band: 16 % to 84 %", title_fontsize=7)
     path = folder / "house-e_D.png"
     figure.savefig(path, dpi=110)
     return [path, _draw_rectification(folder)]
