@@ -108,8 +108,14 @@ def test_joint_zeros_are_reset_by_a_check(
     off = msgspec.structs.replace(good, epoch=80, zero=zero)
     save_model(off, store.path(80))
     start(calibrated)
+    unattended = ("calibrate", CELL, "--check", "--unattended")
     with Client(CELL) as client:
+        code, result = run(*unattended)
+        assert (code, result["error"]["code"]) == (1, "not_idle")
+        assert client.status().lifecycle == "inactive"
         client.enable()
+        code, result = run(*unattended)
+        assert (code, result["status"], result["holds"]) == (1, "recalibrate", False)
         code, result = run("calibrate", CELL, "--check", "--reset-zeros")
         assert code == 0
         (joint,) = result["reset"]["joints"]
@@ -126,6 +132,8 @@ def test_joint_zeros_are_reset_by_a_check(
         assert (code, result["error"]["code"]) == (1, "check_holds")
         assert result["error"]["check"]["status"] == "holds"
         assert client.status().model_epoch == 81
+        code, result = run(*unattended)
+        assert (code, result["holds"]) == (0, True)
         assert store.epochs()[-1] == 81
     for epoch in (80, 81):
         store.path(epoch).unlink()

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from stereoservo.cli.output import (
+    EXIT_FAILED,
     CellArgument,
     CommandError,
     EndpointOption,
@@ -53,6 +54,13 @@ def calibrate(
             help="With --check: where joint zeros have drifted, and nothing else, a new model with moved zeros.",
         ),
     ] = False,
+    unattended: Annotated[
+        bool,
+        typer.Option(
+            "--unattended",
+            help="With --check, for timers: enable nothing, disturb nobody; exit code 1 where the model does not hold.",
+        ),
+    ] = False,
     trials: Annotated[
         Path | None,
         typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
@@ -78,8 +86,8 @@ def calibrate(
 
     With the path of a cell file and no daemon running, one is started for the time of it.
     """
-    if reset_zeros and not check:
-        raise CommandError("argument", "--reset-zeros goes with --check")
+    if (reset_zeros or unattended) and not check:
+        raise CommandError("argument", "--reset-zeros and --unattended go with --check")
     if trials is not None:
         if check:
             raise CommandError("argument", "--check moves the arm, --trials does not: give one of them")
@@ -89,14 +97,16 @@ def calibrate(
     if lines is not None or output is not None:
         raise CommandError("argument", "--lines and --output go with --trials FILE.npz")
     with ExitStack() as stack:
-        if endpoint is None and cell.endswith(".toml"):
+        if not unattended and endpoint is None and cell.endswith(".toml"):
             try:
                 find_daemon(cell)
             except NotRunningError:
                 note("no daemon runs for this cell: starting one")
                 stack.enter_context(DaemonProcess(Path(cell))).wait_ready()
         client = stack.enter_context(Client(cell, endpoint=endpoint, operator=operator))
-        if client.status().lifecycle == "inactive":
+        if unattended:
+            _must_be_idle(client)
+        elif client.status().lifecycle == "inactive":
             client.enable()
         try:
             if reset_zeros:
@@ -105,6 +115,8 @@ def calibrate(
             if check:
                 report = _with_bar(client, "check motion", client.check_model)
                 _tell_check(report, client.cell, endpoint, json)
+                if unattended and report.status == "recalibrate":
+                    raise typer.Exit(EXIT_FAILED)
                 return
             result = _with_bar(
                 client, "trial motions", lambda progress: client.calibrate(progress, report=True)
@@ -115,6 +127,18 @@ def calibrate(
         except FailedError as error:
             raise CommandError(error.event.name or "failed", str(error)) from error
     emit(result, _table(result), json)
+
+
+def _must_be_idle(client: Client) -> None:
+    state = client.status()
+    if state.lifecycle != "active" or state.source != "hold":
+        doing = f"works ({state.source}{f' {state.goal}' if state.goal else ''})"
+        raise CommandError(
+            "not_idle",
+            f"no check: the cell is {state.lifecycle if state.lifecycle != 'active' else doing}; an unattended check "
+            "waits for nothing and enables nothing. Enable the cell, or choose another hour",
+            lifecycle=state.lifecycle, source=state.source,
+        )  # fmt: skip
 
 
 def _with_bar(client: Client, what: str, run: Any) -> Any:
@@ -173,7 +197,7 @@ def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool
     lines = [report.message]
     lines += [f"  {report.trend}"] if report.trend else []
     for what, values in (("joint", report.per_joint), ("camera", report.per_camera)):
-        lines += [f"  {what} {name:16} {value:.2f} sigmas" for name, value in values.items()]
+        lines += [f"  {what:6} {name:16} {value:.2f} sigmas" for name, value in values.items()]
     worst = sorted(report.per_marker.items(), key=lambda item: -item[1])[:3]
     lines.append(
         "  markers, worst first: " + ", ".join(f"{name} {value:.2f}" for name, value in worst) + " sigmas"
