@@ -20,12 +20,6 @@ SIGMA = 0.05
 Run = Callable[..., tuple[int, Any]]
 
 
-@pytest.fixture(autouse=True)
-def roots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STEREOSERVO_RUNTIME_DIR", str(tmp_path / "run"))
-    monkeypatch.setenv("STEREOSERVO_STATE_DIR", str(tmp_path / "state"))
-
-
 @pytest.fixture
 def run(capfd: pytest.CaptureFixture[str]) -> Run:
     def run_it(*arguments: str) -> tuple[int, Any]:

@@ -14,12 +14,6 @@ from stereoservo.runtime.cellfile import load_cell_file
 Run = Callable[..., tuple[int, Any, str]]
 
 
-@pytest.fixture(autouse=True)
-def roots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STEREOSERVO_RUNTIME_DIR", str(tmp_path / "run"))
-    monkeypatch.setenv("STEREOSERVO_STATE_DIR", str(tmp_path / "state"))
-
-
 @pytest.fixture
 def run(capfd: pytest.CaptureFixture[str]) -> Run:
     """Run a command line with --json; gives exit code, the object and stderr."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stereoservo.runtime.cellfile import check_cell, load_cell_file
@@ -11,6 +12,7 @@ from stereoservo_sim.cells import CELLS, demo_cell_path, demo_cell_text, shipped
 from stereoservo_sim.demonstration.truth import true_cell
 
 DEPLOYED = Path(__file__).parents[2] / "deploy" / "cells"
+SIXTY = np.deg2rad(60.0)
 
 
 @pytest.mark.parametrize("name", CELLS)
@@ -32,6 +34,23 @@ def test_the_cell_file_names_what_the_simulation_has(name: str) -> None:
     truth = true_cell(cell)
     assert [camera.name for camera in cell.camera] == [camera.name for camera in truth.rig.cameras]
     assert [limit.joint for limit in cell.safety.limit] == list(truth.robot.joint_names)
+
+
+@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("index", range(6))
+def test_every_calibration_stop_shows_every_marker_to_both_cameras(name: str, index: int) -> None:
+    file = load_cell_file(shipped_cell_path(name))
+    cell = true_cell(file)
+    assert file.calibration is not None
+    joint = cell.robot.joint_names[index]
+    limit = next(limit for limit in file.safety.limit if limit.joint == joint)
+    reach = file.calibration.range[joint]
+    for offset in np.linspace(-reach, reach, file.calibration.stops):
+        q = cell.base.copy()
+        q[index] += offset
+        assert limit.min + file.safety.position_margin < q[index] < limit.max - file.safety.position_margin
+        for camera in cell.rig.cameras:
+            assert cell.visible(q, camera, max_incidence=SIXTY).all(), (joint, offset, camera.name)
 
 
 def test_the_truth_has_the_mount_and_the_lenses_of_the_cell_file() -> None:

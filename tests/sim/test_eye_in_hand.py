@@ -67,20 +67,6 @@ def test_cell_file_fits_the_arm() -> None:
     assert [FILE.calibration.base[name] for name in CELL.robot.joint_names] == CELL.base.tolist()
 
 
-@pytest.mark.parametrize("index", range(6))
-def test_every_calibration_stop_shows_every_marker_to_both_cameras(index: int) -> None:
-    assert FILE.calibration is not None
-    name = CELL.robot.joint_names[index]
-    limit = next(limit for limit in FILE.safety.limit if limit.joint == name)
-    reach = FILE.calibration.range[name]
-    for offset in np.linspace(-reach, reach, FILE.calibration.stops):
-        q = CELL.base.copy()
-        q[index] += offset
-        assert limit.min + FILE.safety.position_margin < q[index] < limit.max - FILE.safety.position_margin
-        for camera in CELL.rig.cameras:
-            assert CELL.visible(q, camera, max_incidence=SIXTY).all(), (name, offset, camera.name)
-
-
 def displacement(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     turn = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
     middle = CELL.body.marker_points.mean(axis=0)

@@ -167,8 +167,7 @@ def refine_translations(
     W = conditioner(common[:, known].reshape(-1, 4))
     size = np.linalg.norm(common[:, known] @ W.T, axis=2, keepdims=True)
     M = common[:, known] @ W.T / size
-    seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)
-    chart, x = shared_plane(np.asarray(np.linalg.solve(W.T, plane), dtype=np.float64), directions @ W.T)
+    seen, chart, x = _whitened(images, W, plane, directions)
     best = minimise(seen, chart.displacements, x, M[0] if len(M) == 1 else M, free_points=False)
     covariance = covariance_of(best.information, "the plane at infinity")
     if points_covariance is not None:
@@ -206,8 +205,7 @@ def bundle_translations(
     W = conditioner(points[known])
     M = points[known] @ W.T
     M = M / np.linalg.norm(M, axis=1, keepdims=True)
-    seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)
-    chart, x = shared_plane(np.asarray(np.linalg.solve(W.T, plane), dtype=np.float64), directions @ W.T)
+    seen, chart, x = _whitened(images, W, plane, directions)
     best = minimise(seen, with_rest(chart.displacements), x, M, free_points=True)
     covariance = covariance_of(best.information, "the plane at infinity")
     estimated = np.full(points.shape, np.nan)
@@ -215,6 +213,14 @@ def bundle_translations(
     estimated = estimated / (estimated @ images.cameras[0, 2])[:, None]
     freedom = images.measurements - len(x) - 3 * int(known.sum())
     return _answer(best, chart, covariance, W, estimated, freedom)
+
+
+def _whitened(
+    images: Images, W: FloatArray, plane: FloatArray, directions: FloatArray
+) -> tuple[Images, SharedPlane, FloatArray]:
+    """Images, chart and start in the frame ``W M`` of the points."""
+    seen = Images(images.cameras @ np.linalg.inv(W), images.pixels, images.weights)
+    return seen, *shared_plane(np.asarray(np.linalg.solve(W.T, plane), dtype=np.float64), directions @ W.T)
 
 
 def _check_start(plane: FloatArray, directions: FloatArray, n: int) -> None:

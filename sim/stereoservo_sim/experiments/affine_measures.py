@@ -222,3 +222,23 @@ def spread(values: npt.ArrayLike) -> dict[str, Any]:
         return {"median": None, "p16": None, "p84": None, "mean": None}
     low, middle, high = np.percentile(finite, [16, 50, 84])
     return {"median": float(middle), "p16": float(low), "p84": float(high), "mean": float(finite.mean())}
+
+
+def answer_of(
+    name: str,
+    seed: int,
+    seeds: int,
+    rows: list[dict[str, Any]],
+    thesis: dict[str, Any],
+    assumptions: list[str],
+) -> dict[str, Any]:
+    """What an experiment of chapter 3 answers, its rows beside the thesis's values and what was assumed."""
+    return {
+        "experiment": name,
+        "seed": seed,
+        "seeds": seeds,
+        "rows": rows,
+        "thesis": thesis,
+        "assumptions": assumptions,
+        "bound_is": "mean error of an estimator at the Cramér-Rao bound, free points, to first order",
+    }

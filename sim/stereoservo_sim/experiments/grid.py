@@ -25,6 +25,7 @@ from stereoservo.geometry.translations import (
 from stereoservo_sim.experiments.affine_measures import (
     CAMERAS_ASSUMED,
     EPIPOLAR_ASSUMED,
+    answer_of,
     converging_rig,
     cramer_rao,
     distance_error,
@@ -133,13 +134,7 @@ def run_grid(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]
         for (estimate, n, method, structure), errors in sorted(values.items())
     ]
     return {
-        "experiment": "grid",
-        "seed": seed,
-        "seeds": seeds,
-        "rows": rows,
-        "thesis": THESIS,
-        "assumptions": ASSUMPTIONS,
-        "bound_is": "mean error of an estimator at the Cramér-Rao bound, free points, to first order",
+        **answer_of("grid", seed, seeds, rows, THESIS, ASSUMPTIONS),
         "one_image_e_d_mm": expected_errors(
             scenes[0], None, _with_known_plane(pair_covariance(rig, scenes[0], SIGMA))
         )[0],

@@ -30,6 +30,7 @@ from stereoservo.geometry.translations import (
 from stereoservo_sim.experiments.affine_measures import (
     CAMERAS_ASSUMED,
     EPIPOLAR_ASSUMED,
+    answer_of,
     collinear_triplets,
     converging_rig,
     cramer_rao,
@@ -157,15 +158,9 @@ def run_gripper(
         for (sigma, m, method, structure), errors in sorted(values.items())
     ]
     return {
-        "experiment": "gripper",
-        "seed": seed,
-        "seeds": seeds,
-        "rows": rows,
-        "thesis": THESIS,
+        **answer_of("gripper", seed, seeds, rows, THESIS, ASSUMPTIONS),
         "methods": METHODS,
-        "assumptions": ASSUMPTIONS,
         "beside_thesis": _beside_thesis(rows),
-        "bound_is": "mean error of an estimator at the Cramér-Rao bound, free points, to first order",
         "triplets": len(triplets),
     }
 

@@ -16,6 +16,7 @@ from stereoservo.geometry.errors import GeometryError
 from stereoservo_sim.experiments.affine_measures import (
     CAMERAS_ASSUMED,
     EPIPOLAR_ASSUMED,
+    answer_of,
     converging_rig,
     cramer_rao,
     distance_error,
@@ -126,15 +127,7 @@ def run_house(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any
         }
         for (sigma, n, method, structure), errors in sorted(values.items())
     ]
-    return {
-        "experiment": "house",
-        "seed": seed,
-        "seeds": seeds,
-        "rows": rows,
-        "thesis": THESIS,
-        "assumptions": ASSUMPTIONS,
-        "bound_is": "mean error of an estimator at the Cramér-Rao bound, free points, to first order",
-    }
+    return answer_of("house", seed, seeds, rows, THESIS, ASSUMPTIONS)
 
 
 def _expected(X: FloatArray, plane: FloatArray, seen: FloatArray) -> dict[str, float]:
