@@ -13,10 +13,14 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from stereoservo_sim.commands.progress import ProgressCall, progress_bar
 from stereoservo_sim.experiments.errors import ExperimentError
+
+LISTED, WIDEST = 200, 400
+"""Rows of a table that a person still reads; its characters across at most."""
 
 
 @dataclass(frozen=True)
@@ -166,15 +170,27 @@ def _with_plots(
 
 
 def show_rows(answer: dict[str, Any], console: Console) -> None:
-    """The rows as a table, a spread as its median and the 16th to 84th percentile; then the thesis's values."""
+    """The rows as a table, a spread as its median and the 16th to 84th percentile; then the thesis's values.
+
+    More than ``LISTED`` rows are left to ``--json`` where a summary stands beside the thesis.
+    """
     rows = answer["rows"]
-    names = list(rows[0])
-    table = Table(title=f"{answer['experiment']}: {answer['seeds']} seeds", title_justify="left")
-    for name in names:
-        table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
-    for row in rows:
-        table.add_row(*(_cell(row[name]) for name in names))
-    console.print(table)
+    title = f"{answer['experiment']}: {answer['seeds']} seeds; medians (16 % to 84 %)"
+    if len(rows) > LISTED and answer.get("beside_thesis"):
+        console.print(f"{title}; all {len(rows)} rows: --json, curves: --plot DIR")
+    else:
+        names = list(rows[0])
+        table = Table(title=title, title_justify="left")
+        for name in names:
+            table.add_column(
+                name, justify="left" if isinstance(rows[0][name], str) else "right", no_wrap=True
+            )
+        for row in rows:
+            table.add_row(*(_cell(row[name]) for name in names))
+        # A figure cut off says nothing: a narrow terminal wraps the lines instead.
+        wide = console.options.update(width=WIDEST)
+        needed = Measurement.get(console, wide, table).maximum
+        Console(file=console.file, width=max(console.width, needed), markup=False).print(table)
     for item in answer.get("beside_thesis", []):
         console.print(
             "beside the thesis: " + ", ".join(f"{key} {_cell(value)}" for key, value in item.items())
@@ -231,6 +247,8 @@ def _cell(value: Any) -> str:
         )
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, list):
+        return " to ".join(_cell(item) for item in value)
     return "-" if value is None else str(value)
 
 
