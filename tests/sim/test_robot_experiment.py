@@ -9,7 +9,7 @@ import pytest
 from stereoservo.cli import main as cli
 from stereoservo.kinematics.axes import framed
 from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.experiments.robot import QUANTITIES, mean_length, cramer_rao, tables, tables_of
+from stereoservo_sim.experiments.robot import QUANTITIES, cramer_rao, mean_length, tables, tables_of
 from stereoservo_sim.experiments.robot_report import draw_robot, run_robot
 from stereoservo_sim.experiments.thesis_robot import (
     LARGEST_ANGLE_ERROR,
