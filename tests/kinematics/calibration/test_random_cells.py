@@ -82,8 +82,14 @@ def test_a_thousand_random_rigs_are_calibrated_from_nothing():
     assert promised(1000, 2000)["success"] >= 995
 
 
-def test_a_failure_is_told_as_one():
-    """Noise of 0.94 px has led the first joint's axis astray: half of the markers contradict it."""
-    verdict = judged(2934)
-    assert verdict.outcome == "failure"
-    assert verdict.code == "markers_disagree"
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(3982, id="fifth joint, 0.77 px"),
+        pytest.param(2934, id="first joint, 0.94 px"),
+    ],
+)
+def test_noise_leads_no_axis_astray(seed):
+    """The linear start finds no rotation here, and the nominal one creeps along a valley beside the minimum."""
+    verdict = judged(seed)
+    assert verdict.outcome == "success", verdict

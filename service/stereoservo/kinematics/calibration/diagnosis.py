@@ -247,7 +247,9 @@ def _kind_hypotheses(trials: TrialData, views: Views) -> Iterator[Hypothesis]:
         sights = virtual_markers(trials, points, usable, stops, groups)
         way = trials.positions[stops, joint] - base[joint]
         other: Kind = "prismatic" if said == "revolute" else "revolute"
-        as_said, as_other = (best_start(kind, cameras, sights, way)[1] for kind in (said, other))
+        as_said, as_other = (
+            best_start(kind, cameras, sights, way, thorough=True)[1] for kind in (said, other)
+        )
         fits[joint] = as_said, as_other, other
     # The other kind must reach what the other joints do; a joint that fits neither way is no case of this.
     floor = float(np.median([min(least, instead) for least, instead, _ in fits.values()])) if fits else 0.0

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, Solution, solve
 from stereoservo.kinematics.calibration.rig import partial_products
+from stereoservo.kinematics.calibration.starts import DIRECTIONS, twist_about
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -20,10 +21,6 @@ STILL = 2e-3
 """How far other joints may stray [rad or m] at the stops of a joint's own trial."""
 GAIN = 8.0
 """Chi-square by which another axis must explain a joint's trial better to be tried in the whole bundle."""
-DIRECTIONS = np.array(
-    [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
-)
-"""26 directions (26, 3) to start from: faces, edges and corners of a cube."""
 
 
 def with_other_axes(solution: Solution) -> list[Rig]:
@@ -72,7 +69,7 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
     middles = [_middle(single, float(end)) for end in (way[still].min(), way[still].max())]
     best: Solution | None = None
     for direction in DIRECTIONS:
-        start = replace(single, generators=_twist(direction, middles, span)[None])
+        start = replace(single, generators=twist_about(direction, middles, span)[None])
         try:
             fit = _solved(start, own)
         except np.linalg.LinAlgError:
@@ -91,19 +88,3 @@ def _middle(rig: Rig, angle: float) -> FloatArray:
     _, after = partial_products(rig, np.array([[angle]]))
     points = rig.points @ after[0, 0].T
     return np.asarray((points[:, :3] / points[:, 3:]).mean(axis=0))
-
-
-def _twist(direction: FloatArray, middles: list[FloatArray], span: float) -> FloatArray:
-    """Unit twist (4, 4) about a ``direction`` (3,) that takes the markers' middle over the trial as seen.
-
-    The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
-    """
-    axis = direction / np.linalg.norm(direction)
-    chord = middles[1] - middles[0]
-    chord = chord - axis * (axis @ chord)
-    centre = 0.5 * (middles[0] + middles[1]) + 0.5 * np.cross(axis, chord) / np.tan(0.5 * span)
-    x, y, z = axis
-    twist = np.zeros((4, 4))
-    twist[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
-    twist[:3, 3] = -np.cross(axis, centre)
-    return twist

@@ -33,6 +33,8 @@ COARSE = tuple(float(2.0 ** (k / 4)) for k in range(-5, 6))
 """Factors about the rigid estimate that a search begins with: nominal cameras misjudge angles."""
 WORTH = 40.0
 """Chi-square by which a factor must improve a joint's own trial."""
+ABOVE_FLOOR = 1.25
+"""How far above the residuals of the other joints' trials one may stay with its factor."""
 SIGNIFICANT = 5.0
 """Deviations from 1 at which a factor is one."""
 LEAST_FACTOR = 2e-3
@@ -58,18 +60,24 @@ def trial_scales(
     trials: TrialData, cameras: FloatArray, points: FloatArray, usable: npt.NDArray[np.bool_]
 ) -> FloatArray:
     """Factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where the trial
-    shows no other, for prismatic joints, and where the trial is of no use.
+    shows no other, for prismatic joints, where the trial is of no use, and where it does not reach with its factor
+    what the other joints' trials do: something else is wrong then.
     """
-    factors = np.ones(len(trials.joint_names))
+    factors, residual = np.ones(len(trials.joint_names)), np.full(len(trials.joint_names), np.nan)
     for joint, kind in enumerate(trials.joint_kinds):
-        if kind != "revolute":
-            continue
         try:
             stops, groups, base = trial_stops(trials, points, joint)
         except CalibrationError:
             continue  # too few stops to tell a scale by
         sights = virtual_markers(trials, points, usable, stops, groups)
-        factors[joint] = _best_factor(cameras, sights, trials.positions[stops, joint] - base[joint])
+        way = trials.positions[stops, joint] - base[joint]
+        if kind == "revolute":
+            factors[joint], residual[joint] = _best_factor(cameras, sights, way)
+        else:
+            residual[joint] = best_start(kind, cameras, sights, way)[1]
+    known = np.isfinite(residual)
+    if known.any():
+        factors[known & (residual > ABOVE_FLOOR * np.median(residual[known]))] = 1.0
     return factors
 
 
@@ -79,22 +87,25 @@ def corrected(trials: TrialData, factors: FloatArray) -> TrialData:
     return msgspec.structs.replace(trials, positions=middle + (trials.positions - middle) / factors)
 
 
-def _best_factor(cameras: FloatArray, sights: Sights, reported: FloatArray) -> float:
-    """The factor of one joint's ``reported`` angles (k,); 1 where none is worth more."""
+def _best_factor(cameras: FloatArray, sights: Sights, reported: FloatArray) -> tuple[float, float]:
+    """The factor of one joint's ``reported`` angles (k,), 1 where none is worth more, and the median residual
+    [sigmas] with it; NaN where no joint fits at all.
+    """
     rough = _rigid_factor(sights, reported)
     rigs: dict[float, tuple[Rig, float]] = {}
     for factor in {1.0, *(rough * step for step in COARSE)}:
-        rig, typical = best_start("revolute", cameras, sights, reported / factor)
+        # As reported, the joint must have had every chance before another factor is believed.
+        rig, typical = best_start("revolute", cameras, sights, reported / factor, thorough=factor == 1.0)
         if rig is not None and np.isfinite(typical):
             rigs[factor] = rig, typical
     if not rigs:
-        return 1.0
+        return 1.0, np.nan
     start = min(rigs, key=lambda factor: rigs[factor][1])
     camera, stop, marker = np.nonzero(sights.usable)
-    rig = rigs[start][0]
     noise = max(1.0, min(typical for _, typical in rigs.values()))
 
-    def cost(log_factor: float) -> float:
+    def solved(log_factor: float, rig: Rig) -> FloatArray:
+        """Residuals [noise]."""
         data = Measurements(
             reported[:, None] / np.exp(log_factor),
             camera,
@@ -103,17 +114,26 @@ def _best_factor(cameras: FloatArray, sights: Sights, reported: FloatArray) -> f
             sights.pixels[sights.usable].reshape(-1, 2),
             noise * sights.sigmas[sights.usable].ravel(),
         )
-        fit = solve(
+        return solve(
             rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, max_evaluations=40
-        )
-        return float(8.0 * (np.sqrt(1.0 + fit.residuals**2 / 4.0) - 1.0).sum())
+        ).residuals
+
+    def cost(log_factor: float, rig: Rig) -> float:
+        return float(8.0 * (np.sqrt(1.0 + solved(log_factor, rig) ** 2 / 4.0) - 1.0).sum())
 
     log = float(np.log(start))
     found = minimize_scalar(
-        cost, bounds=(log - 0.25, log + 0.25), method="bounded", options={"xatol": 1e-4, "maxiter": 25}
+        cost,
+        bounds=(log - 0.25, log + 0.25),
+        args=(rigs[start][0],),
+        method="bounded",
+        options={"xatol": 1e-4, "maxiter": 25},
     )
-    without = cost(0.0) if 1.0 in rigs else np.inf
-    return float(np.exp(found.x)) if without - found.fun > WORTH else 1.0
+    without = cost(0.0, rigs[1.0][0]) if 1.0 in rigs else np.inf
+    if without - found.fun <= WORTH:
+        return 1.0, rigs[1.0][1]
+    squares = (solved(float(found.x), rigs[start][0]).reshape(-1, 2) ** 2).sum(axis=1)
+    return float(np.exp(found.x)), noise * float(np.sqrt(np.median(squares) / np.log(4.0)))
 
 
 def _rigid_factor(sights: Sights, reported: FloatArray) -> float:

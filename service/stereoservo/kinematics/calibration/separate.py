@@ -14,7 +14,12 @@ import numpy.typing as npt
 
 from stereoservo.kinematics.calibration.bundle import Measurements, Rig, solve
 from stereoservo.kinematics.calibration.charts import Kind
-from stereoservo.kinematics.calibration.starts import common_points, linear_generator, nominal_generator
+from stereoservo.kinematics.calibration.starts import (
+    common_points,
+    linear_generator,
+    nominal_generator,
+    turned_generators,
+)
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, finite_rows
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,6 +40,10 @@ STILL = 2e-3
 """How far other joints may stray during a trial [rad or m] and still count as locked."""
 GOOD_FIT = 1.3
 """Median residual [sigmas] of a joint's own trial at which no other start is tried."""
+ALIKE = 1e-3
+"""Relative difference of residuals up to which two starts have ended in the same place."""
+FULL, SHORT = 80, 20
+"""Evaluations of a start, and of each of many."""
 WRONG_SQUARE = 100.0
 """Squared residual [sigmas] at which a pixel is as wrong as can be."""
 MISFIT = 20.0
@@ -155,8 +164,8 @@ def separate_joint(
     """Generator of ``joint`` and the markers from its own trial, cameras (c, 3, 4) fixed (5.52).
 
     ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). Starts one after the other until one fits: linear
-    over all pairs of stops; as if the cameras were nominal ones. Then least squares with free markers, each of a
-    distal configuration its own. Raises CalibrationError naming the joint.
+    over all pairs of stops; as if the cameras were nominal ones; axes all around. Then least squares with free
+    markers, each of a distal configuration its own. Raises CalibrationError naming the joint.
     """
     name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
     stops, groups, base = trial_stops(trials, points, joint)
@@ -173,7 +182,7 @@ def separate_joint(
             markers=int(seen.sum()),
             minimum=MIN_MARKERS,
         )
-    best, least = best_start(kind, cameras, sights, angles)
+    best, least = best_start(kind, cameras, sights, angles, thorough=True)
     if best is None or not least < MISFIT:
         raise CalibrationError(
             "joint_kind",
@@ -228,10 +237,11 @@ def virtual_markers(
 
 
 def best_start(
-    kind: Kind, cameras: FloatArray, sights: Sights, angles: FloatArray
+    kind: Kind, cameras: FloatArray, sights: Sights, angles: FloatArray, *, thorough: bool = False
 ) -> tuple[Rig | None, float]:
     """The single joint of ``kind`` that explains the ``sights`` at ``angles`` (k,) best, with its median residual
-    [sigmas]; starts are tried until one fits.
+    [sigmas]; starts are tried until one fits. ``thorough``: unless one does, or two end alike, rotations about axes
+    all around are tried, too.
     """
     camera, stop, marker = np.nonzero(sights.usable)
     data = Measurements(
@@ -242,37 +252,78 @@ def best_start(
         sights.pixels[sights.usable].reshape(-1, 2),
         sights.sigmas[sights.usable].ravel(),
     )
-    shown = sights.usable.any(axis=(0, 1))
-    best, least, lowest = None, np.inf, np.inf
+    found: list[_Ended] = []
     for start in (linear_generator, nominal_generator):
         generator = start(kind, cameras, sights.points, sights.usable, sights.pixels, sights.sigmas, angles)
-        if generator is None:
-            continue
-        structure = common_points(generator, kind, sights.points, angles)
-        structure[~shown] = [0.0, 0.0, 1.0, 1.0]
-        rig = Rig((kind,), generator[None], cameras, structure)
-        try:
-            fit = solve(
-                rig,
-                data,
-                "projective",
-                cameras=False,
-                loss="soft_l1",
-                loss_scale=3.0,
-                max_evaluations=80,
-            )
-        except np.linalg.LinAlgError:
-            continue  # a point of this start lies in a focal plane; the next one may do
-        # The median of a chi-square with two degrees of freedom is ln 4.
-        squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
-        typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
-        # A wrong axis may fit the half of the markers that hardly move.
-        score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE).mean() / 2.0))
-        if score < lowest:
-            best, least, lowest = fit.rig, typical, score
-        if typical < GOOD_FIT and score < GOOD_FIT:
-            break
-    return best, least
+        if generator is not None:
+            found += _ended(kind, generator, cameras, sights, data, FULL)
+            if found and found[-1].fits:
+                break
+    if thorough and kind == "revolute" and not _sure(found):
+        turned: list[_Ended] = []
+        for generator in turned_generators(sights.points, angles):
+            turned += _ended(kind, generator, cameras, sights, data, SHORT)
+        if turned:
+            rig = min(turned, key=lambda one: one.score).rig
+            found += _ended(kind, rig.generators[0], cameras, sights, data, FULL)
+    best = min(found, key=lambda one: one.score, default=None)
+    return (best.rig, best.typical) if best is not None else (None, np.inf)
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """Where a start ended: ``typical`` median residual and ``score``, that of all pixels, both [sigmas]."""
+
+    rig: Rig
+    typical: float
+    score: float
+    converged: bool
+
+    @property
+    def fits(self) -> bool:
+        return self.typical < GOOD_FIT and self.score < GOOD_FIT
+
+
+def _sure(found: list[_Ended]) -> bool:
+    """Whether the best of these ends is a minimum that fits, or one that two starts have reached."""
+    if not found:
+        return False
+    best = min(found, key=lambda one: one.score)
+    alike = [one for one in found if one.score < (1.0 + ALIKE) * best.score]
+    return best.converged and (best.fits or len(alike) > 1)
+
+
+def _ended(
+    kind: Kind,
+    generator: FloatArray,
+    cameras: FloatArray,
+    sights: Sights,
+    data: Measurements,
+    evaluations: int,
+) -> list[_Ended]:
+    """Where a start with ``generator`` (4, 4) ends after at most ``evaluations``; nothing where it breaks down."""
+    structure = common_points(generator, kind, sights.points, data.offsets[:, 0])
+    structure[~sights.usable.any(axis=(0, 1))] = [0.0, 0.0, 1.0, 1.0]
+    try:
+        fit = solve(
+            Rig((kind,), generator[None], cameras, structure),
+            data,
+            "projective",
+            cameras=False,
+            loss="soft_l1",
+            loss_scale=3.0,
+            max_evaluations=evaluations,
+        )
+    except np.linalg.LinAlgError:
+        return []  # a point of this start lies in a focal plane; the next one may do
+    # The median of a chi-square with two degrees of freedom is ln 4.
+    squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+    typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
+    # A wrong axis may fit the half of the markers that hardly move.
+    score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE).mean() / 2.0))
+    if not np.isfinite(score):
+        return []
+    return [_Ended(fit.rig, typical, score, fit.converged)]
 
 
 def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:

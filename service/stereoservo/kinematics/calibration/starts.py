@@ -4,6 +4,8 @@ cameras.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -25,6 +27,10 @@ IntArray = npt.NDArray[np.int64]
 
 MAX_PAIRS = 150
 """Pairs of stops that a start looks at: plenty for a start, and its cost stays linear in the stops."""
+DIRECTIONS = np.array(
+    [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
+)
+"""26 directions (26, 3) to start from: faces, edges and corners of a cube."""
 
 
 def spread_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
@@ -129,6 +135,44 @@ def nominal_generator(
         if typical < least:
             best, least = generator, typical
     return best
+
+
+def turned_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray]:
+    """Generators (4, 4) of rotations about ``DIRECTIONS``, as if the cameras were nominal ones: each takes the middle
+    of the markers along the trial's chord.
+
+    ``points`` (k, m, 4), ``angles`` (k,). Noise says nothing against any of them, however little the markers turn.
+    Empty where no two stops far apart have three markers in common.
+    """
+    upgrade = np.diag([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0, 1.0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        euclidean = points @ upgrade.T / points[..., 3:]
+    valid = finite_rows(euclidean)
+    common = valid.astype(np.int64) @ valid.T.astype(np.int64)
+    spans = np.where(common >= 3, angles[None, :] - angles[:, None], 0.0)
+    k, n = np.unravel_index(int(spans.argmax()), spans.shape)
+    span = float(spans[k, n])
+    if span < 0.5 * np.ptp(angles):
+        return []
+    both = valid[k] & valid[n]
+    middles = [euclidean[stop, both, :3].mean(axis=0) for stop in (k, n)]
+    return [np.linalg.inv(upgrade) @ twist_about(one, middles, span) @ upgrade for one in DIRECTIONS]
+
+
+def twist_about(direction: FloatArray, middles: Sequence[FloatArray], span: float) -> FloatArray:
+    """Unit twist (4, 4) about a ``direction`` (3,) that takes the markers' middle over the trial as seen.
+
+    The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
+    """
+    axis = direction / np.linalg.norm(direction)
+    chord = middles[1] - middles[0]
+    chord = chord - axis * (axis @ chord)
+    centre = 0.5 * (middles[0] + middles[1]) + 0.5 * np.cross(axis, chord) / np.tan(0.5 * span)
+    x, y, z = axis
+    twist = np.zeros((4, 4))
+    twist[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    twist[:3, 3] = -np.cross(axis, centre)
+    return twist
 
 
 def _robust_least_squares(system: FloatArray, right: FloatArray, rounds: int = 8) -> FloatArray:
