@@ -214,6 +214,10 @@ def epipolar_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> Fl
     return distances
 
 
+ROUNDING_PX = 1e-8
+"""Misfit [px] below which there is nothing but rounding."""
+
+
 def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
     """How many times larger, in variance, the misfit of one homography to matches (n, 2) [px] is than that of ``F``.
 
@@ -229,7 +233,8 @@ def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
     # A transfer carries the left image's noise, too, stretched by the map.
     of_plane = (transfer**2).sum() / (2 * len(left) - 8) / (1.0 + abs(np.linalg.det(H[:2, :2])))
     of_pair = (sampson_distances(F, left, right) ** 2).sum() / max(1, len(left) - 7)
-    return float(of_plane / of_pair)
+    # Two copies of one image leave rounding errors, whose ratio says nothing.
+    return float(of_plane / max(of_pair, ROUNDING_PX**2))
 
 
 def _refuse_plane(left: FloatArray, right: FloatArray, sigma_px: float) -> None:

@@ -10,6 +10,7 @@ from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.outlier_causes import expected_pixels, model_rig
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo_sim import synthetic
+from stereoservo_sim.experiments.thesis_robot import thesis_cell, trial_motions
 from stereoservo_sim.synthetic import FIRST_MARKER, flat_plate, placed, translation, two_faces
 
 SIGMA = 0.1
@@ -386,3 +387,75 @@ def test_wrong_kind_is_named():
         error = refusal(changed(trials, joint_kinds=kinds))
         assert error.code == "joint_kind", error.message
         assert error.data == {"joint": f"j{joint + 1}", "kind": trials.joint_kinds[joint]}
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.02])
+def test_noise_far_below_what_is_stated_is_no_step(sigma):
+    cell = thesis_cell()
+    trials = cell.trials(sigma, np.random.default_rng(7), positions=trial_motions(cell), stated=0.05)
+    result = fit_model(trials, epoch=1)
+    assert result.model.stratum == "metric"
+    assert error_rms(result.model, cell, cell.held_out(np.random.default_rng(8), 20)) < max(sigma, 1e-6)
+
+
+@pytest.mark.parametrize(("understated", "bend"), [(10.0, 0.0), (5.0, 0.0), (10.0, -0.3)])
+def test_understated_noise_is_named_with_the_noise(understated, bend):
+    cell, rng = synthetic.rx90().with_k1(bend), np.random.default_rng(3)
+    error = refusal(cell.trials(0.05, rng, stated=0.05 / understated))
+    assert error.code == "noise_understated"
+    assert error.data["factor"] == pytest.approx(understated, rel=0.15)
+
+
+def test_noise_of_one_camera_understated_is_told_by_camera():
+    cell, rng = synthetic.rx90(), np.random.default_rng(4)
+    trials = cell.trials(0.05, rng)
+    sigmas = trials.sigmas * np.array([1.0, 0.1])[:, None, None]
+    error = refusal(changed(trials, sigmas=sigmas))
+    assert error.code == "noise_understated"
+    assert error.data["cameras"]["cam1"] > 5.0 * error.data["cameras"]["cam0"]
+
+
+@pytest.mark.parametrize("shift", [1.0, 8.0])
+def test_camera_that_is_bumped_is_not_taken_for_noise(shift):
+    trials = synthetic.rx90().trials(0.05, np.random.default_rng(5), stated=0.005)
+    pixels = trials.pixels.copy()
+    pixels[1, 30:] += shift
+    assert refusal(with_sights(trials, pixels)).code == "camera_moved"
+
+
+@pytest.mark.parametrize("factor", [float(np.degrees(1.0)), pytest.param(1000.0, marks=pytest.mark.slow)])
+def test_all_joints_in_another_unit(factor):
+    trials = synthetic.rx90().trials(SIGMA, np.random.default_rng(7))
+    error = refusal(changed(trials, positions=factor * trials.positions))
+    assert error.code == "wrong_scale"
+    for told in error.data["joints"].values():
+        assert told["factor"] == pytest.approx(factor, abs=5.0 * told["deviation"])
+
+
+def test_two_copies_of_one_image_have_no_baseline():
+    trials = synthetic.rx90().trials(SIGMA, np.random.default_rng(7))
+    assert refusal(with_sights(trials, np.repeat(trials.pixels[:1], 2, axis=0))).code == "no_baseline"
+
+
+def test_few_pixels_left_are_no_wrong_kind():
+    rng = np.random.default_rng(1)
+    trials = synthetic.rx90().trials(SIGMA, np.random.default_rng(7))
+    pixels = trials.pixels.copy()
+    pixels[rng.random(pixels.shape[:3]) < 0.6] = np.nan
+    error = refusal(with_sights(trials, pixels))
+    assert error.code == "too_few_markers"
+    assert error.data["markers"] < error.data["minimum"]
+
+
+def test_images_of_one_camera_late_by_a_stop():
+    trials = synthetic.rx90().trials(SIGMA, np.random.default_rng(7))
+    pixels = trials.pixels.copy()
+    pixels[1] = np.roll(pixels[1], 1, axis=0)
+    error = refusal(with_sights(trials, pixels))
+    assert error.code in ("views_unrelated", "views_degenerate")
+    assert "late" in error.message or "at another time than the images" in error.message
+
+
+def test_no_stop_of_any_trial():
+    trials = synthetic.rx90().trials(SIGMA, np.random.default_rng(7))
+    assert refusal(changed(trials, trials=np.full_like(trials.trials, -1))).code == "too_few_markers"

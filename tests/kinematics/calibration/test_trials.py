@@ -1,11 +1,14 @@
 """Trial data: a file that comes back bit for bit, refusals that name what does not fit."""
 
+import io
+
 import msgspec
 import numpy as np
 import pytest
 
 from stereoservo.kinematics.calibration.trials import (
     CalibrationError,
+    TrialCamera,
     check_trials,
     decode_trials,
     encode_trials,
@@ -40,6 +43,28 @@ def holed(positions):
     return np.where(np.arange(len(positions))[:, None] == 2, np.nan, positions)
 
 
+def rewritten(data, /, **arrays):
+    """The file with other arrays, None leaves one out."""
+    with np.load(io.BytesIO(data)) as archive:
+        kept = {**archive, **arrays}
+    buffer = io.BytesIO()
+    np.savez(buffer, **{key: array for key, array in kept.items() if array is not None})
+    return buffer.getvalue()
+
+
+def sized(cameras, size):
+    return tuple(TrialCamera(camera.name, size, size) for camera in cameras)
+
+
+def emptied(data):
+    return {
+        "positions": data.positions[:0],
+        "trials": data.trials[:0],
+        "pixels": data.pixels[:, :0],
+        "sigmas": data.sigmas[:, :0],
+    }
+
+
 def wrong(data, /, **fields):
     return msgspec.structs.replace(data, **fields)
 
@@ -55,7 +80,16 @@ def wrong(data, /, **fields):
         ("bad_data", r"sigmas has shape", lambda t: {"sigmas": t.sigmas[..., None]}),
         ("bad_data", "positions of stop 2", lambda t: {"positions": holed(t.positions)}),
         ("bad_data", "from -1 to 7; -1 to 3", lambda t: {"trials": np.array([-1, 7] * 8)}),
-        ("bad_data", "sigma is 0.0", lambda t: {"sigmas": np.zeros_like(t.sigmas)}),
+        ("bad_data", "has 0 px; positive ones", lambda t: {"sigmas": np.zeros_like(t.sigmas)}),
+        ("bad_data", "has nan px; positive ones up to 64", lambda t: {"sigmas": np.full_like(t.sigmas, np.nan)}),
+        ("bad_data", "has 1000 px; positive ones up to 64", lambda t: {"sigmas": np.full_like(t.sigmas, 1e3)}),
+        ("bad_data", r"has 1e\+300, .* px; pixels within 2560", lambda t: {"pixels": t.pixels * 0 + 1e300}),
+        ("bad_data", "Is its image size", lambda t: {"pixels": t.pixels + 640}),
+        ("bad_data", "size 0x0 px is not positive", lambda t: {"cameras": sized(t.cameras, 0)}),
+        ("bad_data", "at most 1e\\+06", lambda t: {"positions": t.positions + 1e30}),
+        ("bad_data", "'screw'", lambda t: {"joint_kinds": ("screw",) * 4}),
+        ("bad_data", "float64 numbers; indices", lambda t: {"trials": t.trials + 0.5}),
+        ("too_few_stops", "no stops", emptied),
     ],
 )  # fmt: skip
 def test_refuses_what_does_not_fit(trials, code, words, fields):
@@ -71,5 +105,15 @@ def test_refuses_broken_files(trials, tmp_path):
             decode_trials(broken, "here.npz")
         assert caught.value.code == "bad_data"
         assert "here.npz" in str(caught.value)
+    with pytest.raises(CalibrationError, match="array 'pixels' is missing"):
+        decode_trials(rewritten(data, pixels=None), "here.npz")
+    for arrays in (
+        {"trials": trials.trials + 0.4},
+        {"pixels": trials.pixels.astype(complex)},
+        {"positions": trials.positions.ravel()},
+    ):
+        with pytest.raises(CalibrationError, match=r"here\.npz") as caught:
+            decode_trials(rewritten(data, **arrays), "here.npz")
+        assert caught.value.code == "bad_data"
     with pytest.raises(CalibrationError, match="cannot be read"):
         load_trials(tmp_path / "missing.npz")

@@ -46,9 +46,9 @@ from stereoservo.kinematics.calibration.scales import (
     prismatic_ratios,
     trial_scales,
 )
-from stereoservo.kinematics.calibration.separate import best_start, trial_stops, virtual_markers
+from stereoservo.kinematics.calibration.separate import MIN_SHOWN, best_start, trial_stops, virtual_markers
 from stereoservo.kinematics.calibration.strata import FitOptions
-from stereoservo.kinematics.calibration.tracks import find_step, paths_are_smooth
+from stereoservo.kinematics.calibration.tracks import find_step, path_noise, paths_are_smooth
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.calibration.views import first_views
 
@@ -66,6 +66,10 @@ PLAIN = frozenset(
     }
 )
 """Codes that name their cause themselves."""
+MISFITS = frozenset(
+    {"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"}
+)
+"""Codes of data that contradict themselves: what does not fit may tell why."""
 FEW_OUTLIERS = 0.1
 """Share of pixels that a fit may leave out for its hypothesis to count."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
@@ -76,6 +80,16 @@ SUSPICIOUS_OUTLIERS = 0.01
 """Share of outliers from which a fit above the noise floor is looked into."""
 PLANAR_MODULI = 0.1
 """Spread of the moduli of a plane's eigenvalues from stop to stop above which it has left itself."""
+
+
+DEGREES, ABOUT = float(np.degrees(1.0)), 2.0
+"""Factor of a joint that reports degrees, and how many times, either way, a coarse factor may be off a true one."""
+UNDERSTATED = 1.5
+"""How many times the stated sigmas paths must scatter for the detector to be looked into."""
+UNEVEN = 1.5
+"""Residual of one joint's trial over another's up to which both are one noise."""
+WHITE = 0.8
+"""Noise about smooth paths in what a model leaves, over its residual, from which the residual is noise alone."""
 
 
 @dataclass(frozen=True)
@@ -99,23 +113,35 @@ def diagnosed(
         return error
     if error.code == "views_degenerate" and "rms_px" in error.data:
         return _plane_or_baseline(trials, error)
-    named = _named(trials, refit, options)
+    try:
+        named = _named(trials, refit, options)
+    except (GeometryError, np.linalg.LinAlgError):
+        named = None  # data on which the search for a cause breaks down, too: the first error stands
     if named is not None:
         return named
-    return error if error.code == "not_identifiable" else _explained(trials, error, refit, options)
+    if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
+        return _contradicting(trials, error)
+    return _explained(trials, error, refit, options) if error.code in MISFITS else error
 
 
-def _named(trials: TrialData, refit: Refit, options: FitOptions) -> CalibrationError | None:
-    """The error of the first cause that holds, cheap ones first."""
+def _named(
+    trials: TrialData, refit: Refit, options: FitOptions, left: TrialData | None = None
+) -> CalibrationError | None:
+    """The error of the first cause that holds, cheap ones first. ``left``: what a model leaves of the trials."""
     for hypothesis in _exchange_hypotheses(trials):
         if _fits(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
-    stepped = _stepped(trials)
+    stepped = _stepped(trials if left is None else left)
     if stepped is not None:
         return stepped
+    understated = _understated(trials, refit, options)
+    if understated is not None:
+        return understated
     if paths_are_smooth(trials):
+        noise = np.maximum(path_noise(trials), 1.0)
+        noisy = msgspec.structs.replace(trials, sigmas=trials.sigmas * noise[:, None])
         for k in range(1, len(trials.cameras)):
-            if views_unrelated(trials, k):
+            if views_unrelated(noisy, k):
                 return _unrelated(trials, k)
     try:
         views = _views(trials)
@@ -191,14 +217,80 @@ def _stepped(trials: TrialData) -> CalibrationError | None:
     return moved_together(step.stop)
 
 
+def _understated(trials: TrialData, refit: Refit, options: FitOptions) -> CalibrationError | None:
+    """The error of sigmas stated too small, if the trials fit with those that the markers' paths tell, and what the
+    model leaves then is noise.
+    """
+    told = path_noise(trials)
+    if not float(told.max()) > UNDERSTATED:
+        return None
+    mended = msgspec.structs.replace(trials, sigmas=trials.sigmas * np.maximum(told, 1.0)[:, None])
+    result = _fits(mended, refit, options)
+    if result is None:
+        return None
+    factor = result.report.sigma_factor
+    used = result.model.statistics
+    assert used is not None
+    smooth = float(np.median(path_noise(_left_by(mended, result)))) < WHITE * factor
+    wild = used.outliers > SUSPICIOUS_OUTLIERS * (used.measurements // 2 + used.outliers)
+    uneven = max(joint.rms_px for joint in used.joints) > UNEVEN * min(joint.rms_px for joint in used.joints)
+    if smooth or wild or uneven:
+        return None  # noise is none of these: the model is wrong, or positions or times are
+    kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
+    factors = np.maximum(told[:, kept], 1.0) * factor
+    camera, marker = (int(i) for i in np.unravel_index(factors.argmax(), factors.shape))
+    stated = float(np.median(trials.sigmas[camera, :, kept[marker]]))
+    worst = float(factors[camera, marker])
+    return CalibrationError(
+        "noise_understated",
+        f"the pixels scatter farther than their stated sigmas: marker {result.model.marker_ids[marker]} in camera "
+        f"{trials.cameras[camera].name!r} by {worst * stated:.3g} px, stated {stated:.3g} px ({worst:.3g} times; "
+        f"{float(np.median(factors)):.3g} times for half of all; at most {options.max_sigma_factor:g} times is taken). "
+        "With sigmas of that size the trials fit: correct the detector's sigma",
+        factor=float(np.median(factors)),
+        worst=worst,
+        maximum=options.max_sigma_factor,
+        cameras={one.name: float(np.median(row)) for one, row in zip(trials.cameras, factors, strict=True)},
+    )
+
+
+def _left_by(trials: TrialData, result: CalibrationResult) -> TrialData:
+    """The trials with what the model leaves of their pixels: a step stays one, and smooth paths leave noise."""
+    found = predictions(trials, result)
+    return msgspec.structs.replace(
+        trials,
+        marker_ids=found.marker_ids,
+        pixels=found.pixels - found.expected,
+        sigmas=trials.sigmas[:, :, [trials.marker_ids.index(i) for i in found.marker_ids]],
+    )
+
+
 def _scaled(trials: TrialData, views: Views, refit: Refit, options: FitOptions) -> CalibrationError | None:
     """The error of revolute joints whose positions are off by factors, if the trials fit without them."""
     factors = trial_scales(trials, *views)
     if (factors == 1.0).all():
         return None
-    mended = corrected(trials, factors)
-    result = _fits(mended, refit, options)
-    return None if result is None else scale_error(trials, mended, result, factors)
+    for tried in _likely_factors(trials, factors):
+        mended = corrected(trials, tried)
+        result = _fits(mended, refit, options)
+        if result is not None:
+            return scale_error(trials, mended, result, tried)
+    return None
+
+
+def _likely_factors(trials: TrialData, factors: FloatArray) -> list[FloatArray]:
+    """Factors (n,) to try for those that the joints' own trials tell coarsely, the likeliest first: a unit that most
+    revolute joints share, and so perhaps all; degrees; their own.
+    """
+    revolute = np.array([kind == "revolute" for kind in trials.joint_kinds])
+    found = []
+    for unit in (DEGREES, float(np.median(factors[factors != 1.0]))):
+        near = (factors != 1.0) & (np.abs(np.log(factors / unit)) < np.log(ABOUT))
+        if 2 * int(near.sum()) > int(revolute.sum()) > 1:
+            found.append(np.where(revolute, unit, 1.0))
+        if unit == DEGREES and near.any():
+            found.append(np.where(near, unit, factors))
+    return [*found, factors]
 
 
 def scale_error(
@@ -358,6 +450,21 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
     )
 
 
+def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationError:
+    """The error of a joint whose stops are lost because cameras contradict each other, not because they see nothing."""
+    own = trials.trials == trials.joint_names.index(error.data["joint"])
+    seen = int(((trials.visible[:, own].sum(axis=0) >= 2).sum(axis=1) >= MIN_SHOWN).sum())
+    if seen < error.data["minimum"]:
+        return error
+    return CalibrationError(
+        "views_unrelated",
+        f"{error.message}. At {seen} stops two cameras do see {MIN_SHOWN} markers or more, but they fit no epipolar "
+        "geometry with the rest: are images of one camera late, are ids mixed up, did a camera move more than once?",
+        **error.data,
+        markers_seen=seen,
+    )
+
+
 def _plane_or_baseline(trials: TrialData, error: CalibrationError) -> CalibrationError:
     """Which of the two leaves the epipolar geometry open: all markers on one plane, or one centre of projection."""
     out_of_plane = _leaves_its_plane(trials)
@@ -428,7 +535,8 @@ def reviewed(
     notes = list(explain_outliers(trials, result))
     if not statistics.chi2_ok:
         suspicious = float(outliers.mean()) > SUSPICIOUS_OUTLIERS
-        named = _named(trials, refit, options) if suspicious else _stepped(trials)
+        left = _left_by(trials, result)
+        named = _named(trials, refit, options, left) if suspicious else _stepped(left)
         if named is not None:
             raise named
     nearly = not statistics.chi2_ok or any("follow" in note for note in result.report.notes)
@@ -462,8 +570,8 @@ def untested(trials: TrialData) -> tuple[str, ...]:
     if n < 2 or free or moved:
         return ()
     return (
-        "the order of the joints: they move one at a time from one configuration, so the model takes the order that "
-        "the cell states. Free poses, or trials from different configurations, would test it",
+        "the order of the joints and the mount of the cameras: they move one at a time from one configuration, so the "
+        "model takes what the cell states. Free poses, or trials from different configurations, would test it",
     )
 
 

@@ -183,6 +183,15 @@ def separate_joint(
             minimum=MIN_MARKERS,
         )
     best, least = best_start(kind, cameras, sights, angles, thorough=True)
+    if best is None and (common := _common_markers(sights, angles)) < MIN_MARKERS:
+        raise CalibrationError(
+            "too_few_markers",
+            f"joint {name!r}: any two stops of its trial far apart show {common} markers in common to two cameras; at "
+            f"least {MIN_MARKERS} are needed",
+            joint=name,
+            markers=common,
+            minimum=MIN_MARKERS,
+        )
     if best is None or not least < MISFIT:
         raise CalibrationError(
             "joint_kind",
@@ -198,6 +207,13 @@ def separate_joint(
     return JointTrial(
         joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan)
     )
+
+
+def _common_markers(sights: Sights, angles: FloatArray) -> int:
+    """Most virtual markers that two stops half of the trial's range apart have in common."""
+    shown = finite_rows(sights.points).astype(np.int64)
+    apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
+    return int((shown @ shown.T)[apart].max(initial=0))
 
 
 @dataclass(frozen=True)

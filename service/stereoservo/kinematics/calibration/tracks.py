@@ -27,7 +27,7 @@ SAME_POSITION = 1e-5
 PATH_DEGREE = 4
 """Of the polynomials that paths of markers over one joint are compared with."""
 SMOOTH = 10.0
-"""Median distance [sigmas] of pixels from smooth paths; wrong detections leave hundreds."""
+"""Noise [stated sigmas] about smooth paths; wrong detections leave hundreds."""
 STEP_STATISTIC = 60.0
 """Gain in chi-square, at the noise that is left, from which a path has a step."""
 STEP_SHARE = 0.75
@@ -149,19 +149,29 @@ class Step:
     pixels: float
 
 
-def paths_are_smooth(trials: TrialData) -> bool:
-    """Whether the markers' paths are what moving joints make of them, but for noise: no wrong detections."""
+def path_noise(trials: TrialData) -> FloatArray:
+    """How far pixels are from smooth paths [sigmas], for each path (c, m): their noise over the stated one, where
+    polynomials follow the paths; 1 where too few stops show a marker.
+    """
     basis = path_basis(trials)
     used = basis.any(axis=1)
-    rest = []
-    for camera, marker in np.ndindex(len(trials.cameras), len(trials.marker_ids)):
+    noise = np.ones((len(trials.cameras), len(trials.marker_ids)))
+    for camera, marker in np.ndindex(noise.shape):
         rows = np.flatnonzero(used & trials.visible[camera, :, marker])
-        if len(rows) <= basis.shape[1]:
+        freedom = len(rows) - basis.shape[1]
+        if freedom <= 0:
             continue
         pixels = trials.pixels[camera, rows, marker]
-        fitted = basis[rows] @ np.linalg.lstsq(basis[rows], pixels, rcond=None)[0]
-        rest.append(np.linalg.norm(fitted - pixels, axis=1) / trials.sigmas[camera, rows, marker])
-    return bool(rest) and float(np.median(np.concatenate(rest))) < SMOOTH
+        rest = pixels - basis[rows] @ np.linalg.lstsq(basis[rows], pixels, rcond=None)[0]
+        squares = (rest**2).sum(axis=1) / trials.sigmas[camera, rows, marker] ** 2
+        # The median of a chi-square with two degrees of freedom is ln 4.
+        noise[camera, marker] = np.sqrt(np.median(squares) / np.log(4.0) * len(rows) / freedom)
+    return noise
+
+
+def paths_are_smooth(trials: TrialData) -> bool:
+    """Whether the markers' paths are what moving joints make of them, but for noise: no wrong detections."""
+    return float(np.median(path_noise(trials))) < SMOOTH
 
 
 def find_step(trials: TrialData) -> Step | None:
@@ -192,7 +202,7 @@ def find_step(trials: TrialData) -> Step | None:
 
 def path_basis(trials: TrialData) -> FloatArray:
     """Columns (s, p) that smooth paths of markers are combinations of: a constant for each base that trials start
-    from, and powers of the moving joint's way from it; zero for stops of no trial.
+    from, and powers of the moving joint's way from it; zero for stops of no trial, no columns without any.
     """
     positions, columns = trials.positions, []
     bases: dict[tuple[int, ...], FloatArray] = {}
@@ -214,7 +224,7 @@ def path_basis(trials: TrialData) -> FloatArray:
             way[group] = 2.0 * (positions[group, joint] - middle) / span
             degree = min(PATH_DEGREE, (len(group) - 1) // 2)
             columns += [way**power for power in range(1, degree + 1)]
-    return np.stack([*bases.values(), *columns], axis=1)
+    return np.stack([*bases.values(), *columns], axis=1) if bases else np.zeros((len(positions), 0))
 
 
 def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray]:
@@ -245,6 +255,29 @@ def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray]:
             size = np.where(known[:, None], steps.T @ rest, 0.0) / np.where(known, square, 1.0)[:, None]
             gain = (size**2).sum(axis=1) * square
             noise = np.maximum(1.0, ((rest**2).sum() - gain) / freedom)
+            noise = np.maximum(noise, _trial_noise(rest, steps, size, trials.trials[rows], trials.trials))
             gains[camera, marker] = gain / noise
             sizes[camera, marker] = np.linalg.norm(size, axis=1)
     return gains, sizes
+
+
+def _trial_noise(
+    rest: FloatArray, steps: FloatArray, size: FloatArray, of_row: IntArray, of_stop: IntArray
+) -> FloatArray:
+    """Mean square (s,) that is left of the path, about a stop's own trial, once it has a step there.
+
+    Polynomials follow a wide turn badly, and only there: what they leave is no step. ``rest`` (k, 2), ``steps``
+    (k, s) [sigmas], ``size`` (s, 2); ``of_row`` (k,) and ``of_stop`` (s,) number the trials.
+    """
+    noise = np.zeros(len(size))
+    for trial in np.unique(of_row[of_row >= 0]):
+        own, stops = of_row == trial, np.flatnonzero(of_stop == trial)
+        left = rest[own]
+        shape, step = steps[np.ix_(own, stops)], size[stops]
+        squares = (
+            (left**2).sum()
+            - 2.0 * ((shape.T @ left) * step).sum(axis=1)
+            + (shape**2).sum(axis=0) * (step**2).sum(axis=1)
+        )
+        noise[stops] = squares / max(2, 2 * (int(own.sum()) - PATH_DEGREE - 1))
+    return noise

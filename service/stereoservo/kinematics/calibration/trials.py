@@ -19,6 +19,12 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 TRIALS_SCHEMA = 1
+MAX_POSITION = 1e6
+"""Largest joint position [rad or m] that is taken for one."""
+MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
+"""Largest sigma and largest pixel coordinate that are taken for such [image sizes]: a wrong detection is nearer."""
+MAX_OUTSIDE = 0.5
+"""Share of a camera's pixels outside its image above which the image size is taken for a wrong one."""
 
 
 class CalibrationError(Exception):
@@ -31,7 +37,7 @@ class CalibrationError(Exception):
             ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``;
             of the diagnosis ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``, ``joint_order``,
             ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
-            ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``.
+            ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``.
         data: the values the message speaks of.
     """
 
@@ -105,6 +111,15 @@ def check_trials(trials: TrialData) -> None:
             f"{n} joint names and {len(trials.joint_kinds)} kinds; one kind for each of at least one joint "
             "is needed",
         )
+    if trials.images < 0:
+        raise CalibrationError("bad_data", f"images is {trials.images}; 0 or more is needed", key="images")
+    unknown = sorted(set(trials.joint_kinds) - {"revolute", "prismatic"})
+    if unknown:
+        raise CalibrationError(
+            "bad_data",
+            f"joint kinds {unknown} are unknown; revolute and prismatic are taken",
+            key="joint_kinds",
+        )
     if c < 2:
         raise CalibrationError(
             "too_few_cameras",
@@ -128,24 +143,89 @@ def check_trials(trials: TrialData) -> None:
     for key, array, shape in expected:
         if array.shape != shape:
             raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
+    if not s:
+        raise CalibrationError("too_few_stops", "the trials hold no stops; each joint needs some", stops=0)
+    if not np.issubdtype(trials.trials.dtype, np.integer):
+        raise CalibrationError(
+            "bad_data",
+            f"trials holds {trials.trials.dtype} numbers; indices of joints, or -1, are needed",
+            key="trials",
+        )
     if not np.isfinite(trials.positions).all():
         stop = int(np.argwhere(~np.isfinite(trials.positions))[0, 0])
         raise CalibrationError(
             "bad_data", f"positions of stop {stop} are not finite", key="positions", stop=stop
         )
-    if s and (trials.trials.min() < -1 or trials.trials.max() >= n):
+    if trials.trials.min() < -1 or trials.trials.max() >= n:
         raise CalibrationError(
             "bad_data",
             f"trial indices reach from {trials.trials.min()} to {trials.trials.max()}; -1 to {n - 1} are "
             "joints",
             key="trials",
         )
-    sigmas = trials.sigmas[trials.visible]
-    if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
-        worst = sigmas[~(np.isfinite(sigmas) & (sigmas > 0))][0]
+    _check_sizes(trials)
+    _check_pixels(trials)
+
+
+def _check_sizes(trials: TrialData) -> None:
+    for camera in trials.cameras:
+        if camera.width < 1 or camera.height < 1:
+            raise CalibrationError(
+                "bad_data",
+                f"camera {camera.name!r}: image size {camera.width}x{camera.height} px is not positive",
+                key="cameras",
+                camera=camera.name,
+            )
+    if float(np.abs(trials.positions).max()) > MAX_POSITION:
+        stop, joint = np.unravel_index(int(np.abs(trials.positions).argmax()), trials.positions.shape)
         raise CalibrationError(
-            "bad_data", f"a sigma is {worst} px; positive finite ones are needed", key="sigmas"
+            "bad_data",
+            f"position of joint {trials.joint_names[int(joint)]!r} at stop {stop} is "
+            f"{trials.positions[stop, joint]:.6g}; at most {MAX_POSITION:g} [rad or m] is taken",
+            key="positions",
+            stop=int(stop),
         )
+
+
+def _check_pixels(trials: TrialData) -> None:
+    """Refuse sigmas that are none, and measured pixels that no detector finds in an image of that size."""
+    for c, camera in enumerate(trials.cameras):
+        size = max(camera.width, camera.height)
+        seen = trials.visible[c]
+        with np.errstate(invalid="ignore"):
+            good = (trials.sigmas[c] > 0.0) & (trials.sigmas[c] <= MAX_SIGMA * size)
+            inside = (np.abs(trials.pixels[c]) <= MAX_PIXEL * size).all(axis=-1)
+        for key, ok, array, needed in (
+            ("sigmas", good, trials.sigmas[c], f"positive ones up to {MAX_SIGMA * size:g} px are needed"),
+            ("pixels", inside, trials.pixels[c], f"pixels within {MAX_PIXEL * size:g} px are taken"),
+        ):
+            if (ok | ~seen).all():
+                continue
+            stop, marker = (int(i) for i in np.argwhere(seen & ~ok)[0])
+            value = ", ".join(f"{number:.6g}" for number in np.atleast_1d(array[stop, marker]))
+            raise CalibrationError(
+                "bad_data",
+                f"{key}: marker {trials.marker_ids[marker]} at stop {stop} in camera {camera.name!r} "
+                f"({camera.width}x{camera.height} px) has {value} px; {needed}",
+                key=key,
+                camera=camera.name,
+                stop=stop,
+                marker=trials.marker_ids[marker],
+            )
+        with np.errstate(invalid="ignore"):
+            outside = (trials.pixels[c] < -0.5) | (
+                trials.pixels[c] > np.array([camera.width, camera.height]) - 0.5
+            )
+        share = float(outside.any(axis=-1)[seen].mean()) if seen.any() else 0.0
+        if share > MAX_OUTSIDE:
+            raise CalibrationError(
+                "bad_data",
+                f"{share:.0%} of the pixels of camera {camera.name!r} lie outside its image of {camera.width}x"
+                f"{camera.height} px; at most {MAX_OUTSIDE:.0%} are taken. Is its image size the right one?",
+                key="pixels",
+                camera=camera.name,
+                share=share,
+            )
 
 
 def encode_trials(trials: TrialData) -> bytes:
@@ -174,6 +254,8 @@ def encode_trials(trials: TrialData) -> bytes:
 def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
     """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``) naming what does not fit."""
     try:
+        if not data.startswith(b"PK"):  # numpy would take it for a pickle, and say so
+            raise ValueError("it is no .npz archive")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
         header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_Header)
@@ -186,15 +268,22 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             joint_kinds=header.joint_kinds,
             cameras=header.cameras,
             marker_ids=header.marker_ids,
-            positions=np.asarray(arrays["positions"], dtype=np.float64),
-            trials=np.asarray(arrays["trials"], dtype=np.int64),
-            pixels=np.asarray(arrays["pixels"], dtype=np.float64),
-            sigmas=np.asarray(arrays["sigmas"], dtype=np.float64),
+            positions=arrays["positions"].astype(np.float64, casting="same_kind"),
+            trials=arrays["trials"].astype(np.int64, casting="same_kind"),
+            pixels=arrays["pixels"].astype(np.float64, casting="same_kind"),
+            sigmas=arrays["sigmas"].astype(np.float64, casting="same_kind"),
             images=header.images,
         )
-    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, msgspec.DecodeError) as error:
+    except KeyError as error:
+        raise CalibrationError(
+            "bad_data", f"{path}: is not a file of trial data: array {error} is missing", key=str(error)
+        ) from error
+    except (ValueError, TypeError, EOFError, OSError, zipfile.BadZipFile, msgspec.DecodeError) as error:
         raise CalibrationError("bad_data", f"{path}: is not a file of trial data: {error}") from error
-    check_trials(trials)
+    try:
+        check_trials(trials)
+    except CalibrationError as error:
+        raise CalibrationError(error.code, f"{path}: {error.message}", **error.data) from error
     return trials
 
 

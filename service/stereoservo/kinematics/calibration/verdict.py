@@ -55,6 +55,7 @@ CURES = {
     "too_many_outliers": "look at the tracks of the joint named: reflections, mixed-up markers, another joint moving",
     "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
     "camera, a wrong joint scale, a detector that understates its noise",
+    "noise_understated": "raise the detector's sigma to what the text says; look whether images are dark or blurred",
     "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",
     "wrong_scale": "correct the drive's scale: revolute joints report rad, with the gear taken into account",
     "joints_exchanged": "two joints answer under each other's names: correct the order in the joint driver's options",
@@ -63,6 +64,8 @@ CURES = {
     "it, calibrate again",
     "camera_moved": "a camera was moved during the trials: fasten it, calibrate again",
     "marker_slipped": "a marker slipped during the trials: fasten it, calibrate again",
+    "markers_disagree": "run the trials again, with larger motions (calibration.range) or less noise; look whether the "
+    "markers named sit on the same rigid body as the others",
     "markers_collinear": "put markers off their common line: at least one well beside it",
     "markers_exchanged": "the detector of one camera takes two markers for each other: correct its pattern or the ids",
     "views_exchanged": "images of two cameras come under each other's names at times: check their drivers and cables",
@@ -70,6 +73,10 @@ CURES = {
     "markers' ids, and that images are not late",
     "no_baseline": "move the cameras apart, by a tenth of their distance to the markers at least",
     "mixed_mounts": "calibrate cameras that stand and cameras on the tip each on their own",
+    "check_holds": "leave the zeros as they are: there is nothing to reset",
+    "other_cause": "remove the cause that the check names, or calibrate anew: a reset of zeros would hide it",
+    "not_observable": "take a calibration.base where the axes of the joints named are different lines, put the markers "
+    "farther from them, or calibrate anew",
 }
 """What to do about each cause of a failed calibration, by the code of its CalibrationError."""
 
@@ -108,9 +115,8 @@ def verdict(model: CellModel, report: CalibrationReport, depth_spread: float | N
 def failed(code: str, message: str) -> Verdict:
     """What is to be said of a calibration that gave no model."""
     cure = CURES.get(code, "look at the tracks in the report")
-    return Verdict(
-        "not usable", f"not usable: {message.rstrip('.')}. What to do: {cure}.", (message,), (cure,)
-    )
+    said = message if message.endswith((".", "?")) else f"{message}."
+    return Verdict("not usable", f"not usable: {said} What to do: {cure}.", (message,), (cure,))
 
 
 def _residuals(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:
