@@ -22,6 +22,7 @@ from stereoservo.kinematics.model import (
     encode_model,
     load_model,
     save_model,
+    write_atomically,
 )
 
 HOLED = np.where(np.arange(32).reshape(2, 4, 4) == 27, np.nan, 1.0)
@@ -210,3 +211,18 @@ def test_a_file_of_the_first_schema_is_read_as_pinholes_that_stand_still():
     assert model.mount == "eye_to_hand"
     assert not model.tip_first
     assert [camera.lens[0] for camera in model.cameras] == [0.0, 0.0]
+
+
+def test_nothing_but_a_file_is_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for name in ("pipe", "link"):
+        with pytest.raises(OSError, match="Not a regular file"):
+            write_atomically(tmp_path / name, b"data")
+    with pytest.raises(IsADirectoryError, match="the name of a file"):
+        write_atomically(tmp_path, b"data")
+    with pytest.raises(FileNotFoundError, match="a folder that exists"):
+        write_atomically(tmp_path / "none" / "file", b"data")
+    assert (tmp_path / "pipe").is_fifo()
+    assert (tmp_path / "link").is_symlink()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "pipe"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -373,8 +374,29 @@ def load_model(path: Path) -> CellModel:
     return decode_model(data, path)
 
 
+def check_writable(path: Path) -> None:
+    """Raise OSError where `write_atomically` cannot put a file: no such folder, or something else stands there."""
+    if not path.parent.is_dir():
+        code = errno.ENOTDIR if path.parent.exists() else errno.ENOENT
+        raise OSError(code, f"{os.strerror(code)}: a folder that exists is needed", str(path.parent))
+    if path.is_dir():
+        raise OSError(errno.EISDIR, f"{os.strerror(errno.EISDIR)}: the name of a file is needed", str(path))
+    if path.exists() and not path.is_file():
+        raise OSError(
+            errno.EINVAL, "Not a regular file: the name of a file, new or old, is needed", str(path)
+        )
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise OSError(
+            errno.EACCES, f"{os.strerror(errno.EACCES)}: a folder to write to is needed", str(path.parent)
+        )
+
+
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` so that a reader, or a crash, sees the old file or the new one whole. Raises OSError."""
+    """Write ``data`` so that a reader, or a crash, sees the old file or the new one whole.
+
+    Raises OSError, for a path that holds anything but a regular file, too: replacing a device would destroy it.
+    """
+    check_writable(path)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
