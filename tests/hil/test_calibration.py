@@ -94,6 +94,23 @@ def test_check_report_and_damaged_models(
             path.unlink()
 
 
+def test_trial_motions_that_end_early_say_the_code_of_their_reason(
+    calibrated: Path, start: Callable[..., DaemonProcess], run: Callable[..., tuple[int, Any]], tmp_path: Path
+) -> None:
+    """More markers are wanted at a stop than the body has."""
+    text = calibrated.read_text()
+    assert text.count("[calibration]\n") == 1
+    path = tmp_path / calibrated.name
+    path.write_text(text.replace("[calibration]\n", "[calibration]\nmin_markers = 90\n"))
+    start(path)
+    code, result = run("calibrate", CELL)
+    assert (code, result["error"]["code"]) == (1, "MARKERS_NOT_SEEN")
+    (reason,) = result["error"]["reasons"]
+    assert reason["threshold"] == 90
+    code, result = run("calibrate", CELL, "--trials", "any.npz")
+    assert (code, result["error"]["code"]) == (1, "daemon_running")
+
+
 def test_joint_zeros_are_reset_by_a_check(
     calibrated: Path,
     start: Callable[..., DaemonProcess],

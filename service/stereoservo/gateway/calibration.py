@@ -92,7 +92,7 @@ class Calibration:
             epoch = self._models.next_epoch()
             self._fit = Fit(self._job.trials(), self._models.path(epoch), epoch)
         except (CalibrationError, OSError) as error:
-            self._failed(self._fit_id, str(error))
+            self._failed(self._fit_id, str(error), getattr(error, "code", ""))
             return
         self._log.add(
             "fit_started", message=f"{self._job.stops} stops", id=self._fit_id, progress=0.0, origin="gateway"
@@ -114,7 +114,7 @@ class Calibration:
                 reset_to=self._models.path(epoch) if reset else None, epoch=epoch,
             )  # fmt: skip
         except (CalibrationError, OSError) as error:
-            self._failed(self._check_id, str(error))
+            self._failed(self._check_id, str(error), getattr(error, "code", ""))
 
     def follow(self) -> None:
         """Tell the fit's progress; when it has decided, hand its model over; tell what a check says."""

@@ -286,7 +286,7 @@ class Client:
         """Trial motions, fit, model. ``progress`` hears every event of it. ``report``: wait until that is written, too.
 
         The motion has a lease that this client renews (``lease_s=None``: none): a client that dies stops it.
-        Raises RefusedError, FailedError (its event's ``name`` is the code of a fit that failed).
+        Raises RefusedError, FailedError (``code``: of the fit that failed, or of the reason that ended the motion).
         """
         command = Calibrate(str(uuid.uuid4()), lease_s=lease_s)
         event = self._calibration(command, "calibrated", progress, timeout_s, report)

@@ -38,6 +38,11 @@ class FailedError(ClientError):
         super().__init__(f"{what}: {event.kind.replace('_', ' ')}: {event.message}")
         self.event = event
 
+    @property
+    def code(self) -> str:
+        """Its cause's own: the event's ``name`` (a fit's code), else that of its first reason, else ``failed``."""
+        return self.event.name or next((reason.code for reason in self.event.reasons), "failed")
+
 
 class TimedOutError(ClientError):
     """What was waited for did not happen in time."""

@@ -18,7 +18,7 @@ from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroRes
 from stereoservo.kinematics.calibration.trials import TrialData, save_trials
 from stereoservo.kinematics.calibration.verdict import Verdict
 from stereoservo.kinematics.model import CellModel, load_model
-from stereoservo.runtime.calibration_files import report_folder, trials_file
+from stereoservo.runtime.calibration_files import figures_file, report_folder, trials_file
 from stereoservo.runtime.supervisor import child_environment
 
 FIT_TIMEOUT_S = 600.0
@@ -182,4 +182,5 @@ def calibration_result(
         grade=verdict.grade,
         report="" if report is None else str(report),
         trials="" if trials is None else str(trials),
+        figures=str(figures_file(path)),
     )

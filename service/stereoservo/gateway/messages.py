@@ -182,7 +182,8 @@ class FeaturesMessage(msgspec.Struct, frozen=True):
 class CalibrationResult(msgspec.Struct, frozen=True):
     """What a calibration gave. ``covariance_ok``: the residuals are what the measurement noise explains
     (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
-    ``report``, ``trials``: files on the daemon's host; the report is there once ``calibration_report`` was told.
+    ``seconds``: what the fit took. ``report`` (a page), ``figures`` (for programs), ``trials``: files on the daemon's
+    host; the report is there once ``calibration_report`` was told.
     """
 
     rms_px: float
@@ -203,6 +204,7 @@ class CalibrationResult(msgspec.Struct, frozen=True):
     grade: str = ""
     report: str = ""
     trials: str = ""
+    figures: str = ""
 
 
 class EventMessage(msgspec.Struct, frozen=True):

@@ -13,3 +13,8 @@ def trials_file(model_path: Path, epoch: int) -> Path:
 def report_folder(model_path: Path) -> Path:
     """The folder of a model's report; its page is ``index.html``."""
     return model_path.with_name(f"{model_path.stem}-report")
+
+
+def figures_file(model_path: Path) -> Path:
+    """The figures of a model's fit, for programs."""
+    return model_path.with_name(f"{model_path.stem}-report.json")

@@ -25,7 +25,7 @@ from stereoservo.kinematics.calibration.report import CalibrationResult
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData, load_trials
 from stereoservo.kinematics.calibration.verdict import Verdict, depth_spread, failed, verdict
 from stereoservo.kinematics.model import ModelFileError, save_model, write_atomically
-from stereoservo.runtime.calibration_files import report_folder
+from stereoservo.runtime.calibration_files import figures_file, report_folder
 from stereoservo.runtime.lifeline import die_with_parent
 
 NICENESS = 10
@@ -77,8 +77,8 @@ def fit_trials(
     created = datetime.now(UTC).isoformat(timespec="seconds")
     result = fit_model(trials, epoch=epoch, created=created, progress=progress, lens_priors=lens_priors)
     save_model(result.model, model_path)
-    figures = model_path.with_name(model_path.stem + "-report.json")
-    write_atomically(figures, msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n")
+    figures = msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n"
+    write_atomically(figures_file(model_path), figures)
     return result, verdict(result.model, result.report, depth_spread(result.model, trials))
 
 
