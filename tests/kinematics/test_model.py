@@ -28,25 +28,23 @@ from stereoservo.kinematics.model import (
 HOLED = np.where(np.arange(32).reshape(2, 4, 4) == 27, np.nan, 1.0)
 
 
-def rotation_generator(rng):
-    H = np.eye(4) + rng.normal(0, 0.2, (4, 4))
-    J = np.zeros((4, 4))
-    J[0, 1], J[1, 0] = -1.0, 1.0
-    return H @ J @ np.linalg.inv(H)
-
-
 def make_model(seed=0, **fields):
     rng = np.random.default_rng(seed)
     plane = rng.normal(0, 0.3, 4) + np.eye(4)[3]
     points = rng.normal(0, 0.2, (5, 4)) + np.array([0.0, 0.0, 1.0, 1.0])
-    p, a = rng.normal(size=4), rng.normal(size=4)
+    upgrade = np.vstack([rng.normal(size=(3, 4)), plane])
+    twists = np.zeros((2, 4, 4))
+    axis = rng.normal(size=3)
+    twists[0, :3, :3] = np.cross(np.eye(3), axis / np.linalg.norm(axis))
+    twists[0, :3, 3] = -twists[0, :3, :3] @ rng.normal(size=3)
+    twists[1, :3, 3] = rng.normal(size=3)
     model = CellModel(
         schema=MODEL_SCHEMA,
         epoch=4,
         joint_names=("shoulder", "slide"),
         joint_kinds=("revolute", "prismatic"),
         zero=rng.normal(size=2),
-        generators=np.array([rotation_generator(rng), np.outer(p - a * (a @ p) / (a @ a), a)]),
+        generators=np.linalg.inv(upgrade) @ twists @ upgrade,
         cameras=(
             CameraModel("left", rng.normal(size=(3, 4)), 640, 480),
             CameraModel("right", rng.normal(size=(3, 4)), 800, 600, np.array([-0.1, 398.0, 301.0, 400.0])),
@@ -55,7 +53,7 @@ def make_model(seed=0, **fields):
         marker_points=points / (points @ plane)[:, None],
         plane_at_infinity=plane,
         stratum="metric",
-        projective_to_euclidean=rng.normal(size=(4, 4)),
+        projective_to_euclidean=upgrade,
         statistics=FitStatistics(
             0.1, 1000.5, 990, True, 1071, 81, 3, (JointStatistics("shoulder", 0.1 / 3, 9, 0.5),), 450
         ),
@@ -226,3 +224,42 @@ def test_nothing_but_a_file_is_replaced(tmp_path):
     assert (tmp_path / "pipe").is_fifo()
     assert (tmp_path / "link").is_symlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "pipe"]
+
+
+def put(*where):
+    """A change of a file's tree: the last argument goes where the others lead."""
+
+    def change(tree):
+        *keys, last, value = where
+        for key in keys:
+            tree = tree[key]
+        tree[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (put("projective_to_euclidean", np.eye(4).tolist()), "projective_to_euclidean", "Euclidean rotation"),
+        (put("projective_to_euclidean", np.ones((4, 4)).tolist()), "projective_to_euclidean", "invertible"),
+        (put("projective_to_euclidean", np.zeros((4, 4)).tolist()), "projective_to_euclidean", "invertible"),
+        (put("cameras", 0, "matrix", [[1, 2, 3, 4]] * 3), "cameras[0].matrix", "rank 3"),
+        (put("cameras", 1, "matrix", np.zeros((3, 4)).tolist()), "cameras[1].matrix", "rank 3"),
+        (put("cameras", 1, "lens", [-5.0, 398.0, 301.0, 400.0]), "cameras[1].lens", "at most 1"),
+        (put("generators", 0, (1e200 * np.eye(4)).tolist()), "generators[0]", "is needed"),
+        (put("epoch", 10**40), "epoch", r"below 2\^63"),
+        (put("schema", True), "schema", "is True"),
+    ],
+)  # fmt: skip
+def test_refuses_files_whose_numbers_cannot_be_a_cell_s(change, key, words):
+    tree = json.loads(encode_model(make_model()))
+    change(tree)
+    with pytest.raises(ModelFileError, match=words) as caught:
+        decode_model(json.dumps(tree).encode())
+    assert caught.value.key == key
+
+
+def test_refuses_lists_in_lists_without_end():
+    with pytest.raises(ModelFileError, match="is not JSON"):
+        decode_model(b"[" * 100_000)

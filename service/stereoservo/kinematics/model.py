@@ -154,6 +154,12 @@ class ModelFileError(Exception):
         self.key = key
 
 
+MAX_BEND = 1.0
+"""Largest radial parameter of a lens, at its reference radius: no image is read through more."""
+RANK_TOLERANCE = 1e-12
+"""Least singular value of a matrix of rank 3 or 4, relative to its size."""
+METRIC_TOLERANCE = 1e-5
+"""What H_PE may leave of an operator beside a Euclidean twist, relative to it."""
 SYMMETRY_TOLERANCE = 1e-8
 """How far a covariance, scaled to correlations, may be from symmetric and from positive semidefinite."""
 ALGEBRA_TOLERANCE = 1e-6
@@ -167,8 +173,8 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
     """
     if model.schema != MODEL_SCHEMA:
         raise ModelFileError(path, "schema", f"is {model.schema!r}; this version reads {MODEL_SCHEMA}")
-    if model.epoch < 0:
-        raise ModelFileError(path, "epoch", f"is {model.epoch}; a model's epoch is 0 or more")
+    if not 0 <= model.epoch < 2**63:
+        raise ModelFileError(path, "epoch", f"is {model.epoch}; a model's epoch is 0 or more, and below 2^63")
     n, m = len(model.joint_names), len(model.marker_ids)
     if n < 1:
         raise ModelFileError(path, "joint_names", "is empty; a model has at least one joint")
@@ -206,6 +212,15 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         if not np.isfinite(array).all():
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise ModelFileError(path, key, f"entry {where} is {array[where]}; finite numbers are needed")
+    _check_cameras(model, path)
+    _check_algebra(model, path)
+    if model.projective_to_euclidean is not None:
+        _check_metric(model, model.projective_to_euclidean, path)
+    if model.covariance is not None:
+        _check_covariance(model, model.covariance, path)
+
+
+def _check_cameras(model: CellModel, path: Path | str) -> None:
     for i, camera in enumerate(model.cameras):
         if camera.width < 1 or camera.height < 1:
             raise ModelFileError(
@@ -219,9 +234,41 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
                 f"cameras[{i}].lens",
                 f"{camera.name!r}: reference radius {camera.lens[3]:g} px is not positive",
             )
-    _check_algebra(model, path)
-    if model.covariance is not None:
-        _check_covariance(model, model.covariance, path)
+        if abs(camera.lens[0]) > MAX_BEND:
+            raise ModelFileError(
+                path,
+                f"cameras[{i}].lens",
+                f"{camera.name!r}: radial parameter {camera.lens[0]:g}; at most {MAX_BEND:g} either way is taken",
+            )
+        # Each row to one length: what is left is rank, not units.
+        rows = np.linalg.norm(camera.matrix, axis=1)
+        least = float(np.linalg.svd(camera.matrix / rows[:, None])[1][2]) if rows.all() else 0.0
+        if not least > RANK_TOLERANCE:
+            raise ModelFileError(
+                path,
+                f"cameras[{i}].matrix",
+                f"{camera.name!r}: least singular value {least:.2e} with rows of length 1; a projection has rank 3",
+            )
+
+
+def _check_metric(model: CellModel, upgrade: FloatArray, path: Path | str) -> None:
+    """H_PE must bring the operators to Euclidean twists: a rotation's part skew, a translation's zero (5.56)."""
+    key = "projective_to_euclidean"
+    values = np.linalg.svd(upgrade / max(float(np.abs(upgrade).max()), 1e-300), compute_uv=False)
+    if not values[3] > RANK_TOLERANCE * values[0]:
+        raise ModelFileError(path, key, f"has singular values {values.tolist()}; an invertible one is needed")
+    twists = upgrade @ model.generators @ np.linalg.inv(upgrade)
+    for j, (kind, twist) in enumerate(zip(model.joint_kinds, twists, strict=True)):
+        turn = twist[:3, :3]
+        off = float(np.linalg.norm(turn + turn.T if kind == "revolute" else turn) + np.linalg.norm(twist[3]))
+        if not off <= METRIC_TOLERANCE * float(np.linalg.norm(twist)):
+            raise ModelFileError(
+                path,
+                key,
+                f"does not make joint {model.joint_names[j]!r} a Euclidean "
+                f"{'rotation' if kind == 'revolute' else 'translation'}: {off:.2e} is left, with an operator of size "
+                f"{np.linalg.norm(twist):.2e}; a share of {METRIC_TOLERANCE:g} is taken",
+            )
 
 
 def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str) -> None:
@@ -259,8 +306,9 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
         raise ModelFileError(
             path, key, f"variance {worst} is {variances[worst]:.3g}; positive ones are needed"
         )
-    correlation = matrix / np.sqrt(np.outer(variances, variances))
-    if np.abs(correlation - correlation.T).max() > SYMMETRY_TOLERANCE:
+    deviations = np.sqrt(variances)
+    correlation = matrix / deviations[:, None] / deviations[None, :]
+    if not np.abs(correlation - correlation.T).max() <= SYMMETRY_TOLERANCE:
         raise ModelFileError(path, key, "is not symmetric")
     least = float(np.linalg.eigvalsh(correlation)[0])
     if least < -SYMMETRY_TOLERANCE:
@@ -271,11 +319,12 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
 
 def _check_algebra(model: CellModel, path: Path | str) -> None:
     for j, (kind, generator) in enumerate(zip(model.joint_kinds, model.generators, strict=True)):
-        size = float(np.linalg.norm(generator))
-        square = generator @ generator
-        defect = square @ generator + generator if kind == "revolute" else square
+        with np.errstate(over="ignore", invalid="ignore"):
+            size = float(np.linalg.norm(generator))
+            square = generator @ generator
+            defect = square @ generator + generator if kind == "revolute" else square
         limit = ALGEBRA_TOLERANCE * max(size, size**3 if kind == "revolute" else size**2)
-        if size == 0 or float(np.linalg.norm(defect)) > limit:
+        if size == 0 or not float(np.linalg.norm(defect)) <= limit < np.inf:
             law = "Ĥ³ = -Ĥ" if kind == "revolute" else "Ĥ² = 0"
             raise ModelFileError(
                 path,
@@ -326,11 +375,11 @@ def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
     """Inverse of :func:`encode_model`, strictly. Raises ModelFileError."""
     try:
         tree = msgspec.json.decode(data)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ModelFileError(path, "", f"is not JSON: {error}") from error
     if not isinstance(tree, dict):
         raise ModelFileError(path, "", f"holds a {type(tree).__name__}; a JSON object is needed")
-    if tree.get("schema") not in READABLE_SCHEMAS:
+    if type(tree.get("schema")) is not int or tree["schema"] not in READABLE_SCHEMAS:
         known = " and ".join(str(schema) for schema in READABLE_SCHEMAS)
         raise ModelFileError(path, "schema", f"is {tree.get('schema')!r}; this version reads {known}")
     tree["schema"] = MODEL_SCHEMA
