@@ -239,3 +239,14 @@ def test_reproduce_prints_a_table_for_people(tmp_path):
     assert run.exit_code == 0, run.output
     assert "assumed" in run.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["house-e_D.png", "house-rectification.png"]
+
+
+def test_plot_folder_that_is_none_is_told_before_the_run(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    for folder in (tmp_path / "file", tmp_path / "file" / "inner"):
+        run = CliRunner().invoke(app, ["reproduce", "house", "--plot", str(folder), "--json"])
+        assert run.exit_code == 1
+        error = json.loads(run.stdout)["error"]
+        assert error["code"] == "option"
+        assert "a folder, new or old, is needed" in error["message"]
+    assert (tmp_path / "file").read_text() == "kept"

@@ -354,6 +354,8 @@ def reproduce(
         for name in ("data", "hand_tag", "table_tags", "seeds"):
             if getattr(options, name) is not None and name not in chosen.takes:
                 raise ExperimentError("option", f"{experiment} does not take --{name.replace('_', '-')}")
+        if plot is not None:
+            _make_folder(plot)
         with progress_bar() as progress:
             answer = chosen.run(options, progress)
     except (ExperimentError, OSError) as error:
@@ -362,6 +364,16 @@ def reproduce(
         print(json.dumps(answer, allow_nan=False))
     else:
         chosen.show(answer, Console(markup=False))
+
+
+def _make_folder(plot: Path) -> None:
+    """Before the experiment, not after it: a run may take minutes. Raises ExperimentError."""
+    try:
+        plot.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExperimentError(
+            "option", f"--plot {str(plot)!r}: {error.strerror}; a folder, new or old, is needed"
+        ) from error
 
 
 def _find(name: str) -> Experiment:
