@@ -264,7 +264,8 @@ def test_misjudged_sigmas_are_reported(arms):
         assert result.model.stratum == "metric"
     with pytest.raises(CalibrationError) as caught:
         fit_model(changed(trials, sigmas=np.full_like(trials.sigmas, 0.02)), epoch=1)
-    assert caught.value.code == "residual_above_floor"
+    assert caught.value.code == "noise_understated"
+    assert caught.value.data["factor"] == pytest.approx(5.0, rel=0.06)
     assert caught.value.data["sigma_factor"] == pytest.approx(5.0, rel=0.06)
     assert set(caught.value.data["joints"]) == set(trials.joint_names)
     lenient = fit_model(
