@@ -117,6 +117,9 @@ def diagnosed(
         named = _named(trials, refit, options)
     except (GeometryError, np.linalg.LinAlgError):
         named = None  # data on which the search for a cause breaks down, too: the first error stands
+    if named is not None and named.code == "noise_understated":
+        # What was measured stays worth reading: the residual of each joint.
+        return CalibrationError(named.code, named.message, **{**error.data, **named.data})
     if named is not None:
         return named
     if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
