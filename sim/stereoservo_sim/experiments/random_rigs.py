@@ -20,8 +20,8 @@ from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
 from stereoservo.kinematics.calibration.bundle import Measurements, jacobian, residuals
-from stereoservo.kinematics.calibration.diagnosis import solution_of
 from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.kinematics.calibration.refitting import solution_of
 from stereoservo.kinematics.calibration.report import CalibrationResult
 from stereoservo.kinematics.calibration.statistics import covariance_root, variance_factor
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData

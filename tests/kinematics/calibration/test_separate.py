@@ -6,9 +6,9 @@ import pytest
 
 from stereoservo.geometry.displacements import exp_generator
 from stereoservo.kinematics.calibration.bundle import Measurements, solve
-from stereoservo.kinematics.calibration.diagnosis import solution_of
 from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.calibration.outlier_causes import model_rig
+from stereoservo.kinematics.calibration.refitting import solution_of
 from stereoservo.kinematics.calibration.separate import (
     best_start,
     separate_joint,
