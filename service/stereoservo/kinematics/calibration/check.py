@@ -42,6 +42,8 @@ NOISE_MARGIN = 1.2
 GROSS = 6.0, 12.0
 """A pixel is left out that differs from its marker's median over the stops by more than so many sigmas, and so many
 times what that marker's other pixels do in that camera."""
+ALONE = 0.3
+"""Share of an image's pixels up to which they are wrong by themselves; where more are, something is wrong there."""
 MIN_MEASUREMENTS = 40
 SEARCHED = 3
 """Stops over which far joint zeros are searched for."""
@@ -209,7 +211,8 @@ def _screened(bench: Bench, others: list[Cause], found: Estimate) -> list[Cause]
 def isolated(bench: Bench) -> npt.NDArray[np.bool_]:
     """Pixels (k,) that are wrong by themselves: far from what the same marker shows at the other stops.
 
-    Whatever moved in the cell shows in a marker's pixels at all stops alike, or changes from stop to stop.
+    Whatever moved in the cell shows in a marker's pixels at all stops alike, or changes from stop to stop. What shows
+    in many markers of one image, as joints in a wrong order do, is no wrong pixel.
     """
     here = bench.residuals_at(start_state(bench)).reshape(-1, 2)
     gross = np.zeros(len(here), dtype=bool)
@@ -220,6 +223,9 @@ def isolated(bench: Bench) -> npt.NDArray[np.bool_]:
             continue
         away = np.linalg.norm(here[mine] - np.median(here[mine], axis=0), axis=1)
         gross[mine] = away > GROSS[0] + GROSS[1] * np.median(away)
+    images = bench.data.camera * len(bench.data.offsets) + bench.data.stop
+    share = np.bincount(images, gross) / np.maximum(np.bincount(images), 1)
+    gross &= share[images] <= ALONE
     return gross
 
 
@@ -353,16 +359,29 @@ def _unexplained(model: CellModel, bench: Bench, found: Estimate, left: float, a
         for k, marker in enumerate(model.marker_ids)
         if (bench.data.marker == k).any()
     }
+    by_stop = {
+        int(s): float(np.sqrt(squares[bench.data.stop == s].mean())) for s in np.unique(bench.data.stop)
+    }
     worst = max(by_marker, key=lambda marker: by_marker[marker])
+    stop = max(by_stop, key=lambda s: by_stop[s])
     c = int(np.argmax(by_camera))
     rms_px = float(np.sqrt((squares * bench.data.sigmas**2).mean()))
     what = "the rest is" if also else "residuals are"
     return FoundCause(
         "unexplained", model.cameras[c].name, found.chi2, found.left.size - found.x.size, rms_px,
         f"{what} {left:.3g} times the expected noise and no single cause explains it: most in camera "
-        f"{model.cameras[c].name} ({by_camera[c]:.3g} times) and at marker {worst} ({by_marker[worst]:.3g} times). "
-        "Noise of the images (light, focus, dirt), play in a joint, or several changes at once",
+        f"{model.cameras[c].name} ({by_camera[c]:.3g} times), at marker {worst} ({by_marker[worst]:.3g} times) and "
+        f"{_where(model, bench, stop)} ({by_stop[stop]:.3g} times). Noise of the images (light, focus, dirt), play in "
+        "a joint, joints listed in another order than they follow each other, or several changes at once",
     )  # fmt: skip
+
+
+def _where(model: CellModel, bench: Bench, stop: int) -> str:
+    """A stop by the joints that are away from the base there."""
+    offsets = bench.data.offsets - np.median(bench.data.offsets, axis=0)
+    away = np.abs(offsets[stop]) > 0.2 * np.abs(offsets).max(axis=0)
+    names = sorted(model.joint_names[bench.order[k]] for k in np.flatnonzero(away))
+    return f"with {' and '.join(names)} displaced" if names else "at the base"
 
 
 def _message(
