@@ -47,8 +47,8 @@ def undistort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     radius = raw.copy()
     inside = np.ones(raw.shape, dtype=bool)
     if k < 0.0:
-        edge = np.sqrt(-1.0 / (3.0 * k))
-        inside = raw < edge * 2.0 / 3.0
+        # The image ends at 2/3 of the fold's radius 1 / sqrt(-3 k).
+        inside = -k * raw**2 < 4.0 / 27.0
         radius = np.where(inside, radius, 0.0)
     target = np.where(inside, raw, 0.0)
     for _ in range(ITERATIONS):
