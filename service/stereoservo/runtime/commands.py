@@ -19,9 +19,15 @@ Pixels = Annotated[float, Meta(gt=0, le=1000)]
 Lease = Annotated[float, Meta(ge=0.3, le=3600)]
 Fraction = Annotated[float, Meta(gt=0, le=1)]
 
-LAWS = ("stereo", "cartesian3")
-LawName = Literal["stereo", "cartesian3"]
+LAWS = ("stereo", "image", "points", "cartesian3", "cartesian2", "trajectory")
+LawName = Literal["stereo", "image", "points", "cartesian3", "cartesian2", "trajectory"]
 PointSource = Literal["triangulated", "predicted"]
+JacobianName = Literal["current", "desired", "mean", "fixed-depth"]
+ProfileName = Literal["linear", "exponential", "translation-first", "rotation-first", "planar-first"]
+Epoch = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+MarkerId = Annotated[int, Meta(ge=0, le=2**31 - 1)]
+Homogeneous = tuple[float, float, float, float]
+Pixel = tuple[float, float]
 
 
 class FeatureTarget(
@@ -29,14 +35,47 @@ class FeatureTarget(
 ):
     """Set-points: for each camera, marker id -> (u, v), raw pixels. ``model_epoch``: None, or refuse another model."""
 
-    set_points: dict[str, dict[int, tuple[float, float]]]
-    model_epoch: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
+    set_points: dict[str, dict[int, Pixel]]
+    model_epoch: Epoch | None = None
+
+
+class PointTarget(msgspec.Struct, frozen=True, tag="points", tag_field="kind", forbid_unknown_fields=True):
+    """Marker id -> homogeneous point in the model's projective frame; three or more, not on one line.
+
+    ``model_epoch``: of the model in whose frame they are.
+    """
+
+    points: dict[int, Homogeneous]
+    model_epoch: Epoch
+
+
+class DisplacementTarget(
+    msgspec.Struct, frozen=True, tag="displacement", tag_field="kind", forbid_unknown_fields=True
+):
+    """A displacement of the marker body from where it is: 4x4, row-major, projective, current -> goal.
+
+    Either in the frame of the model of ``model_epoch``, or in the projective basis of five markers ``basis`` of the
+    body, no four of them in a plane: in the coordinates in which these are e1 … e4 and (1, 1, 1, 1) now, so that no
+    calibration is in it.
+    """
+
+    matrix: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
+    model_epoch: Epoch | None = None
+    basis: tuple[MarkerId, MarkerId, MarkerId, MarkerId, MarkerId] | None = None
 
 
 class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", forbid_unknown_fields=True):
-    """A goal that was shown before, by its name."""
+    """A goal that was shown before, by its name.
+
+    ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
+    relative to the ``common`` markers that stand on the workpiece, which may have moved since. ``"cameras"``: the ``common``
+    markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen when it was
+    taught and now; empty: all that are both.
+    """
 
     name: Name
+    relative_to: Literal["workpiece", "cameras"] | None = None
+    common: tuple[MarkerId, ...] = ()
 
 
 class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", forbid_unknown_fields=True):
@@ -45,7 +84,69 @@ class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", f
     positions: dict[str, float]
 
 
-Target = FeatureTarget | TaughtTarget | JointTarget
+class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A point, line or plane: the span of one, two or three points, given in exactly one way.
+
+    ``markers``: of the moving body, as they move. ``points``: homogeneous, in the frame of the goal's ``model_epoch``.
+    ``pixels``: for each of two or more cameras the points' raw pixels, where they are.
+    """
+
+    markers: Annotated[tuple[MarkerId, ...], Meta(max_length=3)] = ()
+    points: Annotated[tuple[Homogeneous, ...], Meta(max_length=3)] = ()
+    pixels: dict[str, Annotated[tuple[Pixel, ...], Meta(max_length=3)]] = {}
+
+
+IncidenceKind = Literal[
+    "point-on-point", "point-on-line", "point-on-plane", "line-on-line", "line-on-plane", "plane-on-plane"
+]
+
+
+class IncidenceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``moving`` (of the body) shall lie on ``fixed`` (in the scene) (2.5.3)."""
+
+    kind: IncidenceKind
+    moving: Feature
+    fixed: Feature
+
+
+class IncidenceTarget(
+    msgspec.Struct, frozen=True, tag="incidence", tag_field="kind", forbid_unknown_fields=True
+):
+    """Incidences; the other freedoms are left alone, or given to ``secondary`` in their null space.
+
+    ``secondary``: joint positions, or set-points, approached as far as the incidences allow.
+    """
+
+    incidences: Annotated[tuple[IncidenceSpec, ...], Meta(min_length=1, max_length=16)]
+    secondary: JointTarget | FeatureTarget | None = None
+    model_epoch: Epoch | None = None
+
+
+Target = FeatureTarget | PointTarget | DisplacementTarget | TaughtTarget | JointTarget | IncidenceTarget
+StreamedTarget = FeatureTarget | PointTarget
+
+
+class Centre(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The point of the body that moves on a straight line, in exactly one way.
+
+    ``markers``: their affine middle. ``point``: homogeneous, where it is now in the frame of the model of
+    ``model_epoch``, moving with the body.
+    """
+
+    markers: tuple[MarkerId, ...] = ()
+    point: Homogeneous | None = None
+    model_epoch: Epoch | None = None
+
+
+class AdaptiveGain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``λ(e) = (near − far) exp(−slope·e / (near − far)) + far``: ``near`` at no error, ``far`` at a large one [1/s].
+
+    ``slope`` [1/s per 100 px]: how fast it falls from ``near``.
+    """
+
+    near: Gain
+    far: Gain
+    slope: Positive = 10.0
 
 
 class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,20 +154,62 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ``lease_s``: the goal is aborted when no renewal arrives for so long (None: no lease). ``tolerance_px``: largest
     pixel distance over visible markers and cameras, held ``hold_frames`` frames. ``speed_scale`` may only lower.
+    ``cameras``: whose images the law may use (None: all). ``profile``: of law ``trajectory``.
+
+    ``blend_px``: hand over to the next queued goal as soon as the error is below it, without stopping; without one it
+    is reached as usual. ``acknowledge_s``: reached, the arm holds there and the queue waits until a client
+    acknowledges (a gripper has closed), at most so long; then the queue is cancelled.
     """
 
     id: GoalId
     target: Target
     law: LawName | None = None
     points: PointSource | None = None
-    gain: Gain | None = None
+    jacobian: JacobianName | None = None
+    centre: Centre | None = None
+    cameras: tuple[str, ...] | None = None
+    profile: ProfileName | None = None
+    gain: Gain | AdaptiveGain | None = None
     tolerance_px: Pixels | None = None
     hold_frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None
     speed_scale: Fraction = 1.0
     lease_s: Lease | None = None
     time_limit_s: Positive | None = None
     mode: Literal["preempt", "queue"] = "preempt"
+    blend_px: Pixels | None = None
+    acknowledge_s: Positive | None = None
     check: bool = False
+
+
+class Approach(msgspec.Struct, frozen=True):
+    """How near the planned way comes to a limit: ``room`` [``unit``] is left at ``share`` [0, 1] of it.
+
+    ``subject``: the joint, keep-out or camera; ``marker``: the one that comes near, where one does.
+    """
+
+    code: str
+    subject: str
+    value: float
+    limit: float
+    room: float
+    unit: str
+    share: float
+    marker: int | None = None
+
+
+class PlanReport(msgspec.Struct, frozen=True):
+    """What a goal would do: ``seconds`` it needs, how near it comes to every limit, and its way.
+
+    ``shares`` [0, 1] and ``joints`` by name at these; ``pixels``: camera -> marker -> raw pixels there.
+    """
+
+    law: str
+    way: str
+    seconds: float
+    approaches: tuple[Approach, ...]
+    shares: tuple[float, ...]
+    joints: dict[str, tuple[float, ...]]
+    pixels: dict[str, dict[int, tuple[Pixel, ...]]]
 
 
 class RunGoal(msgspec.Struct, frozen=True, tag="goal", tag_field="command", forbid_unknown_fields=True):
@@ -77,6 +220,26 @@ class RunGoal(msgspec.Struct, frozen=True, tag="goal", tag_field="command", forb
 
 class RenewGoal(msgspec.Struct, frozen=True, tag="renew", tag_field="command", forbid_unknown_fields=True):
     """Renew the lease of a goal."""
+
+    id: GoalId
+
+
+class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command", forbid_unknown_fields=True):
+    """Move the set-points of the active goal: a moving target, streamed at 30 to 200 Hz. It also renews the lease.
+
+    ``stamp_s``: the client's time of this set-point; from two of them the target's velocity is fed forward. None: the
+    time of arrival stands in.
+    """
+
+    id: GoalId
+    target: StreamedTarget
+    stamp_s: float | None = None
+
+
+class AcknowledgeGoal(
+    msgspec.Struct, frozen=True, tag="acknowledge", tag_field="command", forbid_unknown_fields=True
+):
+    """A reached goal with ``acknowledge_s`` may be left: the queue goes on."""
 
     id: GoalId
 
@@ -149,6 +312,8 @@ Command = (
     RunGoal
     | RenewGoal
     | CancelGoal
+    | UpdateGoal
+    | AcknowledgeGoal
     | Hold
     | Resume
     | Enable

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime.commands import Request
+from stereoservo.runtime.commands import PlanReport, Request
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
 
 
@@ -71,6 +71,8 @@ EventKind = Literal[
     "lifecycle",
     "model",
     "goal_started",
+    "goal_face",  # the law works on another face of the body from here on
+    "goal_acknowledged",
     "goal_reached",
     "goal_aborted",
     "goal_cancelled",
@@ -122,6 +124,8 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     name: str = ""
     error_px: float | None = None
     progress: float | None = None
+    plan: PlanReport | None = None
+    """Of a reply to a goal that was planned."""
 
 
 class Status(msgspec.Struct, frozen=True, eq=False):

@@ -1,0 +1,99 @@
+"""How joints compose: what a small motion of all joints does to points and to the operators themselves.
+
+An arm re-zeroed where it stands (Theorem 10) needs no more than its operators there: ``H(q+Δq) H(q)⁻¹`` is their
+product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the loop runs the
+kernels ``displace`` and ``move_operators``.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.screws import exp_twist as exp_twist_reference
+from stereoservo.kinematics.kernels import exp_twist, invert4, kernel, multiply4_into
+
+
+class Composition(IntEnum):
+    """The order in which the joints of an arm act on the markers."""
+
+    BASE_FIRST = 0
+    """Product of exponentials, the base's joint leftmost (5.18): cameras stand."""
+    TIP_FIRST = 1
+    """The tip's joint leftmost: cameras ride on the tip."""
+    SIMULTANEOUS = 2
+    """All joints act at once, ``exp(Σ Δq_j Ĥ_j)``, with operators that stay: an arm commanded by Cartesian twists."""
+
+
+def displacement(operators: FloatArray, composition: Composition, step: FloatArray) -> FloatArray:
+    """What a motion of the joints by ``step`` (n,) does to points: (4, 4). ``operators`` (n, 4, 4) before it."""
+    if composition == Composition.SIMULTANEOUS:
+        return exp_twist_reference(np.tensordot(step, operators, axes=1))
+    H = np.eye(4)
+    for j in _order(composition, len(step)):
+        H = H @ exp_twist_reference(step[j] * operators[j])
+    return H
+
+
+def moved_operators(operators: FloatArray, composition: Composition, step: FloatArray) -> FloatArray:
+    """The operators (n, 4, 4) after a motion of the joints by ``step`` (n,) (5.21)."""
+    if composition == Composition.SIMULTANEOUS:
+        return operators.copy()
+    moved = np.empty_like(operators)
+    H = np.eye(4)
+    for j in _order(composition, len(step)):
+        moved[j] = H @ operators[j] @ np.linalg.inv(H)
+        H = H @ exp_twist_reference(step[j] * operators[j])
+    return moved
+
+
+def _order(composition: Composition, n: int) -> range:
+    return range(n - 1, -1, -1) if composition == Composition.TIP_FIRST else range(n)
+
+
+@kernel
+def displace(operators: FloatArray, composition: int, step: FloatArray) -> FloatArray:
+    """`displacement` as a kernel."""
+    n = step.shape[0]
+    if composition == 2:
+        total = np.zeros((4, 4))
+        for j in range(n):
+            for i in range(4):
+                for k in range(4):
+                    total[i, k] += step[j] * operators[j, i, k]
+        return exp_twist(total)
+    H = np.zeros((4, 4))
+    for i in range(4):
+        H[i, i] = 1.0
+    product = np.empty((4, 4))
+    for nth in range(n):
+        j = n - 1 - nth if composition == 1 else nth
+        multiply4_into(H, exp_twist(step[j] * operators[j]), product)
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = product[i, k]
+    return H
+
+
+@kernel
+def move_operators(operators: FloatArray, composition: int, step: FloatArray) -> FloatArray:
+    """`moved_operators` as a kernel."""
+    n = step.shape[0]
+    moved = operators.copy()
+    if composition == 2:
+        return moved
+    H = np.zeros((4, 4))
+    for i in range(4):
+        H[i, i] = 1.0
+    product = np.empty((4, 4))
+    for nth in range(n):
+        j = n - 1 - nth if composition == 1 else nth
+        multiply4_into(H, operators[j], product)
+        multiply4_into(product, invert4(H), moved[j])
+        multiply4_into(H, exp_twist(step[j] * operators[j]), product)
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = product[i, k]
+    return moved
