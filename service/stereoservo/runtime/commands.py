@@ -68,9 +68,9 @@ class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", 
     """A goal that was shown before, by its name.
 
     ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
-    relative to the ``common`` markers that stand on the workpiece, which may have moved since. ``"cameras"``: the ``common``
-    markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen when it was
-    taught and now; empty: all that are both.
+    relative to the ``common`` markers that stand on the workpiece, which may have moved since. ``"cameras"``: the
+    ``common`` markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen
+    when it was taught and now; empty: all that are both.
     """
 
     name: Name

@@ -40,8 +40,8 @@ class PlanRequest(msgspec.Struct, frozen=True, eq=False):
     """From where to where, with what.
 
     ``operators`` (n, 4, 4), ``joints`` (n,), ``points`` (m, 4) now; ``targets`` (m, 4) at the goal; ``centre``,
-    ``centre_target`` (4,): heights 1. ``faces`` (f, 3): markers of the faces whose sight is kept by every camera that has
-    it now and at the goal. ``kept`` (m,): 1 for markers that must stay in the images of these cameras.
+    ``centre_target`` (4,): heights 1. ``faces`` (f, 3): markers of the faces whose sight is kept by every camera that
+    has it now and at the goal. ``kept`` (m,): 1 for markers that must stay in the images of these cameras.
     ``bend``: whether another way than ``profile``'s straight one is looked for where that is not feasible.
     ``speed_scale`` (0, 1] of velocity and acceleration limits.
     """
