@@ -24,7 +24,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from stereoservo.kinematics.calibration.check_causes import model_rig, pixels_of
+from stereoservo.kinematics.calibration.check_causes import pixels_of
+from stereoservo.kinematics.calibration.model_rig import acting_order, acting_rig
 from stereoservo.kinematics.calibration.report import CalibrationReport
 from stereoservo.kinematics.calibration.rig import Measurements, predicted
 from stereoservo.kinematics.calibration.trials import TrialData
@@ -64,7 +65,7 @@ class Residuals:
 
 def residuals_of(model: CellModel, trials: TrialData, report: CalibrationReport) -> Residuals:
     """Residuals of every pixel of the model's markers. Raises CalibrationError where the trials are not the model's."""
-    rig, order = model_rig(model)
+    rig, order = acting_rig(model), acting_order(model)
     data = pixels_of(model, trials, order)
     pixels = data.pixels - predicted(rig, data)
     outliers = {(out.camera, out.stop, out.marker) for out in report.outliers}

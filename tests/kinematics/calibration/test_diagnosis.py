@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from stereoservo.kinematics.calibration.fit import fit_model
-from stereoservo.kinematics.calibration.outlier_causes import expected_pixels, model_rig
+from stereoservo.kinematics.calibration.model_rig import projective_rig
+from stereoservo.kinematics.calibration.outlier_causes import expected_pixels
 from stereoservo.kinematics.calibration.trials import CalibrationError
 from stereoservo_sim import synthetic
 from stereoservo_sim.experiments.thesis_robot import thesis_cell, trial_motions
@@ -35,7 +36,7 @@ def refusal(trials):
 def error_rms(model, cell, positions):
     """Rms error [px] of predictions, in ideal circumstances a fraction of the noise."""
     kept = [i - FIRST_MARKER for i in model.marker_ids]
-    expected = expected_pixels(model_rig(model), positions - model.zero)
+    expected = expected_pixels(projective_rig(model), positions - model.zero)
     return float(np.sqrt(np.mean((expected - cell.pixels(positions)[:, :, kept]) ** 2)))
 
 
@@ -130,7 +131,7 @@ def test_views_exchanged_at_some_stops(name, seed, share):
 def test_views_exchanged_throughout_are_a_naming():
     cell, trials, _ = cell_and_trials("rx90", 3)
     result = fit_model(with_sights(trials, trials.pixels[::-1]), epoch=1)
-    swapped = expected_pixels(model_rig(result.model), trials.positions - result.model.zero)
+    swapped = expected_pixels(projective_rig(result.model), trials.positions - result.model.zero)
     assert np.sqrt(np.mean((swapped[::-1] - cell.pixels(trials.positions)) ** 2)) < 0.6 * SIGMA
 
 
@@ -208,7 +209,9 @@ def test_sign_and_common_prismatic_scale_are_absorbed():
     positions = trials.positions * [2.0, -1.0, 1.0, 1.0]
     result = fit_model(changed(trials, positions=positions), epoch=1)
     held_out = cell.held_out(rng, 30)
-    expected = expected_pixels(model_rig(result.model), held_out * [2.0, -1.0, 1.0, 1.0] - result.model.zero)
+    expected = expected_pixels(
+        projective_rig(result.model), held_out * [2.0, -1.0, 1.0, 1.0] - result.model.zero
+    )
     assert np.sqrt(np.mean((expected - cell.pixels(held_out)) ** 2)) < 0.6 * SIGMA
 
 

@@ -7,7 +7,7 @@ import pytest
 from stereoservo.geometry.displacements import exp_generator
 from stereoservo.kinematics.calibration.bundle import Measurements, solve
 from stereoservo.kinematics.calibration.fit import fit_model
-from stereoservo.kinematics.calibration.outlier_causes import model_rig
+from stereoservo.kinematics.calibration.model_rig import projective_rig
 from stereoservo.kinematics.calibration.refitting import solution_of
 from stereoservo.kinematics.calibration.separate import (
     best_start,
@@ -117,7 +117,7 @@ def test_a_turned_plate_makes_a_better_model_than_as_many_images_of_a_still_one(
 def projective_noise(trials, result):
     """Deviations (n,) of the generators' entries in the projective bundle."""
     solution = solution_of(trials, result)
-    projective = solve(model_rig(result.model), solution.data, "projective")
+    projective = solve(projective_rig(result.model), solution.data, "projective")
     return generator_noise(projective)
 
 

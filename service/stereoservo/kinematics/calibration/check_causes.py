@@ -21,6 +21,7 @@ from stereoservo.kinematics.calibration.bundle import (
     residuals,
 )
 from stereoservo.kinematics.calibration.check_report import CauseKind
+from stereoservo.kinematics.calibration.model_rig import acting_order, acting_rig
 from stereoservo.kinematics.calibration.normal_equations import triangle_of
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.model import CellModel, ModelCovariance
@@ -92,30 +93,6 @@ def _unbound(B: FloatArray) -> FloatArray:
     return root
 
 
-def model_rig(model: CellModel) -> tuple[Rig, tuple[int, ...]]:
-    """The model as a rig in the best frame that its stratum has, and the order of its joints."""
-    H = model.projective_to_euclidean
-    if H is None:
-        H = np.eye(4)
-        if model.stratum == "affine":
-            H[3] = model.plane_at_infinity
-    inverse = np.linalg.inv(H)
-    order = tuple(range(len(model.joint_names)))
-    if model.tip_first:
-        order = order[::-1]
-    points = model.marker_points @ H.T
-    if model.stratum != "projective":
-        points = points / points[:, 3:]
-    rig = Rig(
-        tuple(model.joint_kinds[j] for j in order),
-        H @ model.generators[list(order)] @ inverse,
-        np.array([camera.matrix @ inverse for camera in model.cameras]),
-        points,
-        np.array([camera.lens for camera in model.cameras]),
-    )
-    return rig, order
-
-
 def pixels_of(model: CellModel, trials: TrialData, order: tuple[int, ...]) -> Measurements:
     """The pixels of markers and cameras that the model knows.
 
@@ -144,7 +121,7 @@ def make_bench(model: CellModel, check: TrialData, made_from: TrialData | None, 
     How well the model is known it says itself; one that does not is taken from the trials of its calibration,
     ``made_from``, and without those as if exact.
     """
-    rig, order = model_rig(model)
+    rig, order = acting_rig(model), acting_order(model)
     data = pixels_of(model, check, order)
     data = replace(data, sigmas=data.sigmas * noise_factor)
     if model.covariance is not None:

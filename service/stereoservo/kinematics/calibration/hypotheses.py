@@ -18,7 +18,8 @@ from stereoservo.kinematics.calibration.exchanges import (
     with_ids_exchanged,
     with_views_exchanged,
 )
-from stereoservo.kinematics.calibration.outlier_causes import expected_pixels, model_rig
+from stereoservo.kinematics.calibration.model_rig import projective_rig
+from stereoservo.kinematics.calibration.outlier_causes import expected_pixels
 from stereoservo.kinematics.calibration.refitting import Refit, Views, fits
 from stereoservo.kinematics.calibration.separate import best_start, trial_stops, virtual_markers
 from stereoservo.kinematics.calibration.strata import FitOptions
@@ -123,7 +124,7 @@ def order_hypotheses(trials: TrialData, refit: Refit, options: FitOptions) -> It
     )
     if alone is None:
         return
-    rig, kept = model_rig(alone.model), [trials.marker_ids.index(i) for i in alone.model.marker_ids]
+    rig, kept = projective_rig(alone.model), [trials.marker_ids.index(i) for i in alone.model.marker_ids]
     seen = trials.pixels[:, free][:, :, kept]
     orders = [np.arange(n)[::-1]]
     for a, b in combinations(range(n), 2):

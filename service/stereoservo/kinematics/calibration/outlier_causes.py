@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.kinematics.calibration.model_rig import projective_rig
 from stereoservo.kinematics.calibration.report import CalibrationResult
 from stereoservo.kinematics.calibration.rig import Measurements, Rig, predicted
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
-from stereoservo.kinematics.model import CellModel
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -49,17 +49,6 @@ class Predictions:
         return np.asarray(np.where(np.isfinite(distance), distance, np.inf) <= NEAR * self.sigmas)
 
 
-def model_rig(model: CellModel) -> Rig:
-    """The rig of a model, in its projective frame."""
-    return Rig(
-        model.joint_kinds,
-        model.generators,
-        np.array([camera.matrix for camera in model.cameras]),
-        model.marker_points,
-        np.array([camera.lens for camera in model.cameras]),
-    )
-
-
 def expected_pixels(rig: Rig, offsets: FloatArray) -> FloatArray:
     """Pixels (c, s, m, 2) of a rig at ``offsets`` (s, n)."""
     shape = (len(rig.cameras), len(offsets), len(rig.points))
@@ -79,7 +68,7 @@ def predictions(trials: TrialData, result: CalibrationResult) -> Predictions:
     names = [camera.name for camera in trials.cameras]
     for outlier in result.report.outliers:
         outliers[names.index(outlier.camera), outlier.stop, model.marker_ids.index(outlier.marker)] = True
-    rig = model_rig(model)
+    rig = projective_rig(model)
     return Predictions(
         rig,
         model.zero,

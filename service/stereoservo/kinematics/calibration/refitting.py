@@ -11,9 +11,8 @@ from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.calibration.bundle import Measurements, Solution, solve
 from stereoservo.kinematics.calibration.lens_starts import straight_lenses, undistorted
 from stereoservo.kinematics.calibration.lenses import FREE_LENS, prior_of_lenses
-from stereoservo.kinematics.calibration.outlier_causes import model_rig
+from stereoservo.kinematics.calibration.model_rig import stratum_rig
 from stereoservo.kinematics.calibration.report import CalibrationResult
-from stereoservo.kinematics.calibration.rig import Rig
 from stereoservo.kinematics.calibration.strata import FitOptions
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.calibration.views import first_views
@@ -46,21 +45,6 @@ def plain_views(trials: TrialData) -> Views:
 def solution_of(trials: TrialData, result: CalibrationResult) -> Solution:
     """The final bundle of a fit again, from its model: linearised in the frame of its stratum, not moved."""
     model = result.model
-    frame: FloatArray = np.eye(4)
-    if model.stratum == "affine":
-        frame[3] = model.plane_at_infinity
-    elif model.projective_to_euclidean is not None:
-        frame = model.projective_to_euclidean
-    back = np.linalg.inv(frame)
-    points = model.marker_points @ frame.T
-    plain = model_rig(model)
-    rig = Rig(
-        model.joint_kinds,
-        frame @ model.generators @ back,
-        plain.cameras @ back,
-        points / points[:, 3:] if model.stratum != "projective" else points,
-        plain.lenses,
-    )
     kept = [trials.marker_ids.index(i) for i in model.marker_ids]
     used = trials.visible[:, :, kept]
     names = [camera.name for camera in trials.cameras]
@@ -77,4 +61,6 @@ def solution_of(trials: TrialData, result: CalibrationResult) -> Solution:
         prior_of_lenses(trials, {}),
     )
     bent = any(camera.lens[0] != 0.0 for camera in model.cameras)
-    return solve(rig, data, model.stratum, lenses=FREE_LENS if bent else "none", max_evaluations=1)
+    return solve(
+        stratum_rig(model), data, model.stratum, lenses=FREE_LENS if bent else "none", max_evaluations=1
+    )

@@ -191,13 +191,14 @@ def depth_spread(model: CellModel, trials: TrialData) -> float | None:
 
     From the curvature of the fit at the model, over the trials' own stops and sigmas.
     """
-    from stereoservo.kinematics.calibration.check_causes import model_rig, pixels_of
+    from stereoservo.kinematics.calibration.check_causes import pixels_of
+    from stereoservo.kinematics.calibration.model_rig import acting_order, acting_rig
     from stereoservo.kinematics.calibration.normal_equations import triangle_of
     from stereoservo.kinematics.calibration.rig import full_charts
 
     if model.stratum == "projective":
         return None
-    rig, order = model_rig(model)
+    rig, order = acting_rig(model), acting_order(model)
     data = pixels_of(model, trials, order)
     charts = full_charts(rig, model.stratum)
     triangle = triangle_of(rig, charts, data)[:-1, :-1]
