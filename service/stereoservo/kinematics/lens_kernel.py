@@ -22,8 +22,10 @@ CONVERGED = 1e-14
 
 @kernel
 def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold."""
+    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. A lens of ``k = 0`` leaves it as it is, to the bit."""
     k, r0 = lens[0], lens[3]
+    if k == 0.0:
+        return u, v
     x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
     bend = k * (x * x + y * y)
     if not 1.0 + 3.0 * bend > 0.0:
@@ -33,8 +35,13 @@ def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
 
 @kernel
 def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Ideal pixel of the raw one ``(u, v)`` by Newton's method on the radius; NaN where there is none."""
+    """Ideal pixel of the raw one ``(u, v)`` by Newton's method on the radius; NaN where there is none.
+
+    A lens of ``k = 0`` leaves it as it is, to the bit.
+    """
     k, r0 = lens[0], lens[3]
+    if k == 0.0:
+        return u, v
     x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
     raw = math.sqrt(x * x + y * y)
     if not math.isfinite(raw) or (k < 0.0 and not raw < 2.0 / 3.0 * math.sqrt(-1.0 / (3.0 * k))):

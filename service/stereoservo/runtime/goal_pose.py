@@ -13,7 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoservo.control.kernels import cartesian3_step, damped_least_squares
-from stereoservo.kinematics.kernels import exp_twist, image_jacobian, project_points, transform_points
+from stereoservo.kinematics.kernels import (
+    BoolArray,
+    exp_twist,
+    image_jacobian,
+    multiply4_into,
+    project_points,
+    transform_points,
+)
 from stereoservo.runtime.estimate import ModelArrays
 from stereoservo.runtime.ports import FloatArray, IntArray
 
@@ -21,13 +28,18 @@ LAW_STEPS = 80
 LAW_GAIN = 0.3  # of the way still to be made, a step
 REFINEMENTS = 12
 REFINE_DAMPING = 1e-12
+CONVERGED = 1e-13  # of a refinement's step in the basis
 
 
 @dataclass(frozen=True)
 class GoalPose:
-    """Marker points at the goal (m, 4) of height a∞ᵀM = 1, and how well they explain the set-points [px]."""
+    """Marker points at the goal (m, 4) of height a∞ᵀM = 1, and how well they explain the set-points [px].
+
+    ``displacement`` (4, 4) takes the body there from where it was.
+    """
 
     points: FloatArray
+    displacement: FloatArray
     rms_px: float
     worst_px: float
     worst_marker: int
@@ -38,7 +50,7 @@ def goal_pose(
     operators: FloatArray,
     points: FloatArray,
     targets: FloatArray,
-    known: FloatArray,
+    known: BoolArray,
     face: IntArray,
     set_points: FloatArray,
     wanted: FloatArray,
@@ -49,32 +61,52 @@ def goal_pose(
     (n, 4, 4): the arm's at present, a basis of displacements where the model knows no metric one.
     """
     basis = operators if arrays.metric_basis is None else arrays.metric_basis
+    D = np.zeros((4, 4))
+    for i in range(4):
+        D[i, i] = 1.0
     moved = points
+    nobody = np.zeros((0, 4))  # on paper no camera has to keep sight of the face
     gains = np.full(3, LAW_GAIN)
     centre_target = targets[known].sum(axis=0) / float(known.sum())
     for _ in range(LAW_STEPS):
         centre = moved[known].sum(axis=0) / float(known.sum())
         twist, _, _, _ = cartesian3_step(
-            basis, moved[face], targets[face], centre, centre_target, arrays.camera_centres, gains
+            basis, moved[face], targets[face], centre, centre_target, nobody, gains
         )
-        moved = _displaced(basis, twist, moved)
+        D = _onwards(basis, twist, D)
+        moved = transform_points(D, points)
+    return refined_pose(arrays, basis, points, D, set_points, wanted)
+
+
+def refined_pose(
+    arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
+    wanted: FloatArray,
+) -> GoalPose:  # fmt: skip
+    """Least squares on all set-points, from a ``displacement`` (4, 4) near by; ``basis`` (k, 4, 4) of displacements."""
+    D = displacement
+    moved = transform_points(D, points)
     weights = np.repeat(wanted.reshape(-1), 2)
     for _ in range(REFINEMENTS):
         pixels, _ = project_points(arrays.matrices, moved)
         jacobian = image_jacobian(basis, arrays.matrices, moved).reshape(-1, basis.shape[0])
         step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, REFINE_DAMPING)
-        moved = _displaced(basis, step, moved)
+        D = _onwards(basis, step, D)
+        moved = transform_points(D, points)
+        if float(np.abs(step).max()) < CONVERGED:
+            break
     pixels, _ = project_points(arrays.matrices, moved)
     distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
     worst = int(distance.max(axis=0).argmax())
     return GoalPose(
         moved,
+        D,
         float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0))),
         float(distance.max()),
         arrays.marker_ids[worst],
     )
 
 
-def _displaced(basis: FloatArray, twist: FloatArray, points: FloatArray) -> FloatArray:
-    moved: FloatArray = transform_points(exp_twist((twist[:, None, None] * basis).sum(axis=0)), points)
-    return moved
+def _onwards(basis: FloatArray, twist: FloatArray, D: FloatArray) -> FloatArray:
+    onwards = np.empty((4, 4))
+    multiply4_into(exp_twist((twist[:, None, None] * basis).sum(axis=0)), D, onwards)
+    return onwards

@@ -10,17 +10,21 @@ import numpy as np
 from stereoservo.control.reasons import Reason
 from stereoservo.runtime.check import start_check
 from stereoservo.runtime.commands import (
+    AcknowledgeGoal,
     Calibrate,
     CancelGoal,
     Command,
     Disable,
+    DisplacementTarget,
     Enable,
     FeatureTarget,
     Goal,
     Hold,
     Home,
+    IncidenceTarget,
     Jog,
     JointTarget,
+    PointTarget,
     RenewGoal,
     Request,
     Reset,
@@ -28,33 +32,18 @@ from stereoservo.runtime.commands import (
     RunGoal,
     TaughtTarget,
     Teach,
+    UpdateGoal,
 )
 from stereoservo.runtime.cycle import Lifecycle, ModelReadiness
 from stereoservo.runtime.motion import Present, measurement_buffers
 from stereoservo.runtime.ports import FloatArray
-from stereoservo.runtime.servoing import start_servoing
+from stereoservo.runtime.refusal import RefusalError
+from stereoservo.runtime.servoing import place_now, start_servoing
 from stereoservo.runtime.state import Holding, Jogging, JointMove, Servoing, Source, Teaching, Visiting
 from stereoservo.runtime.trials import start_trials
 
 QUEUE_LENGTH = 16
 HOME_SPEED = 0.5
-
-
-class RefusalError(Exception):
-    """The core will not do what was asked; carries the reason."""
-
-    def __init__(
-        self,
-        code: str,
-        hint: str,
-        *,
-        subject: str = "",
-        value: float | None = None,
-        threshold: float | None = None,
-        unit: str = "",
-    ) -> None:
-        super().__init__(hint)
-        self.reason = Reason(code, "info", subject, value, threshold, unit, hint)
 
 
 def goal_of(source: Source) -> str:
@@ -96,7 +85,7 @@ def answer(request: Request, present: Present) -> None:
             request=request.request,
             accepted=False,
             message=str(refusal),
-            reasons=(refusal.reason,),
+            reasons=refusal.reasons,
             id=_id(request.command),
         )
         return
@@ -163,6 +152,8 @@ def _carry_out(request: Request, command: Command, present: Present) -> str:
         home = present.settings.home
         state.source = _move(command.id, home, speed, present, lease_s=command.lease_s)
         return "moving home"
+    if isinstance(command, UpdateGoal | AcknowledgeGoal):
+        raise RefusalError("NO_SUCH_GOAL", f"goal {command.id} is not active", subject=command.id)
     return _calibrate(command, present)
 
 
@@ -241,10 +232,16 @@ def _check_goal(goal: Goal, present: Present) -> Source:
         raise RefusalError(
             "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
         )
-    return _feature_goal(goal, target, present)
+    if isinstance(target, IncidenceTarget):
+        raise RefusalError(
+            "NO_SUCH_TARGET", "this cell's core does not drive incidences", subject="incidence"
+        )
+    return _law_goal(goal, target, present)
 
 
-def _feature_goal(goal: Goal, target: FeatureTarget, present: Present) -> Servoing:
+def _law_goal(
+    goal: Goal, target: FeatureTarget | PointTarget | DisplacementTarget, present: Present
+) -> Servoing:
     state = present.state
     if state.model is None or present.arrays is None or state.readiness == ModelReadiness.NONE:
         raise RefusalError("NO_MODEL", "the cell has no model yet: calibrate first")
@@ -253,17 +250,7 @@ def _feature_goal(goal: Goal, target: FeatureTarget, present: Present) -> Servoi
             "MODEL_SUSPECT",
             "the model no longer explains the images: check the cameras and the markers, then calibrate",
         )
-    if target.model_epoch is not None and target.model_epoch != state.model.epoch:
-        raise RefusalError(
-            "OTHER_MODEL",
-            f"the goal was taught with model epoch {target.model_epoch}; the cell has epoch {state.model.epoch}: "
-            "teach it again",
-            value=float(target.model_epoch), threshold=float(state.model.epoch),
-        )  # fmt: skip
-    try:
-        return start_servoing(goal, target, present)
-    except ValueError as error:
-        raise RefusalError("GOAL_UNUSABLE", str(error)) from error
+    return start_servoing(goal, target, present, place_now(present))
 
 
 def _run_goal(goal: Goal, present: Present) -> str:

@@ -2,147 +2,155 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-from math import isfinite
-
 import numpy as np
 
-from stereoservo.control.cartesian3 import cartesian3_reasons
-from stereoservo.control.kernels import cartesian3_step, stereo_step
+from stereoservo.control.law import JacobianChoice, Options, Scene, Task
+from stereoservo.control.laws import LAWS
 from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.kernels import image_jacobian, transform_points, triangulate
-from stereoservo.kinematics.lens_kernel import undistort_pixel
-from stereoservo.runtime.commands import FeatureTarget, Goal
-from stereoservo.runtime.estimate import ModelArrays, chain_at, points_now, with_unit_height
-from stereoservo.runtime.goal_pose import goal_pose
+from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.kernels import invert4, transform_points
+from stereoservo.runtime.commands import (
+    AdaptiveGain,
+    Centre,
+    DisplacementTarget,
+    FeatureTarget,
+    Goal,
+    JacobianName,
+    PointTarget,
+)
+from stereoservo.runtime.estimate import ModelArrays, chain_at, points_now
 from stereoservo.runtime.motion import Motion, Present
-from stereoservo.runtime.ports import FloatArray, IntArray
+from stereoservo.runtime.ports import FloatArray
+from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.state import Servoing
+from stereoservo.runtime.targets import (
+    MIN_MARKERS,
+    Aim,
+    Place,
+    aim_at,
+    camera_index,
+    marker_index,
+    of_this_model,
+    of_unit_height,
+)
 
-MIN_MARKERS = 3
-MIN_FACE_AREA_PX2 = 100.0
-MAX_GOAL_RESIDUAL_PX = 5.0
-STEREO_DAMPING = 1e-6  # relative to the largest diagonal of the normal matrix
-ILL_CONDITIONED = 1e-5
+JACOBIANS: dict[JacobianName, JacobianChoice] = {
+    "current": JacobianChoice.CURRENT,
+    "desired": JacobianChoice.DESIRED,
+    "mean": JacobianChoice.MEAN,
+    "fixed-depth": JacobianChoice.FIXED_DEPTH,
+}
 
 
-def start_servoing(goal: Goal, target: FeatureTarget, present: Present) -> Servoing:
-    """The state of a law before its first step. Raises ValueError naming what makes the goal unusable."""
-    arrays = present.arrays
-    if arrays is None:
-        raise ValueError("no model")
-    settings = present.settings
-    set_points, wanted = _set_points(target, present, arrays)
-    law = goal.law or settings.law
-    seen_by_all = wanted.sum(axis=0) >= 2
-    target_points, ok = triangulate(arrays.matrices, set_points, wanted, 5)
-    known = np.asarray(ok, dtype=bool) & seen_by_all
-    target_points = np.where(known[:, None], with_unit_height(target_points, arrays.plane_at_infinity), 0.0)
-    shown = int((wanted.sum(axis=0) > 0).sum())
-    if shown < MIN_MARKERS:
-        raise ValueError(f"the goal shows {shown} markers; at least {MIN_MARKERS} are needed to fix a pose")
-    face: IntArray = np.zeros(3, np.int64)
-    centre = np.zeros(4)
-    pose_known = law == "cartesian3" or int(known.sum()) >= MIN_MARKERS
-    if pose_known:
-        face = _face(set_points, known, arrays)
-        target_points = _goal_points(present, arrays, target_points, known, face, set_points, wanted)
-        centre = target_points[known].sum(axis=0) / float(known.sum())
+def place_now(present: Present) -> Place:
+    """The body as the estimate has it now. Only with a model."""
+    arrays, prediction = present.arrays, present.prediction
+    assert arrays is not None
+    assert prediction is not None
+    H = chain_at(arrays, present.q + present.state.correction)[0]
+    return Place(present.settings, arrays, transform_points(H, arrays.marker_points), prediction.operators)
+
+
+def start_servoing(
+    goal: Goal, target: FeatureTarget | PointTarget | DisplacementTarget, present: Present, place: Place
+) -> Servoing:
+    """The state of a law before its first step, for a body that sets out from ``place``.
+
+    Raises RefusalError naming what makes the goal unusable.
+    """
+    settings, model = present.settings, present.state.model
+    assert model is not None
+    name = goal.law or settings.law
+    if name not in LAWS:
+        raise RefusalError("NO_SUCH_LAW", f"no law {name!r}; laws: {', '.join(LAWS)}", subject=name)
+    aim = aim_at(target, place, LAWS[name].needs_pose, model.epoch)
+    used = _used_cameras(goal, aim, present)
+    gain = goal.gain or settings.gain
+    near, far, slope = (
+        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
+    )
+    weights, body, centre_target = _centre(goal.centre, aim, place, present, model.epoch)
     source = Servoing(
         goal=goal,
-        law=law,
+        law=name,
         points=goal.points or settings.points,
-        gain=goal.gain or settings.gain,
+        gain_near=near,
+        gain_far=far,
+        gain_slope=slope,
+        jacobian=int(JACOBIANS[goal.jacobian or "mean"]),
         tolerance_px=goal.tolerance_px or settings.tolerance_px,
         hold_frames=goal.hold_frames or settings.hold_frames,
         time_limit_s=goal.time_limit_s or settings.time_limit_s,
         started_ns=present.now_ns,
         lease_s=goal.lease_s,
         lease_until_ns=0,
-        set_points=set_points,
-        wanted=wanted,
-        target_points=target_points,
-        target_known=known.astype(np.float64),
-        pose_known=pose_known,
-        centre_target=centre,
-        face=face,
+        used=used,
+        set_points=aim.set_points,
+        wanted=aim.wanted,
+        rates=np.zeros_like(aim.set_points),
+        target_points=aim.points,
+        target_known=aim.known,
+        pose_known=aim.pose_known,
+        centre_weights=weights,
+        centre_body=body,
+        centre_target=centre_target,
+        face=aim.face,
         last_frames=sum(e.frames for e in present.state.cameras),
     )
     source.renew_lease(present.now_ns)
     return source
 
 
-def _set_points(
-    target: FeatureTarget, present: Present, arrays: ModelArrays
-) -> tuple[FloatArray, FloatArray]:
-    """(c, m, 2) set-points as ideal pixels and (c, m) wanted, of a target in raw ones.
+def _used_cameras(goal: Goal, aim: Aim, present: Present) -> FloatArray:
+    """(c,) 1 for cameras whose images the law may use."""
+    c = len(present.settings.cameras)
+    if goal.cameras is None:
+        return np.ones(c)
+    used = np.zeros(c)
+    for name in goal.cameras:
+        used[camera_index(name, present.settings)] = 1.0
+    shown = int((aim.wanted * used[:, None]).max(axis=0).sum())
+    if shown < MIN_MARKERS:
+        raise RefusalError(
+            "TOO_FEW_MARKERS",
+            f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {MIN_MARKERS} "
+            "are needed",
+            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
+        )  # fmt: skip
+    return used
 
-    Raises ValueError on a camera, marker or pixel that cannot be.
+
+def _centre(
+    centre: Centre | None, aim: Aim, place: Place, present: Present, epoch: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; at the goal.
+
+    The point is stated in the chain's zero. Default: the affine middle of the goal's markers.
     """
-    settings = present.settings
-    c, m = len(settings.cameras), len(arrays.marker_ids)
-    names = [camera.name for camera in settings.cameras]
-    set_points, wanted = np.zeros((c, m, 2)), np.zeros((c, m))
-    for name, markers in target.set_points.items():
-        if name not in names:
-            raise ValueError(f"no camera {name!r}; cameras: {', '.join(names)}")
-        camera = names.index(name)
-        size = settings.cameras[camera]
-        for marker, (u, v) in markers.items():
-            i = arrays.index.get(marker)
-            if i is None:
-                known = ", ".join(str(k) for k in arrays.marker_ids)
-                raise ValueError(f"marker {marker} is not in the model; its markers: {known}")
-            if not (-0.5 <= u <= size.width - 0.5 and -0.5 <= v <= size.height - 0.5):
-                raise ValueError(
-                    f"camera {name!r}, marker {marker}: ({u}, {v}) lies outside its {size.width}x{size.height} image"
-                )
-            ideal = (
-                undistort_pixel(arrays.lenses[camera], u, v) if arrays.lenses[camera, 0] != 0.0 else (u, v)
+    arrays = place.arrays
+    weights = np.zeros(len(arrays.marker_ids))
+    body = np.zeros(4)
+    if centre is None:
+        weights = aim.known / max(float(aim.known.sum()), 1.0)
+    elif bool(centre.markers) == (centre.point is not None):
+        raise RefusalError(
+            "CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none"
+        )
+    elif centre.point is not None:
+        if centre.model_epoch is None:
+            raise RefusalError(
+                "FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is"
             )
-            if not isfinite(ideal[0] + ideal[1]):
-                raise ValueError(
-                    f"camera {name!r}, marker {marker}: ({u}, {v}) lies where the camera's lens images nothing"
-                )
-            set_points[camera, i] = ideal
-            wanted[camera, i] = 1.0
-    return set_points, wanted
-
-
-def _face(set_points: FloatArray, known: FloatArray, arrays: ModelArrays) -> IntArray:
-    """Three markers known at the goal that span the largest triangle in the images."""
-    candidates = np.flatnonzero(known)
-    if candidates.size < 3:
-        raise ValueError(
-            f"{MIN_MARKERS} markers that two cameras show at the goal are needed; {candidates.size} are"
-        )
-    triples = np.array(list(combinations(candidates.tolist(), 3)), dtype=np.int64)
-    a, b, c = (set_points[:, triples[:, k]] for k in range(3))
-    areas = np.abs((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0]).min(axis=0)
-    best = int(areas.argmax())
-    if float(areas[best]) < MIN_FACE_AREA_PX2:
-        ids = [arrays.marker_ids[int(i)] for i in candidates]
-        raise ValueError(f"the markers {ids} of the goal lie on one line; three that span a face are needed")
-    found: IntArray = triples[best]
-    return found
-
-
-def _goal_points(
-    present: Present, arrays: ModelArrays, targets: FloatArray, known: FloatArray, face: IntArray,
-    set_points: FloatArray, wanted: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """The goal's pose as marker points. Raises ValueError where no displacement of the body explains the set-points."""
-    prediction = present.prediction
-    assert prediction is not None
-    points = transform_points(chain_at(arrays, present.q)[0], arrays.marker_points)
-    pose = goal_pose(arrays, prediction.operators, points, targets, known, face, set_points, wanted)
-    if not pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
-        raise ValueError(
-            f"no displacement of the marker body explains the set-points: marker {pose.worst_marker} is off by "
-            f"{pose.worst_px:.2f} px (rms {pose.rms_px:.2f} px; up to {MAX_GOAL_RESIDUAL_PX} px is accepted): are ids "
-            "swapped, is it another body, or is it mirrored?"
-        )
-    return pose.points
+        of_this_model(centre.model_epoch, epoch)
+        now = of_unit_height(np.array(centre.point), arrays, "the centre")[None]
+        H = chain_at(arrays, present.q + present.state.correction)[0]
+        body = transform_points(invert4(H), now)[0]
+        return weights, body, transform_points(aim.displacement, now)[0]
+    else:
+        for marker in centre.markers:
+            weights[marker_index(marker, arrays)] = 1.0
+        weights = weights / float(weights.sum())
+    return weights, body, (weights[:, None] * aim.points).sum(axis=0)
 
 
 def servo_step(source: Servoing, present: Present) -> Motion:
@@ -152,36 +160,88 @@ def servo_step(source: Servoing, present: Present) -> Motion:
         raise AssertionError("a law runs only with a model")
     zero = np.zeros_like(present.q)
     source.moved_s += present.dt_s
-    active = weights * source.wanted
+    usable = weights * source.used[:, None]
+    active = usable * source.wanted
     visible = int((active > 0.0).sum())
     distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
     error_px = float(np.where(active > 0.0, distance, 0.0).max()) if visible else None
     if source.moved_s > source.time_limit_s:
+        return _out_of_time(source, present, error_px)
+    seen = int((active.max(axis=0) > 0.0).sum())
+    if seen < MIN_MARKERS:
         reason = Reason(
-            "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
-            "no error was measured" if error_px is None
-            else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
-        )  # fmt: skip
-        present.emit(
-            "goal_aborted",
-            id=source.goal.id,
-            message="not reached in time",
-            reasons=(reason,),
-            error_px=error_px,
-        )
-        return Motion(zero, finished=True, error_px=error_px)
-    if int((active.max(axis=0) > 0.0).sum()) < MIN_MARKERS:
-        reason = Reason(
-            "TOO_FEW_MARKERS", "hold", "", float((active.max(axis=0) > 0.0).sum()), float(MIN_MARKERS), "markers",
+            "TOO_FEW_MARKERS", "hold", "", float(seen), float(MIN_MARKERS), "markers",
             "bring the goal's markers back into view",
         )  # fmt: skip
         return Motion(zero, needs_features=True, error_px=error_px, reasons=(reason,))
     if _reached(source, present, error_px):
         present.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
         return Motion(zero, finished=True, error_px=error_px)
-    if source.law == "stereo":
-        return _stereo(source, present, arrays, active, error_px)
-    return _cartesian3(source, present, arrays, error_px)
+    law = LAWS[source.law]
+    step = law.step(*scene_and_task(source, present, arrays, usable), options(source, present, error_px))
+    return Motion(
+        step.velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
+        reasons=law.reasons(step),
+    )  # fmt: skip
+
+
+def scene_and_task(
+    source: Servoing, present: Present, arrays: ModelArrays, weights: FloatArray
+) -> tuple[Scene, Task]:
+    """The present and the goal as laws take them."""
+    prediction, pixels = present.prediction, present.pixels
+    assert prediction is not None
+    assert pixels is not None
+    points = points_now(
+        arrays, present.q, prediction, pixels, weights, present.state.correction, source.points
+    )
+    scene = Scene(
+        prediction.operators,
+        int(Composition.TIP_FIRST if arrays.tip_first else Composition.BASE_FIRST),
+        arrays.matrices,
+        arrays.camera_centres,
+        points,
+        pixels,
+        weights,
+    )
+    task = Task(
+        source.set_points,
+        source.wanted,
+        source.rates,
+        source.target_points,
+        np.full(len(points), 1.0 if source.pose_known else 0.0),
+        centre_now(source, present, arrays, points),
+        source.centre_target,
+        source.face,
+    )
+    return scene, task
+
+
+def centre_now(source: Servoing, present: Present, arrays: ModelArrays, points: FloatArray) -> FloatArray:
+    """The goal's centre (4,) as it is now, of a body whose markers are at ``points`` (m, 4)."""
+    if bool((source.centre_weights != 0.0).any()):
+        middle: FloatArray = (source.centre_weights[:, None] * points).sum(axis=0)
+        return middle
+    H = chain_at(arrays, present.q + present.state.correction)[0]
+    moved: FloatArray = transform_points(H, source.centre_body[None])[0]
+    return moved
+
+
+def options(source: Servoing, present: Present, error_px: float | None) -> Options:
+    """How the law goes there in this step."""
+    return Options(gain=source.gain_near, dt_s=present.dt_s, jacobian=source.jacobian)
+
+
+def _out_of_time(source: Servoing, present: Present, error_px: float | None) -> Motion:
+    reason = Reason(
+        "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
+        "no error was measured" if error_px is None
+        else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
+    )  # fmt: skip
+    present.emit(
+        "goal_aborted", id=source.goal.id, message="not reached in time", reasons=(reason,), error_px=error_px
+    )
+    return Motion(np.zeros_like(present.q), finished=True, error_px=error_px)
 
 
 def _reached(source: Servoing, present: Present, error_px: float | None) -> bool:
@@ -193,66 +253,3 @@ def _reached(source: Servoing, present: Present, error_px: float | None) -> bool
         inside = error_px is not None and error_px <= source.tolerance_px
         source.held = source.held + new // cameras if inside else 0
     return source.held >= source.hold_frames
-
-
-def _stereo(
-    source: Servoing, present: Present, arrays: ModelArrays, active: FloatArray, error_px: float | None
-) -> Motion:
-    """(8.36) with the Jacobian developed around triangulated (8.34) or predicted points (8.35).
-
-    Where the goal's pose is known it is the mean of the current and the desired Jacobian (8.1.1), which converges from
-    much farther than either.
-    """
-    prediction, pixels = present.prediction, present.pixels
-    assert prediction is not None
-    assert pixels is not None
-    points = _points(source, present, arrays)
-    jacobian = image_jacobian(prediction.operators, arrays.matrices, points)
-    if source.pose_known:
-        jacobian = 0.5 * (
-            jacobian + image_jacobian(prediction.operators, arrays.matrices, source.target_points)
-        )
-    velocity, _, conditioning = stereo_step(
-        jacobian, pixels, source.set_points, active, source.gain, STEREO_DAMPING
-    )
-    reasons: tuple[Reason, ...] = ()
-    if conditioning < ILL_CONDITIONED:
-        reasons = (
-            Reason(
-                "JACOBIAN_ILL_CONDITIONED", "slow", "", conditioning, ILL_CONDITIONED, "",
-                "the arm is near a singularity, or the markers do not fix its pose: jog away, or use cartesian3",
-            ),
-        )  # fmt: skip
-    return Motion(velocity, True, source.goal.speed_scale, error_px=error_px, reasons=reasons)
-
-
-def _points(source: Servoing, present: Present, arrays: ModelArrays) -> FloatArray:
-    assert present.prediction is not None
-    assert present.pixels is not None
-    assert present.weights is not None
-    return points_now(
-        arrays,
-        present.q,
-        present.prediction,
-        present.pixels,
-        present.weights,
-        present.state.correction,
-        source.points,
-    )
-
-
-def _cartesian3(source: Servoing, present: Present, arrays: ModelArrays, error_px: float | None) -> Motion:
-    """(8.42) from three points that span the goal's face, about the affine middle of the goal's markers."""
-    prediction = present.prediction
-    assert prediction is not None
-    points = _points(source, present, arrays)
-    known = source.target_known > 0.0
-    centre = points[known].sum(axis=0) / float(known.sum())
-    velocity, task_error, allowed, status = cartesian3_step(
-        prediction.operators, points[source.face], source.target_points[source.face], centre, source.centre_target,
-        arrays.camera_centres, np.full(3, source.gain),
-    )  # fmt: skip
-    reasons = cartesian3_reasons(task_error, allowed, status)
-    return Motion(
-        velocity, True, source.goal.speed_scale, error_px=error_px, task_error=task_error, reasons=reasons
-    )

@@ -14,7 +14,7 @@ from stereoservo.runtime.cycle import Lifecycle, ModelReadiness, decode_array, e
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.settings import CoreSettings
 
-STATE_VERSION = 2
+STATE_VERSION = 3
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
 
 
@@ -88,24 +88,33 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
 class Servoing(Leased, tag="law", eq=False, kw_only=True):
     """A law drives the arm to set-points.
 
-    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0. ``target_points`` (m, 4): all markers at the
-    goal, where ``pose_known``; ``target_known`` (m,): those that two cameras show there; ``face`` (3,): three that
-    span it.
+    ``used`` (c,) 1 for cameras whose images the law may use. ``set_points`` (c, m, 2) ideal pixels with ``wanted``
+    (c, m) 1 or 0, and their velocities ``rates`` [px/s]. ``target_points`` (m, 4): all markers at the goal, where
+    ``pose_known``; ``target_known`` (m,): those that fixed it; ``face`` (3,): three that span it. The centre is the
+    affine middle of the markers by ``centre_weights`` (m,), or, where these are zero, the point ``centre_body`` (4,) of
+    the body in the chain's zero; ``centre_target`` (4,) at the goal. Gains [1/s] as in `commands.AdaptiveGain`.
     """
 
     goal: Goal
     law: str
     points: str
-    gain: float
+    gain_near: float
+    gain_far: float
+    gain_slope: float
+    jacobian: int
     tolerance_px: float
     hold_frames: int
     time_limit_s: float
     started_ns: int
+    used: FloatArray
     set_points: FloatArray
     wanted: FloatArray
+    rates: FloatArray
     target_points: FloatArray
     target_known: FloatArray
     pose_known: bool
+    centre_weights: FloatArray
+    centre_body: FloatArray
     centre_target: FloatArray
     face: IntArray
     moved_s: float = 0.0
