@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from stereoservo.control.cartesian3 import COMPONENTS, UNITS, cartesian3_reasons
-from stereoservo.control.kernels import cartesian3_step, stereo_step
-from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene, Task
-from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.kernels import image_jacobian
+from stereoservo.control import cartesian2 as two
+from stereoservo.control import cartesian3 as three
+from stereoservo.control.image import ILL_CONDITIONED, image, image_reasons
+from stereoservo.control.kernels import cartesian3_step
+from stereoservo.control.law import Law, LawStep, Options, Scene, Task
+from stereoservo.control.points import points
+from stereoservo.control.stereo import stereo, stereo_block
+from stereoservo.control.trajectory import trajectory
 
-ILL_CONDITIONED = 1e-5
-_NONE = np.zeros(0)
-_NO_STATUS = np.zeros(0, dtype=np.int64)
-
-
-def stereo(scene: Scene, task: Task, options: Options) -> LawStep:
-    """(8.36) with the chosen Jacobian (8.1.1)."""
-    jacobian = image_jacobian(scene.operators, scene.matrices, scene.points)
-    if options.jacobian == JacobianChoice.MEAN and bool((task.target_known > 0.0).all()):
-        jacobian = 0.5 * (jacobian + image_jacobian(scene.operators, scene.matrices, task.target_points))
-    velocity, _, conditioning = stereo_step(
-        jacobian, scene.pixels, task.set_points, scene.weights * task.wanted, options.gain, options.damping
-    )
-    return LawStep(velocity, _NONE, _NONE, _NO_STATUS, conditioning)
+__all__ = ["CLASSICAL", "ILL_CONDITIONED", "LAWS", "image_reasons"]
 
 
 def cartesian3(scene: Scene, task: Task, options: Options) -> LawStep:
@@ -37,21 +27,20 @@ def cartesian3(scene: Scene, task: Task, options: Options) -> LawStep:
     return LawStep(velocity, error, allowed, status, 1.0)
 
 
-def image_reasons(step: LawStep) -> tuple[Reason, ...]:
-    """What a law in the images has to tell of its step."""
-    if step.conditioning >= ILL_CONDITIONED:
-        return ()
-    hint = "the arm is near a singularity, or the markers do not fix its pose: jog away, or use cartesian3"
-    return (Reason("JACOBIAN_ILL_CONDITIONED", "slow", "", step.conditioning, ILL_CONDITIONED, "", hint),)
-
-
 LAWS: Mapping[str, Law] = {
     "stereo": Law(stereo, needs_pose=False, reasons=image_reasons),
+    "image": Law(image, needs_pose=False, reasons=image_reasons),
+    "points": Law(points, needs_pose=True, reasons=image_reasons),
     "cartesian3": Law(
         cartesian3,
         needs_pose=True,
-        components=COMPONENTS,
-        units=UNITS,
-        reasons=lambda step: cartesian3_reasons(step.error, step.allowed, step.status),
+        components=three.COMPONENTS,
+        units=three.UNITS,
+        reasons=lambda step: three.cartesian3_reasons(step.error, step.allowed, step.status),
     ),
+    "cartesian2": Law(two.cartesian2, needs_pose=True, components=two.COMPONENTS, units=two.UNITS),
+    "trajectory": Law(trajectory, needs_pose=False, reasons=image_reasons),
 }
+
+CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {"stereo-block": stereo_block}
+"""Further laws of the literature, for comparison. `points.euclidean_points` makes one more, for a calibrated rig."""

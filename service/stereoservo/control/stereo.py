@@ -1,6 +1,7 @@
-"""Image-based stereo servoing with the stacked pseudo-inverse (thesis 8.36): the readable reference.
+"""Image-based stereo servoing: stacked (thesis 8.36) and block by block (8.37).
 
-The loop runs `control.kernels.stereo_step`, which is tested against this.
+``stereo_law`` is the readable reference of the bare step, `control.kernels.stereo_step`; the law runs
+`control.image_kernel.image_step`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.control.damped import damped_least_squares_reference
+from stereoservo.control.image import NO_COMPONENTS, NO_STATUS, image
+from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.geometry.homogeneous import FloatArray
 
 DAMPING = 1e-6
@@ -47,3 +50,27 @@ def stereo_law(
     )
     worst = float(np.sqrt((error**2).sum(axis=-1)).max(initial=0.0))
     return StereoStep(-gain * step, worst, conditioning)
+
+
+def stereo(scene: Scene, task: Task, options: Options) -> LawStep:
+    """``q̇ = gain·J⁺(s* − s)``, all cameras stacked (8.36): with one camera left it is the law `image`."""
+    return image(scene, task, options)
+
+
+def stereo_block(scene: Scene, task: Task, options: Options) -> LawStep:
+    """The mean of the laws of the single cameras that see (8.37, halved for two: errata)."""
+    velocity, conditioning, seeing = np.zeros(scene.operators.shape[0]), 1.0, 0
+    for camera in range(scene.matrices.shape[0]):
+        alone = np.zeros_like(task.wanted)
+        alone[camera] = task.wanted[camera]
+        if not (scene.weights * alone > 0.0).any():
+            continue
+        step = image(scene, task._replace(wanted=alone), options)
+        velocity, conditioning, seeing = (
+            velocity + step.velocity,
+            min(conditioning, step.conditioning),
+            seeing + 1,
+        )
+    if seeing == 0:
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, 0.0)
+    return LawStep(velocity / seeing, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, conditioning)

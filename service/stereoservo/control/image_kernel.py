@@ -1,0 +1,149 @@
+"""The laws in the images as one kernel: Jacobian, normal equations and damped solve, without arrays in between.
+
+The readable references are in `control.image`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.control.law import JacobianChoice
+from stereoservo.control.linear_kernels import cholesky_solve
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import kernel
+
+DESIRED = int(JacobianChoice.DESIRED)
+MEAN = int(JacobianChoice.MEAN)
+FIXED_DEPTH = int(JacobianChoice.FIXED_DEPTH)
+
+
+@kernel
+def _velocities_into(operators: FloatArray, M: FloatArray, out: FloatArray) -> None:
+    """``Ĥ_j M`` of one point (4,) into (n, 4)."""
+    for j in range(operators.shape[0]):
+        G = operators[j]
+        for i in range(4):
+            out[j, i] = G[i, 0] * M[0] + G[i, 1] * M[1] + G[i, 2] * M[2] + G[i, 3] * M[3]
+
+
+@kernel
+def _add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, rows: FloatArray) -> None:
+    """``share`` times ``J_G P Ĥ_j M`` (8.33) onto (2, n), for velocities ``Ĥ_j M`` (n, 4); NaN at depth 0."""
+    d = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
+    scale = 1.0 / d if d != 0.0 else math.nan
+    for r in range(2):
+        pixel = (P[r, 0] * M[0] + P[r, 1] * M[1] + P[r, 2] * M[2] + P[r, 3] * M[3]) * scale
+        g0 = (P[r, 0] - pixel * P[2, 0]) * scale
+        g1 = (P[r, 1] - pixel * P[2, 1]) * scale
+        g2 = (P[r, 2] - pixel * P[2, 2]) * scale
+        g3 = (P[r, 3] - pixel * P[2, 3]) * scale
+        for j in range(rows.shape[1]):
+            v = velocity[j]
+            rows[r, j] += share * (g0 * v[0] + g1 * v[1] + g2 * v[2] + g3 * v[3])
+
+
+@kernel
+def image_step_into(
+    operators: FloatArray,
+    matrices: FloatArray,
+    camera_centres: FloatArray,
+    points: FloatArray,
+    target_points: FloatArray,
+    target_known: FloatArray,
+    pixels: FloatArray,
+    set_points: FloatArray,
+    rates: FloatArray,
+    weights: FloatArray,
+    wanted: FloatArray,
+    gain: float,
+    choice: int,
+    damping: float,
+    x: FloatArray,
+) -> float:
+    """`image.image_velocity` into ``x`` (n,); returns the conditioning."""
+    n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
+    N = np.zeros((n, n))
+    b = np.zeros(n)
+    rows = np.empty((2, n))
+    now = np.empty((n, 4))
+    then = np.empty((n, 4))
+    moved = np.empty(4)
+    for p in range(markers):
+        seen = False
+        for c in range(cameras):
+            seen = seen or weights[c, p] * wanted[c, p] > 0.0
+        if not seen:
+            continue
+        kind = choice if target_known[p] > 0.0 else 0
+        if kind in (0, MEAN):
+            _velocities_into(operators, points[p], now)
+        if kind in (DESIRED, MEAN):
+            _velocities_into(operators, target_points[p], then)
+        for c in range(cameras):
+            w = weights[c, p] * wanted[c, p]
+            if not w > 0.0:
+                continue
+            P = matrices[c]
+            for j in range(n):
+                rows[0, j] = 0.0
+                rows[1, j] = 0.0
+            if kind == MEAN:
+                _add_rows(P, points[p], now, 0.5, rows)
+                _add_rows(P, target_points[p], then, 0.5, rows)
+            elif kind == DESIRED:
+                _add_rows(P, target_points[p], then, 1.0, rows)
+            elif kind == FIXED_DEPTH:
+                # On the ray of the present point, at the depth of the target: P maps the centre to nothing.
+                M, T = points[p], target_points[p]
+                depth = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
+                wanted_depth = P[2, 0] * T[0] + P[2, 1] * T[1] + P[2, 2] * T[2] + P[2, 3] * T[3]
+                for i in range(4):
+                    eye = camera_centres[c, i]
+                    moved[i] = eye + (wanted_depth / depth) * (M[i] - eye)
+                _velocities_into(operators, moved, now)
+                _add_rows(P, moved, now, 1.0, rows)
+            else:
+                _add_rows(P, points[p], now, 1.0, rows)
+            w2 = w * w
+            eu = gain * (set_points[c, p, 0] - pixels[c, p, 0]) + rates[c, p, 0]
+            ev = gain * (set_points[c, p, 1] - pixels[c, p, 1]) + rates[c, p, 1]
+            for i in range(n):
+                wu = w2 * rows[0, i]
+                wv = w2 * rows[1, i]
+                b[i] += wu * eu + wv * ev
+                for k in range(i + 1):
+                    N[i, k] += wu * rows[0, k] + wv * rows[1, k]
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, N[i, i])
+    for i in range(n):
+        N[i, i] += damping * largest
+    return cholesky_solve(N, b, x)
+
+
+@kernel
+def image_step(
+    operators: FloatArray,
+    matrices: FloatArray,
+    camera_centres: FloatArray,
+    points: FloatArray,
+    target_points: FloatArray,
+    target_known: FloatArray,
+    pixels: FloatArray,
+    set_points: FloatArray,
+    rates: FloatArray,
+    weights: FloatArray,
+    wanted: FloatArray,
+    gain: float,
+    choice: int,
+    damping: float,
+) -> tuple[FloatArray, float]:
+    """`image.image_velocity` as a kernel: joint velocity (n,) and conditioning."""
+    x = np.zeros(operators.shape[0])
+    conditioning = image_step_into(
+        operators, matrices, camera_centres, points, target_points, target_known, pixels, set_points, rates,
+        weights, wanted, gain, choice, damping, x,
+    )  # fmt: skip
+    return x, conditioning

@@ -1,0 +1,112 @@
+"""The law on points in space as a kernel; its readable reference is in `control.points`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.control.law import JacobianChoice
+from stereoservo.control.linear_kernels import cholesky_solve
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import kernel
+
+DESIRED = int(JacobianChoice.DESIRED)
+MEAN = int(JacobianChoice.MEAN)
+
+
+@kernel
+def pixel_metrics(matrices: FloatArray, points: FloatArray) -> FloatArray:
+    """``J_G P`` of all cameras (m, 2c, 4): what a displacement of a point (m, 4) is worth in pixels; NaN at depth 0."""
+    cameras, markers = matrices.shape[0], points.shape[0]
+    out = np.empty((markers, 2 * cameras, 4))
+    for p in range(markers):
+        M = points[p]
+        for c in range(cameras):
+            P = matrices[c]
+            d = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
+            scale = 1.0 / d if d != 0.0 else math.nan
+            for r in range(2):
+                pixel = (P[r, 0] * M[0] + P[r, 1] * M[1] + P[r, 2] * M[2] + P[r, 3] * M[3]) * scale
+                for i in range(4):
+                    out[p, 2 * c + r, i] = (P[r, i] - pixel * P[2, i]) * scale
+    return out
+
+
+@kernel
+def points_step(
+    operators: FloatArray,
+    points: FloatArray,
+    target_points: FloatArray,
+    weights: FloatArray,
+    metrics: FloatArray,
+    gain: float,
+    choice: int,
+    damping: float,
+) -> tuple[FloatArray, float]:
+    """`points.points_velocity` as a kernel: joint velocity (n,) and conditioning."""
+    n, markers, rows = operators.shape[0], points.shape[0], metrics.shape[1]
+    N = np.zeros((n, n))
+    b = np.zeros(n)
+    x = np.zeros(n)
+    around = np.empty(4)
+    velocity = np.empty((n, 4))
+    row = np.empty(n)
+    for p in range(markers):
+        w = weights[p]
+        if not w > 0.0:
+            continue
+        for i in range(4):
+            if choice == MEAN:
+                around[i] = 0.5 * (points[p, i] + target_points[p, i])
+            elif choice == DESIRED:
+                around[i] = target_points[p, i]
+            else:
+                around[i] = points[p, i]
+        for j in range(n):
+            for i in range(4):
+                velocity[j, i] = (
+                    operators[j, i, 0] * around[0]
+                    + operators[j, i, 1] * around[1]
+                    + operators[j, i, 2] * around[2]
+                    + operators[j, i, 3] * around[3]
+                )
+        for r in range(rows):
+            g = metrics[p, r]
+            error = 0.0
+            for i in range(4):
+                error += g[i] * (target_points[p, i] - points[p, i])
+            for j in range(n):
+                row[j] = (
+                    g[0] * velocity[j, 0]
+                    + g[1] * velocity[j, 1]
+                    + g[2] * velocity[j, 2]
+                    + g[3] * velocity[j, 3]
+                )
+            for j in range(n):
+                wj = w * w * row[j]
+                b[j] += wj * error
+                for k in range(j + 1):
+                    N[j, k] += wj * row[k]
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, N[i, i])
+    for i in range(n):
+        N[i, i] += damping * largest
+    conditioning = cholesky_solve(N, b, x)
+    if choice == MEAN:
+        # The mean finds a turn by θ as 2 tan(θ/2): back to the angle.
+        square = 0.0
+        for i in range(4):
+            for k in range(4):
+                ik, ki = 0.0, 0.0
+                for j in range(n):
+                    ik += x[j] * operators[j, i, k]
+                    ki += x[j] * operators[j, k, i]
+                square -= 0.5 * ik * ki
+        if square > 0.0:
+            half = 0.5 * math.sqrt(square)
+            gain *= math.atan(half) / half
+    for i in range(n):
+        x[i] *= gain
+    return x, conditioning
