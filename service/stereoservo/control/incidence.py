@@ -1,0 +1,287 @@
+"""Incidences as a task: points, lines and planes of the body onto points, lines and planes of the scene (thesis 2.5.3).
+
+What a task leaves free stays as it is, or serves a second task in the null space. Lines and planes have no
+orientation: either way round is reached, whichever is nearer. `incidence_reference` is the readable
+reference; the loop runs `incidence_kernel.incidence_kernel`, which says how residuals are measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.control import incidence_kernel as kernels
+from stereoservo.control.law import LawStep, Options, Scene
+from stereoservo.control.reasons import Reason
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.subspaces import basis
+from stereoservo.kinematics.kernels import image_jacobian
+
+IntArray = npt.NDArray[np.int64]
+
+KINDS = (
+    "point-on-point",
+    "point-on-line",
+    "point-on-plane",
+    "line-on-line",
+    "line-on-plane",
+    "plane-on-plane",
+)
+"""By their codes 0 to 5; the words of the wire."""
+
+FEATURES = ("point", "line", "plane")
+FLAT_PX = 0.5
+"""Distance [px] below which a moving feature's points span no line or plane."""
+
+
+class IncidenceStatus(IntEnum):
+    """What becomes of an incidence. Codes up to 2 mean the same as in `trajectory.three_points.ComponentStatus`."""
+
+    MOVES = 0
+    DONE = 1
+    """Within the tolerance."""
+    NOT_DRIVABLE = 2
+    """The arm, as it stands, has no motion that brings it nearer: a freedom is missing, or it is out of reach."""
+    CONTRADICTS = 3
+    """Alone it could be brought nearer, but not without taking others farther off."""
+    NOT_FINITE = 4
+    """A point is not known, or lies in a camera's focal plane; the velocity is zero."""
+
+
+class IncidenceTask(NamedTuple):
+    """k incidences as arrays.
+
+    ``kinds`` (k,) codes of `KINDS`. ``markers`` (k, 3): indices into ``Scene.points`` of the points that span the
+    moving feature, -1 where there are fewer. ``fixed`` (k, 3, 4): a point of height 1, then one direction of height
+    0 for a line, two for a plane, zero rows where there are fewer. ``tolerance_px`` [px].
+    """
+
+    kinds: IntArray
+    markers: IntArray
+    fixed: FloatArray
+    tolerance_px: float
+
+
+class SecondTask(NamedTuple):
+    """What to do with the freedoms that are left: ``rows`` (r, n) times the velocity shall be ``rates`` (r,).
+
+    ``weights`` (r,): 1/sigma of the rates, 0 where a row is not to be read. Build it by `no_second_task`, `joint_task`,
+    `image_task`.
+    """
+
+    rows: FloatArray
+    rates: FloatArray
+    weights: FloatArray
+
+
+class IncidenceStep(NamedTuple):
+    """``velocity`` (n,) [rad/s or m/s]. ``error_px`` (k,): of each incidence, the largest distance over its points and
+    all cameras between a point's image and that of the nearest point of the feature [px]. ``status`` (k,):
+    `IncidenceStatus`. ``rank``: freedoms that the task takes. ``conditioning``: the smallest singular value that counts
+    over the largest, squared. ``share`` in [0, 1]: of the residual, what joints can still take away to first order.
+    """
+
+    velocity: FloatArray
+    error_px: FloatArray
+    status: IntArray
+    rank: int
+    conditioning: float
+    share: float
+
+
+def incidence_task(
+    kinds: Sequence[str],
+    markers: Sequence[Sequence[int]],
+    fixed: Sequence[FloatArray],
+    plane_at_infinity: FloatArray,
+    tolerance_px: float,
+) -> IncidenceTask:
+    """An `IncidenceTask` of words and points.
+
+    ``kinds`` of `KINDS`; ``markers``: indices into the scene's points, as many as span the moving feature; ``fixed``:
+    (1, 4), (2, 4) or (3, 4) points that span the fixed one, of any height, at infinity or not (a line given by a point
+    and a direction). Raises GeometryError for another number of points, points that span less than the feature, and
+    features wholly at infinity.
+    """
+    k = len(kinds)
+    codes = np.zeros(k, dtype=np.int64)
+    at = np.full((k, 3), -1, dtype=np.int64)
+    forms = np.zeros((k, 3, 4))
+    for i, (kind, own, points) in enumerate(zip(kinds, markers, fixed, strict=True)):
+        if kind not in KINDS:
+            raise GeometryError("shape", f"incidence {kind!r} is not known; there are {', '.join(KINDS)}")
+        codes[i] = KINDS.index(kind)
+        needed = kernels.moving_count(int(codes[i]))
+        if len(own) != needed or len(set(own)) != needed or min(own, default=-1) < 0:
+            raise GeometryError(
+                "shape",
+                f"{kind}: the moving feature has markers {list(own)}; {needed} different ones are needed",
+            )
+        at[i, :needed] = own
+        dimension = kernels.fixed_dimension(int(codes[i]))
+        forms[i, : dimension + 1] = _base_and_directions(kind, points, dimension, plane_at_infinity)
+    return IncidenceTask(codes, at, forms, float(tolerance_px))
+
+
+def _base_and_directions(kind: str, points: FloatArray, dimension: int, infinity: FloatArray) -> FloatArray:
+    points = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    if points.shape != (dimension + 1, 4):
+        raise GeometryError(
+            "shape",
+            f"{kind}: the fixed {FEATURES[dimension]} has shape {points.shape}; ({dimension + 1}, 4) is needed",
+        )
+    span = basis(points)
+    if len(span) <= dimension:
+        raise GeometryError(
+            "degenerate",
+            f"{kind}: the {dimension + 1} points of the fixed {FEATURES[dimension]} span only a "
+            f"{FEATURES[len(span) - 1]}",
+        )
+    heights = span @ infinity
+    size = float(np.linalg.norm(heights))
+    if not size > 1e-9 * float(np.linalg.norm(infinity)):
+        raise GeometryError("degenerate", f"{kind}: the fixed {FEATURES[dimension]} lies at infinity")
+    mean = (points @ infinity)[:, None]
+    finite = np.abs(mean[:, 0]) > 1e-6 * np.linalg.norm(points, axis=1) * np.linalg.norm(infinity)
+    base = (points[finite] / mean[finite]).mean(axis=0) if finite.any() else span.T @ heights / size**2
+    # Directions: the combinations of the span without height.
+    free = np.linalg.svd(heights[None])[2][1:]
+    form: FloatArray = np.concatenate([base[None], free @ span])
+    return form
+
+
+def check_moving(points: FloatArray, matrices: FloatArray, task: IncidenceTask) -> None:
+    """Refuse markers that span no line or plane: ``points`` (m, 4) of height 1, ``matrices`` (c, 3, 4), c >= 2.
+
+    Raises GeometryError, naming the incidence: for points that coincide or are collinear within `FLAT_PX` pixels, that
+    are not known, and for fewer than two cameras, which see no distance along their rays.
+    """
+    if len(matrices) < 2:
+        raise GeometryError(
+            "too_few", f"{len(matrices)} camera; distances in space need the images of two or more"
+        )
+    for k, kind in enumerate(task.kinds):
+        count = kernels.moving_count(int(kind))
+        own = points[task.markers[k, :count]]
+        A = kernels.pixel_gradients(matrices, own[0])
+        edges = (own[1:] - own[0]) @ A.T
+        if not (np.isfinite(own).all() and np.isfinite(A).all()):
+            raise GeometryError("not_finite", f"incidence {k} ({KINDS[kind]}): a marker's point is not known")
+        widths = np.linalg.svd(edges, compute_uv=False) if count > 1 else np.ones(1)
+        if not widths[-1] > FLAT_PX:
+            raise GeometryError(
+                "degenerate",
+                f"incidence {k} ({KINDS[kind]}): its markers {task.markers[k, :count].tolist()} span no "
+                f"{FEATURES[count - 1]} ({widths[-1]:.3g} px, more than {FLAT_PX} px are needed)",
+                width=float(widths[-1]),
+            )
+
+
+def no_second_task(n: int) -> SecondTask:
+    """The freedoms that are left stay as they are."""
+    return SecondTask(np.zeros((0, n)), np.zeros(0), np.zeros(0))
+
+
+def joint_task(
+    positions: FloatArray, targets: FloatArray, wanted: FloatArray, scale: FloatArray, gain: float
+) -> SecondTask:
+    """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: what of each is as much."""
+    rates = np.where(wanted > 0.0, gain * (targets - positions), 0.0)
+    return SecondTask(np.eye(len(positions)), rates, wanted / scale)
+
+
+def image_task(
+    operators: FloatArray,
+    matrices: FloatArray,
+    points: FloatArray,
+    set_points: FloatArray,
+    weights: FloatArray,
+    gain: float,
+) -> SecondTask:
+    """Points (m, 4), as predicted, towards set-points (c, m, 2) [px]; ``weights`` (c, m) = 1/sigma, 0: no set-point."""
+    n = operators.shape[0]
+    J = image_jacobian(operators, matrices, points)
+    image = points[None, :, None, :] * matrices[:, None, :, :]
+    projected = image[..., 0] + image[..., 1] + image[..., 2] + image[..., 3]
+    seen = np.repeat(weights.reshape(-1), 2)
+    error = (projected[..., :2] / projected[..., 2:] - set_points).reshape(-1)
+    rates = np.where(seen > 0.0, -gain * error, 0.0)
+    return SecondTask(np.ascontiguousarray(J.reshape(-1, n)), rates, seen)
+
+
+def incidence_step(
+    scene: Scene,
+    task: IncidenceTask,
+    options: Options,
+    second: SecondTask | None = None,
+    metric: FloatArray | None = None,
+) -> IncidenceStep:
+    """``q̇ = -gain J⁺ e`` by damped least squares, with the least motion, and the second task in its null space.
+
+    Of the scene: ``operators``, ``composition``, ``matrices`` (two or more), ``points``. ``metric`` (n,) > 0: what a
+    unit of each joint's motion costs; None: the pixels by which it moves the points (`incidence_kernel.joint_metric`).
+    Damping rises where the residual, seen a step ``gain * dt_s`` ahead (at least a tenth), would not fall as the linear
+    model says.
+    """
+    n = scene.operators.shape[0]
+    if metric is None:
+        metric = kernels.joint_metric(scene.operators, scene.matrices, scene.points)
+    rest = no_second_task(n) if second is None else second
+    velocity, error, status, rank, conditioning, share = kernels.incidence_kernel(
+        scene.operators,
+        int(scene.composition),
+        scene.matrices,
+        scene.points,
+        task.kinds,
+        task.markers,
+        task.fixed,
+        task.tolerance_px,
+        options.gain,
+        options.dt_s,
+        options.damping,
+        metric,
+        rest.rows,
+        rest.rates,
+        rest.weights,
+    )
+    return IncidenceStep(velocity, error, status, rank, conditioning, share)
+
+
+def as_law_step(step: IncidenceStep) -> LawStep:
+    """In the form of all laws: ``error`` and ``allowed`` in pixels, one component an incidence."""
+    return LawStep(step.velocity, step.error_px, step.error_px, step.status, step.conditioning)
+
+
+def incidence_reasons(step: IncidenceStep, task: IncidenceTask, names: Sequence[str]) -> tuple[Reason, ...]:
+    """Why the task goes no further: one reason a cause, its subject the ``names`` (k,) of the incidences concerned."""
+    reasons = []
+    for status, code, hint in (
+        (
+            IncidenceStatus.CONTRADICTS,
+            "INCIDENCES_CONTRADICT",
+            "these cannot all hold at once: take one out, or correct its feature",
+        ),
+        (
+            IncidenceStatus.NOT_DRIVABLE,
+            "INCIDENCE_NOT_DRIVABLE",
+            "the arm has no motion here that brings it nearer: it lacks the freedom, is stretched, or at a singularity",
+        ),
+        (
+            IncidenceStatus.NOT_FINITE,
+            "INCIDENCE_UNSEEN",
+            "a marker of it is not known, or lies beside a camera: bring it into view",
+        ),
+    ):
+        concerned = np.flatnonzero(step.status == int(status))
+        if len(concerned):
+            worst = concerned[np.argsort(-step.error_px[concerned], kind="stable")]
+            value = float(step.error_px[worst[0]])
+            subject = ", ".join(names[int(i)] for i in worst)
+            known = value if np.isfinite(value) else None
+            reasons.append(Reason(code, "hold", subject, known, task.tolerance_px, "px", hint))
+    return tuple(reasons)

@@ -1,0 +1,482 @@
+"""The loop's form of the incidence law: `incidence.incidence_reference` in numba, tested against it.
+
+A moving point X of the body and a fixed point, line or plane, ``base + Σ s_k d_k`` with ``base`` of height 1 and
+directions of height 0, are compared in the images: ``A`` (2c, 4), the gradient of X's pixels in all cameras, turns
+differences of points of height 1 into pixels. The residual is what of ``A (X - base)`` the feature's own directions
+``A d_k`` do not take up: three, two or one conditions on X, whatever the number of cameras.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.composition import displace
+from stereoservo.kinematics.kernels import kernel, transform_points
+from stereoservo.kinematics.linear_kernels import damped_least_squares, right_singular
+
+IntArray = npt.NDArray[np.int64]
+
+
+class Seen(NamedTuple):
+    """The arm (``operators`` (n, 4, 4), ``composition``) and what of b moving points counts, images as they are now.
+
+    ``points`` (m, 4), of which ``at`` (b,) are compared to ``bases`` (b, 4) by ``gradients`` (b, 2c, 4), less what the
+    orthonormal ``tangents`` (b, 2, 2c) take up.
+    """
+
+    operators: FloatArray
+    composition: int
+    points: FloatArray
+    at: IntArray
+    gradients: FloatArray
+    tangents: FloatArray
+    bases: FloatArray
+
+
+RANK = 1e-3
+"""Singular value of the scaled task Jacobian, relative to the largest, below which a direction is left alone."""
+
+STATIONARY = 0.02
+"""Share of the residual that joints can still take away to first order, below which the task stands still."""
+
+WORTH = 1e-3
+"""Relative decrease of the squared residual from which on a way out of a stand-still counts."""
+
+PROBE = 0.25
+"""Motion of such a probe, in parts of the residual."""
+
+ATTEMPTS = 10
+GROWTH = 8.0
+SUFFICIENT = 0.25
+"""Damping is raised until the residual, seen ahead, falls by this part of what the linear model says."""
+
+AHEAD = 0.1
+"""Least part of a whole step at which the residual is seen ahead."""
+
+METRIC_FLOOR = 0.05
+"""Least metric of a joint, relative to the largest: a joint that moves nothing in the images is not free of charge."""
+
+DROPPED = 1e-9
+"""Length [px, relative to the direction's share before it] below which a direction is no further one."""
+
+MOVES, DONE, NOT_DRIVABLE, CONTRADICTS, NOT_FINITE = 0, 1, 2, 3, 4
+"""As `incidence.IncidenceStatus`."""
+
+
+@kernel
+def moving_count(kind: int) -> int:
+    """How many points span the moving feature."""
+    return 3 if kind == 5 else (2 if kind >= 3 else 1)
+
+
+@kernel
+def fixed_dimension(kind: int) -> int:
+    """Dimension of the fixed feature: 0 a point, 1 a line, 2 a plane."""
+    return 0 if kind == 0 else (1 if kind == 1 or kind == 3 else 2)
+
+
+@kernel
+def pixel_gradients(matrices: FloatArray, X: FloatArray) -> FloatArray:
+    """``A`` (2c, 4) [px]: gradient of the pixels of ``X`` (4,) in cameras (c, 3, 4) (8.8); NaN in a focal plane."""
+    cameras = matrices.shape[0]
+    A = np.empty((2 * cameras, 4))
+    for c in range(cameras):
+        P = matrices[c]
+        d = P[2, 0] * X[0] + P[2, 1] * X[1] + P[2, 2] * X[2] + P[2, 3] * X[3]
+        scale = 1.0 / d if d != 0.0 else math.nan
+        for r in range(2):
+            pixel = (P[r, 0] * X[0] + P[r, 1] * X[1] + P[r, 2] * X[2] + P[r, 3] * X[3]) * scale
+            for i in range(4):
+                A[2 * c + r, i] = (P[r, i] - pixel * P[2, i]) * scale
+    return A
+
+
+@kernel
+def joint_metric(operators: FloatArray, matrices: FloatArray, points: FloatArray) -> FloatArray:
+    """`incidence.joint_metric_reference` as a kernel: (n,) [px/rad or px/m]."""
+    n, m, cameras = operators.shape[0], points.shape[0], matrices.shape[0]
+    metric = np.zeros(n)
+    for p in range(m):
+        A = pixel_gradients(matrices, points[p])
+        for j in range(n):
+            for r in range(2 * cameras):
+                s = 0.0
+                for i in range(4):
+                    moved = 0.0
+                    for k in range(4):
+                        moved += operators[j, i, k] * points[p, k]
+                    s += A[r, i] * moved
+                metric[j] += s * s
+    largest = 0.0
+    for j in range(n):
+        metric[j] = math.sqrt(metric[j] / (cameras * m))
+        largest = max(largest, metric[j])
+    for j in range(n):
+        if not metric[j] > METRIC_FLOOR * largest:
+            metric[j] = METRIC_FLOOR * largest
+        if not metric[j] > 0.0:
+            metric[j] = 1.0
+    return metric
+
+
+@kernel
+def _product(A: FloatArray, x: FloatArray, r: int) -> float:
+    return float(A[r, 0] * x[0] + A[r, 1] * x[1] + A[r, 2] * x[2] + A[r, 3] * x[3])
+
+
+@kernel
+def _tangents(A: FloatArray, fixed: FloatArray, dimension: int) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal ``T`` (2, 2c) and directions ``D`` (2, 4) with ``A D_k = T_k``; zero rows where there are fewer."""
+    rows = A.shape[0]
+    T = np.zeros((2, rows))
+    D = np.zeros((2, 4))
+    for k in range(dimension):
+        before = 0.0
+        for r in range(rows):
+            T[k, r] = _product(A, fixed[1 + k], r)
+            before += T[k, r] * T[k, r]
+        for i in range(4):
+            D[k, i] = fixed[1 + k, i]
+        for _ in range(2):  # twice: orthogonal to rounding
+            for j in range(k):
+                s = 0.0
+                for r in range(rows):
+                    s += T[j, r] * T[k, r]
+                for r in range(rows):
+                    T[k, r] -= s * T[j, r]
+                for i in range(4):
+                    D[k, i] -= s * D[j, i]
+        after = 0.0
+        for r in range(rows):
+            after += T[k, r] * T[k, r]
+        size = math.sqrt(after) if after > DROPPED * DROPPED * before else 0.0
+        for r in range(rows):
+            T[k, r] = T[k, r] / size if size > 0.0 else 0.0
+        for i in range(4):
+            D[k, i] = D[k, i] / size if size > 0.0 else 0.0
+    return T, D
+
+
+@kernel
+def _project_out(T: FloatArray, x: FloatArray) -> None:
+    """Remove from ``x`` (2c,) what the orthonormal rows of ``T`` (2, 2c) take up."""
+    for k in range(2):
+        s = 0.0
+        for r in range(x.shape[0]):
+            s += T[k, r] * x[r]
+        for r in range(x.shape[0]):
+            x[r] -= s * T[k, r]
+
+
+@kernel
+def image_distance(
+    matrices: FloatArray, A: FloatArray, T: FloatArray, D: FloatArray, X: FloatArray, base: FloatArray
+) -> float:
+    """Largest distance [px] over the cameras between the images of ``X`` (4,) and of its nearest point of the feature.
+
+    To first order where that point does not lie before a camera as X does.
+    """
+    rows = A.shape[0]
+    Y = base.copy()
+    first = np.empty(rows)
+    for r in range(rows):
+        first[r] = _product(A, X, r) - _product(A, base, r)
+    for k in range(2):
+        s = 0.0
+        for r in range(rows):
+            s += T[k, r] * first[r]
+        for i in range(4):
+            Y[i] += s * D[k, i]
+    _project_out(T, first)
+    worst = 0.0
+    for c in range(rows // 2):
+        P = matrices[c]
+        here = _product(P, X, 2)
+        there = _product(P, Y, 2)
+        if here * there > 0.0:
+            du = _product(P, X, 0) / here - _product(P, Y, 0) / there
+            dv = _product(P, X, 1) / here - _product(P, Y, 1) / there
+        else:
+            du, dv = first[2 * c], first[2 * c + 1]
+        size = math.sqrt(du * du + dv * dv)
+        if not size <= worst:
+            worst = size
+    return worst
+
+
+@kernel
+def _squared(seen: Seen, motion: FloatArray) -> float:
+    """Squared residual [px²] after a ``motion`` (n,) of the joints, the images' gradients as they were."""
+    points = transform_points(displace(seen.operators, seen.composition, motion), seen.points)
+    total = 0.0
+    rows = seen.gradients.shape[1]
+    e = np.empty(rows)
+    for b in range(seen.at.shape[0]):
+        A = seen.gradients[b]
+        for r in range(rows):
+            e[r] = _product(A, points[seen.at[b]], r) - _product(A, seen.bases[b], r)
+        _project_out(seen.tangents[b], e)
+        for r in range(rows):
+            total += e[r] * e[r]
+    return total
+
+
+@kernel
+def _reducible(J: FloatArray, e: FloatArray) -> float:
+    """Squared part of ``e`` (r,) that lies in the range of ``J`` (r, n), small singular values left out."""
+    rows, n = J.shape
+    V, values = right_singular(J)
+    part = 0.0
+    for i in range(n):
+        if not values[i] > RANK * values[0]:
+            break
+        c = 0.0
+        for r in range(rows):
+            for j in range(n):
+                c += V[j, i] * J[r, j] * e[r]
+        part += (c / values[i]) ** 2
+    return part
+
+
+@kernel
+def incidence_kernel(
+    operators: FloatArray,
+    composition: int,
+    matrices: FloatArray,
+    points: FloatArray,
+    kinds: IntArray,
+    markers: IntArray,
+    fixed: FloatArray,
+    tolerance_px: float,
+    gain: float,
+    dt_s: float,
+    damping: float,
+    metric: FloatArray,
+    second_rows: FloatArray,
+    second_rates: FloatArray,
+    second_weights: FloatArray,
+) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
+    """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
+
+    ``kinds`` (k,), ``markers`` (k, 3) indices into ``points`` (m, 4), ``fixed`` (k, 3, 4) as `incidence.IncidenceTask`
+    has them; ``metric`` (n,) > 0. The second task wants ``second_rows`` (r, n) times the velocity to be
+    ``second_rates`` (r,), weighted by ``second_weights`` (r,); r may be 0.
+    """
+    n = operators.shape[0]
+    constraints = kinds.shape[0]
+    rows = 2 * matrices.shape[0]
+    velocity = np.zeros(n)
+    error = np.zeros(constraints)
+    status = np.zeros(constraints, dtype=np.int64)
+    blocks = 0
+    for k in range(constraints):
+        blocks += moving_count(kinds[k])
+    at = np.empty(blocks, dtype=np.int64)
+    owner = np.empty(blocks, dtype=np.int64)
+    gradients = np.empty((blocks, rows, 4))
+    tangents = np.empty((blocks, 2, rows))
+    bases = np.empty((blocks, 4))
+    J = np.empty((blocks * rows, n))
+    e = np.empty(blocks * rows)
+    column = np.empty(rows)
+    moved = np.empty(4)
+    b = 0
+    finite = True
+    for k in range(constraints):
+        for i in range(moving_count(kinds[k])):
+            X = points[markers[k, i]]
+            A = pixel_gradients(matrices, X)
+            T, D = _tangents(A, fixed[k], fixed_dimension(kinds[k]))
+            at[b], owner[b] = markers[k, i], k
+            gradients[b], tangents[b], bases[b] = A, T, fixed[k, 0]
+            for r in range(rows):
+                column[r] = _product(A, X, r) - _product(A, bases[b], r)
+            _project_out(T, column)
+            for r in range(rows):
+                e[b * rows + r] = column[r]
+                finite = finite and math.isfinite(column[r])
+            for j in range(n):
+                for r in range(4):
+                    moved[r] = _product(operators[j], X, r)
+                for r in range(rows):
+                    column[r] = _product(A, moved, r)
+                _project_out(T, column)
+                for r in range(rows):
+                    J[b * rows + r, j] = column[r] / metric[j]
+                    finite = finite and math.isfinite(J[b * rows + r, j])
+            distance = image_distance(matrices, A, T, D, X, bases[b])
+            if not distance <= error[k]:
+                error[k] = distance
+            b += 1
+    if not finite:
+        for k in range(constraints):
+            status[k] = NOT_FINITE
+        return velocity, error, status, 0, 0.0, 0.0
+
+    V, values = right_singular(J)
+    along = np.zeros(n)
+    for i in range(n):
+        for r in range(blocks * rows):
+            s = 0.0
+            for j in range(n):
+                s += J[r, j] * V[j, i]
+            along[i] += s * e[r]
+    total = 0.0
+    for r in range(blocks * rows):
+        total += e[r] * e[r]
+    rank = 0
+    part = 0.0
+    for i in range(n):
+        if values[i] > RANK * values[0]:
+            rank += 1
+            part += (along[i] / values[i]) ** 2
+    conditioning = (values[rank - 1] / values[0]) ** 2 if rank > 0 else 0.0
+    share = math.sqrt(min(1.0, part / total)) if total > 0.0 else 1.0
+
+    within = True
+    for k in range(constraints):
+        if error[k] <= tolerance_px:
+            status[k] = DONE
+        else:
+            within = False
+    seen = Seen(operators, composition, points, at, gradients, tangents, bases)
+    step = np.zeros(n)
+    escaped = False
+    if not within and not share > STATIONARY:
+        escaped = _way_out(seen, V, metric, total, step)
+        if not escaped:
+            _blame(J, e, owner, rows, status)
+    if not escaped and rank > 0:
+        ahead = min(1.0, max(gain * dt_s, AHEAD))
+        _damped_step(seen, V, values, along, metric, total, damping, ahead, step)
+    for j in range(n):
+        velocity[j] = gain * step[j]
+    _second_task(velocity, V, rank, metric, second_rows, second_rates, second_weights, damping)
+    return velocity, error, status, rank, conditioning, share
+
+
+@kernel
+def _damped_step(
+    seen: Seen,
+    V: FloatArray,
+    values: FloatArray,
+    along: FloatArray,
+    metric: FloatArray,
+    total: float,
+    damping: float,
+    ahead: float,
+    step: FloatArray,
+) -> None:
+    """A step (n,) of damped least squares whose residual, seen ahead, falls as the linear model says."""
+    n = step.shape[0]
+    largest = values[0] * values[0]
+    damp = damping * largest
+    look = np.empty(n)
+    for _ in range(ATTEMPTS):
+        predicted = 0.0
+        for i in range(n):
+            q = values[i] * values[i] + damp
+            predicted += along[i] * along[i] / q * (2.0 * ahead - ahead * ahead * values[i] * values[i] / q)
+        for j in range(n):
+            s = 0.0
+            for i in range(n):
+                s -= V[j, i] * along[i] / (values[i] * values[i] + damp)
+            step[j] = s / metric[j]
+            look[j] = ahead * step[j]
+        # The rounding of the residual itself would decide below it.
+        if predicted <= 1e-12 * total:
+            break
+        left = _squared(seen, look)
+        if total - left >= SUFFICIENT * predicted:
+            break
+        damp = max(GROWTH * damp, 1e-3 * largest)
+
+
+@kernel
+def _way_out(
+    seen: Seen,
+    V: FloatArray,
+    metric: FloatArray,
+    total: float,
+    step: FloatArray,
+) -> bool:
+    """At rest far from the goal: the motion along a singular direction, either sense, that lowers the residual most.
+
+    Finds the way off a ridge (a line exactly across its target, half a turn), where the gradient vanishes.
+    """
+    n = step.shape[0]
+    size = PROBE * math.sqrt(total / seen.at.shape[0])
+    best = (1.0 - WORTH) * total
+    look = np.empty(n)
+    found = False
+    for back in range(n):
+        i = n - 1 - back
+        for sense in range(2):
+            for j in range(n):
+                look[j] = (size if sense == 0 else -size) * V[j, i] / metric[j]
+            left = _squared(seen, look)
+            if left < best:
+                best = left
+                found = True
+                for j in range(n):
+                    step[j] = look[j]
+    return found
+
+
+@kernel
+def _blame(J: FloatArray, e: FloatArray, owner: IntArray, rows: int, status: IntArray) -> None:
+    """Mark what stands in the way: alone movable, it contradicts others; else the arm cannot move it here."""
+    for k in range(status.shape[0]):
+        if status[k] == DONE:
+            continue
+        first = 0
+        count = 0
+        for b in range(owner.shape[0]):
+            if owner[b] == k:
+                if count == 0:
+                    first = b
+                count += 1
+        own = J[first * rows : (first + count) * rows]
+        left = e[first * rows : (first + count) * rows]
+        total = 0.0
+        for r in range(count * rows):
+            total += left[r] * left[r]
+        drivable = _reducible(own, left) > STATIONARY * STATIONARY * total
+        status[k] = CONTRADICTS if drivable else NOT_DRIVABLE
+
+
+@kernel
+def _second_task(
+    velocity: FloatArray,
+    V: FloatArray,
+    rank: int,
+    metric: FloatArray,
+    rows: FloatArray,
+    rates: FloatArray,
+    weights: FloatArray,
+    damping: float,
+) -> None:
+    """Add to ``velocity`` (n,) what serves the second task in the first one's null space: ``Z (S Z)⁺ (ṡ - S q̇₁)``."""
+    n = velocity.shape[0]
+    free = n - rank
+    count = rates.shape[0]
+    if free == 0 or count == 0:
+        return
+    S = np.zeros((count, free))
+    left = np.empty(count)
+    for r in range(count):
+        left[r] = rates[r]
+        for j in range(n):
+            if weights[r] != 0.0:
+                left[r] -= rows[r, j] * velocity[j]
+                for i in range(free):
+                    S[r, i] += rows[r, j] * V[j, rank + i] / metric[j]
+    y, _ = damped_least_squares(S, left, weights, damping)
+    for j in range(n):
+        for i in range(free):
+            velocity[j] += V[j, rank + i] * y[i] / metric[j]
