@@ -1,0 +1,199 @@
+"""Which case with a closed form a chain is: axes that are parallel, axes that meet in one point (thesis 6.3 to 6.7).
+
+A calibrated chain is so only within its covariance. Each condition is a set of incidences that vanish: they are tested
+by chi-square against the covariance propagated to them. A small deviation that the calibration cannot tell from none
+costs nothing: the closed form then starts a refinement on the chain as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.inverse.solutions import Case
+from stereoservo.kinematics.model import CellModel
+
+TAIL = 1e-4
+"""Probability with which chance alone makes a condition fail that holds."""
+EXACT = 1e-6
+"""Largest deviation, with a covariance or without: of a model without, the only test."""
+COARSEST = 0.05
+"""Largest deviation that is put down to the calibration's noise at all."""
+INDEPENDENT = 1e-4
+"""Standard deviation of a combination of incidences, over the largest, below which it is none of its own."""
+
+Condition = Literal["parallel", "common_point", "independent"]
+Test = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A condition on joints (counted from the base), and what was found.
+
+    ``deviation``: sine, in the model's frame, of how far it is from holding exactly. ``chi2`` of ``freedom``, at most
+    ``threshold`` where it holds; None without a covariance: then ``deviation`` is held against `EXACT`.
+    """
+
+    condition: Condition
+    joints: tuple[int, ...]
+    holds: bool
+    deviation: float
+    chi2: float | None = None
+    freedom: int | None = None
+    threshold: float | None = None
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """The ``case`` of a chain. ``inverted``: of its factors in opposite order, so for the inverse displacement."""
+
+    case: Case
+    inverted: bool
+    evidence: tuple[Evidence, ...]
+
+
+def parallel_incidence(first: FloatArray, second: FloatArray) -> Test:
+    """Test function (4,) of a pair of operators (2, 4, 4), linearised at ``first``, ``second`` (4, 4).
+
+    Zero where both move points in the same directions: the range of the second vanishes under the projection onto
+    the first's axis.
+    """
+    along = np.linalg.svd(first)[2][2:]
+    across = np.linalg.svd(second)[0][:, :2]
+
+    def values(operators: FloatArray) -> FloatArray:
+        G, other = operators
+        onto_axis = np.eye(4) + G @ G
+        return np.asarray((along @ onto_axis @ (other @ other) @ across).ravel(), dtype=np.float64)
+
+    return values
+
+
+def common_point_incidence(operators: FloatArray) -> Test:
+    """Test function of operators (k, 4, 4), linearised at those given: zero where one point lies on all axes.
+
+    The least singular vector of all operators in one stack, and what of its motion no other point takes back.
+    """
+    sizes = np.linalg.norm(operators, axis=(1, 2), keepdims=True)
+    U, _, rows = np.linalg.svd((operators / sizes).reshape(-1, 4))
+    point, left = rows[3], U[:, 3:]
+
+    def values(moved: FloatArray) -> FloatArray:
+        return np.asarray(left.T @ ((moved / sizes).reshape(-1, 4) @ point), dtype=np.float64)
+
+    return values
+
+
+class _Judge:
+    """Tests conditions on one chain, each once."""
+
+    def __init__(self, chain: ProjectiveChain, model: CellModel | None) -> None:
+        self.chain = chain
+        self.model = model if model is not None and model.covariance is not None else None
+        self.evidence: dict[tuple[str, tuple[int, ...]], Evidence] = {}
+
+    def parallel(self, *joints: int) -> bool:
+        first, second = self.chain.generators[list(joints)]
+        return self._holds("parallel", joints, parallel_incidence(first, second))
+
+    def common_point(self, *joints: int) -> bool:
+        return self._holds(
+            "common_point", joints, common_point_incidence(self.chain.generators[list(joints)])
+        )
+
+    def spherical(self, *joints: int) -> bool:
+        # Parallel axes meet, too, in the plane that stays fixed.
+        meet = self.common_point(*joints)
+        return meet and not (self.parallel(*joints[:2]) or self.parallel(*joints[1:]))
+
+    def independent(self, *joints: int) -> bool:
+        unit = [G.ravel() / np.linalg.norm(G) for G in self.chain.generators[list(joints)]]
+        least = float(np.linalg.svd(np.array(unit), compute_uv=False)[-1])
+        self.evidence["independent", joints] = Evidence("independent", joints, least > EXACT, least)
+        return least > EXACT
+
+    def _holds(self, condition: Condition, joints: tuple[int, ...], test: Test) -> bool:
+        known = self.evidence.get((condition, joints))
+        if known is None:
+            known = self._tested(condition, joints, test)
+            self.evidence[condition, joints] = known
+        return known.holds
+
+    def _tested(self, condition: Condition, joints: tuple[int, ...], test: Test) -> Evidence:
+        chosen = list(joints)
+        deviation = float(np.linalg.norm(test(self.chain.generators[chosen])))
+        if self.model is None or deviation > COARSEST:
+            return Evidence(condition, joints, deviation <= EXACT, deviation)
+        values, covariance = propagated(self.model, lambda model: test(model.generators[chosen]))
+        variances, vectors = np.linalg.eigh(covariance)
+        kept = variances > INDEPENDENT**2 * variances[-1]
+        statistic = float((((vectors.T @ values)[kept]) ** 2 / variances[kept]).sum())
+        freedom = int(kept.sum())
+        threshold = float(chi2_distribution.isf(TAIL, freedom))
+        return Evidence(condition, joints, statistic <= threshold, deviation, statistic, freedom, threshold)
+
+
+def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
+    """The case of a chain, or of a calibrated model, whose covariance then says what counts as exact.
+
+    Conditions are incidences of operators, in any stratum. ``numerical`` where no closed form fits.
+    """
+    model = arm if isinstance(arm, CellModel) else None
+    chain = chain_of(arm)
+    judge = _Judge(chain, model)
+    order = chain.order
+    for inverted, joints in ((False, order), (True, order[::-1])):
+        case = _case(judge, chain.kinds, joints)
+        # Single points say nothing of a displacement's inverse; short chains read the same both ways.
+        if case is not None and not (inverted and case in ("two_revolute", "two_parallel", "wrist")):
+            return Recognition(case, inverted, tuple(judge.evidence.values()))
+    return Recognition("numerical", False, tuple(judge.evidence.values()))
+
+
+def tested(arm: ProjectiveChain | CellModel, condition: Condition, joints: tuple[int, ...]) -> Evidence:
+    """One condition on revolute ``joints``: two ``parallel``, two or more with a ``common_point``, or prismatic ones
+    that are ``independent``.
+    """
+    judge = _Judge(chain_of(arm), arm if isinstance(arm, CellModel) else None)
+    {"parallel": judge.parallel, "common_point": judge.common_point, "independent": judge.independent}[
+        condition
+    ](*joints)
+    return judge.evidence[condition, joints]
+
+
+def chain_of(arm: ProjectiveChain | CellModel) -> ProjectiveChain:
+    """The chain of a model."""
+    if isinstance(arm, ProjectiveChain):
+        return arm
+    return ProjectiveChain(arm.joint_kinds, arm.generators, arm.zero, arm.tip_first)
+
+
+def _case(judge: _Judge, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Case | None:
+    letters = "".join(kinds[j][0] for j in joints)
+    if letters in ("p", "pp", "ppp"):
+        return "prismatic" if judge.independent(*joints) else None
+    if letters == "r":
+        return "revolute"
+    if letters == "rr":
+        return "two_parallel" if judge.parallel(*joints) else "two_revolute"
+    if letters == "rrr":
+        if _is_arm(judge, joints):
+            return "arm"
+        return "wrist" if judge.spherical(*joints) else None
+    if letters == "rrrrrr" and _is_arm(judge, joints[:3]) and judge.spherical(*joints[3:]):
+        return "arm_with_wrist"
+    if letters == "ppprrr" and judge.independent(*joints[:3]) and judge.spherical(*joints[3:]):
+        return "gantry_with_wrist"
+    return None
+
+
+def _is_arm(judge: _Judge, joints: tuple[int, ...]) -> bool:
+    """The second and third axis parallel, the first across."""
+    return judge.parallel(*joints[1:]) and not judge.parallel(*joints[:2])

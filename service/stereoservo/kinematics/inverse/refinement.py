@@ -1,0 +1,61 @@
+"""Solutions refined on what was measured (thesis 6.8): least error in the images, over the joints alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.inverse.solutions import InverseSolutions, distinct, nearest_turns
+from stereoservo.kinematics.joint_angles import JointAngles, measured_joints
+from stereoservo.kinematics.joint_sights import JointAnglesError, SeenChain, joint_problem
+
+MERGED = 1e-5
+"""Largest difference of joints [rad or m] of two refinements that ended in one minimum."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSolutions:
+    """Configurations of least image error, one for each start that led to one, least cost first.
+
+    ``refused``: starts (t, n) whose descent explains no image, with the reason of each.
+    """
+
+    solutions: tuple[JointAngles, ...]
+    refused: tuple[tuple[FloatArray, str], ...]
+
+
+def refined_on_images(
+    seen: SeenChain,
+    found: InverseSolutions,
+    points: FloatArray,
+    pixels: FloatArray,
+    sigma: FloatArray | float,
+    *,
+    limits: FloatArray | None = None,
+) -> ImageSolutions:
+    """Each of the solutions ``found`` moved to the least squares of (6.8), with covariance.
+
+    ``points`` (m, 4) at the chain's zero, raw set-points ``pixels`` (c, m, 2) [px] of standard deviation ``sigma``, NaN
+    where a camera does not see one. Raises JointAnglesError for shapes and limits that do not fit, and for fewer
+    coordinates than joints.
+    """
+    problem = joint_problem(seen, points, pixels, sigma)
+    refined: list[JointAngles] = []
+    refused: list[tuple[FloatArray, str]] = []
+    for q in found.joints:
+        try:
+            best = measured_joints(problem, limits=limits, start=q, largest_deviation=np.inf)[0]
+            if limits is None:
+                best = replace(best, q=nearest_turns(seen.chain.kinds, best.q, q))
+            refined.append(best)
+        except JointAnglesError as error:
+            if error.code not in ("no_agreement", "outside_limits"):
+                raise
+            refused.append((q, str(error)))
+    refined.sort(key=lambda angles: angles.cost)
+    if refined:
+        kept = distinct(seen.chain.kinds, np.array([angles.q for angles in refined]), MERGED)
+        refined = [refined[i] for i in kept]
+    return ImageSolutions(tuple(refined), tuple(refused))

@@ -1,0 +1,122 @@
+"""Motions of the joints that leave the goal reached: at singular configurations, and of arms with joints to spare."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.inverse.descent import residual_jacobian
+
+NO_MOTION = 1e-6
+"""Singular value of the joints' Jacobian, as a share of the largest, below which a direction moves nothing."""
+PROBE = 0.05
+"""Motion [rad or m] after which a direction still has to leave the goal reached: a stretched elbow's does not."""
+CORRECTIONS = 20
+
+
+def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
+    """Directions (k, n), orthonormal, that move no point of ``points`` (m, 4) to first order at ``q`` (n,).
+
+    Joints are weighed as they move the points, so that units do not matter.
+    """
+    J = residual_jacobian(chain, points, q)
+    sizes = np.linalg.norm(J, axis=0)
+    idle = sizes <= NO_MOTION * max(float(sizes.max()), 1e-300)
+    weights = np.where(idle, 1.0, sizes)
+    _, singular, rows = np.linalg.svd(np.where(idle, 0.0, J) / weights)
+    rank = int((singular > NO_MOTION * max(float(singular[0]), 1e-300)).sum())
+    kernel = rows[rank:] / weights
+    if not len(kernel):
+        return np.zeros((0, chain.joints))
+    return np.asarray(np.linalg.qr(kernel.T)[0].T, dtype=np.float64)
+
+
+def corrected(
+    chain: ProjectiveChain, points: FloatArray, targets: FloatArray, q: FloatArray, tolerance: float
+) -> tuple[FloatArray, float]:
+    """``q`` (n,) brought back to the goal by least motions, and the residual left."""
+    norm = float(np.linalg.norm(targets))
+    residual = np.inf
+    for _ in range(CORRECTIONS):
+        error = (points @ chain.displacement(q).T - targets).ravel()
+        residual = float(np.linalg.norm(error)) / norm
+        if residual <= 0.01 * tolerance or not np.isfinite(residual):
+            break
+        J = residual_jacobian(chain, points, q)
+        step = -np.linalg.lstsq(J, error, rcond=1e-3)[0]
+        q = q + step * min(1.0, 0.2 / max(float(np.abs(step).max()), 1e-300))
+    return q, residual
+
+
+def self_motions(
+    chain: ProjectiveChain, points: FloatArray, targets: FloatArray, q: FloatArray, tolerance: float
+) -> FloatArray:
+    """Directions (k, n) of motions from ``q`` (n,) that leave the goal reached over a finite way.
+
+    A direction that does so to first order only, at the rim of the workspace, is none.
+    """
+    kept = []
+    for direction in null_directions(chain, points, q):
+        ahead, residual = corrected(chain, points, targets, q + PROBE * direction, tolerance)
+        if residual <= tolerance and abs(float((ahead - q) @ direction)) > 0.5 * PROBE:
+            kept.append(direction)
+    return np.array(kept).reshape(-1, chain.joints)
+
+
+def nearest_by_self_motion(
+    chain: ProjectiveChain,
+    points: FloatArray,
+    targets: FloatArray,
+    q: FloatArray,
+    seed: FloatArray,
+    tolerance: float,
+) -> FloatArray:
+    """From ``q`` (n,) along self-motions to where the joints are nearest to ``seed`` (n,), the goal kept."""
+    for _ in range(200):
+        kernel = null_directions(chain, points, q)
+        step = kernel.T @ (kernel @ (seed - q))
+        length = float(np.abs(step).max(initial=0.0))
+        if length < 1e-9:
+            break
+        ahead, residual = corrected(
+            chain, points, targets, q + step * min(1.0, 2.0 * PROBE / length), tolerance
+        )
+        if residual > tolerance or np.linalg.norm(ahead - seed) >= np.linalg.norm(q - seed):
+            break
+        q = ahead
+    return q
+
+
+def slid_inside(
+    chain: ProjectiveChain,
+    points: FloatArray,
+    targets: FloatArray,
+    q: FloatArray,
+    limits: FloatArray,
+    tolerance: float,
+) -> FloatArray | None:
+    """A configuration (n,) inside ``limits`` (n, 2) on the way of the single self-motion of ``q`` (n,), or None.
+
+    Follows the motion both ways for a whole turn, or until it comes to its end.
+    """
+    kernel = null_directions(chain, points, q)
+    if len(kernel) != 1:
+        return None
+    for sense in (1.0, -1.0):
+        here, direction = q, sense * kernel[0]
+        for _ in range(int(np.ceil(2.0 * np.pi / PROBE)) * 2):
+            here, residual = corrected(chain, points, targets, here + PROBE * direction, tolerance)
+            if residual > tolerance:
+                break
+            if (here >= limits[:, 0]).all() and (here <= limits[:, 1]).all():
+                return here
+            onward = null_directions(chain, points, here)
+            if not len(onward):
+                break
+            along = onward.T @ (onward @ direction)
+            size = float(np.linalg.norm(along))
+            if size < 1e-6:
+                break
+            direction = along / size
+    return None

@@ -1,0 +1,141 @@
+"""Answers of inverse kinematics: all solutions, a continuum of them, or how far the goal is from being reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+
+Case = Literal[
+    "prismatic",
+    "revolute",
+    "two_revolute",
+    "two_parallel",
+    "arm",
+    "wrist",
+    "arm_with_wrist",
+    "gantry_with_wrist",
+    "numerical",
+]
+Outcome = Literal["isolated", "continuum", "beyond_limits", "unreachable"]
+
+
+class InverseKinematicsError(ValueError):
+    """A goal, a seed or limits with which the question makes no sense. The text says what would be valid.
+
+    Attributes:
+        code: ``shape``, ``not_finite``, ``mirrored`` (no rigid motion takes the points there), ``not_rigid``,
+            ``degenerate`` (a goal or point on the fixed plane), ``limits``.
+        data: the values that the message speaks of.
+    """
+
+    def __init__(self, code: str, message: str, **data: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.data = data
+
+
+@dataclass(frozen=True, eq=False)
+class Shortfall:
+    """The nearest that an arm comes to a goal out of its reach.
+
+    ``joints`` (n,) of least residual among the approaches tried, ``residual`` as in `InverseSolutions`. ``joint``:
+    whose equation has no root, in closed form; ``excess``: by which share of its amplitude (1.0: twice as far as it
+    reaches; infinite: it moves nothing that matters). None where no single joint is the reason.
+    """
+
+    joints: FloatArray
+    residual: float
+    joint: int | None
+    excess: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class InverseSolutions:
+    """All configurations found, nearest to the seed first.
+
+    ``joints`` (s, n) [rad or m], each checked by forward kinematics: ``residuals`` (s,), the norm of ``H(q)M - M*``
+    over that of ``M*``, points at equal heights (for a displacement the columns of H). Revolute angles are those
+    nearest to the seed, by whole turns, inside the limits.
+
+    ``outcome``: ``isolated`` solutions; ``continuum``, where the goal leaves joints free (singular, or more
+    joints than freedoms), each row one representative; ``beyond_limits``, all of them outside; ``unreachable``.
+    ``self_motions``: for each row directions (k, n) at unit norm along which the arm moves and the goal stays.
+    ``beyond_limits`` (t, n): solutions outside of the limits. ``shortfall`` where unreachable.
+    """
+
+    case: Case
+    outcome: Outcome
+    joints: FloatArray
+    residuals: FloatArray
+    self_motions: tuple[FloatArray, ...]
+    beyond_limits: FloatArray
+    shortfall: Shortfall | None = None
+
+    @property
+    def reached(self) -> bool:
+        """Whether there is a solution inside the limits."""
+        return len(self.joints) > 0
+
+    @property
+    def free_joints(self) -> tuple[tuple[int, ...], ...]:
+        """For each solution the joints that its self-motions move."""
+        return tuple(
+            tuple(int(j) for j in np.flatnonzero(np.abs(motions).max(axis=0, initial=0.0) > MOVING))
+            for motions in self.self_motions
+        )
+
+
+MOVING = 1e-4
+"""Share of a self-motion's direction from which on a joint counts as moving."""
+SAME = 1e-6
+"""Largest difference of joints [rad or m] of two answers that are one."""
+
+
+def nearest_turns(kinds: tuple[str, ...], joints: FloatArray, seed: FloatArray) -> FloatArray:
+    """Joints (..., n) with revolute ones within half a turn of ``seed`` (n,)."""
+    revolute = np.array([kind == "revolute" for kind in kinds])
+    turned = seed + np.mod(joints - seed + np.pi, 2.0 * np.pi) - np.pi
+    return np.asarray(np.where(revolute, turned, joints), dtype=np.float64)
+
+
+def within_limits(
+    kinds: tuple[str, ...], joints: FloatArray, seed: FloatArray, limits: FloatArray | None
+) -> tuple[FloatArray, bool]:
+    """Joints (n,) by whole turns inside ``limits`` (n, 2), nearest to ``seed`` (n,); whether all of them are.
+
+    A joint that no turn brings inside stands as near to its limits as turns bring it.
+    """
+    near = nearest_turns(kinds, joints, seed)
+    if limits is None:
+        return near, True
+    inside = True
+    for j, kind in enumerate(kinds):
+        low, high = limits[j] + np.array([-SAME, SAME])
+        if low <= near[j] <= high:
+            continue
+        if kind == "revolute":
+            bound = low if near[j] < low else high
+            turns = (bound - near[j]) / (2.0 * np.pi)
+            moved = near[j] + 2.0 * np.pi * (np.ceil(turns) if near[j] < low else np.floor(turns))
+            # Past the other limit by less than it lacks here: as near as it gets.
+            if low <= moved <= high:
+                near[j] = moved
+                continue
+            other = moved - 2.0 * np.pi * np.sign(moved - near[j])
+            near[j] = min((moved, other), key=lambda q: max(low - q, q - high))
+        inside = False
+    return near, inside
+
+
+def distinct(kinds: tuple[str, ...], joints: FloatArray, tolerance: float = SAME) -> list[int]:
+    """Indices of rows (s, n) of which none equals an earlier one, up to whole turns."""
+    kept: list[int] = []
+    for i, row in enumerate(joints):
+        apart = nearest_turns(kinds, joints[kept] - row, np.zeros(len(row)))
+        if not len(kept) or np.abs(apart).max(axis=1).min() > tolerance:
+            kept.append(i)
+    return kept

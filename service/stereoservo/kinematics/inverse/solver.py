@@ -1,0 +1,272 @@
+"""Inverse kinematics of a projective chain: the case recognised, its candidates made, refined, checked and sorted.
+
+In every stratum: operators and points suffice (thesis 6). Nothing here knows a metric or the plane at infinity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.inverse import goals, numerical
+from stereoservo.kinematics.inverse.arm import arm
+from stereoservo.kinematics.inverse.branches import Branches, together
+from stereoservo.kinematics.inverse.descent import descended, residual_jacobian
+from stereoservo.kinematics.inverse.prismatic import prismatic_joints
+from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
+from stereoservo.kinematics.inverse.revolute import turn_between
+from stereoservo.kinematics.inverse.self_motion import (
+    NO_MOTION,
+    nearest_by_self_motion,
+    self_motions,
+    slid_inside,
+)
+from stereoservo.kinematics.inverse.six_axis import arm_with_wrist, gantry_with_wrist
+from stereoservo.kinematics.inverse.solutions import (
+    Case,
+    InverseKinematicsError,
+    InverseSolutions,
+    Shortfall,
+    distinct,
+    within_limits,
+)
+from stereoservo.kinematics.inverse.two_revolute import two_general, two_parallel
+from stereoservo.kinematics.inverse.wrist import wrist
+from stereoservo.kinematics.model import CellModel
+
+TOLERANCE = 1e-8
+"""Residual up to which a goal counts as reached: rounding, for goals that are exact."""
+WITNESSES = 4
+"""Points of a goal that are tried in the cases that work on a single one."""
+POLISH = 1e-9
+"""Damping of the refinement of a candidate: next to none."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """A goal in one form: points and targets (m, 4) of equal heights; the displacement where they tell it."""
+
+    chain: ProjectiveChain
+    points: FloatArray
+    targets: FloatArray
+    displacement: FloatArray | None
+    seed: FloatArray
+    limits: FloatArray | None
+    tolerance: float
+
+
+def inverse_kinematics(
+    arm: ProjectiveChain | CellModel,
+    *,
+    displacement: FloatArray | None = None,
+    points: FloatArray | None = None,
+    targets: FloatArray | None = None,
+    seed: FloatArray | None = None,
+    limits: FloatArray | None = None,
+    tolerance: float = TOLERANCE,
+    recognition: Recognition | None = None,
+) -> InverseSolutions:
+    """All configurations that reach a goal.
+
+    The goal is a ``displacement`` (4, 4) from the chain's zero, of any scale, or ``targets`` (m, 4) of ``points``
+    (m, 4) at the zero, of any heights. ``seed`` (n,), default the zero, orders the solutions, and is where a joint
+    stays that the goal leaves free. ``limits`` (n, 2) [rad or m]; prismatic joints need theirs where there is no
+    closed form.
+    ``tolerance``: residual up to which a goal counts as reached; measured goals need that of their noise.
+    ``recognition``: of this arm, where it is known already (of a model with a covariance it takes a second).
+
+    Raises InverseKinematicsError for goals that are no motion of this kind of arm (mirrored, another body), for shapes
+    that do not fit and for what is not finite. Out of reach and out of limits are answers, not errors.
+    """
+    chain = chain_of(arm)
+    problem = _problem(chain, displacement, points, targets, seed, limits, tolerance)
+    known = recognise(arm) if recognition is None else recognition
+    branches = _closed_form(problem, known)
+    if branches is None:
+        return _searched(problem)
+    starts = chain.zero + branches.steps
+    ends, left = descended(chain, problem.points, problem.targets, starts, damping=POLISH)
+    solved = left <= tolerance
+    if not solved.any():
+        return _unreachable(problem, known.case, ends, left, branches)
+    return _answer(problem, known.case, ends[solved], left[solved])
+
+
+def _problem(
+    chain: ProjectiveChain,
+    displacement: FloatArray | None,
+    points: FloatArray | None,
+    targets: FloatArray | None,
+    seed: FloatArray | None,
+    limits: FloatArray | None,
+    tolerance: float,
+) -> _Problem:
+    n = chain.joints
+    if n == 0:
+        raise InverseKinematicsError("shape", "the chain has no joint; one or more are needed")
+    seed = chain.zero if seed is None else goals.finite("seed", seed, (n,))
+    if limits is not None:
+        limits = np.asarray(limits, dtype=np.float64)
+        if limits.shape != (n, 2) or not (limits[:, 0] <= limits[:, 1]).all():
+            raise InverseKinematicsError(
+                "limits", f"limits {limits.tolist()}; {n} pairs are needed, the lower first"
+            )
+    if not 0.0 < tolerance < 1.0:
+        raise InverseKinematicsError("shape", f"tolerance {tolerance}; between 0 and 1 is needed")
+    if displacement is not None and points is None and targets is None:
+        H = goals.scaled_displacement(chain.generators, displacement)
+        # A displacement is what it does to the columns of the identity.
+        return _Problem(chain, np.eye(4), np.ascontiguousarray(H.T), H, seed, limits, tolerance)
+    if displacement is None and points is not None and targets is not None:
+        at_zero, at_goal = goals.equal_heights(chain.generators, points, targets)
+        misfit = max(tolerance, 1e-9)
+        between = goals.displacement_between(chain.generators, at_zero, at_goal, misfit=misfit)
+        return _Problem(chain, at_zero, at_goal, between, seed, limits, tolerance)
+    raise InverseKinematicsError("shape", "give a displacement, or points and targets: one goal is needed")
+
+
+def _closed_form(problem: _Problem, known: Recognition) -> Branches | None:
+    """Candidates of the recognised case, columns in the order of the chain's joints; None where there is no closed
+    form, or none for this goal.
+    """
+    order = list(problem.chain.order[::-1] if known.inverted else problem.chain.order)
+    sense = -1.0 if known.inverted else 1.0
+    G = sense * problem.chain.generators[order]
+    seed = (problem.seed - problem.chain.zero)[order]
+    if known.inverted:
+        if problem.displacement is None:
+            return None
+        back = np.asarray(np.linalg.inv(problem.displacement), dtype=np.float64)
+        found = _candidates(known.case, G, back, np.eye(4), back.T, seed)
+    else:
+        found = _candidates(known.case, G, problem.displacement, problem.points, problem.targets, seed)
+    if found is None:
+        return None
+    base_first = np.argsort(order)
+    return Branches(found.steps[:, base_first], found.excess[:, base_first], found.free[:, base_first])
+
+
+def _candidates(
+    case: Case,
+    G: FloatArray,
+    H: FloatArray | None,
+    points: FloatArray,
+    targets: FloatArray,
+    seed: FloatArray,
+) -> Branches | None:
+    single_point = {"two_revolute": two_general, "two_parallel": two_parallel, "arm": arm}
+    whole_rotation = {
+        "wrist": wrist,
+        "arm_with_wrist": arm_with_wrist,
+        "gantry_with_wrist": gantry_with_wrist,
+    }
+    if case == "prismatic":
+        return prismatic_joints(G, points, targets)
+    if case == "revolute":
+        return turn_between(G[0], points, targets, float(seed[0]))
+    if case in single_point:
+        pairs = zip(points[:WITNESSES], targets[:WITNESSES], strict=True)
+        return together([single_point[case](G, A, goal, seed) for A, goal in pairs])
+    if case in whole_rotation and H is not None:
+        return whole_rotation[case](G, H, seed)
+    return None
+
+
+def _searched(problem: _Problem) -> InverseSolutions:
+    """The case without a closed form: isolated solutions, or the nearest of a continuum."""
+    chain = problem.chain
+    rank = _rank(problem)
+    search = numerical.all_solutions if rank == chain.joints else numerical.one_solution
+    ends, left, best = search(
+        chain,
+        problem.points,
+        problem.targets,
+        limits=problem.limits,
+        tolerance=problem.tolerance,
+        seed=problem.seed,
+    )
+    if not len(ends):
+        residual = float(descended(chain, problem.points, problem.targets, best[None], iterations=0)[1][0])
+        return _nothing(problem, "numerical", Shortfall(best, residual, None, None))
+    if rank < chain.joints:
+        ends = np.array([_settled(problem, q) for q in _representatives(problem, ends)])
+        left = descended(chain, problem.points, problem.targets, ends, iterations=0)[1]
+    return _answer(problem, "numerical", ends, left)
+
+
+def _rank(problem: _Problem) -> int:
+    """Freedoms of the goal that the joints drive, where they drive most of them."""
+    most = 0
+    for q in numerical.even_starts(problem.chain, problem.limits, 4):
+        J = residual_jacobian(problem.chain, problem.points, q)
+        singular = np.linalg.svd(J, compute_uv=False)
+        most = max(most, int((singular > NO_MOTION * max(float(singular[0]), 1e-300)).sum()))
+    return most
+
+
+def _representatives(problem: _Problem, ends: FloatArray) -> FloatArray:
+    """The one of a continuum's points (s, n) that is nearest to the seed; with limits, the first few."""
+    turned = np.array([within_limits(problem.chain.kinds, q, problem.seed, problem.limits)[0] for q in ends])
+    order = np.argsort(np.linalg.norm(turned - problem.seed, axis=1), kind="stable")
+    return turned[order[: 1 if problem.limits is None else 8]]
+
+
+def _settled(problem: _Problem, q: FloatArray) -> FloatArray:
+    return nearest_by_self_motion(
+        problem.chain, problem.points, problem.targets, q, problem.seed, problem.tolerance
+    )
+
+
+def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray) -> InverseSolutions:
+    """Solutions (s, n) told apart, inside the limits, nearest to the seed first."""
+    chain = problem.chain
+    by_residual = np.argsort(left, kind="stable")
+    joints, left = joints[by_residual], left[by_residual]
+    inside: list[tuple[FloatArray, float, FloatArray]] = []
+    outside: list[FloatArray] = []
+    for i in distinct(chain.kinds, joints):
+        q, fits = within_limits(chain.kinds, joints[i], problem.seed, problem.limits)
+        motions = self_motions(chain, problem.points, problem.targets, q, problem.tolerance)
+        if not fits and len(motions) == 1 and problem.limits is not None:
+            slid = slid_inside(chain, problem.points, problem.targets, q, problem.limits, problem.tolerance)
+            if slid is not None:
+                q, fits = slid, True
+                motions = self_motions(chain, problem.points, problem.targets, q, problem.tolerance)
+        if fits:
+            inside.append((q, float(left[i]), motions))
+        else:
+            outside.append(q)
+    inside.sort(key=lambda solution: float(np.linalg.norm(solution[0] - problem.seed)))
+    n = chain.joints
+    rows = np.array([q for q, _, _ in inside]).reshape(-1, n)
+    residuals = descended(chain, problem.points, problem.targets, rows, iterations=0)[1]
+    motions_of = tuple(motions for _, _, motions in inside)
+    return InverseSolutions(
+        case,
+        "beyond_limits" if not inside else "continuum" if any(map(len, motions_of)) else "isolated",
+        rows,
+        residuals,
+        motions_of,
+        np.array(outside).reshape(-1, n),
+    )
+
+
+def _unreachable(
+    problem: _Problem, case: Case, ends: FloatArray, left: FloatArray, branches: Branches
+) -> InverseSolutions:
+    """The joint named is the first, in the order in which the case is solved, that fails in every branch."""
+    nearest = int(np.argmin(left))
+    failing = (branches.excess > problem.tolerance).all(axis=0)
+    joint, excess = None, None
+    if failing.any():
+        joint = int(np.flatnonzero(failing)[0])
+        excess = float(branches.excess[:, joint].min())
+    return _nothing(problem, case, Shortfall(ends[nearest], float(left[nearest]), joint, excess))
+
+
+def _nothing(problem: _Problem, case: Case, shortfall: Shortfall) -> InverseSolutions:
+    none = np.zeros((0, problem.chain.joints))
+    return InverseSolutions(case, "unreachable", none, np.zeros(0), (), none, shortfall)
