@@ -1,0 +1,203 @@
+"""``stereoservo simulate TASKS.csv``: alignment tasks in closed loop, judged on the truth."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stereoservo.control.laws import LAWS
+from stereoservo_sim.commands.progress import progress_bar
+from stereoservo_sim.tasks.calibrations import FRAMES, STOPS
+from stereoservo_sim.tasks.campaign import SettingsError, default_jobs, run_campaign
+from stereoservo_sim.tasks.closed_loop import LoopSettings
+from stereoservo_sim.tasks.setting import DEFAULT_GAIN, DEFAULT_RATE_HZ
+from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks
+
+LawOption = StrEnum("LawOption", {name: name for name in LAWS})  # type: ignore[misc]
+DEFAULT_LAW = LawOption("cartesian3")
+
+
+class ArmOption(StrEnum):
+    """--arm"""
+
+    FREE = "free"
+    RX90 = "rx90"
+
+
+class CalibrationOption(StrEnum):
+    """--calibration"""
+
+    SELF = "self"
+    EXACT = "exact"
+    COARSE = "coarse"
+
+
+class JacobianOption(StrEnum):
+    """--jacobian"""
+
+    CURRENT = "current"
+    DESIRED = "desired"
+    MEAN = "mean"
+    FIXED_DEPTH = "fixed-depth"
+
+
+class PointsOption(StrEnum):
+    """--points"""
+
+    PREDICTED = "predicted"
+    TRIANGULATED = "triangulated"
+
+
+def simulate(
+    tasks: Annotated[Path, typer.Argument(metavar="TASKS.csv", help="A task file.")],
+    arm: Annotated[
+        ArmOption, typer.Option(help="free: six Cartesian generators; rx90: six revolute joints.")
+    ] = ArmOption.FREE,
+    calibration: Annotated[
+        CalibrationOption,
+        typer.Option(
+            help=f"self: learnt once from trial motions, {STOPS} stops a joint, {FRAMES} frames averaged at each; "
+            "exact: from the truth; coarse: metric, with 10 % focal and 5° hand-eye error."
+        ),
+    ] = CalibrationOption.SELF,
+    law: Annotated[LawOption, typer.Option(help="The law.")] = DEFAULT_LAW,
+    jacobian: Annotated[JacobianOption, typer.Option(help="Of laws in the images.")] = JacobianOption.MEAN,
+    centre: Annotated[
+        str, typer.Option(help="Point that goes straight: middle (of the markers), or a marker, 0 to 3.")
+    ] = "middle",
+    points: Annotated[
+        PointsOption, typer.Option(help="predicted by kinematics and corrected, or triangulated anew.")
+    ] = PointsOption.PREDICTED,
+    gain: Annotated[float, typer.Option(help="[1/s]")] = DEFAULT_GAIN,
+    rate: Annotated[float, typer.Option(help="Of the loop [Hz].")] = DEFAULT_RATE_HZ,
+    noise_px: Annotated[float, typer.Option(help="Standard deviation of each pixel coordinate [px].")] = 0.1,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of everything random.")] = 0,
+    jobs: Annotated[
+        int, typer.Option(min=0, help="Processes; the results do not depend on it [0: one a processor].")
+    ] = 0,
+    drop_camera: Annotated[
+        str | None,
+        typer.Option(metavar="START:SECONDS", help="The second camera is dropped for a time [s]."),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
+    ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """Run every task of a file in closed loop; the controller sees noisy pixels only, the judge the truth."""
+    # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    settings = LoopSettings(
+        law=law.value,
+        arm=arm.value,
+        calibration=calibration.value,
+        jacobian=jacobian.value,
+        centre=_centre(centre),
+        points=points.value,
+        gain=_within("--gain", gain, 1e-3, 50.0),
+        rate_hz=_within("--rate", rate, 1.0, 10_000.0),
+        noise_px=_within("--noise-px", noise_px, 0.0, 100.0),
+        seed=seed,
+        drop_camera=_drop(drop_camera),
+    )
+    chosen = _chosen(read_tasks(tasks), limit, ids)
+    with progress_bar() as progress:
+        answer = run_campaign(
+            chosen, settings, jobs or default_jobs(), lambda done, total: progress("tasks", done, total)
+        )
+    answer = {"file": str(tasks), **answer}
+    if as_json:
+        sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
+    else:
+        _show(answer, Console(markup=False, highlight=False))
+
+
+def _centre(text: str) -> str:
+    if text not in ("middle", "0", "1", "2", "3"):
+        raise SettingsError(f"--centre {text!r}: middle, or a marker from 0 to 3, is needed")
+    return text
+
+
+def _within(name: str, value: float, low: float, high: float) -> float:
+    if not low <= value <= high:
+        raise SettingsError(f"{name} {value:g}: a number from {low:g} to {high:g} is needed")
+    return value
+
+
+def _drop(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    start, _, duration = text.partition(":")
+    try:
+        found = float(start), float(duration)
+    except ValueError:
+        found = (-1.0, -1.0)
+    if not all(0.0 <= value < 1e6 for value in found):
+        raise SettingsError(f"--drop-camera {text!r}: START:SECONDS, like 2:2, is needed")
+    return found
+
+
+def _chosen(
+    tasks: tuple[AlignmentTask, ...], limit: int | None, ids: str | None
+) -> tuple[AlignmentTask, ...]:
+    if ids is not None:
+        by_id = {task.id: task for task in tasks}
+        try:
+            wanted = dict.fromkeys(int(part) for part in ids.split(","))
+        except ValueError:
+            raise SettingsError(f"--ids {ids!r}: ids by commas, like 3,14,15, are needed") from None
+        unknown = [number for number in wanted if number not in by_id]
+        if unknown:
+            raise SettingsError(f"--ids: the file has no task {unknown[0]}; it has {len(tasks)} others")
+        tasks = tuple(by_id[number] for number in wanted)
+    return tasks[:limit]
+
+
+def _show(answer: dict[str, Any], console: Console) -> None:
+    failed = [task for task in answer["tasks"] if task["success"] is False]
+    if failed:
+        table = Table(
+            "id", "reason", "steps", "error px", "back face", "out of view", "off line mm", box=None
+        )
+        for task in failed:
+            table.add_row(
+                str(task["id"]), task["refused"] or task["reason"], str(task["iterations"]),
+                _number(task["final_error_px"]), str(task["back_face"]), str(task["out_of_view"]),
+                _number(task["line_deviation_mm"]),
+            )  # fmt: skip
+        console.print(table)
+    judged = len(answer["tasks"]) - answer["unreachable"]
+    rate = "no task can be reached" if answer["success_rate"] is None else f"{answer['success_rate']:.2%}"
+    low, high = answer["wilson_95"]
+    console.print(
+        f"{answer['solved']} of {judged} solved ({rate}; Wilson 95 %: {low:.2%} to {high:.2%}), {answer['refused']} "
+        f"refused before moving, {answer['failed_moving']} failed on the way, {answer['unreachable']} out of reach"
+    )
+    for key, (name, unit) in SHOWN.items():
+        if answer[key] is not None:
+            console.print(
+                f"{name}: median {answer[key]['median']:.3g}{unit}, max {answer[key]['max']:.3g}{unit}"
+            )
+    console.print(f"{answer['seconds']:.1f} s")
+
+
+SHOWN = {
+    "line_deviation_mm": ("deviation from the line", " mm"),
+    "final_error_px": ("error at rest", " px"),
+    "error_over_floor": ("error at rest over what image noise leaves", ""),
+    "rest_mm_s": ("velocity at rest, rms", " mm/s"),
+    "rest_mrad_s": ("turn rate at rest, rms", " mrad/s"),
+    "iterations": ("steps", ""),
+}
+"""Of the answer: names and units for people."""
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

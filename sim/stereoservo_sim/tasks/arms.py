@@ -1,0 +1,165 @@
+"""The arms that tasks are made with, in truth: where the plate is, and where a command takes it.
+
+``free`` is a virtual arm of six Cartesian generators that act at once; ``rx90`` a serial arm of six revolute joints
+with limits. The controller knows the readings of their joints and nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.kernels import exp_twist, multiply4_into
+from stereoservo_sim.synthetic import (
+    RX90_ROWS,
+    SyntheticCell,
+    dh_link,
+    placed,
+    rotation,
+    translation,
+)
+from stereoservo_sim.tasks.setting import (
+    HEIGHT,
+    HOMOGENEOUS_MARKERS,
+    MARKERS,
+    WIDTH,
+    camera_poses,
+    cartesian_twists,
+    intrinsics,
+)
+from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
+
+FloatArray = npt.NDArray[np.float64]
+ArmName = Literal["free", "rx90"]
+
+MID_RANGE = translation(0.0, 0.0, 1.1) @ rotation("y", 15) @ rotation("x", -10)
+"""The plate's pose (4, 4) at which the arms learn."""
+PLATE_ON_FLANGE = translation(0.0, 0.0, 0.02) @ rotation("x", 180)
+"""(4, 4): the plate's printed face looks along the flange's z."""
+RX90_HOME = np.radians([10.0, -60.0, 165.0, 20.0, 50.0, 15.0])
+RX90_LIMITS = np.radians(
+    [(-160.0, 160.0), (-227.5, 47.5), (-52.5, 232.5), (-270.0, 270.0), (-105.0, 120.0), (-270.0, 270.0)]
+)
+"""(6, 2) [rad]"""
+
+
+class Arm(Protocol):
+    """An arm in the middle of a task. ``pose`` (4, 4) of the plate in the rig, ``joints`` (n,): its readings."""
+
+    pose: FloatArray
+    joints: FloatArray
+    composition: Composition
+    limits: FloatArray
+
+    def move(self, velocity: FloatArray, dt_s: float) -> None:
+        """Run at ``velocity`` (n,) for ``dt_s``, exactly."""
+        ...
+
+
+class FreeArm:
+    """Translations along and rotations about the rig's axes through the plate's middle at the start (re-based there).
+
+    ``joints``: the velocities' integrals, from zero.
+    """
+
+    composition = Composition.SIMULTANEOUS
+    limits = np.tile([-np.inf, np.inf], (6, 1))
+
+    def __init__(self, start: FloatArray) -> None:
+        self.pose = start.copy()
+        self.joints = np.zeros(6)
+        self._twists = cartesian_twists(start[:3, 3])
+
+    def move(self, velocity: FloatArray, dt_s: float) -> None:
+        """Displace the plate by ``exp(dt Σ q̇_j T_j)``."""
+        step = velocity * dt_s
+        moved = np.empty((4, 4))
+        multiply4_into(exp_twist((step[:, None, None] * self._twists).sum(axis=0)), self.pose, moved)
+        self.pose = moved
+        self.joints = self.joints + step
+
+
+class SerialArm:
+    """The RX 90 from a configuration ``joints`` (6,)."""
+
+    composition = Composition.BASE_FIRST
+    limits = RX90_LIMITS
+
+    def __init__(self, cell: SyntheticCell, joints: FloatArray) -> None:
+        self._cell = cell
+        self.joints = joints.copy()
+        self.pose = cell.flange(joints) @ PLATE_ON_FLANGE
+
+    def move(self, velocity: FloatArray, dt_s: float) -> None:
+        """Integrate the joints. Limits are the caller's to watch."""
+        self.joints = self.joints + velocity * dt_s
+        self.pose = self._cell.flange(self.joints) @ PLATE_ON_FLANGE
+
+
+def _cameras() -> tuple[FloatArray, FloatArray]:
+    """Intrinsics and poses from the rig to each camera, as synthetic cells have them."""
+    return np.array([intrinsics()] * 2), np.linalg.inv(camera_poses())
+
+
+def free_cell() -> SyntheticCell:
+    """The free arm at mid-range as a chain 3P3R whose joints move one at a time: what its trial motions show."""
+    # From joint frame to joint frame, z along x, y, z, x, y, z of the rig.
+    turns = [rotation("y", 90), rotation("x", -90), np.eye(4)] * 2
+    facing = MID_RANGE.copy()
+    facing[:3, 3] = 0.0
+    links = tuple(np.linalg.inv(turn) @ then for turn, then in zip(turns, [*turns[1:], facing], strict=True))
+    intrinsic, poses = _cameras()
+    lenses = np.tile(np.array([0.0, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1), 0.5 * WIDTH]), (2, 1))
+    return SyntheticCell(
+        translation(*MID_RANGE[:3, 3]) @ turns[0],
+        ("prismatic",) * 3 + ("revolute",) * 3,
+        links,
+        MARKERS,
+        intrinsic,
+        poses,
+        np.zeros(6),
+        np.zeros(6),
+        lenses,
+    )
+
+
+def rx90_cell() -> SyntheticCell:
+    """The RX 90 with the plate at mid-range when at home."""
+    body = (HOMOGENEOUS_MARKERS @ PLATE_ON_FLANGE.T)[:, :3]
+    turned = MID_RANGE @ np.linalg.inv(PLATE_ON_FLANGE)
+    turned[:3, 3] = 0.0
+    return placed(
+        ("revolute",) * 6,
+        tuple(dh_link(*row) for row in RX90_ROWS),
+        body,
+        RX90_HOME,
+        np.zeros(6),
+        turned,
+        cameras=_cameras(),
+        distance=float(MID_RANGE[2, 3]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Configurations of the RX 90 at a task's start and goal, the pair with the smallest largest joint motion."""
+
+    start: FloatArray
+    goal: FloatArray
+
+
+def rx90_reach(cell: SyntheticCell, start: FloatArray, goal: FloatArray) -> Reach | None:
+    """How the RX 90 reaches two poses (4, 4) of the plate within its limits; None where it does not."""
+    back = np.linalg.inv(PLATE_ON_FLANGE)
+    found = [
+        inverse_kinematics(np.linalg.inv(cell.base) @ pose @ back, RX90_LIMITS) for pose in (start, goal)
+    ]
+    if not (len(found[0]) and len(found[1])):
+        return None
+    travel = np.abs(found[0][:, None] - found[1][None]).max(axis=-1)
+    i, k = np.unravel_index(int(travel.argmin()), travel.shape)
+    return Reach(found[0][i], found[1][k])

@@ -1,0 +1,189 @@
+"""What the controller knows: learnt from trial motions (``self``), from the truth (``exact``), or metric and wrong
+(``coarse``).
+
+``self``: joint by joint from mid-range, `STOPS` stops a joint as far as both cameras keep the plate in view,
+`FRAMES` noisy frames averaged at each, as the daemon does. From then on the arm's own readings say where it is: the
+free arm's operators are re-based to a task's start by the displacement that its readings tell.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from stereoservo.geometry.cameras import camera_centre
+from stereoservo.geometry.displacements import conjugate
+from stereoservo.geometry.screws import exp_twist
+from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.kernels import chain_forward
+from stereoservo.kinematics.model import CellModel
+from stereoservo_sim.exact_model import exact_model, twists
+from stereoservo_sim.synthetic import SyntheticCell
+from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, Reach, free_cell, rx90_cell
+from stereoservo_sim.tasks.setting import (
+    FOCAL_ERROR,
+    HAND_EYE_ERROR_DEG,
+    camera_matrices,
+    camera_poses,
+    cartesian_twists,
+)
+from stereoservo_sim.tasks.task_file import AlignmentTask
+
+FloatArray = npt.NDArray[np.float64]
+CalibrationName = Literal["self", "exact", "coarse"]
+
+STOPS, FRAMES = 17, 12
+"""Of a joint's trial motion, and averaged at a stop."""
+LEAST_SIGMA_PX = 1e-3
+"""Noise of the trials' averages where the images have none: a fit weighs by it."""
+TRIAL_MARGIN_PX, TRIAL_ANGLE_DEG = 20.0, 65.0
+"""Trial motions end this far from an image's border, and where the plate is seen at this angle from its normal."""
+MAX_TURN, MAX_TRAVEL = np.radians(50.0), 0.25
+"""[rad], [m] to either side."""
+
+
+class Calibration(NamedTuple):
+    """An arm with its model; None where it is metric and wrong, a task's own. ``facts``: for the report."""
+
+    arm: ArmName
+    cell: SyntheticCell
+    model: CellModel | None
+    facts: dict[str, object]
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What the controller knows when a task starts.
+
+    ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4) and ``points`` (m, 4) of height ``plane_at_infinity @ M = 1``; the
+    points by kinematics alone, None where the markers' places on the body are unknown. ``basis`` (r, 4, 4): operators
+    that span the displacements; of a serial arm those at its ``zero`` (n,), None where they stay.
+    """
+
+    composition: Composition
+    matrices: FloatArray
+    camera_centres: FloatArray
+    plane_at_infinity: FloatArray
+    basis: FloatArray
+    points: FloatArray | None
+    zero: FloatArray | None = None
+
+    def operators(self, joints: FloatArray) -> FloatArray:
+        """(n, 4, 4) at the arm's readings (n,) (5.21)."""
+        if self.zero is None:
+            return self.basis
+        kinds = np.zeros(len(self.basis), dtype=np.uint8)
+        found: FloatArray = chain_forward(self.basis, kinds, self.zero, joints)[1]
+        return found
+
+
+def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed: int) -> Calibration:
+    """Once a file and seed. Raises CalibrationError where the trial motions give no model."""
+    cell = with_trial_ranges(free_cell() if arm == "free" else rx90_cell())
+    started = time.perf_counter()
+    if calibration == "coarse":
+        return Calibration(
+            arm, cell, None, {"focal_error": FOCAL_ERROR, "hand_eye_error_deg": HAND_EYE_ERROR_DEG}
+        )
+    if calibration == "exact":
+        return Calibration(arm, cell, exact_model(cell), {})
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+    sigma = max(noise_px / np.sqrt(FRAMES), LEAST_SIGMA_PX)
+    result = fit_model(cell.trials(sigma, rng, STOPS), epoch=1)
+    facts = {
+        "stops_per_joint": STOPS,
+        "frames_per_stop": FRAMES,
+        "ranges": [round(float(value), 4) for value in cell.ranges],
+        "sigma_px": sigma,
+        "rms_px": result.report.rms_px,
+        "stratum": result.model.stratum,
+        "seconds": round(time.perf_counter() - started, 3),
+    }
+    return Calibration(arm, cell, result.model, facts)
+
+
+def with_trial_ranges(cell: SyntheticCell) -> SyntheticCell:
+    """The cell with each joint's range (n,) to either side as far as both cameras keep seeing the printed face."""
+    shares = np.linspace(0.0, 1.0, 101)
+    largest = np.where([kind == "revolute" for kind in cell.kinds], MAX_TURN, MAX_TRAVEL)
+    ranges = np.empty(len(largest))
+    for j, most in enumerate(largest):
+        good = np.ones(len(shares), dtype=bool)
+        for sign in (-1.0, 1.0):
+            positions = np.repeat(cell.home[None], len(shares), axis=0)
+            positions[:, j] += sign * most * shares
+            good &= cell.in_view(positions, TRIAL_MARGIN_PX).all(axis=(0, 2)) & _shows_face(cell, positions)
+        reached = len(shares) if good.all() else int(np.argmin(good))
+        ranges[j] = most * shares[max(reached - 1, 0)]
+    return replace(cell, ranges=ranges)
+
+
+def _shows_face(cell: SyntheticCell, positions: FloatArray) -> npt.NDArray[np.bool_]:
+    """(s,): whether each camera sees the plate's front at less than ``TRIAL_ANGLE_DEG`` from its normal."""
+    markers = cell.markers(positions)[..., :3]
+    middle = markers.mean(axis=1)
+    normal = -np.cross(markers[:, 1] - markers[:, 0], markers[:, 3] - markers[:, 0])
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    sight = camera_poses()[:, None, :3, 3] - middle
+    cosine = (sight * normal).sum(axis=-1) / np.linalg.norm(sight, axis=-1)
+    return np.asarray((cosine > np.cos(np.radians(TRIAL_ANGLE_DEG))).all(axis=0))
+
+
+def known_at_start(calibration: Calibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
+    """The controller's knowledge at the start of ``task``; ``reach``: of a serial arm."""
+    if calibration.model is None:
+        return _coarse(calibration, task, reach)
+    model = calibration.model
+    matrices = np.array([camera.matrix for camera in model.cameras])
+    infinity = model.plane_at_infinity
+    centres = _camera_centres(matrices, infinity)
+    if reach is not None:
+        chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
+        points = model.marker_points @ chain.displacement(reach.start).T
+        return Knowledge(
+            Composition.BASE_FIRST, matrices, centres, infinity, model.generators, points, model.zero
+        )
+    shift, turn = readings(task.start)
+    moved = exp_twist(np.tensordot(shift, model.generators[:3], axes=1))
+    turned = exp_twist(np.tensordot(turn, model.generators[3:], axes=1))
+    basis = np.concatenate([model.generators[:3], conjugate(moved, model.generators[3:])])
+    points = model.marker_points @ (moved @ turned).T
+    return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, points, None)
+
+
+def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What the free arm's own joints read at a pose (4, 4): shift (3,) [m] and turn (3,) [rad] from mid-range.
+
+    First the turn about the middle where the plate was, then the shift.
+    """
+    turn = Rotation.from_matrix(start[:3, :3] @ MID_RANGE[:3, :3].T).as_rotvec()
+    return start[:3, 3] - MID_RANGE[:3, 3], turn
+
+
+def _coarse(calibration: Calibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
+    """Metric, in the rig's frame: focal lengths too long, the arm turned about the plate's middle at the start."""
+    matrices = camera_matrices(1.0 + FOCAL_ERROR)
+    infinity = np.array([0.0, 0.0, 0.0, 1.0])
+    centres = _camera_centres(matrices, infinity)
+    middle = task.start[:3, 3]
+    turn = Rotation.from_rotvec(np.radians(HAND_EYE_ERROR_DEG) * task.error_axis).as_matrix()
+    if reach is None:
+        basis = cartesian_twists(middle, turn)
+        return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, None)
+    error = np.eye(4)
+    error[:3, :3], error[:3, 3] = turn, middle - turn @ middle
+    cell = calibration.cell
+    generators = conjugate(error, twists(cell, cell.home))
+    return Knowledge(Composition.BASE_FIRST, matrices, centres, infinity, generators, None, cell.home)
+
+
+def _camera_centres(matrices: FloatArray, infinity: FloatArray) -> FloatArray:
+    centres = np.array([camera_centre(P) for P in matrices])
+    return np.asarray(centres / (centres @ infinity)[:, None])

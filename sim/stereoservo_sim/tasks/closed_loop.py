@@ -1,0 +1,327 @@
+"""One task in closed loop: the controller sees noisy pixels and commands; the judge sees the truth and says what came
+of it.
+
+Set-points are the exact projections of the goal (a goal is taught at rest, averaged over many frames); the target
+points are found from them with what the controller knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.control.law import JacobianChoice, Options, Scene, Task
+from stereoservo.control.laws import LAWS
+from stereoservo.kinematics.kernels import triangulate
+from stereoservo.runtime.estimate import ModelArrays
+from stereoservo.runtime.goal_pose import goal_pose
+from stereoservo_sim.tasks.arms import Arm, ArmName, FreeArm, SerialArm, rx90_reach
+from stereoservo_sim.tasks.calibrations import Calibration, CalibrationName, Knowledge, known_at_start
+from stereoservo_sim.tasks.estimate import Estimate, PointsName
+from stereoservo_sim.tasks.judge import error_px, line_deviations, noise_floor_px, sight
+from stereoservo_sim.tasks.setting import (
+    DEFAULT_GAIN,
+    DEFAULT_RATE_HZ,
+    FACE,
+    MAX_ITERATIONS,
+    MIN_DEPTH,
+    SUCCESS_PX,
+)
+from stereoservo_sim.tasks.task_file import AlignmentTask
+
+FloatArray = npt.NDArray[np.float64]
+
+TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
+REST_STEPS = 50
+"""Steps at 25 Hz over which an error must hold, and over which it is averaged; the same time at other rates."""
+STILL_FALLING = 0.75
+"""A mean error below this share of the one before it still falls: the task has not come to rest."""
+NEGLIGIBLE_PX = 1e-4
+"""Below it an error counts as settled, falling or not."""
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How tasks are run.
+
+    ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
+    of the markers or the number of one.
+    """
+
+    law: str = "cartesian3"
+    arm: ArmName = "free"
+    calibration: CalibrationName = "self"
+    jacobian: Literal["current", "desired", "mean", "fixed-depth"] = "mean"
+    centre: str = "middle"
+    points: PointsName = "predicted"
+    gain: float = DEFAULT_GAIN
+    rate_hz: float = DEFAULT_RATE_HZ
+    noise_px: float = 0.1
+    seed: int = 0
+    drop_camera: tuple[float, float] | None = None
+
+
+class TaskResult(msgspec.Struct, frozen=True):
+    """What came of a task, judged on noise-free projections.
+
+    ``success``: None where the arm cannot reach it. ``iterations``: until the error stayed below `SUCCESS_PX`, or all
+    that were made. ``final_error_px``: mean over the last `REST_STEPS` of the largest error over markers and cameras
+    used; ``floor_px``: what image noise leaves of it to this loop. ``line_deviation_mm``: the largest distance of
+    the plate's middle from the straight way. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
+    ``closest_view_px``: least distance of a marker from an image's border, on the whole way. ``reason``: why it failed.
+    """
+
+    id: int
+    law: str
+    success: bool | None
+    iterations: int
+    final_error_px: float | None
+    back_face: bool
+    out_of_view: bool
+    line_deviation_mm: float | None
+    floor_px: float | None
+    rest_mm_s: float | None
+    rest_mrad_s: float | None
+    closest_view_px: float | None
+    reason: str = ""
+    refused: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The way that a task went: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines."""
+
+    poses: FloatArray
+    errors_px: FloatArray
+    facing: FloatArray
+
+
+def run_task(
+    task: AlignmentTask, calibration: Calibration, settings: LoopSettings
+) -> tuple[TaskResult, Trace]:
+    """Run one task; the same task, calibration and settings give the same result, whatever ran before."""
+    reach = None
+    if settings.arm == "rx90":
+        reach = rx90_reach(calibration.cell, task.start, task.goal)
+        if reach is None:
+            return _unreachable(task, settings)
+    arm: Arm = FreeArm(task.start) if reach is None else SerialArm(calibration.cell, reach.start)
+    controller = Controller(known_at_start(calibration, task, reach), task, settings)
+    rng = np.random.default_rng([settings.seed, task.id])
+    return _run(task, arm, controller, settings, rng)
+
+
+class Controller:
+    """Pixels and readings in, joint velocity out. It knows its `Knowledge` and the goal's pixels."""
+
+    def __init__(self, knowledge: Knowledge, task: AlignmentTask, settings: LoopSettings) -> None:
+        self._knowledge = knowledge
+        self._dt_s = 1.0 / settings.rate_hz
+        self._law = LAWS[settings.law]
+        self._options = Options(
+            gain=settings.gain,
+            dt_s=self._dt_s,
+            jacobian=JacobianChoice[settings.jacobian.upper().replace("-", "_")],
+        )
+        self.estimate = Estimate(knowledge, settings.points, self._dt_s)
+        self._set_points = sight(task.goal).pixels
+        self._cameras = cameras_used(settings.law)
+        self._wanted = np.ones(self._set_points.shape[:2])
+        self._wanted[self._cameras :] = 0.0
+        self._middle = np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
+        self._task: Task | None = None
+        self._operators = knowledge.basis
+
+    def step(self, pixels: FloatArray, seen: FloatArray, joints: FloatArray) -> FloatArray:
+        """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,)."""
+        knowledge = self._knowledge
+        self._operators = knowledge.operators(joints)
+        self.estimate.seen(pixels, seen * self._wanted)
+        points = self.estimate.points
+        if self._task is None:
+            self._task = self._start(points)
+        task = self._task._replace(centre=self._middle @ points)
+        scene = Scene(
+            self._operators, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points,
+            self.estimate.pixels, seen * self._wanted,
+        )  # fmt: skip
+        return np.asarray(self._law.step(scene, task, self._options).velocity)
+
+    def moved(self, velocity: FloatArray) -> None:
+        """The arm's readings say that it moved at ``velocity`` for a step."""
+        self.estimate.moved(self._operators, velocity * self._dt_s)
+
+    def _start(self, points: FloatArray) -> Task:
+        knowledge = self._knowledge
+        every = np.ones(self._set_points.shape[:2])
+        found, ok = triangulate(knowledge.matrices, self._set_points, every, 5)
+        targets = found / (found @ knowledge.plane_at_infinity)[:, None]
+        if knowledge.points is not None:
+            pose = goal_pose(
+                _arrays(knowledge), knowledge.basis, points, targets, ok, FACE, self._set_points, every
+            )
+            targets = pose.points
+        return Task(
+            set_points=self._set_points,
+            wanted=self._wanted,
+            rates=np.zeros_like(self._set_points),
+            target_points=targets,
+            target_known=np.ones(len(targets)),
+            centre=self._middle @ points,
+            centre_target=self._middle @ targets,
+            face=FACE,
+        )
+
+
+def cameras_used(law: str) -> int:
+    """How many cameras a law looks through."""
+    return 1 if law == "image" else 2
+
+
+def _arrays(knowledge: Knowledge) -> ModelArrays:
+    """As the daemon's search for the goal's pose takes a model."""
+    n, m = len(knowledge.basis), len(FACE) + 1
+    return ModelArrays(
+        generators=knowledge.basis,
+        kinds=np.zeros(n, dtype=np.uint8),
+        zero=np.zeros(n),
+        tip_first=False,
+        matrices=knowledge.matrices,
+        lenses=np.zeros((len(knowledge.matrices), 4)),
+        marker_points=np.zeros((m, 4)),
+        plane_at_infinity=knowledge.plane_at_infinity,
+        camera_centres=knowledge.camera_centres,
+        metric_basis=None,
+        marker_ids=tuple(range(m)),
+        index={i: i for i in range(m)},
+    )
+
+
+def _run(
+    task: AlignmentTask, arm: Arm, controller: Controller, settings: LoopSettings, rng: np.random.Generator
+) -> tuple[TaskResult, Trace]:
+    dt_s = 1.0 / settings.rate_hz
+    window = max(2, round(REST_STEPS * settings.rate_hz / DEFAULT_RATE_HZ))
+    limit = round(TIME_LIMIT_S * settings.rate_hz)
+    used = cameras_used(settings.law)
+    set_points = sight(task.goal).pixels
+    poses, errors, facing = np.empty((limit + 1, 4, 4)), np.full(limit + 1, np.nan), np.empty(limit + 1)
+    margin, back_face, out_of_view, reason = np.inf, False, False, ""
+    steps = 0
+    for k in range(limit + 1):
+        truth = sight(arm.pose)
+        steps = k + 1
+        poses[k], facing[k] = arm.pose, truth.facing
+        margin = min(margin, truth.margin_px)
+        back_face |= truth.facing <= 0.0
+        out_of_view |= not truth.in_view
+        if truth.depth_m <= MIN_DEPTH:
+            reason = "BEHIND_CAMERA"
+            break
+        errors[k] = error_px(truth.pixels, set_points, used)
+        if k == limit or _settled(errors, k, window):
+            break
+        frame = truth.pixels + rng.normal(0.0, 1.0, truth.pixels.shape) * settings.noise_px
+        seen = _seen(truth.pixels.shape, settings, k * dt_s)
+        velocity = controller.step(frame, seen, arm.joints)
+        if not np.isfinite(velocity).all():
+            reason = "NO_COMMAND"
+            break
+        ahead = arm.joints + velocity * dt_s
+        if (ahead < arm.limits[:, 0]).any() or (ahead > arm.limits[:, 1]).any():
+            reason = "JOINT_LIMIT"
+            break
+        arm.move(velocity, dt_s)
+        controller.moved(velocity)
+    trace = Trace(poses[:steps], errors[:steps], facing[:steps])
+    flags = (back_face, out_of_view)
+    return _judged(task, settings, trace, flags, margin, reason, window), trace
+
+
+def _seen(shape: tuple[int, ...], settings: LoopSettings, time_s: float) -> FloatArray:
+    seen = np.ones(shape[:2])
+    if settings.drop_camera is not None:
+        start, duration = settings.drop_camera
+        if start <= time_s < start + duration:
+            seen[1] = 0.0
+    return seen
+
+
+def _settled(errors: FloatArray, k: int, window: int) -> bool:
+    """Whether the error has been small for a window, and does not fall any more."""
+    if k < window or not errors[k] < SUCCESS_PX or (k % max(window // 10, 1)):
+        return False
+    last = errors[k - window + 1 : k + 1]
+    if not last.max() < SUCCESS_PX:
+        return False
+    if last.mean() < NEGLIGIBLE_PX:
+        return True
+    before = errors[max(k - 2 * window, 0) : k - window + 1]
+    return bool(len(before) >= window and last.mean() > STILL_FALLING * before.mean())
+
+
+def _judged(
+    task: AlignmentTask,
+    settings: LoopSettings,
+    trace: Trace,
+    flags: tuple[bool, bool],
+    margin: float,
+    reason: str,
+    window: int,
+) -> TaskResult:
+    back_face, out_of_view = flags
+    dt_s = 1.0 / settings.rate_hz
+    last = trace.errors_px[-window:]
+    converged = not reason and len(last) == window and bool((last < SUCCESS_PX).all())
+    if not reason and not converged:
+        reason = "NOT_CONVERGED"
+    if back_face or out_of_view:
+        reason = reason or ("BACK_FACE" if back_face else "OUT_OF_VIEW")
+    above = np.flatnonzero(~(trace.errors_px < SUCCESS_PX))
+    iterations = (
+        int(above[-1]) + 1 if converged and len(above) else (0 if converged else len(trace.poses) - 1)
+    )
+    moves, turns = _rest_velocity(trace.poses[-window:], dt_s)
+    finite = last[np.isfinite(last)]
+    return TaskResult(
+        id=task.id,
+        law=settings.law,
+        success=not reason,
+        iterations=iterations,
+        final_error_px=float(finite.mean()) if len(finite) else None,
+        back_face=back_face,
+        out_of_view=out_of_view,
+        line_deviation_mm=1e3 * float(line_deviations(trace.poses, task.start, task.goal).max()),
+        floor_px=noise_floor_px(
+            task.goal, settings.noise_px, settings.gain, dt_s, cameras_used(settings.law)
+        ),
+        rest_mm_s=1e3 * moves if converged else None,
+        rest_mrad_s=1e3 * turns if converged else None,
+        closest_view_px=float(margin) if np.isfinite(margin) else None,
+        reason=reason,
+    )
+
+
+def _rest_velocity(poses: FloatArray, dt_s: float) -> tuple[float, float]:
+    """Rms speed [m/s] and turn rate [rad/s] of the plate between poses (k, 4, 4)."""
+    if len(poses) < 2:
+        return 0.0, 0.0
+    shift = np.diff(poses[:, :3, 3], axis=0) / dt_s
+    turn = np.einsum("kji,kjl->kil", poses[:-1, :3, :3], poses[1:, :3, :3])
+    odd = 0.5 * (turn - turn.transpose(0, 2, 1))
+    rate = np.stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=1) / dt_s
+    return (
+        float(np.sqrt((shift * shift).sum(axis=1).mean())),
+        float(np.sqrt((rate * rate).sum(axis=1).mean())),
+    )
+
+
+def _unreachable(task: AlignmentTask, settings: LoopSettings) -> tuple[TaskResult, Trace]:
+    result = TaskResult(
+        task.id, settings.law, None, 0, None, False, False, None, None, None, None, None, "UNREACHABLE"
+    )
+    return result, Trace(task.start[None], np.zeros(0), np.zeros(0))

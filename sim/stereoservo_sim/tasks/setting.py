@@ -1,0 +1,73 @@
+"""The stage of task files v1, which their head comments state: two cameras, a plate of four markers, what fails.
+
+Rig frame: the middle of the baseline, x from the left to the right camera, z ahead [m]. Plate: its printed face looks
+along -z.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo_sim.synthetic import rotation, translation
+
+FloatArray = npt.NDArray[np.float64]
+
+FOCAL, CENTRE_U, CENTRE_V = 800.0, 320.0, 240.0
+"""[px]"""
+WIDTH, HEIGHT = 640, 480
+"""A point is in view where 0 <= u < 640 and 0 <= v < 480."""
+BASELINE, YAW_DEG = 0.20, 10.0
+"""[m], and how far each camera is turned inwards [°]."""
+MARKERS = np.array([(-0.05, -0.05, 0.0), (0.05, -0.05, 0.0), (0.05, 0.05, 0.0), (-0.05, 0.05, 0.0)])
+"""(4, 3) in the plate's frame [m]."""
+FACE = np.array([0, 1, 2], dtype=np.int64)
+"""Three markers that span the face."""
+MIN_DEPTH = 0.01
+"""A marker nearer to a camera's plane than this is behind it [m]."""
+SUCCESS_PX = 0.5
+MAX_ITERATIONS = 2000
+DEFAULT_RATE_HZ, DEFAULT_GAIN = 25.0, 0.5
+FOCAL_ERROR, HAND_EYE_ERROR_DEG = 0.1, 5.0
+"""Of the coarse calibration: share of the focal length, angle about the task's own axis."""
+
+HOMOGENEOUS_MARKERS = np.hstack([MARKERS, np.ones((4, 1))])
+
+
+def intrinsics(scale: float = 1.0) -> FloatArray:
+    """(3, 3) with the focal length times ``scale``."""
+    return np.array([[FOCAL * scale, 0.0, CENTRE_U], [0.0, FOCAL * scale, CENTRE_V], [0.0, 0.0, 1.0]])
+
+
+def camera_poses() -> FloatArray:
+    """Left and right camera in the rig's frame: rMcl, rMcr (2, 4, 4)."""
+    return np.array(
+        [
+            translation(-0.5 * BASELINE, 0, 0) @ rotation("y", YAW_DEG),
+            translation(0.5 * BASELINE, 0, 0) @ rotation("y", -YAW_DEG),
+        ]
+    )
+
+
+def camera_matrices(focal_scale: float = 1.0) -> FloatArray:
+    """(2, 3, 4): points of the rig's frame to pixels."""
+    K = intrinsics(focal_scale)
+    return np.array([K @ np.linalg.inv(pose)[:3] for pose in camera_poses()])
+
+
+def twist(direction: FloatArray, point: FloatArray | None = None) -> FloatArray:
+    """(4, 4): rotation about the unit ``direction`` (3,) through ``point`` (3,), or translation along it."""
+    T = np.zeros((4, 4))
+    if point is None:
+        T[:3, 3] = direction
+        return T
+    x, y, z = direction
+    T[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    T[:3, 3] = -T[:3, :3] @ point
+    return T
+
+
+def cartesian_twists(middle: FloatArray, axes: FloatArray | None = None) -> FloatArray:
+    """Translations along and rotations about the columns of ``axes`` (3, 3) through ``middle`` (3,): (6, 4, 4)."""
+    columns = (np.eye(3) if axes is None else axes).T
+    return np.array([twist(a) for a in columns] + [twist(a, middle) for a in columns])
