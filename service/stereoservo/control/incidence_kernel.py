@@ -58,7 +58,7 @@ SUFFICIENT = 0.25
 AHEAD = 0.1
 """Least part of a whole step at which the residual is seen ahead."""
 
-METRIC_FLOOR = 0.05
+METRIC_FLOOR = 0.01
 """Least metric of a joint, relative to the largest: a joint that moves nothing in the images is not free of charge."""
 
 DROPPED = 1e-9
@@ -335,6 +335,8 @@ def incidence_kernel(
         if values[i] > RANK * values[0]:
             rank += 1
             part += (along[i] / values[i]) ** 2
+        else:
+            along[i] = 0.0
     conditioning = (values[rank - 1] / values[0]) ** 2 if rank > 0 else 0.0
     share = math.sqrt(min(1.0, part / total)) if total > 0.0 else 1.0
 
@@ -461,22 +463,27 @@ def _second_task(
     weights: FloatArray,
     damping: float,
 ) -> None:
-    """Add to ``velocity`` (n,) what serves the second task in the first one's null space: ``Z (S Z)⁺ (ṡ - S q̇₁)``."""
+    """Add to ``velocity`` (n,) what serves the second task in the first one's null space: ``(S N)⁺ (ṡ - S q̇₁)``."""
     n = velocity.shape[0]
-    free = n - rank
     count = rates.shape[0]
-    if free == 0 or count == 0:
+    if rank == n or count == 0:
         return
-    S = np.zeros((count, free))
-    left = np.empty(count)
+    # In joint coordinates, by the projector: damping would depend on the choice of a basis of the null space.
+    projector = np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            for k in range(rank, n):
+                projector[i, j] += V[i, k] * V[j, k]
+    S = np.zeros((count, n))
+    left = np.zeros(count)
     for r in range(count):
+        if weights[r] == 0.0:
+            continue
         left[r] = rates[r]
         for j in range(n):
-            if weights[r] != 0.0:
-                left[r] -= rows[r, j] * velocity[j]
-                for i in range(free):
-                    S[r, i] += rows[r, j] * V[j, rank + i] / metric[j]
+            left[r] -= rows[r, j] * velocity[j]
+            for i in range(n):
+                S[r, i] += rows[r, j] / metric[j] * projector[j, i]
     y, _ = damped_least_squares(S, left, weights, damping)
     for j in range(n):
-        for i in range(free):
-            velocity[j] += V[j, rank + i] * y[i] / metric[j]
+        velocity[j] += y[j] / metric[j]

@@ -18,7 +18,7 @@ from stereoservo.kinematics.kernels import image_jacobian
 def joint_metric_reference(operators: FloatArray, matrices: FloatArray, points: FloatArray) -> FloatArray:
     """Pixels (n,) that a unit of each joint moves the points by, rms over points and cameras [px/rad or px/m].
 
-    A twentieth of the largest at least, so that no joint turns for nothing.
+    A hundredth of the largest at least, so that no joint turns for nothing.
     """
     J = image_jacobian(operators, matrices, points)
     metric = np.sqrt((J**2).sum(axis=(0, 1, 2)) / (J.shape[0] * J.shape[1]))
@@ -95,6 +95,7 @@ def incidence_reference(
     along = np.zeros(n)
     along[: len(values)] = values * (U[:, : len(values)].T @ e)
     rank = int((sigma > kernels.RANK * sigma[0]).sum())
+    along[rank:] = 0.0
     share = float(np.sqrt(min(1.0, ((along[:rank] / sigma[:rank]) ** 2).sum() / max(float(e @ e), 1e-300))))
     ahead = min(1.0, max(options.gain * options.dt_s, kernels.AHEAD))
     damp = options.damping * sigma[0] ** 2
@@ -111,11 +112,11 @@ def incidence_reference(
             break
         damp = max(kernels.GROWTH * damp, 1e-3 * sigma[0] ** 2)
     velocity = options.gain * step
-    free = (Vt[rank:] / metric).T
-    if free.shape[1] and len(second.rates):
+    if rank < n and len(second.rates):
+        S = (second.rows / metric) @ (Vt[rank:].T @ Vt[rank:])
         left_over = second.rates - second.rows @ velocity
-        y, _ = damped_least_squares_reference(second.rows @ free, left_over, second.weights, options.damping)
-        velocity = velocity + free @ y
+        y, _ = damped_least_squares_reference(S, left_over, second.weights, options.damping)
+        velocity = velocity + y / metric
     status = np.where(error <= task.tolerance_px, int(IncidenceStatus.DONE), int(IncidenceStatus.MOVES))
     conditioning = float((sigma[rank - 1] / sigma[0]) ** 2) if rank else 0.0
     return IncidenceStep(velocity, error, status, rank, conditioning, share)
