@@ -1,0 +1,87 @@
+"""How the components of a Cartesian motion share the way: ``μ(σ)``, monotone from 0 to 1 on [0, 1] (7.26, 7.4.3).
+
+Linear: all together, at an even pace. Exponential: as a feedback loop does, ``(1 − e^{−kσ})/(1 − e^{−k})``, scaled to
+end at 1 (errata). First and last: the component moves in the first or in the last three fifths; in the fifth in the
+middle one hands over to the other.
+"""
+
+from __future__ import annotations
+
+import math
+
+from stereoservo.kinematics.kernels import kernel
+from stereoservo.trajectory.plan import Profile
+
+LINEAR, FIRST, LAST, EXPONENTIAL = 0.0, 1.0, 2.0, 3.0
+"""Shapes of one component."""
+
+DECAY = 4.0
+"""How many time constants an exponential motion lasts: what is left of it when linear scaling ends it is 2 %."""
+HANDS_OVER, ENDS = 0.4, 0.6
+"""Where a component that goes first begins to slow down, and has ended."""
+
+SHAPES: dict[Profile, tuple[float, float, float]] = {
+    "linear": (LINEAR, LINEAR, LINEAR),
+    "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
+    "translation-first": (FIRST, LAST, LAST),
+    "rotation-first": (LAST, FIRST, FIRST),
+    "planar-first": (LAST, LAST, FIRST),
+}
+"""Of translation, hinge and planar rotation."""
+
+
+def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Shapes for components of ``amounts``; where only one kind of shape has anything to do, nothing waits: linear."""
+    own = SHAPES[profile]
+    at_work = {shape for shape, amount in zip(own, amounts, strict=True) if amount != 0.0}
+    if profile == "exponential" or len(at_work) > 1:
+        return own
+    return SHAPES["linear"]
+
+
+@kernel
+def _first(sigma: float) -> float:
+    rate = 2.0 / (HANDS_OVER + ENDS)
+    if sigma <= HANDS_OVER:
+        return rate * sigma
+    if sigma >= ENDS:
+        return 1.0
+    x = (sigma - HANDS_OVER) / (ENDS - HANDS_OVER)
+    return rate * (HANDS_OVER + (ENDS - HANDS_OVER) * 0.5 * (x + math.sin(math.pi * x) / math.pi))
+
+
+@kernel
+def _first_rate(sigma: float) -> float:
+    rate = 2.0 / (HANDS_OVER + ENDS)
+    if sigma <= HANDS_OVER:
+        return rate
+    if sigma >= ENDS:
+        return 0.0
+    x = (sigma - HANDS_OVER) / (ENDS - HANDS_OVER)
+    return rate * 0.5 * (1.0 + math.cos(math.pi * x))
+
+
+@kernel
+def progress(shape: float, sigma: float) -> float:
+    """``μ(σ)`` of one component."""
+    sigma = min(1.0, max(0.0, sigma))
+    if shape == FIRST:
+        return _first(sigma)
+    if shape == LAST:
+        return 1.0 - _first(1.0 - sigma)
+    if shape == EXPONENTIAL:
+        return math.expm1(-DECAY * sigma) / math.expm1(-DECAY)
+    return sigma
+
+
+@kernel
+def progress_rate(shape: float, sigma: float) -> float:
+    """``dμ/dσ`` of one component."""
+    sigma = min(1.0, max(0.0, sigma))
+    if shape == FIRST:
+        return _first_rate(sigma)
+    if shape == LAST:
+        return _first_rate(1.0 - sigma)
+    if shape == EXPONENTIAL:
+        return -DECAY * math.exp(-DECAY * sigma) / math.expm1(-DECAY)
+    return 1.0

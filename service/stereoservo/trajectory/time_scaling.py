@@ -1,0 +1,116 @@
+"""When an arm is where on its way: the fastest times that keep the joints' velocity and acceleration limits.
+
+The pace ``x = ṡ²`` along the samples ``s`` is bounded by the velocities, its slope ``2s̈`` by the accelerations
+``q' s̈ + q'' ṡ²``; both are linear in ``x``, so that a pass backwards (from which pace can the arm still stop?) and a
+greedy pass forwards give the fastest (Pham and Pham, 2018). Starts and ends at rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import kernel
+
+FASTEST = 1e8
+"""Largest pace [(samples/s)²]: where no joint moves, the way is over in a ten-thousandth of a second a sample."""
+HALVINGS = 50
+
+
+@kernel
+def _next_paces(
+    slope: FloatArray, bow: FloatArray, limits: FloatArray, pace: float, ceiling: float
+) -> tuple[float, float]:
+    """Least and largest pace after an interval that begins with ``pace``; empty where the first is above the second."""
+    least, largest = 0.0, ceiling
+    for j in range(slope.shape[0]):
+        if not math.isfinite(limits[j]):
+            continue
+        # slope (x⁺ − x)/2 + bow (x⁺ + x)/2 within the limit
+        ahead = 0.5 * (slope[j] + bow[j])
+        now = 0.5 * (bow[j] - slope[j]) * pace
+        if ahead > 0.0:
+            largest = min(largest, (limits[j] - now) / ahead)
+            least = max(least, (-limits[j] - now) / ahead)
+        elif ahead < 0.0:
+            largest = min(largest, (-limits[j] - now) / ahead)
+            least = max(least, (limits[j] - now) / ahead)
+        elif abs(now) > limits[j]:
+            largest = -1.0
+    return least, largest
+
+
+@kernel
+def sample_times(
+    joints: FloatArray, velocity_max: FloatArray, acceleration_max: FloatArray, even: bool
+) -> FloatArray:
+    """Times (K,) [s] from 0 of the samples ``joints`` (K, n), with limits (n,), infinite where there is none.
+
+    ``even``: the samples follow each other at one pace, as far as accelerations let them.
+    """
+    K, n = joints.shape
+    times = np.zeros(K)
+    if K < 2:
+        return times
+    slopes = np.empty((K - 1, n))
+    for k in range(K - 1):
+        for j in range(n):
+            slopes[k, j] = joints[k + 1, j] - joints[k, j]
+    bows = np.zeros((K - 1, n))
+    for k in range(K - 1):
+        for j in range(n):
+            before = slopes[k, j] - slopes[k - 1, j] if k > 0 else slopes[min(k + 1, K - 2), j] - slopes[k, j]
+            after = slopes[k + 1, j] - slopes[k, j] if k < K - 2 else before
+            bows[k, j] = 0.5 * (before + after)
+    ceilings = np.full(K, FASTEST)
+    for k in range(K):
+        for j in range(n):
+            steepest = 0.0
+            if k > 0:
+                steepest = abs(slopes[k - 1, j])
+            if k < K - 1:
+                steepest = max(steepest, abs(slopes[k, j]))
+            if steepest > 0.0 and math.isfinite(velocity_max[j]):
+                ceilings[k] = min(ceilings[k], (velocity_max[j] / steepest) ** 2)
+    if even:
+        lowest = FASTEST
+        for k in range(K):
+            lowest = min(lowest, ceilings[k])
+        for k in range(K):
+            ceilings[k] = lowest
+    ceilings[0] = 0.0
+    ceilings[K - 1] = 0.0
+    for back in range(K - 1):
+        k = K - 2 - back
+        least, largest = _next_paces(slopes[k], bows[k], acceleration_max, ceilings[k], ceilings[k + 1])
+        if least <= largest:
+            continue
+        low, high = 0.0, ceilings[k]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            least, largest = _next_paces(slopes[k], bows[k], acceleration_max, middle, ceilings[k + 1])
+            if least <= largest:
+                low = middle
+            else:
+                high = middle
+        ceilings[k] = low
+    pace = 0.0
+    for k in range(K - 1):
+        least, largest = _next_paces(slopes[k], bows[k], acceleration_max, pace, ceilings[k + 1])
+        after = max(0.0, largest)
+        if k == K - 2:
+            after = 0.0
+        both = math.sqrt(pace) + math.sqrt(after)
+        if both <= 0.0:
+            # from rest to rest in one interval: half the way each
+            duration = 0.0
+            for j in range(n):
+                if math.isfinite(acceleration_max[j]):
+                    duration = max(duration, 2.0 * math.sqrt(abs(slopes[k, j]) / acceleration_max[j]))
+            times[k + 1] = times[k] + max(duration, 1.0 / math.sqrt(FASTEST))
+        else:
+            times[k + 1] = times[k] + 2.0 / both
+        pace = after
+    return times

@@ -1,0 +1,101 @@
+"""Following a plan: where body and joints shall be at a time, how fast they move, and how far the time goes on."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import kernel
+from stereoservo.trajectory.plan import Plan
+
+FOLLOWS = 0.5
+"""Lag, relative to the largest that is tolerated, up to which the plan goes on at full pace."""
+
+
+class PlanSample(NamedTuple):
+    """``displacement`` (4, 4) of the body from its pose when the plan began, its rate (4, 4) [1/s]; ``joints`` (n,) and
+    their rates (n,) [rad/s or m/s].
+    """
+
+    displacement: FloatArray
+    displacement_rate: FloatArray
+    joints: FloatArray
+    joint_rates: FloatArray
+
+
+@kernel
+def _rate(times: FloatArray, values: FloatArray, k: int, i: int) -> float:
+    """Rate at sample ``k`` of the parabola through it and its neighbours; 0 at the ends, where the plan rests."""
+    if k == 0 or k == times.shape[0] - 1:
+        return 0.0
+    before, after = times[k] - times[k - 1], times[k + 1] - times[k]
+    first = (values[k, i] - values[k - 1, i]) / before
+    second = (values[k + 1, i] - values[k, i]) / after
+    rate: float = (first * after + second * before) / (before + after)
+    return rate
+
+
+@kernel
+def interpolate_into(
+    times: FloatArray, values: FloatArray, t_s: float, out: FloatArray, rates: FloatArray
+) -> None:
+    """Values (w,) and rates (w,) at ``t_s`` of samples (K, w): cubic, with continuous rates; at rest outside."""
+    K, width = values.shape
+    if K == 1 or not t_s > times[0]:
+        for i in range(width):
+            out[i], rates[i] = values[0, i], 0.0
+        return
+    if t_s >= times[K - 1]:
+        for i in range(width):
+            out[i], rates[i] = values[K - 1, i], 0.0
+        return
+    low, high = 0, K - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if times[middle] <= t_s:
+            low = middle
+        else:
+            high = middle
+    h = times[high] - times[low]
+    x = (t_s - times[low]) / h
+    for i in range(width):
+        a, b = values[low, i], values[high, i]
+        u, v = h * _rate(times, values, low, i), h * _rate(times, values, high, i)
+        rise = b - a
+        c2, c3 = 3.0 * rise - 2.0 * u - v, u + v - 2.0 * rise
+        out[i] = a + x * (u + x * (c2 + x * c3))
+        rates[i] = (u + x * (2.0 * c2 + 3.0 * x * c3)) / h
+
+
+def sample_plan(plan: Plan, t_s: float) -> PlanSample:
+    """The plan at ``t_s`` [s]; before its begin and after its end it rests there. NaN counts as the begin."""
+    H, H_rate = np.empty(16), np.empty(16)
+    n = plan.joints.shape[1]
+    joints, joint_rates = np.empty(n), np.empty(n)
+    interpolate_into(plan.times, plan.displacements.reshape(-1, 16), t_s, H, H_rate)
+    interpolate_into(plan.times, plan.joints, t_s, joints, joint_rates)
+    return PlanSample(H.reshape(4, 4), H_rate.reshape(4, 4), joints, joint_rates)
+
+
+def pace(lag: float) -> float:
+    """Share [0, 1] of full pace at ``lag``: how far the body is behind, 1 being the largest that is tolerated.
+
+    Full up to ``FOLLOWS``, then falling smoothly to a stand at 1. A lag that is not a number stands still.
+    """
+    if not lag < 1.0:
+        return 0.0
+    x = min(1.0, (1.0 - lag) / (1.0 - FOLLOWS))
+    return x * x * (3.0 - 2.0 * x)
+
+
+def advance(plan: Plan, t_s: float, dt_s: float, lag: float) -> float:
+    """The plan's time ``dt_s`` later [s]: it waits for a body that lags, so that nothing is fed forward that it misses.
+
+    The rates of `sample_plan` are to be scaled by the same `pace`.
+    """
+    end = float(plan.times[-1])
+    start = t_s if math.isfinite(t_s) else 0.0
+    return min(end, max(0.0, start) + max(0.0, dt_s) * pace(lag))
