@@ -52,4 +52,5 @@ def adaptive_gain(near: float, far: float, slope: float, error_px: float) -> flo
     span = abs(near - far)
     if span == 0.0 or error_px <= 0.0:
         return near
-    return far + (near - far) * math.exp(-slope * (error_px / SLOPE_UNIT_PX) / span)
+    gain = far + (near - far) * math.exp(-slope * (error_px / SLOPE_UNIT_PX) / span)
+    return max(min(near, far), min(max(near, far), gain))
