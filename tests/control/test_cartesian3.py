@@ -80,8 +80,9 @@ def test_reasons_name_the_component(virtual):
     world = virtual.free_arm(np.random.default_rng(4), T0)
     step = assert_same(inputs(virtual, world, T0, T_star))
     waiting = {r.subject.split(" ")[0]: r for r in cartesian3_reasons(*step[1:])}
-    assert waiting["revolution"].code == "VISIBILITY_WAIT"
-    assert waiting["revolution"].threshold < waiting["revolution"].value
+    assert waiting["translation"].code == "VISIBILITY_WAIT"
+    assert waiting["translation"].threshold < waiting["translation"].value
+    assert step.task_error[1] == pytest.approx(np.radians(240), rel=1e-6)
     assert (step.status >= ComponentStatus.MOVES).all()
 
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from stereoservo.control.cartesian3_kernel import cartesian3_step
+from stereoservo.control.cartesian_kernel import cartesian3_step, cartesian_step
 from stereoservo.control.linear_kernels import (
     cholesky_solve,
     damped_least_squares,
@@ -21,7 +21,14 @@ from stereoservo.control.linear_kernels import (
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
 
-__all__ = ["cartesian3_step", "damped_least_squares", "null_direction", "right_singular", "stereo_step"]
+__all__ = [
+    "cartesian3_step",
+    "cartesian_step",
+    "damped_least_squares",
+    "null_direction",
+    "right_singular",
+    "stereo_step",
+]
 
 
 @kernel

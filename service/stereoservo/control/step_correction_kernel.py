@@ -1,0 +1,173 @@
+"""`control.step_correction` as a kernel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.control.linear_kernels import cholesky_solve
+from stereoservo.control.step_correction import BRACKETS, CONVERGED, DAMPING, ITERATIONS
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import exp_twist, kernel, multiply4_into
+
+STRUCTURE = 1e-18
+"""Squared relative residue of ``Ĥ³ = −cĤ`` below which the closed form of the exponential holds."""
+
+SIMULTANEOUS = 2
+TIP_FIRST = 1
+
+
+@kernel
+def exponential_into(
+    G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray
+) -> None:
+    """``exp(amount G)`` into (4, 4): in closed form of a revolution or translation (4.27, 3.21), else the series.
+
+    ``square``, ``cube`` (4, 4): scratch.
+    """
+    multiply4_into(G, G, square)
+    multiply4_into(G, square, cube)
+    c = -0.5 * (square[0, 0] + square[1, 1] + square[2, 2] + square[3, 3])
+    size, rest = 0.0, 0.0
+    for i in range(4):
+        for k in range(4):
+            size += G[i, k] * G[i, k]
+            rest += (cube[i, k] + c * G[i, k]) ** 2
+    if rest <= STRUCTURE * size**3 and c >= 0.0:
+        rate = math.sqrt(c)
+        if rate * abs(amount) > 1e-8:
+            half = math.sin(0.5 * rate * amount)
+            first, second = math.sin(rate * amount) / rate, 2.0 * half * half / c
+        else:
+            first, second = amount, 0.5 * amount * amount
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = first * G[i, k] + second * square[i, k]
+            H[i, i] += 1.0
+        return
+    whole = exp_twist(amount * G)
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = whole[i, k]
+
+
+@kernel
+def step_into(
+    operators: FloatArray,
+    composition: int,
+    step: FloatArray,
+    H: FloatArray,
+    turned: FloatArray,
+    work: FloatArray,
+) -> None:
+    """The displacement by ``step`` into ``H`` (4, 4), `step_correction.step_operators` into ``turned`` (n, 4, 4).
+
+    ``work`` (5, 4, 4): scratch.
+    """
+    n = step.shape[0]
+    first, second, factor, inverse, total = work[0], work[1], work[2], work[3], work[4]
+    if composition == SIMULTANEOUS:
+        for i in range(4):
+            for k in range(4):
+                s = 0.0
+                for j in range(n):
+                    s += step[j] * operators[j, i, k]
+                total[i, k] = s
+        exponential_into(total, 1.0, first, second, H)
+        for j in range(n):
+            for i in range(4):
+                for k in range(4):
+                    turned[j, i, k] = operators[j, i, k]
+                    factor[i, k] = operators[j, i, k]
+            for order in range(BRACKETS):
+                multiply4_into(total, factor, first)
+                multiply4_into(factor, total, second)
+                for i in range(4):
+                    for k in range(4):
+                        factor[i, k] = (first[i, k] - second[i, k]) / (order + 2)
+                        turned[j, i, k] += factor[i, k]
+        return
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = 1.0 if i == k else 0.0
+            inverse[i, k] = H[i, k]
+    for nth in range(n):
+        j = n - 1 - nth if composition == TIP_FIRST else nth
+        G = operators[j]
+        multiply4_into(H, G, total)
+        multiply4_into(total, inverse, turned[j])
+        exponential_into(G, step[j], first, second, factor)
+        multiply4_into(H, factor, total)
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = total[i, k]
+        exponential_into(G, -step[j], first, second, factor)
+        multiply4_into(factor, inverse, total)
+        for i in range(4):
+            for k in range(4):
+                inverse[i, k] = total[i, k]
+
+
+@kernel
+def corrected_step(
+    operators: FloatArray, composition: int, points: FloatArray, wanted: FloatArray, step: FloatArray
+) -> FloatArray:
+    """`step_correction.corrected_step` as a kernel."""
+    n, count = step.shape[0], points.shape[0]
+    found, best = step.copy(), step.copy()
+    H = np.empty((4, 4))
+    turned = np.empty((n, 4, 4))
+    work = np.empty((5, 4, 4))
+    N = np.empty((n, n))
+    b = np.empty(n)
+    change = np.empty(n)
+    column = np.empty((n, 4))
+    moved = np.empty((count, 4))
+    before = math.inf
+    for _ in range(ITERATIONS):
+        step_into(operators, composition, found, H, turned, work)
+        error = 0.0
+        for p in range(count):
+            for i in range(4):
+                s = 0.0
+                for k in range(4):
+                    s += H[i, k] * points[p, k]
+                moved[p, i] = s
+                error += (wanted[p, i] - s) ** 2
+        if not error < before:
+            break
+        before = error
+        for j in range(n):
+            best[j] = found[j]
+            b[j] = 0.0
+            for k in range(n):
+                N[j, k] = 0.0
+        for p in range(count):
+            for j in range(n):
+                for i in range(4):
+                    s = 0.0
+                    for k in range(4):
+                        s += turned[j, i, k] * moved[p, k]
+                    column[j, i] = s
+            for j in range(n):
+                for i in range(4):
+                    b[j] += column[j, i] * (wanted[p, i] - moved[p, i])
+                for k in range(j + 1):
+                    for i in range(4):
+                        N[j, k] += column[j, i] * column[k, i]
+        largest = 0.0
+        for j in range(n):
+            largest = max(largest, N[j, j])
+        for j in range(n):
+            N[j, j] += DAMPING * largest
+        cholesky_solve(N, b, change)
+        most = 0.0
+        for j in range(n):
+            found[j] += change[j]
+            most = max(most, abs(change[j]))
+        if most < CONVERGED:
+            for j in range(n):
+                best[j] = found[j]
+            break
+    return best
