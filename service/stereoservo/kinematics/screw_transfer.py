@@ -59,16 +59,22 @@ def screw_of_points(S: FloatArray, S_dot: FloatArray, moving_camera: bool = Fals
 
     Raises GeometryError for fewer than three points, and where they lie on one line, about which a turn is not seen.
     """
-    S = np.asarray(S, dtype=np.float64)
+    S, rates = _finite("points", S), _finite("velocities", S_dot)
     if len(S) < 3:
         raise GeometryError("too_few", f"{len(S)} points; three fix a screw", points=len(S))
     spread = np.linalg.svd(S - S.mean(axis=0), compute_uv=False)
     if not spread[1] > 1e-9 * max(float(spread[0]), float(np.abs(S).max())):
         raise GeometryError("degenerate", "the points lie on one line; a turn about it moves none of them")
     J = point_interaction(S, moving_camera).reshape(-1, 6)
-    rates = np.asarray(S_dot, dtype=np.float64).ravel()
-    vector = np.asarray(np.linalg.lstsq(J, rates, rcond=None)[0], dtype=np.float64)
+    vector = np.asarray(np.linalg.lstsq(J, rates.ravel(), rcond=None)[0], dtype=np.float64)
     return Screw(vector[:3], vector[3:])
+
+
+def _finite(what: str, values: FloatArray) -> FloatArray:
+    values = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(values).all():
+        raise GeometryError("not_finite", f"{what} must be finite, got {values.tolist()}")
+    return values
 
 
 def screw_operator(screw: Screw) -> FloatArray:
@@ -127,8 +133,8 @@ def joint_velocity(operators: FloatArray, velocity: FloatArray) -> FloatArray:
 
     Operators in one frame, any. Raises GeometryError where the arm cannot make that motion here, naming what is left.
     """
-    A = np.asarray(operators, dtype=np.float64).reshape(len(operators), 16).T
-    b = np.asarray(velocity, dtype=np.float64).ravel()
+    A = _finite("operators", operators).reshape(len(operators), 16).T
+    b = _finite("velocity", velocity).ravel()
     size = np.linalg.norm(A, axis=0)
     scaled = A / np.where(size > 0, size, 1.0)
     q_dot = np.linalg.lstsq(scaled, b, rcond=1e-9)[0]
@@ -203,7 +209,7 @@ def base_link(poses: FloatArray, displacements: FloatArray) -> BaseLink:
     model's stratum was. ``residual``: rms of the equations at ``|H_base| = 1``. Raises GeometryError naming what is
     too few or parallel.
     """
-    poses, displacements = np.asarray(poses, dtype=np.float64), np.asarray(displacements, dtype=np.float64)
+    poses, displacements = _finite("poses", poses), _finite("displacements", displacements)
     if poses.shape != displacements.shape or poses.ndim != 3 or len(poses) < 3:
         raise GeometryError(
             "too_few",
@@ -214,7 +220,7 @@ def base_link(poses: FloatArray, displacements: FloatArray) -> BaseLink:
     eye = np.eye(4)
     rows = np.concatenate([np.kron(eye, d.T) - np.kron(b, eye) for b, d in zip(B, D, strict=True)])
     _, values, vectors = np.linalg.svd(rows)
-    if not values[-2] > 1e3 * max(float(values[-1]), 1e-12 * float(values[0])):
+    if not values[-2] > 10.0 * max(float(values[-1]), 1e-12 * float(values[0])):
         raise GeometryError(
             "degenerate",
             f"the poses do not fix the link (least singular values {values[-2]:.3g}, {values[-1]:.3g}): turn the hand "
