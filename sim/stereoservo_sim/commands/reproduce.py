@@ -275,6 +275,14 @@ def show_random_rigs(answer: dict[str, Any], console: Console) -> None:
         console.print(f"case {case['seed']}: {case['outcome']} {case['code']} {case['message']}")
 
 
+def run_inverse_kinematics_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``inverse-kinematics`` from its options; ``seeds`` poses a family, 100 by default."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.inverse_kinematics import POSES, run_inverse_kinematics
+
+    return run_inverse_kinematics(seeds=options.seeds or POSES, seed=options.seed, progress=progress)
+
+
 EXPERIMENTS: dict[str, Experiment] = {
     "real-franka": Experiment(
         "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
@@ -323,6 +331,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         frozenset({"seeds"}),
         run_random_rigs_command,
         show_random_rigs,
+    ),
+    "inverse-kinematics": Experiment(
+        "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
+        frozenset({"seeds"}),
+        run_inverse_kinematics_command,
+        show_rows,
     ),
 }
 """By the name given on the command line."""

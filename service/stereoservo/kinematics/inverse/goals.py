@@ -19,6 +19,8 @@ RANK_TOLERANCE = 1e-6
 FIT_STEPS = 60
 STARTS = 24
 SETTLED = 1e-14
+WHOLE_GROUP = 6
+"""Dimension of the algebra of all rigid motions."""
 
 
 def finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
@@ -113,8 +115,9 @@ def displacement_between(
     """The displacement (4, 4), of the group that the joints generate, that takes points (m, 4) nearest to targets.
 
     Three points that are not collinear will do: the group knows rigid motions, so that no metric is asked for. Equal
-    heights. None where the points leave it open. Raises InverseKinematicsError, ``not_rigid``, where they are of
-    another shape than the targets: a residual above ``misfit`` (the norm of what is left, over that of the targets).
+    heights. None where the points leave it open, or the joints do not generate all rigid motions and none of theirs
+    fits. Raises InverseKinematicsError, ``not_rigid``, where no rigid motion does: a residual above ``misfit`` (the
+    norm of what is left, over that of the targets).
     """
     algebra = motion_algebra(generators)
     slopes = (algebra @ points.T).transpose(0, 2, 1).reshape(len(algebra), -1)
@@ -133,6 +136,8 @@ def displacement_between(
             best, least = H, residual
         if least <= misfit:
             return best
+    if len(algebra) < WHOLE_GROUP:
+        return None
     raise InverseKinematicsError(
         "not_rigid",
         f"no displacement of this arm's kind takes the points to their targets: {least:.2e} of the targets' norm is "

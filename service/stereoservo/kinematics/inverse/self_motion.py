@@ -22,7 +22,9 @@ def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -
     """
     J = residual_jacobian(chain, points, q)
     sizes = np.linalg.norm(J, axis=0)
-    idle = sizes <= NO_MOTION * max(float(sizes.max()), 1e-300)
+    moved = points @ chain.displacement(q).T
+    most = np.linalg.norm(chain.operators_at(q), axis=(1, 2)) * float(np.linalg.norm(moved))
+    idle = sizes <= NO_MOTION * most
     weights = np.where(idle, 1.0, sizes)
     _, singular, rows = np.linalg.svd(np.where(idle, 0.0, J) / weights)
     rank = int((singular > NO_MOTION * max(float(singular[0]), 1e-300)).sum())

@@ -1,0 +1,206 @@
+"""Inverse kinematics of every family of arms (thesis 6) on random arms, hidden by random projective frames.
+
+The projective solver is given operators and points or displacements; a metric solver that shares nothing with it judges
+whether all solutions are found and how far their joints are off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.inverse.recognition import Recognition, recognise
+from stereoservo.kinematics.inverse.self_motion import corrected
+from stereoservo.kinematics.inverse.solutions import InverseSolutions
+from stereoservo.kinematics.inverse.solver import inverse_kinematics
+from stereoservo_sim.commands.progress import ProgressCall
+from stereoservo_sim.experiments.arm_families import FAMILIES, Family, SingularPose
+from stereoservo_sim.experiments.euclidean_inverse import Axes
+
+FloatArray = npt.NDArray[np.float64]
+
+POSES = 100
+"""Poses of each family by default."""
+ARMS = 20
+"""Arms, each in its own frame, that share the poses of a family."""
+SAME = 1e-5
+"""Largest difference of joints [rad or m] of a solution found and the metric one."""
+SOLVED = 1e-8
+FAR = 5.0
+"""Way [m] by which a goal is moved out of reach."""
+WALK = 0.3
+"""Motion [rad] along a self-motion that has to leave the goal reached."""
+
+THESIS = "chapter 6 derives the solutions and prints no figure of their accuracy"
+
+
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """An arm as the projective solver sees it, and the frame (4, 4) that hides it."""
+
+    axes: Axes
+    frame: FloatArray
+    chain: ProjectiveChain
+    recognition: Recognition
+
+    def solve(self, pose: FloatArray, point: FloatArray | None) -> InverseSolutions:
+        """The projective answer for a Euclidean ``pose`` (4, 4), or for what it does to a ``point`` (3,)."""
+        if point is None:
+            H = self.frame @ pose @ np.linalg.inv(self.frame)
+            return inverse_kinematics(self.chain, displacement=H, recognition=self.recognition)
+        at_zero = np.append(point, 1.0)
+        return inverse_kinematics(
+            self.chain,
+            points=(self.frame @ at_zero)[None],
+            targets=(self.frame @ pose @ at_zero)[None],
+            recognition=self.recognition,
+        )
+
+
+def hide(axes: Axes, rng: np.random.Generator) -> Hidden:
+    """``axes`` in a random, well-conditioned frame; zeros of the joints anywhere."""
+    while True:
+        frame = np.eye(4) + 0.35 * rng.normal(size=(4, 4))
+        if np.linalg.det(frame) > 0.2 and np.linalg.cond(frame) < 8.0:
+            break
+    kinds = tuple("revolute" if turns else "prismatic" for turns in axes.revolute)
+    zero = rng.uniform(-1.0, 1.0, len(kinds))
+    chain = ProjectiveChain(kinds, frame @ axes.twists() @ np.linalg.inv(frame), zero)
+    return Hidden(axes, frame, chain, recognise(chain))
+
+
+def run_inverse_kinematics(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """Every family over ``seeds`` poses, with a tenth as many singular and unreachable ones."""
+    rows = []
+    for i, (name, family) in enumerate(FAMILIES.items()):
+        progress("inverse kinematics", i, len(FAMILIES))
+        rows.append(family_row(name, family, seeds, np.random.default_rng([seed, i])))
+    progress("inverse kinematics", len(FAMILIES), len(FAMILIES))
+    return {
+        "experiment": "inverse-kinematics",
+        "seed": seed,
+        "seeds": seeds,
+        "rows": rows,
+        "thesis": {},
+        "assumptions": [
+            THESIS,
+            f"seeds are poses of a family, shared by up to {ARMS} random arms; joints uniform over a turn or 1 m",
+            "found: solutions of the metric solver that the projective one has, too; others: further ones that forward "
+            "kinematics confirms",
+            "joint errors against the metric solver, rad or m; singular and unreachable: handled of tried",
+        ],
+    }
+
+
+def family_row(name: str, family: Family, poses: int, rng: np.random.Generator) -> dict[str, Any]:
+    """The figures of one family."""
+    solved = known = found = others = 0
+    errors: list[float] = []
+    residual = 0.0
+    singular, unreachable = [0, 0], [0, 0]
+    cases: set[str] = set()
+    extra = max(1, poses // 10)
+    for count, corner in zip(_shares(poses), _shares(extra, len(_shares(poses))), strict=True):
+        hidden = hide(family.axes(rng), rng)
+        cases.add(hidden.recognition.case)
+        axes = hidden.axes
+        low, high = np.where(axes.revolute, -np.pi, -0.5), np.where(axes.revolute, np.pi, 0.5)
+        q = rng.uniform(low, high, (count, len(low)))
+        points = rng.uniform(-0.5, 0.5, (count, 3)) if family.single_point else None
+        goals = axes.displacements(q)
+        truth = family.judge(axes, goals, points, rng)
+        for k in range(count):
+            point = None if points is None else points[k]
+            answer = hidden.solve(goals[k], point)
+            solved += answer.reached
+            residual = max(residual, float(answer.residuals.max(initial=0.0)))
+            if truth is None:
+                errors.append(_walk(hidden, answer, goals[k]))
+                continue
+            right = truth[k][~np.isnan(truth[k]).any(axis=1)]
+            apart = differences(axes, right, answer.joints - hidden.chain.zero)
+            matched = apart <= SAME
+            known, found = known + len(right), found + int(matched.sum())
+            others += max(0, len(answer.joints) - int(matched.sum()))
+            errors += apart[matched].tolist()
+        for _ in range(corner):
+            if family.singular is not None:
+                singular[1] += 1
+                singular[0] += singular_handled(family.singular(hidden.axes, rng), hidden)
+            if family.bounded:
+                unreachable[1] += 1
+                unreachable[0] += unreachable_handled(hidden, family, rng)
+    redundant = known == 0
+    return {
+        "family": name,
+        "case": " ".join(sorted(cases)),
+        "poses": poses,
+        "solved": solved,
+        "solutions": None if redundant else known,
+        "found_share": None if redundant else found / known,
+        "others": None if redundant else others,
+        "worst_joint_error": None if redundant else max(errors, default=None),
+        "median_joint_error": None if redundant else float(np.median(errors)),
+        "worst_residual": residual,
+        "worst_walk_residual": max(errors) if redundant else None,
+        "singular": f"{singular[0]} of {singular[1]}" if singular[1] else None,
+        "unreachable": f"{unreachable[0]} of {unreachable[1]}" if unreachable[1] else None,
+    }
+
+
+def differences(axes: Axes, right: FloatArray, joints: FloatArray) -> FloatArray:
+    """Largest difference (s,) [rad or m] of each right solution (s, n) to the nearest of ``joints`` (r, n)."""
+    if not len(joints):
+        return np.full(len(right), np.inf)
+    apart = right[:, None] - joints[None]
+    turned = np.where(axes.revolute, np.mod(apart + np.pi, 2.0 * np.pi) - np.pi, apart)
+    return np.asarray(np.abs(turned).max(axis=2).min(axis=1), dtype=np.float64)
+
+
+def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
+    """Whether the answer at a singular pose reaches it and says what is free, or gives the isolated solution."""
+    goal = hidden.axes.displacements(pose.joints[None])[0]
+    answer = hidden.solve(goal, pose.point)
+    if not answer.reached or answer.residuals.max() > SOLVED:
+        return False
+    if pose.free is not None:
+        return answer.outcome == "continuum" and any(pose.free in free for free in answer.free_joints)
+    apart = differences(hidden.axes, pose.joints[None], answer.joints - hidden.chain.zero)
+    return bool(apart[0] <= 1e-3 and answer.outcome == "isolated")
+
+
+def unreachable_handled(hidden: Hidden, family: Family, rng: np.random.Generator) -> bool:
+    """Whether a goal far away is said to be unreachable, with the nearest approach."""
+    q = rng.uniform(-0.5, 0.5, (1, len(hidden.axes.revolute)))
+    goal = hidden.axes.displacements(q)[0]
+    away = rng.normal(size=3)
+    goal[:3, 3] += FAR * away / np.linalg.norm(away)
+    point = rng.uniform(-0.5, 0.5, 3) if family.single_point else None
+    answer = hidden.solve(goal, point)
+    short = answer.shortfall
+    return bool(answer.outcome == "unreachable" and short is not None and short.residual > SOLVED)
+
+
+def _walk(hidden: Hidden, answer: InverseSolutions, goal: FloatArray) -> float:
+    """Residual after ``WALK`` along the self-motion of a redundant arm; infinite where there is none."""
+    if not answer.reached or not len(answer.self_motions[0]):
+        return float("inf")
+    target = (hidden.frame @ goal @ np.linalg.inv(hidden.frame)).T
+    q = answer.joints[0]
+    worst = 0.0
+    for _ in range(10):
+        motion = answer.self_motions[0][0]
+        q, residual = corrected(hidden.chain, np.eye(4), target, q + 0.1 * WALK * motion, SOLVED)
+        worst = max(worst, residual)
+    moved = float(np.abs(q - answer.joints[0]).max())
+    return worst if moved > 0.1 * WALK else float("inf")
+
+
+def _shares(poses: int, arms: int | None = None) -> list[int]:
+    """How many of ``poses`` each arm gets."""
+    arms = max(1, min(ARMS, poses // 5)) if arms is None else arms
+    return [poses // arms + (i < poses % arms) for i in range(arms)]
