@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.cli import calibrate
 from stereoservo.cli import main as cli
+from stereoservo.cli import stored_trials
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.calibration.trials import save_trials
 from stereoservo.kinematics.model import load_model
@@ -86,7 +86,7 @@ def test_the_seconds_of_the_fit_are_measured(
 ) -> None:
     trials = stored(tmp_path / "t.npz", rx90())
     clock = iter([100.0, 101.25])
-    monkeypatch.setattr(calibrate, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr(stored_trials, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     assert run("bench", "--trials", trials)[1]["seconds"] == 1.25
 
 

@@ -8,16 +8,22 @@ from stereoservo.gateway.intake import Intake
 from stereoservo.gateway.keys import KeySpace
 from stereoservo.gateway.messages import Reply, encode
 from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.transfer import Resolved, TransferError
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.runtime.commands import (
+    AcknowledgeGoal,
     Command,
     FeatureTarget,
     Goal,
     Hold,
+    IncidenceTarget,
     JointTarget,
+    PlanReport,
     RenewGoal,
     RunGoal,
     TaughtTarget,
+    Teach,
+    UpdateGoal,
 )
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.warmup import _settings
@@ -67,14 +73,27 @@ class StubReplies:
         self.sent.append((query, msgspec.json.decode(payload, type=Reply)))
 
 
-class StubTaught:
-    def target(self, name: str) -> FeatureTarget:
-        return FeatureTarget(POINTS, 7)
+class StubTeaching:
+    """Resolves ``pick``; any goal relative to a workpiece has moved too far."""
+
+    def __init__(self) -> None:
+        self.expected: list[tuple[int, tuple[int, ...]]] = []
+
+    def resolve(self, target: TaughtTarget) -> Resolved:
+        if target.relative_to is not None:
+            raise TransferError("marker 12 is 8.3 px off")
+        return Resolved(FeatureTarget(POINTS, 7), "known to 0.1 px")
+
+    def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
+        return target
+
+    def expect(self, request: int, tool: tuple[int, ...]) -> None:
+        self.expected.append((request, tool))
 
 
 class Bench:
     def __init__(self) -> None:
-        self.link, self.replies = StubLink(), StubReplies()
+        self.link, self.replies, self.teaching = StubLink(), StubReplies(), StubTeaching()
         self.published: list[bytes] = []
         self.log = EventLog("boot", self.published.append)
         self.intake = Intake(
@@ -83,7 +102,7 @@ class Bench:
             self.replies,
             self.log,
             lambda: GoalContext(_settings(), ("pick",), None),
-            StubTaught(),
+            self.teaching,
             "boot",
         )  # type: ignore[arg-type]
 
@@ -92,9 +111,9 @@ class Bench:
         self.intake.goal_query(query)
         return query
 
-    def answer(self, request: int, accepted: bool, message: str = "") -> None:
+    def answer(self, request: int, accepted: bool, message: str = "", plan: PlanReport | None = None) -> None:
         self.intake.core_reply(
-            Event(9, 9, "reply", request=request, accepted=accepted, message=message, id=ID)
+            Event(9, 9, "reply", request=request, accepted=accepted, message=message, id=ID, plan=plan)
         )
 
     def kinds(self) -> list[str]:
@@ -149,6 +168,73 @@ def test_a_taught_goal_reaches_the_core_as_set_points_with_its_epoch(bench: Benc
     assert isinstance(command, RunGoal)
     assert command.goal.target == FeatureTarget(POINTS, 7)
     assert command.goal.law == "stereo"
+    bench.answer(1, True, "accepted")
+    assert bench.replies.sent[0][1].message == "accepted; known to 0.1 px"
+
+
+def test_a_taught_goal_that_cannot_be_carried_over_is_refused_with_the_reason(bench: Bench) -> None:
+    bench.goal(Goal(ID, TaughtTarget("pick", "workpiece")))
+    assert bench.link.asked == []
+    reply = bench.replies.sent[0][1]
+    assert reply.problems == ("target: marker 12 is 8.3 px off",)
+    assert reply.id == ID
+
+
+def test_a_plan_is_handed_on_and_not_kept_for_retries(bench: Bench) -> None:
+    goal = Goal(ID, JointTarget({"j1": 0.1}))
+    plan = PlanReport("joints", "straight", 2.5, (), (0.0, 1.0), {"j1": (0.0, 0.1)}, {})
+    bench.goal(goal)
+    bench.answer(1, True, "accepted", plan)
+    bench.goal(goal)
+    assert [reply.plan for _, reply in bench.replies.sent] == [plan, None]
+
+
+def test_goals_have_time_to_be_planned_and_commands_have_not(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
+    bench.goal(Goal(ID, JointTarget({"j1": 0.1})))
+    bench.intake.command_query(Message(KEYS.command("hold", "bob"), None))
+    now += intake_module.REPLY_TIMEOUT_S + 0.01
+    bench.intake.expire()
+    ((_, reply),) = bench.replies.sent
+    assert "within 1 s" in reply.message
+    now += intake_module.PLANNED_REPLY_TIMEOUT_S
+    bench.intake.expire()
+    assert "within 5 s" in bench.replies.sent[1][1].message
+
+
+def test_streamed_set_points_and_acknowledgements_are_put_on_the_goals_key(bench: Bench) -> None:
+    update = UpdateGoal(ID, FeatureTarget(POINTS), 12.5)
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), encode(update)))
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), encode(AcknowledgeGoal(ID))))
+    assert bench.link.asked == [(update, "anna"), (AcknowledgeGoal(ID), "anna")]
+    assert bench.kinds() == []
+
+
+def test_a_stream_that_is_refused_is_told_once_a_second(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
+    wrong = encode(UpdateGoal(ID, FeatureTarget({"middle": POINTS["left"]})))
+    late = encode(UpdateGoal(ID, FeatureTarget(POINTS)))
+    for k in range(200):
+        now = 100.0 + 0.005 * k
+        bench.intake.goal_sample(Message(KEYS.goal("anna"), wrong if k % 2 else late))
+        if not k % 2:
+            bench.answer(len(bench.link.asked), False, "the goal has ended")
+    assert bench.kinds() == ["goal_refused"]
+    now = 101.5
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), wrong))
+    assert bench.kinds() == ["goal_refused"] * 2
+    assert "no camera 'middle'" in bench.log.since(2).events[0].message
+
+
+def test_the_tool_of_a_taught_goal_is_remembered_with_its_request(bench: Bench) -> None:
+    bench.intake.command_query(Message(KEYS.command("teach", "bob"), encode(Teach("pick", 5, (0, 1, 2)))))
+    assert bench.teaching.expected == [(1, (0, 1, 2))]
 
 
 def test_a_put_goal_is_told_by_an_event_when_it_is_refused(bench: Bench) -> None:

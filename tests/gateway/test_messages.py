@@ -120,12 +120,12 @@ def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"law": "image"}, "law: Invalid enum value 'image'; valid: stereo, cartesian3"),
+        ({"law": "pbvs"}, "law: Invalid enum value 'pbvs'; valid: stereo, image, points, cartesian3"),
         ({"gain": -1}, "gain: Expected `float` > 0.0, got -1"),
         ({"zz": 1}, "unknown field `zz`; known: id, target, law"),
         (
-            {"target": {"kind": "points"}},
-            "target.kind: Invalid value 'points'; valid: features, taught, joints",
+            {"target": {"kind": "wish"}},
+            "target.kind: Invalid value 'wish'; valid: features, points, displacement, taught, joints, incidence",
         ),
         (
             {"target": {"kind": "features", "set_points": {"left": {"abc": [1, 2]}}}},

@@ -8,20 +8,21 @@ import pytest
 
 from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
 from stereoservo.kinematics.model import save_model
+from stereoservo.runtime.commands import FeatureTarget
 from stereoservo.runtime.cycle import Event, Sample
-from stereoservo.runtime.taught import TaughtFileError
+from stereoservo.runtime.taught import TaughtFileError, taught_goal
 from stereoservo.runtime.warmup import _model, _settings
 
 
 def taught_event(name: str) -> Event:
     sample = Sample(
         "left",
-        np.array([2, 5]),
-        np.array([[1.5, 2.5], [3.0, 4.0]]),
-        np.zeros((2, 2, 2)),
+        np.array([2, 5, 77]),
+        np.array([[1.5, 2.5], [3.0, 4.0], [9.0, 9.0]]),
+        np.tile(0.01 * np.eye(2), (3, 1, 1)),
         20,
-        np.full(2, 20.0),
-        np.zeros(2),
+        np.full(3, 20.0),
+        np.zeros(3),
     )
     return Event(1, 1, "taught", name=name, joints=np.arange(6.0), samples=(sample,))
 
@@ -29,12 +30,58 @@ def taught_event(name: str) -> Event:
 def test_a_taught_goal_is_there_after_a_restart_with_its_epoch(tmp_path: Path) -> None:
     store = TaughtStore(tmp_path / "taught.json")
     assert store.names == ()
-    store.add(taught_event("pick"), 3, "2026")
-    store.add(taught_event("park"), 4, "2026")
+    model = msgspec.structs.replace(_model(), epoch=3)
+    store.add("pick", taught_goal(taught_event("pick"), model, "2026"))
+    store.add("park", taught_goal(taught_event("park"), model, "2026", tool=(2, 5, 77)))
     again = TaughtStore(tmp_path / "taught.json")
     assert again.names == ("park", "pick")
-    assert again.target("pick").set_points == {"left": {2: (1.5, 2.5), 5: (3.0, 4.0)}}
-    assert again.target("pick").model_epoch == 3
+    assert again.goals == store.goals
+    pick = again.goals["pick"]
+    assert pick.target == FeatureTarget({"left": {2: (1.5, 2.5), 5: (3.0, 4.0)}}, 3)
+    assert pick.others == {"left": {77: (9.0, 9.0)}}  # of no body: it stands on the workpiece
+    assert pick.sigmas == {"left": {2: 0.1, 5: 0.1, 77: 0.1}}
+    assert again.goals["park"].tool == (2, 5, 77)
+    assert pick.model is not None
+    assert np.array_equal(np.reshape(pick.model.cameras[0].matrix, (3, 4)), model.cameras[0].matrix)
+
+
+OLD = """{"schema": 1, "goals": {"pick": {"target": {"kind": "features", "set_points":
+{"left": {"2": [1.5, 2.5], "77": [9.0, 9.0]}}, "model_epoch": 3}, "joints": [0.5], "created": "2025"}}}"""
+
+
+def test_a_file_of_schema_1_gains_what_the_model_of_its_epoch_knows(tmp_path: Path) -> None:
+    path = tmp_path / "taught.json"
+    path.write_text(OLD)
+    models = ModelStore(tmp_path)
+    gone = TaughtStore(path, models.of_epoch).goals["pick"]
+    assert gone.model is None
+    assert gone.target.set_points == {"left": {2: (1.5, 2.5), 77: (9.0, 9.0)}}
+    save_model(msgspec.structs.replace(_model(), epoch=3), models.path(3))
+    store = TaughtStore(path, models.of_epoch)
+    pick = store.goals["pick"]
+    assert pick.model is not None
+    assert pick.target.set_points == {"left": {2: (1.5, 2.5)}}
+    assert pick.others == {"left": {77: (9.0, 9.0)}}
+    assert (pick.joints, pick.created) == ((0.5,), "2025")
+    store.add("pick", pick)
+    assert msgspec.json.decode(path.read_bytes())["schema"] == 2
+    assert TaughtStore(path).goals["pick"] == pick
+
+
+def test_a_file_of_taught_goals_with_a_cut_matrix_names_it(tmp_path: Path) -> None:
+    path = tmp_path / "taught.json"
+    store = TaughtStore(path)
+    store.add("pick", taught_goal(taught_event("pick"), _model(), ""))
+    tree = msgspec.json.decode(path.read_bytes())
+    tree["goals"]["pick"]["model"]["cameras"][1]["matrix"].pop()
+    path.write_bytes(msgspec.json.encode(tree))
+    with pytest.raises(
+        TaughtFileError, match=r"goals\.pick\.model: right\.matrix has 11 numbers; 12 are needed"
+    ):
+        TaughtStore(path)
+    path.write_text('{"schema": 9, "goals": {}}')
+    with pytest.raises(TaughtFileError, match="schema 9; this program reads 1 and 2"):
+        TaughtStore(path)
 
 
 def test_a_damaged_file_of_taught_goals_is_told_and_kept(tmp_path: Path) -> None:

@@ -59,8 +59,7 @@ def test_good_goals_have_no_problem() -> None:
         (
             JointTarget({"j1": 0.1}),
             {"law": "stereo"},
-            "law: 'stereo' works on set-points in images; a "
-            "target of joints takes none of stereo, cartesian3",
+            "law: 'stereo' works on set-points in images; a target of joints takes none of stereo, image",
         ),
         (JointTarget({"j1": 0.1}), {"gain": 2.0}, "gain: 2.0 belongs to an image law"),
         (JointTarget({}), {}, "is empty; joints: j1, j2"),
@@ -89,8 +88,8 @@ def test_without_a_model_its_markers_are_not_asked_for() -> None:
 
 
 def test_jogs_are_checked_against_joints_and_their_limits() -> None:
-    assert check_command(Jog({"j1": 0.9, "j2": -1.0}), SETTINGS) == []
-    assert "no joint 'x'; joints: j1" in check_command(Jog({"x": 0.1}), SETTINGS)[0]
-    assert "-1 to 1 is valid" in check_command(Jog({"j1": 1.5}), SETTINGS)[0]
-    assert "is empty" in check_command(Jog({}), SETTINGS)[0]
-    assert check_command(Hold(), SETTINGS) == []
+    assert check_command(Jog({"j1": 0.9, "j2": -1.0}), CONTEXT) == []
+    assert "no joint 'x'; joints: j1" in check_command(Jog({"x": 0.1}), CONTEXT)[0]
+    assert "-1 to 1 is valid" in check_command(Jog({"j1": 1.5}), CONTEXT)[0]
+    assert "is empty" in check_command(Jog({}), CONTEXT)[0]
+    assert check_command(Hold(), CONTEXT) == []

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-import uuid
+from collections.abc import Iterator
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, cast
 
 import msgspec
 import typer
 
+from stereoservo.cli.goal_input import (
+    adaptive,
+    make_goal,
+    numbers,
+    read,
+    stream_lines,
+    target_tree,
+)
+from stereoservo.cli.goal_text import plan_table
 from stereoservo.cli.output import (
     CellArgument,
     CommandError,
@@ -18,11 +28,10 @@ from stereoservo.cli.output import (
     OperatorOption,
     emit,
     note,
-    pairs,
 )
 from stereoservo.gateway.client import Client, ClientError, GoalHandle
-from stereoservo.gateway.messages import decode, encode
-from stereoservo.runtime.commands import FeatureTarget, Goal, JointTarget, Target, TaughtTarget
+from stereoservo.gateway.messages import decode
+from stereoservo.runtime.commands import LAWS, Goal, StreamedTarget
 
 WAITING_LEASE_S = 2.0
 """Who waits for a goal stands behind it: when that process dies, the arm stops."""
@@ -31,6 +40,14 @@ WAITING_LEASE_S = 2.0
 def goal(
     cell: CellArgument,
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")] = "",
+    relative_to: Annotated[
+        str | None,
+        typer.Option(help="Of a taught goal: workpiece (which may have moved) or cameras (which have)."),
+    ] = None,
+    common: Annotated[
+        str | None,
+        typer.Option(metavar="IDS", help="Markers seen when it was taught and now: 10,11,12 (default: all)."),
+    ] = None,
     joint: Annotated[
         list[str] | None,
         typer.Option("--joint", metavar="NAME=RAD", help="Joint position [rad or m]; repeatable."),
@@ -39,10 +56,57 @@ def goal(
         Path | None,
         typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
     ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            "--points", metavar="FILE", help='JSON: {"points": {"marker": [x, y, z, w]}, "model_epoch": N}.'
+        ),
+    ] = None,
+    displacement: Annotated[
+        Path | None,
+        typer.Option(
+            "--displacement",
+            metavar="FILE",
+            help='JSON: {"matrix": 4x4, "model_epoch": N or "basis": 5 ids}.',
+        ),
+    ] = None,
+    incidence: Annotated[
+        Path | None,
+        typer.Option("--incidence", metavar="FILE", help='JSON: {"incidences": […], "secondary": …}.'),
+    ] = None,
+    follow_file: Annotated[
+        str | None,
+        typer.Option(
+            "--follow",
+            metavar="FILE|-",
+            help='A moving target: JSON lines {"stamp_s": …, "set_points" or "points": …}.',
+        ),
+    ] = None,
     file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="A whole goal as JSON.")] = None,
-    law: Annotated[str | None, typer.Option(help="stereo or cartesian3 (default: the cell's).")] = None,
-    points: Annotated[str | None, typer.Option(help="triangulated or predicted, for law stereo.")] = None,
+    law: Annotated[str | None, typer.Option(help=f"{', '.join(LAWS)} (default: the cell's).")] = None,
+    point_source: Annotated[
+        str | None, typer.Option(help="Where points come from: triangulated or predicted.")
+    ] = None,
+    jacobian: Annotated[
+        str | None, typer.Option(help="current, desired, mean or fixed-depth, for laws in images.")
+    ] = None,
+    centre: Annotated[
+        str | None,
+        typer.Option(
+            metavar="IDS", help="Markers whose middle moves on the line (default: all of the goal)."
+        ),
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option("--camera", help="Camera that may be used; repeatable (default: all).")
+    ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(help="linear, exponential, translation-first, …, for law trajectory."),
+    ] = None,
     gain: Annotated[float | None, typer.Option(help="Gain [1/s].")] = None,
+    adaptive_gain: Annotated[
+        str | None, typer.Option(metavar="NEAR:FAR[:SLOPE]", help="Gain that falls with the error [1/s].")
+    ] = None,
     tolerance: Annotated[float | None, typer.Option(help="Largest pixel distance at the goal [px].")] = None,
     hold_frames: Annotated[int | None, typer.Option(help="Frames for which the tolerance must hold.")] = None,
     speed_scale: Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")] = 1.0,
@@ -55,51 +119,89 @@ def goal(
     ] = None,
     time_limit: Annotated[float | None, typer.Option(help="Abort after so long [s].")] = None,
     queue: Annotated[bool, typer.Option("--queue", help="After the active goal, not instead of it.")] = False,
-    check: Annotated[bool, typer.Option("--check", help="Only say whether it would be accepted.")] = False,
+    blend: Annotated[
+        float | None,
+        typer.Option(metavar="PX", help="Go on to the next goal below this error, without a stop."),
+    ] = None,
+    acknowledge: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Reached, wait so long for `acknowledge` before going on."),
+    ] = None,
+    check: Annotated[bool, typer.Option("--check", help="Only say what it would do; nothing moves.")] = False,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait for its end.")] = True,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:
     """Send a goal and wait for its end. Ctrl-C cancels it."""
+    stream: Iterator[tuple[float | None, StreamedTarget]] | None = None
+    if gain is not None and adaptive_gain is not None:
+        raise CommandError("usage", "--gain and --adaptive-gain: one of them")
+    if follow_file is not None:
+        if file or name or joint or set_points or points or displacement or incidence:
+            raise CommandError("usage", "--follow is a target of its own; its first line is where it begins")
+        stream = stream_lines(follow_file)
+        first = next(stream, None)
+        if first is None:
+            raise CommandError("stream", f"{follow_file}: holds no set-points; a line at least is needed")
+        stream = chain([first], stream)
+        target = cast("dict[str, Any]", msgspec.to_builtins(first[1], str_keys=True))
+    elif file is None:
+        files = {"points": points, "displacement": displacement, "incidence": incidence}
+        target = target_tree(name, joint, set_points, files, relative_to, common)
     if file is not None:
-        wanted = decode(_read(file), Goal)
+        wanted = decode(read(file), Goal)
     else:
-        tree: dict[str, Any] = {
-            "id": str(uuid.uuid4()),
-            "target": msgspec.to_builtins(_target(name, joint, set_points)),
+        options: dict[str, Any] = {
             "law": law,
-            "points": points,
-            "gain": gain,
+            "points": point_source,
+            "jacobian": jacobian,
+            "centre": None if centre is None else {"markers": numbers(centre, "--centre")},
+            "cameras": camera or None,
+            "profile": profile,
+            "gain": gain if adaptive_gain is None else adaptive(adaptive_gain),
             "tolerance_px": tolerance,
             "hold_frames": hold_frames,
             "speed_scale": speed_scale,
             "lease_s": lease,
             "time_limit_s": time_limit,
             "mode": "queue" if queue else "preempt",
+            "blend_px": blend,
+            "acknowledge_s": acknowledge,
         }
-        wanted = decode(
-            encode({key: value for key, value in tree.items() if value is not None}),
-            Goal,  # NaN is refused, not dropped
-        )
+        wanted = make_goal(target, options)
     if wait and wanted.lease_s is None:
         wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         if check or wanted.check:
             reply = client.check(wanted)
-            emit(reply, reply.message, json)
+            emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)
             return
-        try:
-            handle = client.send(wanted)
-            note(f"goal {handle.id} accepted")
-            if wait:
-                follow(handle, json)
-            else:
-                emit({"id": handle.id, "accepted": True}, handle.id, json)
-        except KeyboardInterrupt:
-            with suppress(ClientError):  # not accepted yet, or ended already
-                client.cancel(wanted.id)
-            raise
+        _run(client, wanted, stream, wait, json)
+
+
+def _run(
+    client: Client,
+    wanted: Goal,
+    stream: Iterator[tuple[float | None, StreamedTarget]] | None,
+    wait: bool,
+    as_json: bool,
+) -> None:
+    try:
+        handle = client.send(wanted)
+        note(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
+        if stream is not None:
+            note(f"{handle.stream(stream)} set-points followed")
+        if wait:
+            follow(handle, as_json)
+            if wanted.acknowledge_s is not None:
+                note(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
+        else:
+            emit({"id": handle.id, "accepted": True}, handle.id, as_json)
+    except KeyboardInterrupt:
+        with suppress(ClientError):  # not accepted yet, or ended already
+            client.cancel(wanted.id)
+        raise
 
 
 def follow(handle: GoalHandle, as_json: bool) -> None:
@@ -110,21 +212,3 @@ def follow(handle: GoalHandle, as_json: bool) -> None:
         raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.message}", goal=tree)
     error = "" if result.error_px is None else f", error {result.error_px:.3f} px"
     emit(result, f"reached in {result.seconds:.2f} s{error}", as_json)
-
-
-def _target(name: str, joints: list[str] | None, set_points: Path | None) -> Target:
-    if sum((bool(name), bool(joints), set_points is not None)) != 1:
-        raise CommandError("usage", "one of NAME (a taught goal), --joint, --set-points or --file is needed")
-    if name:
-        return TaughtTarget(name)
-    if joints:
-        return JointTarget(pairs(joints, "--joint"))
-    assert set_points is not None
-    return FeatureTarget(decode(_read(set_points), dict[str, dict[int, tuple[float, float]]]))
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise CommandError("file", f"{path}: {error.strerror}") from error

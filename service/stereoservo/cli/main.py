@@ -35,6 +35,7 @@ COMMANDS: dict[str, str] = {
     "hold": "verbs:hold",
     "resume": "verbs:resume",
     "reset": "verbs:reset",
+    "acknowledge": "verbs:acknowledge",
     "record": "record:record",
     "replay": "replay:replay",
     "drivers": "drivers:drivers",

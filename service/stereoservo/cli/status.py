@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from stereoservo.cli.goal_text import progress_words
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, emit
 from stereoservo.gateway.client import Client
 from stereoservo.gateway.messages import StateMessage
@@ -30,8 +31,8 @@ def describe(state: StateMessage) -> str:
         "  markers " + "  ".join(f"{camera} {count}" for camera, count in state.visible.items()),
     ]
     if state.goal:
-        error = "" if state.error_px is None else f", error {state.error_px:.3f} px"
-        lines.append(f"  goal    {state.goal} ({state.law or 'joints'}){error}")
+        said = progress_words(state)
+        lines.append(f"  goal    {state.goal} ({state.law or 'joints'})" + (f": {said}" if said else ""))
     lines += [
         f"  {reason.level:7} {' '.join(filter(None, (reason.code, reason.subject)))}: {reason.hint}"
         for reason in state.reasons

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
 import typer
 
-from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit
+from stereoservo.cli.goal_input import numbers, read
+from stereoservo.cli.output import (
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+)
 from stereoservo.gateway.client import Client
+from stereoservo.gateway.messages import Synthesise, decode, encode
 
 
 def teach(
@@ -16,11 +27,51 @@ def teach(
         str, typer.Argument(metavar="NAME", help="Name of the goal; an older one of that name is replaced.")
     ],
     frames: Annotated[int, typer.Option(help="Frames a camera to average.", min=1, max=1000)] = 20,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            metavar="IDS",
+            help="Markers on the tool by which the goal is meant: it then survives a marker body that is mounted anew.",
+        ),
+    ] = None,
+    drawing: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            help='Make it from drawings, JSON: {"workpiece": {"10": [x, y, z]}, "tool": {"0": …}, "pose": 4x4}.',
+        ),
+    ] = None,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Store what the cameras see now as a goal."""
+    """Store what the cameras see now as a goal, with all other markers in view; or make one from drawings."""
+    if drawing is not None:
+        if tool is not None:
+            raise CommandError(
+                "usage", "--tool goes with what the cameras see; in a drawing, its tool is named"
+            )
+        wanted = read_drawing(drawing, name)
+        with Client(cell, endpoint=endpoint, operator=operator) as client:
+            reply = client.synthesise(wanted)
+        emit(reply, reply.message, json)
+        return
+    markers = () if tool is None else tuple(numbers(tool, "--tool"))
     with Client(cell, endpoint=endpoint, operator=operator) as client:
-        event = client.teach(name, frames)
+        event = client.teach(name, frames, tool=markers)
     emit(event, event.message, json)
+
+
+def read_drawing(path: Path, name: str) -> Synthesise:
+    """A drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
+    try:
+        tree: Any = msgspec.json.decode(read(path))
+    except msgspec.DecodeError as error:
+        raise CommandError("file", f"{path}: is not JSON: {error}") from error
+    if not isinstance(tree, dict):
+        raise CommandError("file", f"{path}: holds {type(tree).__name__}; a JSON object is needed")
+    pose = tree.get("pose")
+    if isinstance(pose, list) and all(isinstance(row, list) for row in pose):
+        tree["pose"] = [number for row in pose for number in row]
+    return decode(encode({**tree, "name": name}), Synthesise)

@@ -1,6 +1,10 @@
-"""``stereoservo enable · disable · hold · resume · reset``."""
+"""``stereoservo enable · disable · hold · resume · reset · acknowledge``."""
 
 from __future__ import annotations
+
+from typing import Annotated
+
+import typer
 
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit
 from stereoservo.gateway.client import Client
@@ -64,4 +68,17 @@ def reset(
     """Leave a fault whose cause is gone; the arm stays off until `enable`."""
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         reply = client.reset()
+    emit(reply, reply.message, json)
+
+
+def acknowledge(
+    cell: CellArgument,
+    goal_id: Annotated[str, typer.Argument(metavar="ID", help="The goal that was reached.")],
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """A reached goal that waits may be left (a gripper has closed): the queue goes on."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        reply = client.acknowledge(goal_id)
     emit(reply, reply.message, json)

@@ -8,7 +8,9 @@ from typing import Annotated
 
 import typer
 
+from stereoservo.cli.goal_text import progress_words
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, emit
+from stereoservo.control.reasons import Reason
 from stereoservo.gateway.client import Client
 from stereoservo.gateway.messages import EventMessage, FeaturesMessage, StateMessage
 
@@ -43,7 +45,12 @@ def _line(message: StateMessage | EventMessage | FeaturesMessage) -> str:
         return f"{message.seq:5} {message.kind:22} {message.id[:8]:8} {message.message}"
     if isinstance(message, FeaturesMessage):
         return f"      {message.camera} frame {message.seq}: {len(message.ids)} markers"
-    error = "" if message.error_px is None else f", error {message.error_px:.3f} px"
-    return f"      {message.lifecycle}, {message.source}{error}, " + " ".join(
-        f"{q:+.3f}" for q in message.joints.values()
+    said = [message.lifecycle, message.source, progress_words(message)]
+    said.append(" ".join(f"{q:+.3f}" for q in message.joints.values()))
+    return (
+        "      " + ", ".join(filter(None, said)) + "".join(f"; {_why(reason)}" for reason in message.reasons)
     )
+
+
+def _why(reason: Reason) -> str:
+    return f"{reason.code}: {reason.hint}" if reason.hint else reason.code

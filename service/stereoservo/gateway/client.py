@@ -10,14 +10,14 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Self, TypeVar, Unpack
 
 import msgspec
 from zenoh.handlers import RingChannel
 
+from stereoservo.gateway import calibrating
 from stereoservo.gateway.errors import (
     ClientError,
     DaemonLostError,
@@ -26,7 +26,7 @@ from stereoservo.gateway.errors import (
     RefusedError,
     TimedOutError,
 )
-from stereoservo.gateway.following import EventWatch, GoalHandle, GoalResult, Lease
+from stereoservo.gateway.following import EventWatch, GoalHandle, GoalResult
 from stereoservo.gateway.keys import KeySpace
 from stereoservo.gateway.messages import (
     ENCODING,
@@ -38,37 +38,39 @@ from stereoservo.gateway.messages import (
     Record,
     Reply,
     StateMessage,
+    Synthesise,
+    decode,
     encode,
 )
 from stereoservo.gateway.session import client_config, close_session, open_session
+from stereoservo.gateway.targets import GoalOptions, as_target
 from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.runtime.commands import (
-    Calibrate,
+    AcknowledgeGoal,
     CancelGoal,
     Command,
     Disable,
     Enable,
-    FeatureTarget,
     Goal,
     Hold,
     Home,
     Jog,
     JointTarget,
-    LawName,
-    PointSource,
     RenewGoal,
     Reset,
     Resume,
+    StreamedTarget,
     Target,
-    TaughtTarget,
     Teach,
+    UpdateGoal,
 )
 from stereoservo.runtime.daemon import find_daemon
 
 POLL_S = 0.01
 TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
 DRAIN = 32
-REPORT_TIMEOUT_S = 120.0
+GOAL_TIMEOUT_S = 7.0
+"""A goal is planned before it is answered; the daemon itself gives up after five seconds."""
 
 _T = TypeVar("_T")
 
@@ -112,8 +114,8 @@ class Client:
                 return bytes(reply.ok.payload.to_bytes())
         raise NoReplyError(key, timeout)
 
-    def _ask(self, what: str, key: str, payload: bytes) -> Reply:
-        reply = msgspec.json.decode(self._get(key, payload), type=Reply)
+    def _ask(self, what: str, key: str, payload: bytes, timeout_s: float | None = None) -> Reply:
+        reply = msgspec.json.decode(self._get(key, payload, timeout_s), type=Reply)
         if not reply.accepted:
             raise RefusedError(what, reply)
         return reply
@@ -204,68 +206,79 @@ class Client:
     def goal(
         self,
         target: Target | str | Mapping[str, Any],
-        *,
-        law: LawName | None = None,
-        points: PointSource | None = None,
-        gain: float | None = None,
-        tolerance_px: float | None = None,
-        hold_frames: int | None = None,
-        speed_scale: float = 1.0,
-        lease_s: float | None = 5.0,
-        time_limit_s: float | None = None,
-        mode: Literal["preempt", "queue"] = "preempt",
+        **options: Unpack[GoalOptions],
     ) -> GoalHandle:
-        """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by
-        camera.
+        """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
 
-        The lease is renewed by a thread of this client until the goal has ended or the client is closed: a client that
-        dies stops the arm. ``lease_s=None``: the goal goes on without the client.
-        Raises RefusedError with every problem, NoReplyError.
+        ``lease_s`` is 5 unless given. The lease is renewed by a thread of this client until the goal has ended or the
+        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal goes on without the client.
+        Raises RefusedError with every problem, NoReplyError, MessageError.
         """
-        goal = Goal(
-            id=str(uuid.uuid4()),
-            target=as_target(target),
-            law=law,
-            points=points,
-            gain=gain,
-            tolerance_px=tolerance_px,
-            hold_frames=hold_frames,
-            speed_scale=speed_scale,
-            lease_s=lease_s,
-            time_limit_s=time_limit_s,
-            mode=mode,
-        )
-        return self.send(goal)
+        options.setdefault("lease_s", 5.0)
+        return self.send(self.make_goal(target, **options))
+
+    @staticmethod
+    def make_goal(target: Target | str | Mapping[str, Any], **options: Unpack[GoalOptions]) -> Goal:
+        """A goal with an id of its own; for :meth:`check` and :meth:`send`. Raises MessageError for bad fields."""
+        return decode(encode({"id": str(uuid.uuid4()), "target": as_target(target), **options}), Goal)
 
     def check(self, goal: Goal) -> Reply:
-        """Whether a goal would be accepted. Raises RefusedError."""
-        return self._ask("goal", self._goal_key, encode(msgspec.structs.replace(goal, check=True)))
+        """What a goal would do, without moving: the reply's ``plan`` has way, time and approaches to limits.
+
+        Raises RefusedError.
+        """
+        return self._ask(
+            "goal", self._goal_key, encode(msgspec.structs.replace(goal, check=True)), GOAL_TIMEOUT_S
+        )
 
     def send(self, goal: Goal) -> GoalHandle:
-        """Send a goal made by the caller."""
+        """Send a goal made by the caller; returns when it was planned and accepted."""
         watch = EventWatch(self)
         try:
-            self._ask("goal", self._goal_key, encode(goal))
+            reply = self._ask("goal", self._goal_key, encode(goal), GOAL_TIMEOUT_S)
         except BaseException:
             watch.close()
             raise
-        return GoalHandle(self, goal, watch)
+        return GoalHandle(self, goal, watch, reply)
+
+    def update(
+        self, goal_id: str, target: StreamedTarget, stamp_s: float | None = None, *, answered: bool = False
+    ) -> None:
+        """Move the set-points of the active goal, which renews its lease, too. ``stamp_s``: this client's time of them.
+
+        A put, for streams of 30 to 200 Hz: what is refused is told by ``goal_refused`` events, at most one a second.
+        ``answered``: asks, and raises RefusedError.
+        """
+        command = UpdateGoal(goal_id, target, stamp_s)
+        if answered:
+            self.command("update", command)
+        else:
+            self._session.put(self._goal_key, encode(command), encoding=ENCODING)
+
+    def acknowledge(self, goal_id: str) -> Reply:
+        """A reached goal with ``acknowledge_s`` may be left. Raises RefusedError."""
+        return self.command("acknowledge", AcknowledgeGoal(goal_id))
 
     def home(self, speed_scale: float = 1.0, lease_s: float | None = 5.0) -> GoalHandle:
         """Move every joint to the cell's home position; the lease is renewed as for goals."""
         command = Home(str(uuid.uuid4()), speed_scale, lease_s)
         watch = EventWatch(self)
         try:
-            self.command("home", command)
+            reply = self.command("home", command)
         except BaseException:
             watch.close()
             raise
-        return GoalHandle(self, Goal(command.id, JointTarget({}), lease_s=lease_s), watch)
+        return GoalHandle(self, Goal(command.id, JointTarget({}), lease_s=lease_s), watch, reply)
 
-    def teach(self, name: str, frames: int = 20, timeout_s: float = 30.0) -> EventMessage:
-        """Store what the cameras see now as goal ``name``. Raises RefusedError, FailedError."""
+    def teach(
+        self, name: str, frames: int = 20, timeout_s: float = 30.0, *, tool: tuple[int, ...] = ()
+    ) -> EventMessage:
+        """Store what the cameras see now as goal ``name``; ``tool``: the markers by which it is meant.
+
+        Raises RefusedError, FailedError.
+        """
         with EventWatch(self) as watch:
-            reply = self.command("teach", Teach(name, frames))
+            reply = self.command("teach", Teach(name, frames, tool))
             event = watch.wait(
                 lambda e: e.request == reply.request and e.kind in ("taught", "warning"),
                 f"teaching {name!r}",
@@ -274,6 +287,10 @@ class Client:
         if event.kind != "taught":
             raise FailedError(f"teaching {name!r}", event)
         return event
+
+    def synthesise(self, wanted: Synthesise) -> Reply:
+        """Make a goal from drawings; the workpiece's markers are seen now. Raises RefusedError."""
+        return self._ask("synthesise", self.keys.command("synthesise", self.operator), encode(wanted))
 
     def calibrate(
         self,
@@ -288,11 +305,7 @@ class Client:
         The motion has a lease that this client renews (``lease_s=None``: none): a client that dies stops it.
         Raises RefusedError, FailedError (``code``: of the fit that failed, or of the reason that ended the motion).
         """
-        command = Calibrate(str(uuid.uuid4()), lease_s=lease_s)
-        event = self._calibration(command, "calibrated", progress, timeout_s, report)
-        if event.calibration is None:
-            raise FailedError("calibration", event)
-        return event.calibration
+        return calibrating.calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
 
     def check_model(
         self,
@@ -302,11 +315,7 @@ class Client:
         lease_s: float | None = 5.0,
     ) -> CheckReport:
         """A short check motion, and whether the model in use still holds. Raises RefusedError, FailedError."""
-        command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s)
-        event = self._calibration(command, "checked", progress, timeout_s, False)
-        if event.check is None:
-            raise FailedError("check", event)
-        return event.check
+        return calibrating.check_model(self, progress, timeout_s, lease_s)
 
     def reset_zeros(
         self,
@@ -320,49 +329,7 @@ class Client:
         ``progress`` hears the ``checked`` event, too. Raises RefusedError, FailedError (its event's ``name``:
         ``check_holds``, ``other_cause``, ``not_observable`` or the code of a check that failed).
         """
-        command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s, reset_zeros=True)
-        event = self._calibration(command, "zeros_reset", progress, timeout_s, False)
-        if event.reset is None:
-            raise FailedError("reset of joint zeros", event)
-        return event.reset
-
-    def _calibration(
-        self,
-        command: Calibrate,
-        success: str,
-        progress: Callable[[EventMessage], None] | None,
-        timeout_s: float,
-        report: bool,
-    ) -> EventMessage:
-        lease: Lease | None = None
-
-        def until(*ends: str) -> Callable[[EventMessage], bool]:
-            def wanted(event: EventMessage) -> bool:
-                if event.id != command.id:
-                    return False
-                if lease is not None and event.kind in ("calibration_finished", "check_finished"):
-                    lease.end()
-                if progress is not None:
-                    progress(event)
-                return event.kind in ends
-
-            return wanted
-
-        with EventWatch(self) as watch:
-            self.command("calibrate", command)
-            lease = Lease(self, command.id, command.lease_s)
-            try:
-                end = watch.wait(
-                    until(success, "calibration_failed", "calibration_aborted"), "calibration", timeout_s
-                )
-            finally:
-                lease.end()
-            if report and end.kind != "calibration_aborted":
-                with suppress(
-                    TimedOutError
-                ):  # the model is there; its report is told by an event, if it comes
-                    watch.wait(until("calibration_report"), "the report", REPORT_TIMEOUT_S)
-        return end
+        return calibrating.reset_zeros(self, progress, timeout_s, lease_s)
 
     # -- watching -------------------------------------------------------------------------------------------
 
@@ -419,22 +386,6 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def as_target(target: Target | str | Mapping[str, Any]) -> Target:
-    """What a target may be short for: a taught goal's name, positions by joint, set-points by camera."""
-    if isinstance(target, str):
-        return TaughtTarget(target)
-    if isinstance(target, Mapping):
-        if all(isinstance(value, Mapping) for value in target.values()) and target:
-            return FeatureTarget(
-                {
-                    camera: {int(marker): (float(u), float(v)) for marker, (u, v) in points.items()}
-                    for camera, points in target.items()
-                }
-            )
-        return JointTarget({str(name): float(value) for name, value in target.items()})
-    return target
 
 
 def _tls_directory() -> Path | None:

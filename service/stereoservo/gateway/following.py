@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -12,9 +12,10 @@ import msgspec
 import zenoh
 from zenoh.handlers import RingChannel
 
+from stereoservo.control.reasons import Reason
 from stereoservo.gateway.errors import ClientError, DaemonLostError, NoReplyError, TimedOutError
-from stereoservo.gateway.messages import EventMessage
-from stereoservo.runtime.commands import Goal
+from stereoservo.gateway.messages import EventMessage, Reply
+from stereoservo.runtime.commands import Goal, StreamedTarget
 
 if TYPE_CHECKING:
     from stereoservo.gateway.client import Client
@@ -38,6 +39,19 @@ class GoalResult(msgspec.Struct, frozen=True):
     error_px: float | None
     reasons: tuple[Any, ...]
     seconds: float
+
+
+class GoalProgress(msgspec.Struct, frozen=True):
+    """How far a goal is: ``progress`` of its way [0, 1] and ``seconds_left`` where known, ``reasons`` in words.
+
+    ``active``: False while it is queued and once it has ended.
+    """
+
+    active: bool
+    progress: float | None
+    seconds_left: float | None
+    error_px: float | None
+    reasons: tuple[Reason, ...]
 
 
 class EventWatch:
@@ -147,8 +161,10 @@ class Lease:
 class GoalHandle:
     """A goal that was accepted. As a context manager it cancels the goal when left before its end."""
 
-    def __init__(self, client: Client, goal: Goal, watch: EventWatch) -> None:
+    def __init__(self, client: Client, goal: Goal, watch: EventWatch, reply: Reply) -> None:
         self.id = goal.id
+        self.plan = reply.plan
+        self.message = reply.message
         self._client = client
         self._watch = watch
         self._started = time.monotonic()
@@ -162,16 +178,8 @@ class GoalHandle:
             event = self._watch.wait(
                 lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
             )
-            self._end()
-            outcome: Any = TERMINAL[event.kind]
-            self._result = GoalResult(
-                self.id,
-                outcome,
-                event.message,
-                event.error_px,
-                event.reasons,
-                time.monotonic() - self._started,
-            )
+            self._finish(event)
+        assert self._result is not None
         return self._result
 
     def reached(self, timeout_s: float = 600.0) -> GoalResult:
@@ -180,6 +188,52 @@ class GoalHandle:
         if result.outcome != "reached":
             raise ClientError(f"goal {self.id} was {result.outcome}: {result.message}")
         return result
+
+    @property
+    def ended(self) -> bool:
+        """Whether its terminal event was seen, by :meth:`wait` or while streaming."""
+        return self._result is not None
+
+    def progress(self) -> GoalProgress:
+        """How far it is now, and in words why it is slow or stuck. Raises NoReplyError."""
+        state = self._client.status()
+        if state.goal != self.id:
+            return GoalProgress(False, None, None, None, ())
+        return GoalProgress(True, state.progress, state.seconds_left, state.error_px, state.reasons)
+
+    def update(self, target: StreamedTarget, stamp_s: float | None = None) -> None:
+        """Move its set-points; see `Client.update`."""
+        self._client.update(self.id, target, stamp_s)
+
+    def stream(self, set_points: Iterable[tuple[float | None, StreamedTarget]]) -> int:
+        """Put (stamp [s], target) as they come, until they, or the goal, end; gives how many were put.
+
+        The iterable sets the pace. Raises DaemonLostError.
+        """
+        count = 0
+        for stamp_s, target in set_points:
+            self._look()
+            if self._result is not None:
+                break
+            self.update(target, stamp_s)
+            count += 1
+        return count
+
+    def acknowledge(self) -> None:
+        """Reached, it may be left: the queue goes on. Raises RefusedError."""
+        self._client.acknowledge(self.id)
+
+    def _look(self) -> None:
+        for event in self._watch.poll():
+            if event.id == self.id and event.kind in TERMINAL:
+                self._finish(event)
+                return
+
+    def _finish(self, event: EventMessage) -> None:
+        self._end()
+        outcome: Any = TERMINAL[event.kind]
+        seconds = time.monotonic() - self._started
+        self._result = GoalResult(self.id, outcome, event.message, event.error_px, event.reasons, seconds)
 
     def cancel(self) -> None:
         """Cancel it."""

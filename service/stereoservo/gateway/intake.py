@@ -18,13 +18,29 @@ from stereoservo.gateway.keys import InvalidKeyError, KeySpace
 from stereoservo.gateway.messages import MessageError, Reply, decode, decode_command, encode
 from stereoservo.gateway.publisher import EventLog, ReplyThread
 from stereoservo.gateway.servolink import ServoLink
-from stereoservo.gateway.stores import TaughtStore
+from stereoservo.gateway.teaching import Teaching
+from stereoservo.gateway.transfer import TransferError
 from stereoservo.gateway.validation import GoalContext, check_command, check_goal
-from stereoservo.runtime.commands import CancelGoal, Command, Goal, RenewGoal, RunGoal, TaughtTarget
+from stereoservo.runtime.commands import (
+    AcknowledgeGoal,
+    CancelGoal,
+    Command,
+    Goal,
+    IncidenceTarget,
+    RenewGoal,
+    RunGoal,
+    TaughtTarget,
+    Teach,
+    UpdateGoal,
+)
 from stereoservo.runtime.cycle import Event
 
 REPLY_TIMEOUT_S = 1.0
+PLANNED_REPLY_TIMEOUT_S = 5.0
+"""A goal is planned, a slice a cycle, before it is answered."""
 KNOWN_GOALS = 1000
+TOLD_EVERY_S = 1.0
+"""Refused set-points of a stream, which nobody waits for, are told by events no more often than this."""
 
 
 @dataclass
@@ -33,6 +49,8 @@ class _Pending:
     command: Command
     operator: str
     deadline: float
+    seconds: float
+    note: str = ""
 
 
 class _Answered(Exception):  # noqa: N818 - not an error: the way out with a reply
@@ -51,7 +69,7 @@ class Intake:
         replies: ReplyThread,
         log: EventLog,
         context: Callable[[], GoalContext],
-        taught: TaughtStore,
+        teaching: Teaching,
         boot: str,
     ) -> None:
         self._keys = keys
@@ -59,10 +77,12 @@ class Intake:
         self._replies = replies
         self._log = log
         self._context = context
-        self._taught = taught
+        self._teaching = teaching
         self._boot = boot
         self._pending: dict[int, _Pending] = {}
         self._goals: OrderedDict[str, Reply] = OrderedDict()
+        self._note = ""
+        self._stream_told = -TOLD_EVERY_S
 
     # -- from zenoh -----------------------------------------------------------------------------------------
 
@@ -71,7 +91,7 @@ class Intake:
         self._take(query, str(query.key_expr), _payload(query), self._goal)
 
     def goal_sample(self, sample: Any) -> None:
-        """A goal, or a renewal, by ``put``: nobody hears a reply, so a refusal becomes an event."""
+        """A goal, or what concerns one, by ``put``: nobody hears a reply, so a refusal becomes an event."""
         self._take(None, str(sample.key_expr), sample.payload.to_bytes(), self._goal)
 
     def command_query(self, query: Any) -> None:
@@ -84,7 +104,8 @@ class Intake:
         if query is not None and "*" in key:
             query.drop()  # somebody looks around; goals and commands are addressed
             return
-        operator = ""
+        operator, self._note = "", ""
+        streamed = query is None and b'"update"' in payload
         try:
             operator, command = work(key, payload)
             number = self._link.ask(command, operator)
@@ -93,40 +114,61 @@ class Intake:
                     self._refused("the servo process does not take requests; see `stereoservo status`")
                 )
         except (MessageError, InvalidKeyError) as error:
-            self._answer(query, self._refused("the message is not valid", str(error)), operator or key)
+            self._answer(
+                query, self._refused("the message is not valid", str(error)), operator or key, streamed
+            )
         except _Answered as answered:
-            self._answer(query, answered.reply, operator or key)
+            self._answer(query, answered.reply, operator or key, streamed)
         else:
-            self._pending[number] = _Pending(query, command, operator, time.monotonic() + REPLY_TIMEOUT_S)
+            seconds = PLANNED_REPLY_TIMEOUT_S if isinstance(command, RunGoal) else REPLY_TIMEOUT_S
+            deadline = time.monotonic() + seconds
+            self._pending[number] = _Pending(query, command, operator, deadline, seconds, self._note)
+            if isinstance(command, Teach):
+                self._teaching.expect(number, command.tool)
 
     def _goal(self, key: str, payload: bytes) -> tuple[str, Command]:
         operator = self._keys.operator_of_goal(key)
         if b'"command"' in payload:
-            return operator, decode(payload, RenewGoal | CancelGoal)  # type: ignore[arg-type]
+            kinds: Any = RenewGoal | CancelGoal | UpdateGoal | AcknowledgeGoal
+            command: Command = decode(payload, kinds)
+            self._require(check_command(command, self._context()), "the command is not valid")
+            return operator, command
         goal = decode(payload, Goal)
         known = None if goal.check else self._goals.get(goal.id)
         if known is not None and known.accepted:
             if goal.lease_s is not None:  # the goal put again is its renewal
                 return operator, RenewGoal(goal.id)
             raise _Answered(known)
-        problems = check_goal(goal, self._context())
+        self._require(check_goal(goal, self._context()), "the goal is not valid", goal.id)
+        return operator, RunGoal(self._resolved(goal))
+
+    def _resolved(self, goal: Goal) -> Goal:
+        """The goal as the core takes it: taught ones as set-points, standing markers as their pixels."""
+        try:
+            if isinstance(goal.target, IncidenceTarget):
+                return msgspec.structs.replace(goal, target=self._teaching.resolve_incidence(goal.target))
+            if not isinstance(goal.target, TaughtTarget):
+                return goal
+            resolved = self._teaching.resolve(goal.target)
+        except TransferError as error:
+            raise _Answered(
+                self._refused("the goal cannot be placed now", f"target: {error}", goal=goal.id)
+            ) from error
+        self._note = resolved.note
+        goal = msgspec.structs.replace(goal, target=resolved.target)
+        self._require(
+            check_goal(goal, self._context()), "the taught goal does not fit the cell any more", goal.id
+        )
+        return goal
+
+    def _require(self, problems: list[str], message: str, goal: str = "") -> None:
         if problems:
-            raise _Answered(self._refused("the goal is not valid", *problems, goal=goal.id))
-        if isinstance(goal.target, TaughtTarget):
-            goal = msgspec.structs.replace(goal, target=self._taught.target(goal.target.name))
-            problems = check_goal(goal, self._context())
-            if problems:
-                raise _Answered(
-                    self._refused("the taught goal does not fit the cell any more", *problems, goal=goal.id)
-                )
-        return operator, RunGoal(goal)
+            raise _Answered(self._refused(message, *problems, goal=goal))
 
     def _command(self, key: str, payload: bytes) -> tuple[str, Command]:
         verb, operator = self._keys.command_of(key)
         command = decode_command(verb, payload)
-        problems = check_command(command, self._context().settings)
-        if problems:
-            raise _Answered(self._refused(f"the {verb} command is not valid", *problems))
+        self._require(check_command(command, self._context()), f"the {verb} command is not valid")
         return operator, command
 
     # -- from the core --------------------------------------------------------------------------------------
@@ -136,19 +178,21 @@ class Intake:
         pending = self._pending.pop(event.request, None)
         if pending is None:
             return
+        message = "; ".join(filter(None, (event.message, pending.note)))
         reply = Reply(
-            accepted=bool(event.accepted), message=event.message, id=event.id, request=event.request,
-            reasons=event.reasons, boot=self._boot,
+            accepted=bool(event.accepted), message=message, id=event.id, request=event.request,
+            reasons=event.reasons, boot=self._boot, plan=event.plan,
         )  # fmt: skip
         if isinstance(pending.command, RunGoal):
             goal = pending.command.goal
             if not goal.check:
-                self._goals[goal.id] = reply
+                self._goals[goal.id] = msgspec.structs.replace(reply, plan=None)
                 while len(self._goals) > KNOWN_GOALS:
                     self._goals.popitem(last=False)
                 if reply.accepted:
                     self._log.add_core(event, "goal_accepted", pending.operator)
-        self._answer(pending.query, reply, pending.operator)
+        streamed = pending.query is None and isinstance(pending.command, UpdateGoal)
+        self._answer(pending.query, reply, pending.operator, streamed)
 
     def operator_of(self, request: int) -> str:
         """Who made a request that still waits; empty when unknown."""
@@ -160,7 +204,7 @@ class Intake:
         now = time.monotonic()
         for number in [number for number, pending in self._pending.items() if now > pending.deadline]:
             pending = self._pending.pop(number)
-            text = f"the servo process did not answer within {REPLY_TIMEOUT_S:g} s"
+            text = f"the servo process did not answer within {pending.seconds:g} s"
             self._answer(
                 pending.query,
                 self._refused(f"{text}; whether it took the request is unknown"),
@@ -172,10 +216,15 @@ class Intake:
     def _refused(self, message: str, *problems: str, goal: str = "") -> Reply:
         return Reply(accepted=False, message=message, id=goal, problems=problems, boot=self._boot)
 
-    def _answer(self, query: Any, reply: Reply, operator: str) -> None:
+    def _answer(self, query: Any, reply: Reply, operator: str, streamed: bool = False) -> None:
         if query is not None:
             self._replies.reply(query, encode(reply))
         elif not reply.accepted:
+            if streamed:
+                now = time.monotonic()
+                if now - self._stream_told < TOLD_EVERY_S:
+                    return
+                self._stream_told = now
             text = "; ".join((reply.message, *reply.problems))
             self._log.add(
                 "goal_refused",

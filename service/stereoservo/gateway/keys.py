@@ -20,7 +20,10 @@ VERBS = (
     "teach",
     "cancel",
     "renew",
+    "update",
+    "acknowledge",
     "record",
+    "synthesise",
 )
 """Commands with an operator; ``stop`` has a key of its own."""
 

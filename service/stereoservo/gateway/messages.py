@@ -6,13 +6,15 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import msgspec
+from msgspec import Meta
 
 from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.runtime.commands import (
+    AcknowledgeGoal,
     Calibrate,
     CancelGoal,
     Command,
@@ -22,15 +24,22 @@ from stereoservo.runtime.commands import (
     Hold,
     Home,
     Jog,
+    MarkerId,
+    Name,
+    PlanReport,
     RenewGoal,
     Reset,
     Resume,
     Target,
     Teach,
+    UpdateGoal,
 )
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
+
+Drawn = tuple[float, float, float]
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 _T = TypeVar("_T")
 _NOT_FINITE = re.compile(rb"(?<![\w\"])(-?NaN|[+-]?Infinity|-?inf|nan)(?![\w\"])")
@@ -48,6 +57,8 @@ COMMANDS: dict[str, type[Command]] = {
     "teach": Teach,
     "cancel": CancelGoal,
     "renew": RenewGoal,
+    "update": UpdateGoal,
+    "acknowledge": AcknowledgeGoal,
 }
 """What the payload of ``command/<verb>/<operator>`` decodes into; the ``command`` tag may be left out."""
 
@@ -56,6 +67,22 @@ class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", for
     """Begin or end a flight recording. The gateway's own business: the core does not hear of it."""
 
     on: bool = True
+
+
+class Synthesise(
+    msgspec.Struct, frozen=True, tag="synthesise", tag_field="command", forbid_unknown_fields=True
+):
+    """Make the goal ``name`` from drawings. The gateway's own business: the core does not hear of it.
+
+    ``workpiece``, ``tool``: marker -> (x, y, z) in the coordinates of either's drawing, one unit of length for both.
+    ``pose`` 4x4, row-major: from the tool's drawing to the workpiece's, in the position of alignment. The workpiece's
+    markers are to be seen now.
+    """
+
+    name: Name
+    workpiece: dict[MarkerId, Drawn]
+    tool: dict[MarkerId, Drawn]
+    pose: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)] = IDENTITY
 
 
 class MessageError(ValueError):
@@ -95,11 +122,13 @@ class ModelInfo(msgspec.Struct, frozen=True):
 
 
 class TaughtInfo(msgspec.Struct, frozen=True):
-    """A taught goal and the model it was taught with."""
+    """A taught goal and the model it was taught with. ``standing``: markers beside body and ``tool``."""
 
     name: str
     model_epoch: int
     created: str
+    standing: tuple[int, ...] = ()
+    tool: tuple[int, ...] = ()
 
 
 class CellInfo(msgspec.Struct, frozen=True):
@@ -164,6 +193,9 @@ class StateMessage(msgspec.Struct, frozen=True):
     last_event: int = 0
     notes: tuple[str, ...] = ()
     """What the cell's keeper should know, a damaged model file say."""
+    progress: float | None = None
+    """Of the active goal's way, 0 to 1, where it is known."""
+    seconds_left: float | None = None
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):
@@ -242,8 +274,9 @@ class EventList(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message
-    itself.
+    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message itself.
+
+    ``plan``: what a goal would do, or will, where it was planned.
     """
 
     accepted: bool
@@ -253,6 +286,7 @@ class Reply(msgspec.Struct, frozen=True):
     reasons: tuple[Reason, ...] = ()
     problems: tuple[str, ...] = ()
     boot: str = ""
+    plan: PlanReport | None = None
 
 
 SCHEMAS: dict[str, Any] = {
@@ -264,6 +298,7 @@ SCHEMAS: dict[str, Any] = {
     "info": CellInfo,
     "reply": Reply,
     "command-record": Record,
+    "command-synthesise": Synthesise,
     **{f"command-{verb}": kind for verb, kind in COMMANDS.items()},
 }
 

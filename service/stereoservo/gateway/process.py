@@ -12,7 +12,6 @@ import signal
 import sys
 import time
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +19,17 @@ import msgspec
 import zenoh
 from zenoh.handlers import RingChannel
 
-import stereoservo
 from stereoservo.gateway.calibration import Calibration
+from stereoservo.gateway.description import cell_info
 from stereoservo.gateway.intake import Intake
 from stereoservo.gateway.keys import VERBS, InvalidKeyError, KeySpace
 from stereoservo.gateway.messages import (
-    CameraInfo,
     CellInfo,
-    JointInfo,
     MessageError,
-    ModelInfo,
     Record,
     Reply,
     StateMessage,
-    TaughtInfo,
+    Synthesise,
     decode,
     encode,
     schema,
@@ -56,11 +52,13 @@ from stereoservo.gateway.session import (
     open_session,
     stop_config,
 )
+from stereoservo.gateway.sights import NewestSights
 from stereoservo.gateway.stop import StopThread
 from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
+from stereoservo.gateway.teaching import Teaching
+from stereoservo.gateway.transfer import TransferError
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.runtime.channel import ChannelServer
-from stereoservo.runtime.commands import LAWS
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.daemon import DaemonInfo
 from stereoservo.runtime.directories import DirectoryError
@@ -82,6 +80,8 @@ LAST_TURNS = 100
 SERVO_STALE_S = 0.5
 DRAIN = 32
 EXIT_SETUP = 3
+OWN_VERBS = ("record", "synthesise")
+"""Commands that the gateway carries out itself."""
 
 
 class Gateway:
@@ -93,7 +93,6 @@ class Gateway:
         directories = plan.directories
         self.boot = f"{plan.boot}-{os.getpid()}"
         cell_dir = Path(plan.cell_path).parent
-        self._taught = TaughtStore(directories.taught)
         self._models = ModelStore(directories.models)
         self._journal = Journal(directories.journal)
         self.keys = KeySpace(plan.cell.cell.name)
@@ -105,8 +104,16 @@ class Gateway:
         self._link = ServoLink(directories)
         self._link.records = bool(plan.record)
         self._replies = ReplyThread()
+        self._calibration = Calibration(self.settings, self._models, self._link, self.log, directories.checks)
+        self._sights = NewestSights({camera.name: camera.systematic_px for camera in self.settings.cameras})
+        self._teaching = Teaching(
+            TaughtStore(directories.taught, self._models.of_epoch),
+            self._sights,
+            lambda: self._calibration.model,
+            self.log,
+        )
         self._intake = Intake(
-            self.keys, self._link, self._replies, self.log, self._context, self._taught, self.boot
+            self.keys, self._link, self._replies, self.log, self._context, self._teaching, self.boot
         )
         self._reports = ChannelServer(directories.reports_socket)
         self._observations = [
@@ -119,7 +126,6 @@ class Gateway:
         self._state: StateMessage | None = None
         self._state_heard = 0.0
         self._state_sent = 0.0
-        self._calibration = Calibration(self.settings, self._models, self._link, self.log, directories.checks)
         self._recordings = Recordings(plan, self.log)
         self._handled_path = directories.runtime / "handled"
         self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
@@ -133,9 +139,11 @@ class Gateway:
         self._command_queries = [
             session.declare_queryable(keys.any_command(verb), RingChannel(32))
             for verb in VERBS
-            if verb not in ("enable", "record")
+            if verb not in ("enable", *OWN_VERBS)
         ]
-        self._record_queries = session.declare_queryable(keys.any_command("record"), RingChannel(32))
+        self._own_queries = [
+            session.declare_queryable(keys.any_command(verb), RingChannel(32)) for verb in OWN_VERBS
+        ]
         self._event_queries = session.declare_queryable(keys.event, RingChannel(32))
         self._state_queries = session.declare_queryable(keys.state, RingChannel(32))
         self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
@@ -149,7 +157,7 @@ class Gateway:
     def _context(self) -> GoalContext:
         model = self._calibration.model
         markers = None if model is None else model.marker_ids
-        return GoalContext(self.settings, self._taught.names, markers)
+        return GoalContext(self.settings, self._teaching.names, markers)
 
     # -- the loop -------------------------------------------------------------------------------------------
 
@@ -182,7 +190,7 @@ class Gateway:
             (self._goal_puts, self._intake.goal_sample),
             (self._goal_queries, self._intake.goal_query),
             *((queryable, self._intake.command_query) for queryable in self._command_queries),
-            (self._record_queries, self._take_record),
+            *((queryable, self._take_own) for queryable in self._own_queries),
             (self._event_queries, self._answer_events),
             (self._state_queries, self._answer_state),
             (self._info_queries, self._answer_info),
@@ -198,26 +206,32 @@ class Gateway:
             self._intake.command_query(self._stop.enables.popleft())
         return busy
 
-    def _take_record(self, query: Any) -> None:
+    def _take_own(self, query: Any) -> None:
         key = str(query.key_expr)
         if "*" in key:
             query.drop()
             return
+        payload = query.payload.to_bytes() if query.payload is not None else b"{}"
         try:
-            self.keys.command_of(key)
-            wanted = decode(query.payload.to_bytes() if query.payload is not None else b"{}", Record)
+            verb, _ = self.keys.command_of(key)
+            if verb == "record":
+                reply = self._record(decode(payload, Record))
+            else:
+                reply = Reply(True, self._teaching.synthesise(decode(payload, Synthesise)), boot=self.boot)
         except (MessageError, InvalidKeyError) as error:
             reply = Reply(False, "the message is not valid", problems=(str(error),), boot=self.boot)
-        else:
-            self._link.records = wanted.on
-            if not wanted.on:
-                steps = self._recordings.stop()
-                reply = Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
-            elif self._recordings.running:
-                reply = Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
-            else:
-                reply = Reply(True, "recording begins; its event names the file", boot=self.boot)
+        except TransferError as error:
+            reply = Reply(False, "no goal could be made", problems=(str(error),), boot=self.boot)
         self._replies.reply(query, encode(reply))
+
+    def _record(self, wanted: Record) -> Reply:
+        self._link.records = wanted.on
+        if not wanted.on:
+            steps = self._recordings.stop()
+            return Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
+        if self._recordings.running:
+            return Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
+        return Reply(True, "recording begins; its event names the file", boot=self.boot)
 
     def _answer_events(self, query: Any) -> None:
         given = str(query.parameters)
@@ -250,51 +264,15 @@ class Gateway:
 
     def info(self) -> CellInfo:
         """What the cell is."""
-        settings, plan = self.settings, self.plan
-        limits = settings.limits
         model = self._calibration.model
-        return CellInfo(
-            cell=settings.cell,
-            version=stereoservo.__version__,
-            boot=self.boot,
-            joints=tuple(
-                JointInfo(
-                    name,
-                    kind,
-                    float(limits.position_min[i]),
-                    float(limits.position_max[i]),
-                    float(limits.velocity_max[i]),
-                )
-                for i, (name, kind) in enumerate(zip(settings.joint_names, settings.joint_kinds, strict=True))
-            ),
-            cameras=tuple(
-                CameraInfo(
-                    camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids
-                )
-                for camera in settings.cameras
-            ),
-            laws=LAWS,
-            law=settings.law,
-            tolerance_px=settings.tolerance_px,
-            model=None
-            if model is None
-            else ModelInfo(
-                model.epoch,
-                model.stratum,
-                model.marker_ids,
-                model.created,
-                None if model.statistics is None else model.statistics.rms_px,
-                str(self._models.path(model.epoch)),
-            ),
-            taught=tuple(
-                TaughtInfo(name, goal.target.model_epoch or 0, goal.created)
-                for name, goal in sorted(self._taught.goals.items())
-            ),
-            can_calibrate=settings.trials is not None,
-            can_home=settings.home is not None,
-            dry_run=plan.dry_run,
-            commissioning=plan.commissioning,
-            recording=self._recordings.path if self._recordings.running else "",
+        return cell_info(
+            self.plan,
+            self.settings,
+            self.boot,
+            model,
+            None if model is None else self._models.path(model.epoch),
+            self._teaching.goals,
+            self._recordings.path if self._recordings.running else "",
         )
 
     # -- what the core says ---------------------------------------------------------------------------------
@@ -306,26 +284,13 @@ class Gateway:
             return
         fresh = event.seq > self._handled
         if event.kind == "taught" and fresh:
-            self._store_taught(event)
+            self._teaching.taught(event)
         self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
         if event.kind in ("taught", "calibration_finished", "check_finished"):
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
             self._handled_path.write_text(str(self._handled))
-
-    def _store_taught(self, event: Event) -> None:
-        model = self._calibration.model
-        epoch = 0 if model is None else model.epoch
-        try:
-            self._taught.add(event, epoch, _now())
-        except OSError as error:
-            self.log.add(
-                "warning",
-                message=f"taught goal {event.name!r} is not saved: {error}",
-                name=event.name,
-                origin="gateway",
-            )
 
     # -- telling --------------------------------------------------------------------------------------------
 
@@ -335,6 +300,7 @@ class Gateway:
             if data is None:
                 continue
             observation = observation_decoder.decode(data)
+            self._sights.add(observation)
             try:
                 payload = encode(features_message(observation))
             except MessageError as error:
@@ -412,7 +378,7 @@ class Gateway:
             self._goal_puts,
             self._goal_queries,
             *self._command_queries,
-            self._record_queries,
+            *self._own_queries,
             self._event_queries,
             self._state_queries,
             self._info_queries,
@@ -423,10 +389,6 @@ class Gateway:
         self._link.close()
         self._reports.close()
         self._journal.close()
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def run(plan: RunPlan, termination: Termination) -> None:

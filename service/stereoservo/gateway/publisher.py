@@ -143,7 +143,7 @@ def state_message(
         joints=_finite(names, status.positions),
         velocities=_finite(names, status.velocities),
         command=_finite(names, status.command),
-        error_px=status.error_px if status.error_px is not None and np.isfinite(status.error_px) else None,
+        error_px=_number(status.error_px),
         task_error=tuple(float(x) for x in status.task_error if np.isfinite(x)),
         innovation_px={name: value for name, value in status.innovation_px.items() if np.isfinite(value)},
         visible=status.visible,
@@ -162,7 +162,14 @@ def state_message(
         differences=state.differences,
         last_event=last_event,
         notes=notes,
+        progress=_number(getattr(status, "progress", None)),
+        seconds_left=_number(getattr(status, "seconds_left", None)),
     )
+
+
+def _number(value: float | None) -> float | None:
+    """A finite number, else None."""
+    return float(value) if value is not None and np.isfinite(value) else None
 
 
 def _finite(names: tuple[str, ...], values: Any) -> dict[str, float]:

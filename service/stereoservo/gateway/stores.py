@@ -8,34 +8,31 @@ import re
 from pathlib import Path
 
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
-from stereoservo.runtime.commands import FeatureTarget
-from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.settings import CoreSettings
-from stereoservo.runtime.taught import TaughtGoal, load_taught, save_taught, taught_goal
+from stereoservo.runtime.taught import ModelOf, TaughtGoal, load_taught, save_taught
 
 JOURNAL_BYTES = 10_000_000
 
 
 class TaughtStore:
-    """Taught goals by name. Raises TaughtFileError for a damaged file (which stays as it is)."""
+    """Taught goals by name. ``model_of``: see `load_taught`.
 
-    def __init__(self, path: Path) -> None:
+    Raises TaughtFileError for a damaged file (which stays as it is).
+    """
+
+    def __init__(self, path: Path, model_of: ModelOf = lambda _: None) -> None:
         self._path = path
-        self.goals: dict[str, TaughtGoal] = load_taught(path)
+        self.goals: dict[str, TaughtGoal] = load_taught(path, model_of)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the goals, sorted."""
         return tuple(sorted(self.goals))
 
-    def add(self, event: Event, model_epoch: int, created: str) -> None:
-        """Store what a ``taught`` event carries, in place of an older goal of that name. Raises OSError."""
-        self.goals[event.name] = taught_goal(event, model_epoch, created)
+    def add(self, name: str, goal: TaughtGoal) -> None:
+        """Store a goal in place of an older one of that name. Raises OSError."""
+        self.goals[name] = goal
         save_taught(self._path, self.goals)
-
-    def target(self, name: str) -> FeatureTarget:
-        """The set-points of a taught goal, bound to its model's epoch. Raises KeyError."""
-        return self.goals[name].target
 
 
 class ModelStore:
@@ -59,6 +56,13 @@ class ModelStore:
     def next_epoch(self) -> int:
         """One more than the last."""
         return max(self.epochs(), default=0) + 1
+
+    def of_epoch(self, epoch: int) -> CellModel | None:
+        """The model of an epoch, None where its file is gone or damaged."""
+        try:
+            return load_model(self.path(epoch))
+        except ModelFileError:
+            return None
 
     def newest_fitting(self, settings: CoreSettings) -> tuple[CellModel | None, list[str]]:
         """The newest model that fits the cell's joints and cameras, and why newer ones were passed over."""

@@ -302,10 +302,15 @@ class Calibrate(
 
 
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbid_unknown_fields=True):
-    """Store what the cameras see now, averaged over ``frames`` frames a camera, as a goal named ``name``."""
+    """Store what the cameras see now, averaged over ``frames`` frames a camera, as a goal named ``name``.
+
+    ``tool``: the markers by which the goal is meant, features of the tool rather than the hand's own; three or more.
+    The gateway keeps them; to the core they mean nothing.
+    """
 
     name: Name
     frames: Annotated[int, Meta(ge=1, le=1000)] = 20
+    tool: tuple[MarkerId, ...] = ()
 
 
 Command = (

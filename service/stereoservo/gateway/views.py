@@ -1,0 +1,158 @@
+"""Pixels of taught goals and of now as arrays in ideal pixels, with the cameras they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.gateway.sights import Sights
+from stereoservo.geometry.alignment import AlignmentFrame
+from stereoservo.geometry.cameras import triangulate, triangulation_covariance
+from stereoservo.geometry.distortion import distort, distortion_jacobian, undistort
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.strata import projective_to_affine
+from stereoservo.kinematics.model import CellModel, Stratum
+from stereoservo.runtime.taught import TaughtGoal, TaughtModel
+
+UNKNOWN_SIGMA_PX = 0.1
+"""Of a pixel whose deviation was not kept (goals of schema 1)."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Markers ``ids`` in cameras: ``Ps`` (c, 3, 4), ``lenses`` (c, 4), ``sizes`` (c, 2); ``pixels`` (c, n, 2) ideal,
+    NaN where not seen, ``sigmas`` (c, n) [px]. ``scene`` (m, 4): points that are in front of all cameras.
+    """
+
+    cameras: tuple[str, ...]
+    Ps: FloatArray
+    lenses: FloatArray
+    sizes: FloatArray
+    ids: list[int]
+    pixels: FloatArray
+    sigmas: FloatArray
+    scene: FloatArray
+
+    @classmethod
+    def empty(cls, model: CellModel, ids: Sequence[int]) -> Views:
+        """The cameras of a model, nothing seen yet."""
+        shape = (len(model.cameras), len(ids))
+        return cls(
+            tuple(camera.name for camera in model.cameras),
+            np.array([camera.matrix for camera in model.cameras]),
+            np.array([camera.lens for camera in model.cameras]),
+            np.array([(camera.width, camera.height) for camera in model.cameras], dtype=np.float64),
+            list(ids),
+            np.full((*shape, 2), np.nan),
+            np.full(shape, np.inf),
+            model.marker_points,
+        )
+
+    def set(self, camera: str, marker: int, raw: tuple[float, float], sigma: float) -> None:
+        """Enter a raw pixel; cameras and markers that are not of these views are passed over."""
+        if camera not in self.cameras or marker not in self.ids:
+            return
+        c, k = self.cameras.index(camera), self.ids.index(marker)
+        ideal = undistort(self.lenses[c], np.array(raw))
+        self.pixels[c, k] = ideal
+        if np.isfinite(ideal).all():
+            bend = float(np.sqrt(abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal)))))
+            self.sigmas[c, k] = sigma / bend
+
+    def of(self, ids: Sequence[int]) -> Views:
+        """The same of some markers, in their order; those that are not there are unseen."""
+        pixels = np.full((len(self.cameras), len(ids), 2), np.nan)
+        sigmas = np.full((len(self.cameras), len(ids)), np.inf)
+        for k, marker in enumerate(ids):
+            if marker in self.ids:
+                pixels[:, k] = self.pixels[:, self.ids.index(marker)]
+                sigmas[:, k] = self.sigmas[:, self.ids.index(marker)]
+        return Views(self.cameras, self.Ps, self.lenses, self.sizes, list(ids), pixels, sigmas, self.scene)
+
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """Points (n, 4) at depth 1 in the first camera and their covariances (n, 4, 4); NaN where not seen twice."""
+        points = triangulate(self.Ps, self.pixels, self.sigmas, iterations=6)
+        spread = np.full((len(points), 4, 4), np.nan)
+        known = np.isfinite(points).all(axis=1)
+        if known.any():
+            spread[known] = triangulation_covariance(self.Ps, points[known], self.sigmas[:, known])
+        return points, spread
+
+    def fronts(self) -> FloatArray:
+        """``(c,)``: the sign of the third row's product with a point in front of each camera, 1 for the first."""
+        depths = self.scene @ self.Ps[:, 2].T
+        depths = depths * np.sign(depths[:, :1])
+        return np.where((depths > 0).sum(axis=0) * 2 >= len(self.scene), 1.0, -1.0)
+
+    def raw(self, pixels: FloatArray) -> FloatArray:
+        """Raw pixels (c, n, 2) of ideal ones; NaN beyond a lens's fold."""
+        return np.array([distort(lens, seen) for lens, seen in zip(self.lenses, pixels, strict=True)])
+
+
+def sights_views(sights: Sights, model: CellModel, ids: Sequence[int]) -> Views:
+    """What is seen now of some markers."""
+    views = Views.empty(model, ids)
+    for camera, seen in sights.items():
+        for marker, sight in seen.items():
+            views.set(camera, marker, sight.pixel, sight.sigma)
+    return views
+
+
+def taught_views(goal: TaughtGoal) -> Views:
+    """All that was seen when a goal was taught, by the cameras of then. The goal must have its model."""
+    assert goal.model is not None
+    cameras = goal.model.cameras
+    seen: Mapping[str, Mapping[int, tuple[float, float]]]
+    ids = sorted({m for seen in (goal.target.set_points, goal.others) for p in seen.values() for m in p})
+    shape = (len(cameras), len(ids))
+    views = Views(
+        tuple(camera.name for camera in cameras),
+        np.array([camera.matrix for camera in cameras]).reshape(-1, 3, 4),
+        np.array([camera.lens for camera in cameras]),
+        np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64),
+        ids,
+        np.full((*shape, 2), np.nan),
+        np.full(shape, np.inf),
+        np.zeros((0, 4)),
+    )
+    for seen in (goal.target.set_points, goal.others):
+        for camera, points in seen.items():
+            for marker, pixel in points.items():
+                views.set(camera, marker, pixel, goal.sigmas.get(camera, {}).get(marker, UNKNOWN_SIGMA_PX))
+    return views
+
+
+def of_taught(model: TaughtModel) -> AlignmentFrame:
+    """The frame of a goal's model."""
+    upgrade = model.projective_to_euclidean
+    return _frame(
+        model.stratum,
+        np.array([camera.matrix for camera in model.cameras]).reshape(-1, 3, 4),
+        np.array(model.plane_at_infinity),
+        None if upgrade is None else np.array(upgrade).reshape(4, 4),
+    )
+
+
+def of_model(model: CellModel) -> AlignmentFrame:
+    """The frame of a model."""
+    return _frame(
+        model.stratum,
+        np.array([camera.matrix for camera in model.cameras]),
+        model.plane_at_infinity,
+        model.projective_to_euclidean,
+    )
+
+
+def _frame(stratum: Stratum, Ps: FloatArray, plane: FloatArray, upgrade: FloatArray | None) -> AlignmentFrame:
+    if stratum == "projective":
+        return AlignmentFrame(Ps)
+    try:
+        affine: FloatArray | None = projective_to_affine(plane)
+    except (
+        GeometryError
+    ):  # the plane passes through the first camera: a Euclidean frame says where it is, too
+        affine = upgrade
+    return AlignmentFrame(Ps, affine, upgrade if stratum == "metric" else None)

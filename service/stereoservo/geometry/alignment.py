@@ -1,0 +1,304 @@
+"""What brings known points onto the same points where cameras see them now, within the group that the frames allow.
+
+`moved_cameras.frame_change` for every stratum: a workpiece that has moved, cameras that were exchanged, points of a
+drawing (thesis 8.6: targets "can be reprojected onto images actually taken, even if the cameras have changed"). With
+two metric frames a rigid motion or a similarity of three points does, with two affine ones an affinity of four, else
+a homography of five. All are fitted to the pixels by one Gauss-Newton iteration on the group. Pixels are ideal ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import expm
+
+from stereoservo.geometry.cameras import (
+    check_views,
+    project_many,
+    projection_jacobian_many,
+    triangulate,
+    triangulation_covariance,
+)
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray, move_points, to_homogeneous, whitener
+from stereoservo.geometry.homography import homography_from_points, pixel_whitening, unit_determinant
+from stereoservo.geometry.moved_cameras import (
+    OFF_PLANE,
+    FrameChange,
+    plane_deviations,
+    refuse_coplanar,
+)
+
+Family = Literal["rigid", "similar", "affine", "projective"]
+POINTS_NEEDED: dict[Family, int] = {"rigid": 3, "similar": 3, "affine": 4, "projective": 5}
+"""Points in general position that determine a map of the family."""
+ITERATIONS = 30
+CONVERGED = 1e-11
+STRAIGHT = 1e-6
+"""Second singular value of points on one line, relative to the first."""
+
+
+@dataclass(frozen=True)
+class AlignmentFrame:
+    """A projective frame: its cameras (c, 3, 4), and what brings it to an affine and a Euclidean one, where known."""
+
+    Ps: FloatArray
+    to_affine: FloatArray | None = None
+    to_euclidean: FloatArray | None = None
+
+
+DRAWING = AlignmentFrame(np.zeros((0, 3, 4)), np.eye(4), np.eye(4))
+"""The frame of a drawing: Euclidean, in a unit of length of its own, without cameras."""
+
+
+def family_between(old: AlignmentFrame, new: AlignmentFrame, same_scale: bool) -> Family:
+    """The smallest group that contains the map between two frames; ``same_scale``: of length, in both."""
+    if old.to_euclidean is not None and new.to_euclidean is not None:
+        return "rigid" if same_scale else "similar"
+    return "affine" if old.to_affine is not None and new.to_affine is not None else "projective"
+
+
+def _algebra(family: Family) -> FloatArray:
+    """A basis (k, 4, 4) of the group's generators, with trace 0, so that determinants stay."""
+    units = np.eye(16).reshape(16, 4, 4)
+    moves = [units[3], units[7], units[11]]
+    turns = [units[4 * i + j] - units[4 * j + i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    size = np.diag([1.0, 1.0, 1.0, -3.0])
+    if family == "rigid":
+        return np.array([*moves, *turns])
+    if family == "similar":
+        return np.array([*moves, *turns, size])
+    last = 3 if family == "affine" else 4
+    off = [units[4 * i + j] for i in range(last) for j in range(4) if i != j]
+    stretch = [units[5 * i] - units[15] for i in range(3)]
+    return np.array([*off, *stretch])
+
+
+def _upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[FloatArray, FloatArray]:
+    """What brings either frame to where the group's generators are those of `_algebra`."""
+    pairs = {"rigid": "to_euclidean", "similar": "to_euclidean", "affine": "to_affine"}
+    if family == "projective":
+        return np.eye(4), np.eye(4)
+    found = [getattr(frame, pairs[family]) for frame in (old, new)]
+    if found[0] is None or found[1] is None:
+        raise GeometryError("stratum", f"a {family} map needs two frames whose {pairs[family]} is known")
+    return found[0], found[1]
+
+
+def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> FloatArray:
+    """``T`` (4, 4), proper, of least squares from points ``(n, 3)`` to ``(n, 3)``; ``scaled``: its scale is free.
+
+    Raises GeometryError for fewer than three points and points on one line.
+    """
+    if len(X) < 3:
+        raise GeometryError("too_few", f"{len(X)} points; a rigid motion needs at least 3", points=len(X))
+    middle_X, middle_Y = X.mean(axis=0), Y.mean(axis=0)
+    x, y = X - middle_X, Y - middle_Y
+    for name, centred in (("first", x), ("second", y)):
+        singular = np.linalg.svd(centred, compute_uv=False)
+        if not singular[1] > STRAIGHT * singular[0]:
+            raise GeometryError(
+                "degenerate", f"the {name} points lie on one line: a turn about it stays open"
+            )
+    U, singular, Vt = np.linalg.svd(y.T @ x)
+    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    T = np.eye(4)
+    scale = float(np.sum(singular * proper) / np.sum(x * x)) if scaled else 1.0
+    T[:3, :3] = scale * (U * proper) @ Vt
+    T[:3, 3] = middle_Y - T[:3, :3] @ middle_X
+    return T
+
+
+def affinity_from_points(X: FloatArray, Y: FloatArray) -> FloatArray:
+    """``T`` (4, 4) of least squares from points ``(n, 3)`` to ``(n, 3)``. Raises GeometryError where they are flat."""
+    if len(X) < 4:
+        raise GeometryError("too_few", f"{len(X)} points; an affinity needs at least 4", points=len(X))
+    rows = np.hstack([X - X.mean(axis=0), np.ones((len(X), 1))])
+    solution, _, rank, _ = np.linalg.lstsq(rows, Y, rcond=1e-9)
+    if rank < 4:
+        raise GeometryError("degenerate", "the points lie in one plane: an affinity off it stays open")
+    T = np.eye(4)
+    T[:3, :3] = solution[:3].T
+    T[:3, 3] = solution[3] - T[:3, :3] @ X.mean(axis=0)
+    return T
+
+
+def align(
+    family: Family,
+    old: AlignmentFrame,
+    new: AlignmentFrame,
+    M_old: FloatArray,
+    pixels_new: FloatArray,
+    sigmas: FloatArray | float = 1.0,
+    M_covariance: FloatArray | None = None,
+    names: Sequence[int] | None = None,
+) -> FrameChange:
+    """The map of a family from points ``(n, 4)`` of the old frame onto where the new cameras see them.
+
+    Of least reprojection error over ``pixels_new`` (c, n, 2) [px], NaN where missing, ``sigmas`` (c, n) or a number
+    [px]; ``M_covariance`` (n, 4, 4) as for `homography_refine`. ``names`` (n,): what to call the points. With the sign
+    that keeps points in front, and its covariance, as `frame_change` returns it.
+
+    Raises GeometryError for too few points seen by two cameras, and where they leave the map open.
+    """
+    called = np.arange(len(M_old)) if names is None else np.asarray(names)
+    sigma = np.broadcast_to(np.asarray(sigmas, dtype=np.float64), pixels_new.shape[:2])
+    pixels, weights = check_views(new.Ps, pixels_new, 1.0 / sigma)
+    M_new = triangulate(new.Ps, pixels_new, sigma, iterations=6)
+    both = np.flatnonzero(np.isfinite(M_old).all(axis=1) & np.isfinite(M_new).all(axis=1))
+    if len(both) < POINTS_NEEDED[family]:
+        raise GeometryError(
+            "too_few",
+            f"{len(both)} points are known and seen by two cameras ({called[both].tolist()}); a {family} map needs "
+            f"at least {POINTS_NEEDED[family]}",
+            points=called[both].tolist(),
+        )
+    own = None if M_covariance is None else np.asarray(M_covariance, dtype=np.float64)
+    spread = triangulation_covariance(new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both])
+    _refuse_flat(family, M_new[both], spread, called[both].tolist())
+    up_old, up_new = _upgrades(family, old, new)
+    T = _start(family, M_old[both], M_new[both], up_old, up_new)
+    used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
+    views = _Views(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
+    # About the points' middle, in units of their spread: turns and moves are then told apart well.
+    local = _local(family, move_points(up_new, M_new[both])) @ up_new
+    generators = np.linalg.inv(local) @ _algebra(family) @ local
+    T = _descend(T, generators, views)
+    whitened, J = views.linearised(T, generators)
+    _, singular, rows = np.linalg.svd(J, full_matrices=False)
+    k = len(generators)
+    if len(singular) < k or not singular[k - 1] > 1e-10 * singular[0]:
+        raise GeometryError("degenerate", f"points {called[used].tolist()} leave the {family} map open")
+    chart = (generators @ T).reshape(k, 16).T @ (rows.T / singular)
+    freedom = 2 * int((weights[:, used] > 0).sum()) - k
+    rms = float(np.sqrt(whitened @ whitened / freedom)) if freedom > 0 else 0.0
+    return FrameChange(T, chart @ chart.T, tuple(used.tolist()), rms, freedom)
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Points ``(n, 4)`` and their pixels ``(c, n, 2)`` with weights ``(c, n)``, 0 where missing."""
+
+    Ps: FloatArray
+    M: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+    covariance: FloatArray | None
+
+    def linearised(self, T: FloatArray, generators: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whitened residuals (r,) and their derivatives (r, k) by ``exp(Σ x Ĝ) T`` at x = 0."""
+        moved = self.M @ T.T
+        whitening = pixel_whitening(self.Ps, T, self.M, self.weights, self.covariance)
+        difference = (project_many(self.Ps, moved) - self.pixels).transpose(1, 0, 2).reshape(len(moved), -1)
+        by_point = projection_jacobian_many(self.Ps, moved)
+        slopes = np.einsum("cnij,kjl,nl->ncik", by_point, generators, moved)
+        slopes = slopes.reshape(len(moved), -1, len(generators))
+        residuals: FloatArray = np.einsum("nij,nj->ni", whitening, difference).ravel()
+        return residuals, (whitening @ slopes).reshape(-1, len(generators))
+
+
+def _descend(T: FloatArray, generators: FloatArray, views: _Views) -> FloatArray:
+    """Gauss-Newton on the group, steps halved until the error falls."""
+    for _ in range(ITERATIONS):
+        residuals, J = views.linearised(T, generators)
+        step = -np.linalg.lstsq(J, residuals, rcond=1e-12)[0]
+        cost = residuals @ residuals
+        for _ in range(12):
+            trial: FloatArray = expm(np.tensordot(step, generators, axes=1)) @ T
+            after, _ = views.linearised(trial, generators)
+            if after @ after <= cost * (1.0 + 1e-12):
+                T = trial
+                break
+            step = 0.5 * step
+        else:
+            return T  # no direction leads down: this is the minimum, as far as numbers tell
+        if float(np.abs(step).max()) < CONVERGED:
+            break
+    return T
+
+
+def _start(
+    family: Family, M_old: FloatArray, M_new: FloatArray, up_old: FloatArray, up_new: FloatArray
+) -> FloatArray:
+    """A first map from both reconstructions, ``|det| = 1``, with the sign that keeps points in front."""
+    if family == "projective":
+        return homography_from_points(M_old, M_new)
+    X, Y = move_points(up_old, M_old), move_points(up_new, M_new)
+    x, y = X[:, :3] / X[:, 3:], Y[:, :3] / Y[:, 3:]
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise GeometryError("degenerate", "a point lies in the plane at infinity")
+    T = affinity_from_points(x, y) if family == "affine" else _similarity(x, y, family)
+    T = unit_determinant(np.linalg.inv(up_new) @ T @ up_old, f"the {family} map")
+    return -T if float(np.sign(np.sum(move_points(T, M_old) * M_new, axis=1)).sum()) < 0 else T
+
+
+def _similarity(x: FloatArray, y: FloatArray, family: Family) -> FloatArray:
+    return similarity_from_points(x, y, scaled=family == "similar")
+
+
+def _local(family: Family, X: FloatArray) -> FloatArray:
+    """Coordinates about the points ``(n, 4)`` of an upgraded frame."""
+    if family == "projective":
+        return whitener(X)
+    x = X[:, :3] / X[:, 3:]
+    middle = x.mean(axis=0)
+    local = np.eye(4)
+    local[:3, 3] = -middle
+    local[:3] /= max(float(np.sqrt(((x - middle) ** 2).sum(axis=1).mean())), 1e-300)
+    return local
+
+
+def _refuse_flat(family: Family, M: FloatArray, covariance: FloatArray, names: list[int]) -> None:
+    if family == "projective":
+        refuse_coplanar(M, covariance, names)
+    elif family == "affine":
+        _, deviations = plane_deviations(M, covariance)
+        if deviations < OFF_PLANE:
+            raise GeometryError(
+                "degenerate",
+                f"points {names} are coplanar: they stand {deviations:.3g} standard deviations off their plane, "
+                f"{OFF_PLANE:g} are needed; add a point off it",
+                coplanar=names,
+                deviations=deviations,
+            )
+
+
+def point_residuals(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Rms distance ``(n,)`` [px] of points ``(n, 4)`` from their pixels ``(c, n, 2)``; NaN where none is seen."""
+    squares = ((project_many(Ps, M) - pixels) ** 2).sum(axis=-1)
+    seen = np.isfinite(squares)
+    count = seen.sum(axis=0)
+    total = np.where(seen, squares, 0.0).sum(axis=0)
+    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def reprojected(Ps: FloatArray, M: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels ``(c, n, 2)`` of points ``(n, 4)`` and the larger standard deviation ``(c, n)`` [px] of each.
+
+    ``covariance`` (n, 4, 4) of the points.
+    """
+    J = projection_jacobian_many(Ps, M)
+    spread = np.einsum("cnij,njk,cnlk->cnil", J, covariance, J)
+    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[..., -1], 0.0))
+    return project_many(Ps, M), deviations
+
+
+def drawn_points(coordinates: FloatArray, placed: FloatArray | None = None) -> FloatArray:
+    """Homogeneous points ``(n, 4)`` of drawn ones ``(n, 3)``, after the rigid motion ``placed`` (4, 4), if given.
+
+    Raises GeometryError where that is none: a mirror image, a change of size.
+    """
+    points = to_homogeneous(np.asarray(coordinates, dtype=np.float64))
+    if placed is None:
+        return points
+    R = placed[:3, :3]
+    defect = float(max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(placed[3] - [0, 0, 0, 1]).max()))
+    if defect > 1e-6 or np.linalg.det(R) < 0:
+        what = "is a mirror image" if defect <= 1e-6 else f"is off a rigid motion by {defect:.2g}"
+        raise GeometryError(
+            "not_rigid", f"the matrix {what}; a rotation, a translation and a last row 0, 0, 0, 1 are needed"
+        )
+    return move_points(placed, points)
