@@ -75,10 +75,10 @@ def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArra
     """
     axis, angle = rotation[:3], float(rotation[3])
     whole = 2.0 * math.pi
-    single = _turning(axis, 0.0, axis, angle)
-    single_back = _turning(axis, 0.0, axis, angle - whole)
+    single = _turning(axis, angle, axis, 0.0)
+    single_back = _turning(axis, angle - whole, axis, 0.0)
     if normal is None:
-        return single, single_back
+        return single, single, single_back, single, single_back
     hinge, theta_r, theta_p = _hinge_and_planar(rotation, normal)
     return (
         _turning(hinge, theta_r, normal, theta_p),

@@ -235,6 +235,7 @@ def follow_way(
     last: int,
     samples: int,
     surroundings: Surroundings,
+    rest: FloatArray,
     composition: int,
     redundant: bool,
     tolerance: float,
@@ -248,6 +249,7 @@ def follow_way(
 ) -> tuple[int, int]:
     """The arm along samples ``first`` to before ``last``: kind of limit broken or −1, and where.
 
+    ``rest`` (m, 3): what the end of the way leaves of each point's way to its goal, made up for on the way.
     ``operators``, ``joints``, ``displacement``, ``bias`` go along, in place; ``all_joints`` (samples, n) and
     ``all_displacements`` (samples, 4, 4) are filled. ``tolerance`` [px] between way and arm; beyond it the way is not
     reachable. It is infinite on the way, not at the end, for arms that lack freedoms.
@@ -257,6 +259,9 @@ def follow_way(
         share = k / (samples - 1.0)
         if k > 0:
             wanted = moved(pose_on_way(way, share), s.body)
+            for p in range(wanted.shape[0]):
+                for i in range(3):
+                    wanted[p, i] += share * rest[p, i]
             left = reach(
                 wanted,
                 s.body,
@@ -284,6 +289,39 @@ def follow_way(
         broken = check_joints(joints, share, s, table)
         if broken < 0:
             broken = check_view(moved(displacement, s.body), share, s, table, True)
+        if broken >= 0:
+            return broken, k
+    return -1, last
+
+
+@kernel
+def follow_joints(
+    step: FloatArray,
+    first: int,
+    last: int,
+    samples: int,
+    surroundings: Surroundings,
+    composition: int,
+    operators: FloatArray,
+    joints: FloatArray,
+    displacement: FloatArray,
+    all_joints: FloatArray,
+    all_displacements: FloatArray,
+    table: FloatArray,
+) -> tuple[int, int]:
+    """`follow_way` for a way that is straight in the joints, by ``step`` (n,) a sample."""
+    for k in range(first, last):
+        share = k / (samples - 1.0)
+        if k > 0:
+            move_arm(operators, composition, step, joints, displacement)
+        for j in range(joints.shape[0]):
+            all_joints[k, j] = joints[j]
+        for i in range(4):
+            for r in range(4):
+                all_displacements[k, i, r] = displacement[i, r]
+        broken = check_joints(joints, share, surroundings, table)
+        if broken < 0:
+            broken = check_view(moved(displacement, surroundings.body), share, surroundings, table, True)
         if broken >= 0:
             return broken, k
     return -1, last

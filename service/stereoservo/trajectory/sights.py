@@ -21,7 +21,6 @@ from stereoservo.trajectory.rooms import (
     check_view,
     elevation,
     empty_table,
-    moved,
 )
 
 GRAZING = math.radians(3.0)
@@ -33,17 +32,16 @@ YIELD = 1e-6
 
 
 def read_surroundings(
-    request: PlanRequest, frame: FloatArray, inverse: FloatArray, body: FloatArray, at_goal: FloatArray
+    request: PlanRequest, frame: FloatArray, inverse: FloatArray, body: FloatArray, goal: FloatArray
 ) -> tuple[Surroundings, Approach | None]:
     """What a way has to respect, in the motion frame; and why there can be none: an end of it out of view, or hidden.
 
-    ``body`` (m, 3), ``at_goal`` (4, 4): its displacement to the goal.
+    ``body`` (m, 3) now, ``goal`` (m, 3).
     """
     r, limits = request, request.limits
     cameras = np.stack([_moved_camera(P, frame) for P in r.matrices])
     eyes = np.ascontiguousarray(transform_points(inverse, np.ascontiguousarray(r.camera_centres))[:, :3])
     faces = np.ascontiguousarray(r.faces, dtype=np.int64).reshape(-1, 3)
-    goal = moved(at_goal, body)
     sides, grazing = _kept_sights(body, goal, faces, eyes)
     surroundings = Surroundings(
         body=body,
