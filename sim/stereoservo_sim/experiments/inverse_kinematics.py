@@ -91,7 +91,7 @@ def run_inverse_kinematics(*, seeds: int, seed: int, progress: ProgressCall) -> 
             f"seeds are poses of a family, shared by up to {ARMS} random arms; joints uniform over a turn or 1 m",
             "found: solutions of the metric solver that the projective one has, too; others: further ones that forward "
             "kinematics confirms",
-            "joint errors against the metric solver, rad or m; singular and unreachable: handled of tried",
+            "joint errors against the metric solver, rad or m; singular, unreachable, self-motion: handled of tried",
         ],
     }
 
@@ -101,7 +101,7 @@ def family_row(name: str, family: Family, poses: int, rng: np.random.Generator) 
     solved = known = found = others = 0
     errors: list[float] = []
     residual = 0.0
-    singular, unreachable = [0, 0], [0, 0]
+    singular, unreachable, walked = [0, 0], [0, 0], [0, 0]
     cases: set[str] = set()
     extra = max(1, poses // 10)
     for count, corner in zip(_shares(poses), _shares(extra, len(_shares(poses))), strict=True):
@@ -119,7 +119,8 @@ def family_row(name: str, family: Family, poses: int, rng: np.random.Generator) 
             solved += answer.reached
             residual = max(residual, float(answer.residuals.max(initial=0.0)))
             if truth is None:
-                errors.append(_walk(hidden, answer, goals[k]))
+                walked[1] += 1
+                walked[0] += walk_handled(hidden, answer, goals[k])
                 continue
             right = truth[k][~np.isnan(truth[k]).any(axis=1)]
             apart = differences(axes, right, answer.joints - hidden.chain.zero)
@@ -134,21 +135,20 @@ def family_row(name: str, family: Family, poses: int, rng: np.random.Generator) 
             if family.bounded:
                 unreachable[1] += 1
                 unreachable[0] += unreachable_handled(hidden, family, rng)
-    redundant = known == 0
     return {
         "family": name,
         "case": " ".join(sorted(cases)),
         "poses": poses,
         "solved": solved,
-        "solutions": None if redundant else known,
-        "found_share": None if redundant else found / known,
-        "others": None if redundant else others,
-        "worst_joint_error": None if redundant else max(errors, default=None),
-        "median_joint_error": None if redundant else float(np.median(errors)),
+        "solutions": known or None,
+        "found_share": found / known if known else None,
+        "others": others if known else None,
+        "worst_joint_error": max(errors, default=None),
+        "median_joint_error": float(np.median(errors)) if errors else None,
         "worst_residual": residual,
-        "worst_walk_residual": max(errors) if redundant else None,
-        "singular": f"{singular[0]} of {singular[1]}" if singular[1] else None,
-        "unreachable": f"{unreachable[0]} of {unreachable[1]}" if unreachable[1] else None,
+        "singular": _of(singular),
+        "unreachable": _of(unreachable),
+        "self_motion": _of(walked),
     }
 
 
@@ -185,19 +185,21 @@ def unreachable_handled(hidden: Hidden, family: Family, rng: np.random.Generator
     return bool(answer.outcome == "unreachable" and short is not None and short.residual > SOLVED)
 
 
-def _walk(hidden: Hidden, answer: InverseSolutions, goal: FloatArray) -> float:
-    """Residual after ``WALK`` along the self-motion of a redundant arm; infinite where there is none."""
+def walk_handled(hidden: Hidden, answer: InverseSolutions, goal: FloatArray) -> bool:
+    """Whether the self-motion told of a redundant arm leaves the goal reached over `WALK`."""
     if not answer.reached or not len(answer.self_motions[0]):
-        return float("inf")
+        return False
     target = (hidden.frame @ goal @ np.linalg.inv(hidden.frame)).T
-    q = answer.joints[0]
-    worst = 0.0
+    q, motion = answer.joints[0], answer.self_motions[0][0]
     for _ in range(10):
-        motion = answer.self_motions[0][0]
         q, residual = corrected(hidden.chain, np.eye(4), target, q + 0.1 * WALK * motion, SOLVED)
-        worst = max(worst, residual)
-    moved = float(np.abs(q - answer.joints[0]).max())
-    return worst if moved > 0.1 * WALK else float("inf")
+        if residual > SOLVED:
+            return False
+    return bool(np.abs(q - answer.joints[0]).max() > 0.1 * WALK)
+
+
+def _of(handled: list[int]) -> str | None:
+    return f"{handled[0]} of {handled[1]}" if handled[1] else None
 
 
 def _shares(poses: int, arms: int | None = None) -> list[int]:

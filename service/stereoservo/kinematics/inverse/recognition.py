@@ -23,11 +23,11 @@ from stereoservo.kinematics.model import CellModel
 TAIL = 1e-4
 """Probability with which chance alone makes a condition fail that holds."""
 EXACT = 1e-6
-"""Largest deviation, with a covariance or without: of a model without, the only test."""
+"""Largest deviation of a chain, or of a model without a covariance."""
 COARSEST = 0.05
 """Largest deviation that is put down to the calibration's noise at all."""
-INDEPENDENT = 1e-4
-"""Standard deviation of a combination of incidences, over the largest, below which it is none of its own."""
+PARALLEL_FREEDOM = 2
+"""Conditions that two directions are one, once both lie in the plane that all joints fix."""
 
 Condition = Literal["parallel", "common_point", "independent"]
 Test = Callable[[FloatArray], FloatArray]
@@ -37,8 +37,9 @@ Test = Callable[[FloatArray], FloatArray]
 class Evidence:
     """A condition on joints (counted from the base), and what was found.
 
-    ``deviation``: sine, in the model's frame, of how far it is from holding exactly. ``chi2`` of ``freedom``, at most
-    ``threshold`` where it holds; None without a covariance: then ``deviation`` is held against `EXACT`.
+    ``deviation``: sine, in the model's frame, of how far it is from holding exactly. ``chi2`` of ``freedom``
+    conditions, at most ``threshold`` where it holds. None without a covariance, where ``deviation`` is held against
+    `EXACT`, and above `COARSEST`.
     """
 
     condition: Condition
@@ -101,12 +102,12 @@ class _Judge:
 
     def parallel(self, *joints: int) -> bool:
         first, second = self.chain.generators[list(joints)]
-        return self._holds("parallel", joints, parallel_incidence(first, second))
+        return self._holds("parallel", joints, parallel_incidence(first, second), PARALLEL_FREEDOM)
 
     def common_point(self, *joints: int) -> bool:
-        return self._holds(
-            "common_point", joints, common_point_incidence(self.chain.generators[list(joints)])
-        )
+        test = common_point_incidence(self.chain.generators[list(joints)])
+        # Two conditions for each axis through a point, less the three coordinates of the point.
+        return self._holds("common_point", joints, test, 2 * len(joints) - 3)
 
     def spherical(self, *joints: int) -> bool:
         # Parallel axes meet, too, in the plane that stays fixed.
@@ -119,23 +120,23 @@ class _Judge:
         self.evidence["independent", joints] = Evidence("independent", joints, least > EXACT, least)
         return least > EXACT
 
-    def _holds(self, condition: Condition, joints: tuple[int, ...], test: Test) -> bool:
+    def _holds(self, condition: Condition, joints: tuple[int, ...], test: Test, freedom: int) -> bool:
         known = self.evidence.get((condition, joints))
         if known is None:
-            known = self._tested(condition, joints, test)
+            known = self._tested(condition, joints, test, freedom)
             self.evidence[condition, joints] = known
         return known.holds
 
-    def _tested(self, condition: Condition, joints: tuple[int, ...], test: Test) -> Evidence:
+    def _tested(self, condition: Condition, joints: tuple[int, ...], test: Test, freedom: int) -> Evidence:
         chosen = list(joints)
         deviation = float(np.linalg.norm(test(self.chain.generators[chosen])))
         if self.model is None or deviation > COARSEST:
             return Evidence(condition, joints, deviation <= EXACT, deviation)
         values, covariance = propagated(self.model, lambda model: test(model.generators[chosen]))
+        # More incidences than conditions: what is beyond them varies in second order only.
         variances, vectors = np.linalg.eigh(covariance)
-        kept = variances > INDEPENDENT**2 * variances[-1]
-        statistic = float((((vectors.T @ values)[kept]) ** 2 / variances[kept]).sum())
-        freedom = int(kept.sum())
+        variances, vectors = variances[-freedom:], vectors[:, -freedom:]
+        statistic = float(((vectors.T @ values) ** 2 / variances).sum())
         threshold = float(chi2_distribution.isf(TAIL, freedom))
         return Evidence(condition, joints, statistic <= threshold, deviation, statistic, freedom, threshold)
 

@@ -46,7 +46,7 @@ def corrected(
         if residual <= 0.01 * tolerance or not np.isfinite(residual):
             break
         J = residual_jacobian(chain, points, q)
-        step = -np.linalg.lstsq(J, error, rcond=1e-3)[0]
+        step = -np.linalg.lstsq(J, error, rcond=NO_MOTION)[0]
         q = q + step * min(1.0, 0.2 / max(float(np.abs(step).max()), 1e-300))
     return q, residual
 

@@ -193,7 +193,7 @@ def _searched(problem: _Problem) -> InverseSolutions:
         return _nothing(problem, "numerical", Shortfall(best, residual, None, None))
     if rank < chain.joints:
         ends = np.array([_settled(problem, q) for q in _representatives(problem, ends)])
-        left = descended(chain, problem.points, problem.targets, ends, iterations=0)[1]
+        ends, left = descended(chain, problem.points, problem.targets, ends, damping=POLISH)
     return _answer(problem, "numerical", ends, left)
 
 
