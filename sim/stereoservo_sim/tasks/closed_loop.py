@@ -23,6 +23,7 @@ from stereoservo_sim.tasks.arms import Arm, ArmName, FreeArm, SerialArm, rx90_re
 from stereoservo_sim.tasks.calibrations import Calibration, CalibrationName, Knowledge, known_at_start
 from stereoservo_sim.tasks.estimate import Estimate, PointsName
 from stereoservo_sim.tasks.judge import error_px, line_deviations, noise_floor_px, sight
+from stereoservo_sim.tasks.planned_way import LOOK_S, PlannedWay, RefusedError, planned_way
 from stereoservo_sim.tasks.setting import (
     DEFAULT_GAIN,
     DEFAULT_RATE_HZ,
@@ -110,7 +111,7 @@ def run_task(
         if reach is None:
             return _unreachable(task, settings)
     arm: Arm = FreeArm(task.start) if reach is None else SerialArm(calibration.cell, reach.start)
-    controller = Controller(known_at_start(calibration, task, reach), task, settings)
+    controller = Controller(known_at_start(calibration, task, reach), task, settings, arm.limits)
     rng = np.random.default_rng([settings.seed, task.id])
     return _run(task, arm, controller, settings, rng)
 
@@ -118,7 +119,9 @@ def run_task(
 class Controller:
     """Pixels and readings in, joint velocity out. It knows its `Knowledge` and the goal's pixels."""
 
-    def __init__(self, knowledge: Knowledge, task: AlignmentTask, settings: LoopSettings) -> None:
+    def __init__(
+        self, knowledge: Knowledge, task: AlignmentTask, settings: LoopSettings, limits: FloatArray
+    ) -> None:
         self._knowledge = knowledge
         self._dt_s = 1.0 / settings.rate_hz
         self._law = LAWS[settings.law]
@@ -134,13 +137,23 @@ class Controller:
         self._wanted[self._cameras :] = 0.0
         self._middle = np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
         self._task: Task | None = None
+        self._plans = settings.law == "trajectory"
+        self._look_steps = round(LOOK_S * settings.rate_hz) if self._plans else 0
+        self._way: PlannedWay | None = None
+        self._limits = limits
         self._operators = knowledge.basis
 
     def step(self, pixels: FloatArray, seen: FloatArray, joints: FloatArray) -> FloatArray:
-        """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,)."""
+        """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,).
+
+        Raises RefusedError where a way has to be planned and there is none.
+        """
         knowledge = self._knowledge
         self._operators = knowledge.operators(joints)
         self.estimate.seen(pixels, seen * self._wanted)
+        if self._look_steps > 0:
+            self._look_steps -= 1
+            return np.zeros(len(joints))
         points = self.estimate.points
         if self._task is None:
             self._task = self._start(points)
@@ -149,6 +162,10 @@ class Controller:
             self._operators, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points,
             self.estimate.pixels, seen * self._wanted,
         )  # fmt: skip
+        if self._plans:
+            if self._way is None:
+                self._way = planned_way(scene, task, joints, self._limits)
+            task = self._way.task_now(scene, task, self._dt_s)
         return np.asarray(self._law.step(scene, task, self._options).velocity)
 
     def moved(self, velocity: FloatArray) -> None:
@@ -210,7 +227,7 @@ def _run(
     used = cameras_used(settings.law)
     set_points = sight(task.goal).pixels
     poses, errors, facing = np.empty((limit + 1, 4, 4)), np.full(limit + 1, np.nan), np.empty(limit + 1)
-    margin, back_face, out_of_view, reason = np.inf, False, False, ""
+    margin, back_face, out_of_view, reason, refused = np.inf, False, False, "", ""
     steps = 0
     for k in range(limit + 1):
         truth = sight(arm.pose)
@@ -227,7 +244,11 @@ def _run(
             break
         frame = truth.pixels + rng.normal(0.0, 1.0, truth.pixels.shape) * settings.noise_px
         seen = _seen(truth.pixels.shape, settings, k * dt_s)
-        velocity = controller.step(frame, seen, arm.joints)
+        try:
+            velocity = controller.step(frame, seen, arm.joints)
+        except RefusedError as error:
+            reason, refused = "REFUSED", error.reason
+            break
         if not np.isfinite(velocity).all():
             reason = "NO_COMMAND"
             break
@@ -239,7 +260,7 @@ def _run(
         controller.moved(velocity)
     trace = Trace(poses[:steps], errors[:steps], facing[:steps])
     flags = (back_face, out_of_view)
-    return _judged(task, settings, trace, flags, margin, reason, window), trace
+    return _judged(task, settings, trace, flags, margin, (reason, refused), window), trace
 
 
 def _seen(shape: tuple[int, ...], settings: LoopSettings, time_s: float) -> FloatArray:
@@ -270,10 +291,11 @@ def _judged(
     trace: Trace,
     flags: tuple[bool, bool],
     margin: float,
-    reason: str,
+    reasons: tuple[str, str],
     window: int,
 ) -> TaskResult:
     back_face, out_of_view = flags
+    reason, refused = reasons
     dt_s = 1.0 / settings.rate_hz
     last = trace.errors_px[-window:]
     converged = not reason and len(last) == window and bool((last < SUCCESS_PX).all())
@@ -303,6 +325,7 @@ def _judged(
         rest_mrad_s=1e3 * turns if converged else None,
         closest_view_px=float(margin) if np.isfinite(margin) else None,
         reason=reason,
+        refused=refused,
     )
 
 

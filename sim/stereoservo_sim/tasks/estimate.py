@@ -27,7 +27,7 @@ from stereoservo_sim.tasks.calibrations import Knowledge
 FloatArray = npt.NDArray[np.float64]
 PointsName = Literal["predicted", "triangulated"]
 
-FILTER_S = 0.2
+FILTER_S = 0.5
 """Over which innovations are averaged; at the start over all frames there have been."""
 DAMPING = 1e-9
 FIRST_ROUNDS = 5
