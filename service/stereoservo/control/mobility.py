@@ -1,0 +1,245 @@
+"""Which freedoms an arm has here, in the words of what the cameras see (thesis 7.3.3, 8; errata, deficient arms).
+
+A numerical criterion on the Jacobian of the body's points, in right-angled coordinates whose unit is the body's radius.
+Planning and refusals ask here, with numpy; the loop calls `mobility_kernel`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.control.mobility_kernel import drivable_freedoms, joints_to_block, point_jacobian
+from stereoservo.geometry.body_frame import body_frame
+from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.velocities import twist_matrix
+from stereoservo.kinematics.kernels import image_jacobian
+
+FREEDOMS = (
+    "translation across the image, sideways",
+    "translation across the image, up and down",
+    "translation towards the camera",
+    "rotation about the image's horizontal axis",
+    "rotation about the image's vertical axis",
+    "rotation in the image plane",
+)
+"""The six of a rigid body about its middle, as seen by one camera."""
+
+REACH = 0.03
+"""Part of a wanted motion that may be left unmade: error of the operators."""
+
+WEAK = 3e-3
+"""Singular value, relative to the largest, below which motions are large for little effect."""
+
+PARALLEL = 0.03
+"""Sine below which motions count as one where freedoms of an arm elsewhere are counted."""
+
+NAMED = 0.5
+"""Components of a motion at least this large, relative to the largest, are named."""
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """A motion of the body, ``name`` in words, ``generator`` (4, 4) in the model's frame.
+
+    ``share`` in [0, 1]: how much of it the arm makes.
+    """
+
+    name: str
+    generator: FloatArray
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Mobility:
+    """The freedoms of an arm of n joints as it stands.
+
+    ``rank`` freedoms of the body are drivable, ``capacity`` are elsewhere. ``freedoms``: the six of `FREEDOMS`, with
+    shares. ``missing``: 6 - rank motions of which the arm makes nothing. ``directions`` (n, n): joint motions as
+    columns, in units of the joints, that move the body by ``values`` (n,) [body radii, rms over its points],
+    descending, and by ``pixels`` (n,) [px, rms over points and cameras]. ``self_motions`` (n, n - rank): columns [rad
+    or m] that leave the body where it is. ``block``: indices of joints to hold still here.
+    """
+
+    rank: int
+    capacity: int
+    freedoms: tuple[Freedom, ...]
+    missing: tuple[Freedom, ...]
+    values: FloatArray
+    pixels: FloatArray
+    directions: FloatArray
+    self_motions: FloatArray
+    block: tuple[int, ...]
+
+
+def mobility(
+    operators: FloatArray,
+    matrices: FloatArray,
+    points: FloatArray,
+    plane_at_infinity: FloatArray,
+    H_projective_to_euclidean: FloatArray | None = None,
+    unit: FloatArray | None = None,
+    camera: str = "the first camera",
+) -> Mobility:
+    """The freedoms of an arm: ``operators`` (n, 4, 4) at the current configuration, ``points`` (m, 4) of height 1.
+
+    ``matrices`` (c, 3, 4), whose first camera names the motions; ``unit`` (n,) [rad or m]: what of each joint's motion
+    is as much, None: 1. Without ``H_projective_to_euclidean`` right angles are estimated (`geometry.body_frame`).
+    Raises GeometryError for points on one line, which do not show all freedoms, and as `body_frame` does.
+    """
+    n = operators.shape[0]
+    units = np.ones(n) if unit is None else np.asarray(unit, dtype=np.float64)
+    E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
+    named = _rigid_motions(E)
+    fields = _motions(E, named, points)
+    _refuse_line(fields)
+    rank, values, V, made = _drivable(E, operators, points, units)
+    shares = np.linalg.norm(made.T @ (fields / np.linalg.norm(fields, axis=0)), axis=0)
+    missing = tuple(
+        Freedom(_describe(E, X, points, camera), X, 0.0) for X in _left_over(named, fields, made, rank)
+    )
+    capacity = min(n, _closure(np.stack([_twist(E, X) for X in operators]))) if n else 0
+    block = joints_to_block(_motions(E, operators, points), units, capacity, WEAK) if n else np.zeros(0)
+    J = image_jacobian(operators, matrices, points) * units
+    pixels = np.sqrt(((J @ V) ** 2).sum(axis=(0, 1, 2)) / (J.shape[0] * J.shape[1]))
+    return Mobility(
+        rank=rank,
+        capacity=capacity,
+        freedoms=tuple(
+            Freedom(f"{name} of {camera}", X, float(share))
+            for name, X, share in zip(FREEDOMS, named, np.minimum(shares, 1.0), strict=True)
+        ),
+        missing=missing,
+        values=values,
+        pixels=pixels,
+        directions=V,
+        self_motions=units[:, None] * V[:, rank:],
+        block=tuple(np.flatnonzero(block).tolist()),
+    )
+
+
+def missing_freedom(
+    operators: FloatArray,
+    matrices: FloatArray,
+    points: FloatArray,
+    plane_at_infinity: FloatArray,
+    wanted: FloatArray,
+    H_projective_to_euclidean: FloatArray | None = None,
+    camera: str = "the first camera",
+    tolerance: float = REACH,
+) -> Freedom | None:
+    """What of a ``wanted`` motion of the body (4, 4), a generator or twist of any size, the arm cannot make here.
+
+    None where at most ``tolerance`` of it is left unmade, or nothing is wanted. The ``generator`` is the part that is
+    left. Raises GeometryError as `mobility` does, and for a motion that is not finite.
+    """
+    if not np.isfinite(wanted).all():
+        raise GeometryError("not_finite", f"the wanted motion is not finite: {np.asarray(wanted).tolist()}")
+    n = operators.shape[0]
+    E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
+    field = _motions(E, wanted[None], points)[:, 0]
+    _, _, _, made = _drivable(E, operators, points, np.ones(n))
+    left = field - made @ (made.T @ field)
+    size = float(np.linalg.norm(field))
+    if float(np.linalg.norm(left)) <= tolerance * size:
+        return None
+    named = _rigid_motions(E)
+    _refuse_line(_motions(E, named, points))
+    twist = np.linalg.pinv(_motions(E, named, points)) @ left
+    rest = np.tensordot(twist, named, axes=1)
+    share = float(np.linalg.norm(made.T @ field)) / size
+    return Freedom(_describe(E, rest, points, camera), rest, share)
+
+
+def _left_over(named: FloatArray, fields: FloatArray, made: FloatArray, rank: int) -> list[FloatArray]:
+    """Generators of the freedoms that are not ``made`` (3m, rank): those nearest to the named ones, strongest first."""
+    body = np.linalg.qr(fields)[0]
+    rest = fields / np.linalg.norm(fields, axis=0)
+    rest = rest - made @ (made.T @ rest)
+    generators = []
+    for _ in range(len(named) - rank):
+        strongest = rest[:, int(np.linalg.norm(rest, axis=0).argmax())]
+        strongest = body @ (body.T @ strongest)
+        twist = np.linalg.pinv(fields) @ strongest
+        generators.append(np.tensordot(twist / np.abs(twist).max(), named, axes=1))
+        rest = rest - np.outer(strongest, strongest @ rest) / float(strongest @ strongest)
+    return generators
+
+
+def _drivable(
+    E: FloatArray, operators: FloatArray, points: FloatArray, units: FloatArray
+) -> tuple[int, FloatArray, FloatArray, FloatArray]:
+    """`drivable_freedoms`, and the motions that they make of the points as orthonormal columns (3m, rank)."""
+    n = operators.shape[0]
+    if not n:
+        return 0, np.zeros(0), np.zeros((0, 0)), np.zeros((3 * len(points), 0))
+    rows = _motions(E, operators, points)
+    rank, values, V = drivable_freedoms(rows, units)
+    return rank, values, V, (rows * units) @ V[:, :rank] / values[:rank]
+
+
+def _rigid_motions(E: FloatArray) -> FloatArray:
+    """Generators (6, 4, 4) of `FREEDOMS` in the frame that ``E`` (4, 4) maps the body's frame to."""
+    local = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
+    motions: FloatArray = E @ local @ np.linalg.inv(E)
+    return motions
+
+
+def _twist(E: FloatArray, X: FloatArray) -> FloatArray:
+    """Components (6,) of a motion ``X`` (4, 4) along `FREEDOMS`."""
+    local = np.linalg.solve(E, X @ E)
+    odd = 0.5 * (local[:3, :3] - local[:3, :3].T)
+    return np.array([*local[:3, 3], odd[2, 1], odd[0, 2], odd[1, 0]])
+
+
+def _motions(E: FloatArray, generators: FloatArray, points: FloatArray) -> FloatArray:
+    """`point_jacobian` (3m, k) of generators (k, 4, 4) in the body's frame."""
+    form = np.ascontiguousarray(np.linalg.inv(E)[:3])
+    return point_jacobian(np.ascontiguousarray(generators), np.ascontiguousarray(points), form)
+
+
+def _refuse_line(fields: FloatArray) -> None:
+    singular = np.linalg.svd(fields, compute_uv=False)
+    if not singular[-1] > 1e-3 * singular[0]:
+        raise GeometryError(
+            "degenerate",
+            "the points lie on one line; three that span a face show all freedoms",
+            singular=singular,
+        )
+
+
+def _describe(E: FloatArray, X: FloatArray, points: FloatArray, camera: str) -> str:
+    """A motion in words: its components by how far they move the body's points."""
+    sizes = np.linalg.norm(_motions(E, _rigid_motions(E), points), axis=0) * np.abs(_twist(E, X))
+    order = [i for i in np.argsort(-sizes, kind="stable").tolist() if sizes[i] > NAMED * sizes.max()]
+    return " together with ".join(FREEDOMS[i] for i in order) + f" of {camera}"
+
+
+def _closure(twists: FloatArray) -> int:
+    """Freedoms that joints (n, 6), of components as `_twist` gives, have together as they move: brackets included."""
+    twists = twists[np.linalg.norm(twists, axis=1) > 0.0]
+    if not len(twists):
+        return 0
+    v, w = twists[:, :3], twists[:, 3:]
+    turning = np.linalg.norm(w, axis=1) > PARALLEL * np.linalg.norm(v, axis=1) / 1e3
+    arms = np.linalg.norm(v[turning], axis=1) / np.linalg.norm(w[turning], axis=1)
+    length = max(float(np.sqrt((arms**2).mean())), 1.0) if turning.any() else 1.0
+    scaled = np.hstack([v / length, w])
+    basis = _independent(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))
+    while True:
+        brackets = [
+            np.concatenate([np.cross(a[3:], b[:3]) - np.cross(b[3:], a[:3]), np.cross(a[3:], b[3:])])
+            for i, a in enumerate(basis)
+            for b in basis[:i]
+        ]
+        grown = _independent(np.vstack([basis, *brackets]))
+        if len(grown) == len(basis):
+            return len(basis)
+        basis = grown
+
+
+def _independent(vectors: FloatArray) -> FloatArray:
+    _, values, rows = np.linalg.svd(vectors, full_matrices=False)
+    return np.ascontiguousarray(rows[values > PARALLEL * values[0]])

@@ -1,0 +1,213 @@
+"""What the loop asks of an arm's freedoms in every step, in numba; tested against `mobility_reference`.
+
+Freedoms count by the motion of the body's points in right-angled coordinates of any unit: ``rows`` (3m, n) is their
+Jacobian (`point_jacobian`). Pixels would tell sideways from depth, not strong joints from weak ones. No BLAS, LAPACK or
+fastmath.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import kernel
+from stereoservo.kinematics.linear_kernels import right_singular
+
+BoolArray = npt.NDArray[np.bool_]
+
+LOST = 1e-3
+"""Singular value, relative to the largest, below which a freedom is lost; the operators are estimates."""
+
+EQUAL = 1e-6
+"""Difference of two joints' parts in a lost freedom that decides nothing: the one nearer to the base is taken."""
+
+
+@kernel
+def point_jacobian(operators: FloatArray, points: FloatArray, form: FloatArray) -> FloatArray:
+    """Jacobian (3m, n) of points (m, 4) of height 1: ``form (Ĥ_j M)``, over the root of m.
+
+    ``form`` (3, 4) maps differences of points to right-angled coordinates: the upper rows of the inverse of
+    `geometry.body_frame.body_frame`, which hold as long as the model does, whatever the pose.
+    """
+    n, m = operators.shape[0], points.shape[0]
+    rows = np.empty((3 * m, n))
+    size = 1.0 / math.sqrt(m)
+    moved = np.empty(4)
+    for p in range(m):
+        for j in range(n):
+            for i in range(4):
+                moved[i] = (
+                    operators[j, i, 0] * points[p, 0]
+                    + operators[j, i, 1] * points[p, 1]
+                    + operators[j, i, 2] * points[p, 2]
+                    + operators[j, i, 3] * points[p, 3]
+                )
+            for r in range(3):
+                rows[3 * p + r, j] = size * (
+                    form[r, 0] * moved[0]
+                    + form[r, 1] * moved[1]
+                    + form[r, 2] * moved[2]
+                    + form[r, 3] * moved[3]
+                )
+    return rows
+
+
+@kernel
+def _scaled(rows: FloatArray, unit: FloatArray) -> FloatArray:
+    out = np.empty(rows.shape)
+    for r in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            out[r, j] = rows[r, j] * unit[j]
+    return out
+
+
+@kernel
+def drivable_freedoms(rows: FloatArray, unit: FloatArray) -> tuple[int, FloatArray, FloatArray]:
+    """Freedoms of the body that the arm drives here, singular values (n,), descending, joint motions as columns (n, n).
+
+    ``rows`` (r, n); ``unit`` (n,) > 0 [rad or m]: what of each joint's motion is as much; columns are in units. 0 and
+    NaN where ``rows`` are not finite.
+    """
+    J = _scaled(rows, unit)
+    n = unit.shape[0]
+    total = 0.0
+    for r in range(J.shape[0]):
+        for j in range(n):
+            total += abs(J[r, j])
+    if not math.isfinite(total):
+        return 0, np.full(n, math.nan), np.full((n, n), math.nan)
+    V, values = right_singular(J)
+    rank = 0
+    for i in range(n):
+        if values[i] > LOST * values[0]:
+            rank += 1
+    return rank, values, V
+
+
+@kernel
+def joints_to_block(rows: FloatArray, unit: FloatArray, capacity: int, least: float) -> BoolArray:
+    """Joints (n,) to hold still so that the rest drives what there is to drive without large motions for little effect.
+
+    As many as there are singular values below ``least`` times the largest, among the ``capacity`` freedoms that such an
+    arm has elsewhere (6 for six joints, 4 for a SCARA): of a redundant arm's self-motions none is blocked. Each time
+    that joint is taken which has the largest part in the weak motions of those that are left.
+    """
+    J = _scaled(rows, unit)
+    n = J.shape[1]
+    blocked = np.zeros(n, dtype=np.bool_)
+    for _ in range(n):
+        left = 0
+        for j in range(n):
+            if not blocked[j]:
+                left += 1
+        rest = np.empty((J.shape[0], left))
+        index = np.empty(left, dtype=np.int64)
+        k = 0
+        for j in range(n):
+            if not blocked[j]:
+                index[k] = j
+                for r in range(J.shape[0]):
+                    rest[r, k] = J[r, j]
+                k += 1
+        V, values = right_singular(rest)
+        strong = 0
+        for i in range(left):
+            if values[i] > least * values[0]:
+                strong += 1
+        if left - strong <= max(n - capacity, 0) or strong == 0:
+            break
+        chosen = -1
+        most = 0.0
+        for k in range(left):
+            part = 0.0
+            for i in range(strong, left):
+                part += V[k, i] * V[k, i]
+            if part > most + EQUAL:
+                most = part
+                chosen = k
+        if chosen < 0:
+            break
+        blocked[index[chosen]] = True
+    return blocked
+
+
+@kernel
+def missing_share(rows: FloatArray, motion: FloatArray) -> float:
+    """Part in [0, 1] of a wanted motion (r,) of the points that no joint motion makes; 0 for none wanted, 1 for NaN.
+
+    ``motion``: the same rows of the wanted generator, `point_jacobian` of it alone.
+    """
+    count, n = rows.shape
+    total = 0.0
+    for r in range(count):
+        total += motion[r] * motion[r]
+    if total == 0.0:
+        return 0.0
+    rank, values, V = drivable_freedoms(rows, np.ones(n))
+    if not math.isfinite(total) or rank == 0:
+        return 1.0
+    rest = motion.copy()
+    u = np.empty(count)
+    for i in range(rank):
+        s = 0.0
+        for r in range(count):
+            u[r] = 0.0
+            for j in range(n):
+                u[r] += rows[r, j] * V[j, i] / values[i]
+            s += u[r] * rest[r]
+        for r in range(count):
+            rest[r] -= s * u[r]
+    left = 0.0
+    for r in range(count):
+        left += rest[r] * rest[r]
+    return math.sqrt(min(1.0, left / total))
+
+
+@kernel
+def self_motion_from_limits(
+    rows: FloatArray, positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float
+) -> FloatArray:
+    """A joint velocity (n,) that leaves the body where it is and drives joints from their limits towards the middle.
+
+    ``rows`` (r, n): `point_jacobian`. ``positions``, ``lower``, ``upper`` (n,) [rad or m], infinite for a joint without
+    limits; ``rate`` [1/s]: no joint is faster than half its range times ``rate`` (without limits: 1 rad or m times it).
+    The pull rises with the cube of the way from the middle. A motion fades out as it comes to move the body; an arm
+    without self-motions rests.
+    """
+    n = positions.shape[0]
+    half = np.ones(n)
+    pull = np.zeros(n)
+    for j in range(n):
+        width = upper[j] - lower[j]
+        if width > 0.0 and math.isfinite(width):
+            half[j] = 0.5 * width
+            x = max(-1.0, min(1.0, (positions[j] - lower[j]) / half[j] - 1.0))
+            pull[j] = -x * x * x
+    out = np.zeros(n)
+    _, values, V = drivable_freedoms(rows, half)
+    if not math.isfinite(values[0]):
+        return out
+    for i in range(n):
+        if values[0] > 0.0:
+            relative = values[i] / (LOST * values[0])
+            fade = max(0.0, 1.0 - relative * relative)
+        else:
+            fade = 1.0
+        if fade == 0.0:
+            continue
+        s = 0.0
+        for j in range(n):
+            s += V[j, i] * pull[j]
+        for j in range(n):
+            out[j] += fade * s * V[j, i]
+    fastest = 1.0
+    for j in range(n):
+        fastest = max(fastest, abs(out[j]))
+    for j in range(n):
+        out[j] *= rate * half[j] / fastest
+        if not math.isfinite(out[j]):
+            out[j] = 0.0
+    return out
