@@ -6,9 +6,10 @@ import pytest
 from stereoservo.gateway import intake as intake_module
 from stereoservo.gateway.intake import Intake
 from stereoservo.gateway.keys import KeySpace
+from stereoservo.gateway.matching import TransferError
 from stereoservo.gateway.messages import Reply, encode
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.transfer import Resolved, TransferError
+from stereoservo.gateway.transfer import Resolved
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.runtime.commands import (
     AcknowledgeGoal,

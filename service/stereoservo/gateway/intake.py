@@ -15,11 +15,11 @@ from typing import Any
 import msgspec
 
 from stereoservo.gateway.keys import InvalidKeyError, KeySpace
+from stereoservo.gateway.matching import TransferError
 from stereoservo.gateway.messages import MessageError, Reply, decode, decode_command, encode
 from stereoservo.gateway.publisher import EventLog, ReplyThread
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.teaching import Teaching
-from stereoservo.gateway.transfer import TransferError
 from stereoservo.gateway.validation import GoalContext, check_command, check_goal
 from stereoservo.runtime.commands import (
     AcknowledgeGoal,

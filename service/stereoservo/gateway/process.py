@@ -23,6 +23,7 @@ from stereoservo.gateway.calibration import Calibration
 from stereoservo.gateway.description import cell_info
 from stereoservo.gateway.intake import Intake
 from stereoservo.gateway.keys import VERBS, InvalidKeyError, KeySpace
+from stereoservo.gateway.matching import TransferError
 from stereoservo.gateway.messages import (
     CellInfo,
     MessageError,
@@ -56,7 +57,6 @@ from stereoservo.gateway.sights import NewestSights
 from stereoservo.gateway.stop import StopThread
 from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.teaching import Teaching
-from stereoservo.gateway.transfer import TransferError
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.runtime.channel import ChannelServer
 from stereoservo.runtime.cycle import Event

@@ -11,11 +11,13 @@ from datetime import UTC, datetime
 
 import msgspec
 
+from stereoservo.gateway.drawings import synthesise
+from stereoservo.gateway.matching import TransferError
 from stereoservo.gateway.messages import Synthesise
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.sights import NewestSights, Sights
 from stereoservo.gateway.stores import TaughtStore
-from stereoservo.gateway.transfer import Resolved, TransferError, resolve, synthesise
+from stereoservo.gateway.transfer import Resolved, resolve
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.commands import Feature, IncidenceTarget, TaughtTarget
 from stereoservo.runtime.cycle import Event
