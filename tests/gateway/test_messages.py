@@ -21,7 +21,18 @@ from stereoservo.gateway.messages import (
     require_finite,
     schema,
 )
-from stereoservo.runtime.commands import FeatureTarget, Goal, Hold, Jog, JointTarget
+from stereoservo.runtime.commands import (
+    AcknowledgeGoal,
+    AdaptiveGain,
+    Approach,
+    FeatureTarget,
+    Goal,
+    Hold,
+    Jog,
+    JointTarget,
+    PlanReport,
+    UpdateGoal,
+)
 
 ID = "12345678-1234"
 GOAL = {"id": ID, "target": {"kind": "features", "set_points": {"left": {"3": [1.5, 2.5]}}}}
@@ -146,3 +157,56 @@ def test_an_integer_that_no_later_stage_can_carry_is_refused() -> None:
     )
     with pytest.raises(MessageError, match="1000000000000000000000000000000"):
         decode(payload, Goal)
+
+
+def test_a_plan_survives_the_wire_and_old_readers_do_without() -> None:
+    plan = PlanReport(
+        "cartesian3",
+        "linear",
+        3.25,
+        (Approach("FIELD_OF_VIEW", "left", 12.0, 5.0, 7.0, "px", 0.4, 3),),
+        (0.0, 1.0),
+        {"j1": (0.1, 0.2)},
+        {"left": {3: ((1.0, 2.0), (3.0, 4.0))}},
+    )
+    reply = Reply(True, "the goal would be accepted", plan=plan)
+    assert msgspec.json.decode(encode(reply), type=Reply) == reply
+
+    class OldReply(msgspec.Struct, frozen=True):
+        accepted: bool
+        message: str = ""
+
+    assert msgspec.json.decode(encode(reply), type=OldReply) == OldReply(True, "the goal would be accepted")
+    assert msgspec.json.decode(b'{"accepted": true}', type=Reply).plan is None
+
+
+def test_commands_about_goals_are_told_apart_by_their_tag() -> None:
+    set_points = {"kind": "features", "set_points": {"left": {"3": [1.5, 2.5]}}}
+    update = decode_command("update", msgspec.json.encode({"id": ID, "target": set_points, "stamp_s": 2.5}))
+    assert update == UpdateGoal(ID, FeatureTarget({"left": {3: (1.5, 2.5)}}), 2.5)
+    assert decode_command("acknowledge", b'{"id": "%s"}' % ID.encode()) == AcknowledgeGoal(ID)
+    with pytest.raises(MessageError, match="Invalid value 'taught'"):
+        decode_command("update", msgspec.json.encode({"id": ID, "target": {"kind": "taught", "name": "a"}}))
+
+
+def test_a_gain_is_a_number_or_falls_with_the_error() -> None:
+    gain = {"near": 4, "far": 0.8, "slope": 30}
+    assert decode(msgspec.json.encode(GOAL | {"gain": gain}), Goal).gain == AdaptiveGain(4.0, 0.8, 30.0)
+    assert decode(msgspec.json.encode(GOAL | {"gain": 2}), Goal).gain == 2.0
+    with pytest.raises(MessageError, match="far"):
+        decode(msgspec.json.encode(GOAL | {"gain": {"near": 4}}), Goal)
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(Goal.__struct_fields__), st.none() | st.text() | st.floats() | st.integers()
+    )
+)
+def test_any_goal_is_taken_or_refused_with_words(tree: dict[str, Any]) -> None:
+    try:
+        data = msgspec.json.encode(GOAL | tree)
+        goal = decode(data, Goal)
+    except MessageError as error:
+        assert str(error)
+    else:
+        assert decode(encode(goal), Goal) == goal
