@@ -17,9 +17,11 @@ from stereoservo.control.incidence import (
     incidence_step,
     incidence_task,
     joint_task,
+    limits_task,
 )
 from stereoservo.control.law import Options, Scene
 from stereoservo.geometry.errors import GeometryError
+from stereoservo.kinematics.kernels import image_jacobian
 
 SPANS = {
     "point-on-point": (1, 1),
@@ -224,6 +226,35 @@ def test_contradiction_ends_at_rest_with_those_concerned_named(virtual):
     assert reason.value == pytest.approx(step.error_px.max())
 
 
+@pytest.mark.parametrize("gap", [0.006, 0.05])
+def test_contradiction_is_told_from_noise(virtual, gap):
+    """A few pixels apart, with noise of 0.1 px and a tolerance of 0.5 px: named in nearly every step, and at rest."""
+    rng = np.random.default_rng(16)
+    T0, T1 = virtual.random_task(rng, 40, 0.1)
+    world = virtual.free_arm(rng, T0)
+    goal = virtual.PLATE @ T1.T
+    aside = goal[0] + gap * T1[:, 0]
+    task = incidence_task(
+        ["point-on-point", "point-on-line", "point-on-point"], [[0], [0], [2]],
+        [world.hidden(goal[:1]), world.hidden(np.array([aside, aside + T1[:, 1]])), world.hidden(goal[2:3])],
+        world.infinity, 0.5,
+    )  # fmt: skip
+    drive(world, task, 2.0, 8.0, until=-1.0, sigma=0.1, rng=rng)
+    named, speeds = [], []
+    for _ in range(100):
+        scene = scene_of(world)
+        noisy = world.triangulated(scene.pixels + rng.normal(0, 0.1, scene.pixels.shape))
+        step = incidence_step(scene._replace(points=noisy), task, Options(2.0, DT))
+        named.append((step.status[:2] == IncidenceStatus.CONTRADICTS).all())
+        speeds.append(
+            np.abs(image_jacobian(scene.operators, scene.matrices, scene.points) @ step.velocity).max()
+        )
+        world.q = world.q + DT * step.velocity
+    assert np.mean(named) > 0.9
+    # pixels a second: the gain times five standard deviations of a pixel, nothing of the gap
+    assert max(speeds) < 2.0 * 0.1 * 5
+
+
 def test_what_the_arm_cannot_move_is_named(virtual):
     """A gantry of three slides cannot lay a tilted plate into a plane; its corner it can."""
     rng = np.random.default_rng(10)
@@ -263,6 +294,23 @@ def test_second_task_of_joints_in_the_null_space(virtual, gain):
     assert errors[-1] < 1e-3
     np.testing.assert_allclose(world.q, wanted_q, atol=2e-3)
     assert step.rank == 1
+
+
+def test_freedoms_that_are_left_drive_from_the_limits(virtual):
+    """A point held in a plane by six joints: one that starts at its limit leaves it, the plane is kept."""
+    rng = np.random.default_rng(17)
+    world = virtual.rx90(rng)
+    there = world.markers()
+    task = incidence_task(["point-on-plane"], [[0]], [world.hidden(there[:3])], world.infinity, TOLERANCE)
+    lower, upper = world.q - 1.5, world.q + 1.5
+    lower[1], upper[1] = world.q[1] - 0.02, world.q[1] + 1.0
+    lower[5], upper[5] = -np.inf, np.inf
+    _, errors = drive(
+        world, task, 5.0, 6.0, until=-1.0, second=lambda scene: limits_task(world.q, lower, upper, 0.5)
+    )
+    assert errors.max() < 0.2
+    share = (world.q - lower)[:5] / (upper - lower)[:5]
+    assert share.min() > 0.1  # 0.02 at the start
 
 
 def test_second_task_never_moves_the_first(virtual):

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from stereoservo.control import incidence_kernel as kernels
 from stereoservo.control.law import LawStep, Options, Scene
+from stereoservo.control.mobility_kernel import limit_pull
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
@@ -71,7 +72,7 @@ class SecondTask(NamedTuple):
     """What to do with the freedoms that are left: ``rows`` (r, n) times the velocity shall be ``rates`` (r,).
 
     ``weights`` (r,): 1/sigma of the rates, 0 where a row is not to be read. Build it by `no_second_task`, `joint_task`,
-    `image_task`.
+    `limits_task`, `image_task`.
     """
 
     rows: FloatArray
@@ -193,6 +194,12 @@ def joint_task(
     """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: what of each is as much."""
     rates = np.where(wanted > 0.0, gain * (targets - positions), 0.0)
     return SecondTask(np.eye(len(positions)), rates, wanted / scale)
+
+
+def limits_task(positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float) -> SecondTask:
+    """Joints from their limits towards the middle of their ranges, the farther the stronger (`limit_pull`)."""
+    pull, half = limit_pull(positions, lower, upper)
+    return SecondTask(np.eye(len(positions)), rate * half * pull, 1.0 / half)
 
 
 def image_task(

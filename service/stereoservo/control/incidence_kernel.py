@@ -44,8 +44,11 @@ RANK = 1e-3
 STATIONARY = 0.02
 """Share of the residual that joints can still take away to first order, below which the task stands still."""
 
+MOSTLY = 0.25
+"""The same share where what can be taken away is less than the tolerance: noise keeps it from vanishing."""
+
 WORTH = 1e-3
-"""Relative decrease of the squared residual from which on a way out of a stand-still counts."""
+"""Relative decrease of the squared residual, beyond the linear model's, from which on a way out of a rest counts."""
 
 PROBE = 0.25
 """Motion of such a probe, in parts of the residual."""
@@ -349,8 +352,8 @@ def incidence_kernel(
     seen = Seen(operators, composition, points, at, gradients, tangents, bases)
     step = np.zeros(n)
     escaped = False
-    if not within and not share > STATIONARY:
-        escaped = _way_out(seen, V, metric, total, step)
+    if not within and (not share > STATIONARY or (share < MOSTLY and math.sqrt(part) <= tolerance_px)):
+        escaped = _way_out(seen, V, metric, total, part, step)
         if not escaped:
             _blame(J, e, owner, rows, status)
     if not escaped and rank > 0:
@@ -405,6 +408,7 @@ def _way_out(
     V: FloatArray,
     metric: FloatArray,
     total: float,
+    part: float,
     step: FloatArray,
 ) -> bool:
     """At rest far from the goal: the motion along a singular direction, either sense, that lowers the residual most.
@@ -413,7 +417,7 @@ def _way_out(
     """
     n = step.shape[0]
     size = PROBE * math.sqrt(total / seen.at.shape[0])
-    best = (1.0 - WORTH) * total
+    best = (1.0 - WORTH) * total - part
     look = np.empty(n)
     found = False
     for back in range(n):
@@ -448,7 +452,7 @@ def _blame(J: FloatArray, e: FloatArray, owner: IntArray, rows: int, status: Int
         total = 0.0
         for r in range(count * rows):
             total += left[r] * left[r]
-        drivable = _reducible(own, left) > STATIONARY * STATIONARY * total
+        drivable = _reducible(own, left) > MOSTLY * MOSTLY * total
         status[k] = CONTRADICTS if drivable else NOT_DRIVABLE
 
 

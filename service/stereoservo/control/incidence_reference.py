@@ -70,7 +70,7 @@ class _Residual:
 def incidence_reference(
     scene: Scene, task: IncidenceTask, options: Options, second: SecondTask, metric: FloatArray
 ) -> IncidenceStep:
-    """`incidence_step` in numpy; without the way out of a stand-still, where it gives the damped step."""
+    """`incidence_step` in numpy, but for a task at rest far from its goal: no way out, nobody to blame."""
     residuals = [
         _Residual.of(
             scene.matrices, scene.points[i], form[0], form[1 : 1 + kernels.fixed_dimension(kind)], i, k

@@ -167,6 +167,24 @@ def missing_share(rows: FloatArray, motion: FloatArray) -> float:
 
 
 @kernel
+def limit_pull(positions: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pull (n,) in [-1, 1] to the middle of each joint's range, the cube of the way from it, and half ranges (n,).
+
+    No pull and a half range of 1 where ``lower`` and ``upper`` (n,) are infinite, or leave no range.
+    """
+    n = positions.shape[0]
+    half = np.ones(n)
+    pull = np.zeros(n)
+    for j in range(n):
+        width = upper[j] - lower[j]
+        if width > 0.0 and math.isfinite(width):
+            half[j] = 0.5 * width
+            x = max(-1.0, min(1.0, (positions[j] - lower[j]) / half[j] - 1.0))
+            pull[j] = -x * x * x
+    return pull, half
+
+
+@kernel
 def self_motion_from_limits(
     rows: FloatArray, positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float
 ) -> FloatArray:
@@ -178,14 +196,7 @@ def self_motion_from_limits(
     without self-motions rests.
     """
     n = positions.shape[0]
-    half = np.ones(n)
-    pull = np.zeros(n)
-    for j in range(n):
-        width = upper[j] - lower[j]
-        if width > 0.0 and math.isfinite(width):
-            half[j] = 0.5 * width
-            x = max(-1.0, min(1.0, (positions[j] - lower[j]) / half[j] - 1.0))
-            pull[j] = -x * x * x
+    pull, half = limit_pull(positions, lower, upper)
     out = np.zeros(n)
     _, values, V = drivable_freedoms(rows, half)
     if not math.isfinite(values[0]):
