@@ -252,8 +252,16 @@ class Bench:
             f"not seen in {seconds} s; events: {[(e.kind, e.message) for e in self.events[start:]]}"
         )
 
-    def reply(self, command: Command) -> Event:
-        return next(e for e in self.step(command).events if e.kind == "reply")
+    def reply(self, command: Command, seconds: float = 20.0) -> Event:
+        """Send a command and step until its own reply."""
+        request = (self.seq + 1) * 10
+        outputs = self.step(command)
+        for _ in range(round(seconds * self.settings.rate_hz)):
+            for event in outputs.events:
+                if event.kind == "reply" and event.request == request:
+                    return event
+            outputs = self.step()
+        raise AssertionError(f"no reply in {seconds} s")
 
     def ready(self) -> Bench:
         """Model in, arm enabled, first frames seen."""

@@ -9,8 +9,7 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import following, intake
-from stereoservo.runtime.averaging import add_observation, averages
+from stereoservo.runtime import following, goals, intake
 from stereoservo.runtime.check import check_step
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
@@ -27,30 +26,40 @@ from stereoservo.runtime.estimate import (
     priors,
     remember_joints,
 )
+from stereoservo.runtime.incidences import incidence_motion
 from stereoservo.runtime.motion import Motion, Present, joint_move
 from stereoservo.runtime.ports import CameraObservation, FloatArray
 from stereoservo.runtime.servoing import servo_step
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import (
+    Awaiting,
     Checking,
     CoreState,
     Holding,
+    Incidence,
     Jogging,
     JointMove,
+    LawRun,
     Servoing,
+    Source,
     Trials,
     Visiting,
     camera_estimate,
     initial_state,
 )
+from stereoservo.runtime.teaching import teach_step
 from stereoservo.runtime.trials import trials_step
 
 PRIOR_RATE_HZ = 125.0
 VELOCITY_FILTER_S = 0.01
 AT_REST = 1e-3  # [rad/s or m/s]
-TEACH_TIMEOUT_S = 20.0
 FRESH_S = 0.15
 FRESH_FRAMES = 2.5  # without a frame for so many periods a law is said to coast
+
+SOURCES: dict[type[Source], str] = {
+    Holding: "hold", Awaiting: "acknowledge", Jogging: "jog", JointMove: "joints", Servoing: "law", Incidence: "law",
+    Trials: "calibrate", Checking: "check",
+}  # fmt: skip
 
 
 class ServoCore:
@@ -99,15 +108,16 @@ class ServoCore:
         for request in inputs.requests:
             intake.answer(request, present)
         self._watch_following(present)
-        self._teach(present)
+        teach_step(present)
         self._watch_model(present)
-        intake.next_goal(present)
+        goals.go_on(present)
+        intake.answer_waiting(present)
         motion = self._move(present)
         safety = self._safety(inputs, present, motion)
         active = state.lifecycle == Lifecycle.ACTIVE
         state.command = safety.limited.copy() if active else np.zeros_like(q)
         if motion.finished:
-            state.source = Holding()
+            goals.finish(motion, present)
         state.step += 1
         return StepOutputs(
             command=state.command.copy() if active else None,
@@ -174,7 +184,7 @@ class ServoCore:
                 emit("warning", message=f"model refused: {error}")
             else:
                 state.pending_model = inputs.model_update.model
-        if state.pending_model is None or isinstance(state.source, Servoing):
+        if state.pending_model is None or isinstance(state.source, LawRun) or state.planning is not None:
             return
         if bool((np.abs(state.command) > AT_REST).any()):
             return
@@ -231,41 +241,10 @@ class ServoCore:
 
     def _stop(self, present: Present) -> None:
         reason = Reason("STOPPED", "hold", hint="resume, then send the goal again")
-        intake.end_source(present, "goal_aborted", (reason,), "stopped")
-        intake.end_queue(present, (reason,), "stopped")
+        goals.end_source(present, "goal_aborted", (reason,), "stopped")
+        goals.end_queue(present, (reason,), "stopped")
         present.state.stopped = True
         present.emit("stopped", message="stop: the arm brakes and holds", reasons=(reason,))
-
-    def _teach(self, present: Present) -> None:
-        teaching = self.state.teaching
-        if teaching is None:
-            return
-        if bool((np.abs(self.state.command) > AT_REST).any()):
-            self.state.teaching = None
-            present.emit(
-                "warning",
-                request=teaching.request,
-                accepted=False,
-                name=teaching.name,
-                message=f"teaching {teaching.name!r} failed: the arm moved",
-            )
-            return
-        for observation in present.observations:
-            add_observation(teaching, self.settings, observation, teaching.frames_wanted, teaching.started_ns)
-        if bool((teaching.frames >= teaching.frames_wanted).all()):
-            self.state.teaching = None
-            present.emit(
-                "taught", request=teaching.request, name=teaching.name, joints=present.q,
-                samples=averages(teaching, self.settings), message=f"goal {teaching.name!r} taught",
-            )  # fmt: skip
-        elif (present.now_ns - teaching.started_ns) * 1e-9 > TEACH_TIMEOUT_S:
-            self.state.teaching = None
-            slow = self.settings.cameras[int(teaching.frames.argmin())].name
-            present.emit(
-                "warning", request=teaching.request, accepted=False, name=teaching.name,
-                message=f"teaching {teaching.name!r} failed: camera {slow} gave {int(teaching.frames.min())} of "
-                f"{teaching.frames_wanted} frames in {TEACH_TIMEOUT_S:.0f} s",
-            )  # fmt: skip
 
     def _watch_following(self, present: Present) -> None:
         """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
@@ -274,8 +253,8 @@ class ServoCore:
         reason = following.watch(self.state, self.settings, present.q, present.dt_s)
         if reason is None or self.state.lifecycle != Lifecycle.ACTIVE:
             return  # an arm that is off may be moved by hand
-        intake.end_source(present, "goal_aborted", (reason,), reason.hint)
-        intake.end_queue(present, (reason,), reason.hint)
+        goals.end_source(present, "goal_aborted", (reason,), reason.hint)
+        goals.end_queue(present, (reason,), reason.hint)
         self.state.fault = [reason]
         self.state.lifecycle = Lifecycle.FAULT
         self.state.driver_request = "deactivate"
@@ -302,8 +281,8 @@ class ServoCore:
                 f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
             )  # fmt: skip
             present.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
-            if isinstance(state.source, Servoing):
-                intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+            if isinstance(state.source, LawRun):
+                goals.end_source(present, "goal_aborted", (reason,), reason.hint)
             return
 
     def _move(self, present: Present) -> Motion:
@@ -313,16 +292,16 @@ class ServoCore:
         if state.lifecycle != Lifecycle.ACTIVE:
             if not isinstance(state.source, Holding):
                 reason = Reason("NOT_ACTIVE", "hold", hint=f"the cell became {state.lifecycle}")
-                intake.end_source(
+                goals.end_source(
                     present, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}"
                 )
-                intake.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
+                goals.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
             return rest
         source = state.source
-        if isinstance(source, Servoing | JointMove | Visiting) and source.lease_expired(present.now_ns):
+        if isinstance(source, LawRun | JointMove | Visiting) and source.lease_expired(present.now_ns):
             hint = "the client did not renew its lease: is it alive?"
             reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
-            intake.end_source(present, "goal_aborted", (reason,), reason.hint)
+            goals.end_source(present, "goal_aborted", (reason,), reason.hint)
             return rest
         if state.held or state.stopped:
             return rest
@@ -339,6 +318,8 @@ class ServoCore:
             return check_step(source, present)
         if isinstance(source, Servoing):
             return servo_step(source, present)
+        if isinstance(source, Incidence):
+            return incidence_motion(source, present)
         return rest
 
     def _safety(self, inputs: StepInputs, present: Present, motion: Motion) -> SafetyResult:
@@ -391,18 +372,14 @@ class ServoCore:
         state = self.state
         reasons = self._reasons(motion, safety)
         source = state.source
-        names = {
-            Holding: "hold", Jogging: "jog", JointMove: "joints", Servoing: "law", Trials: "calibrate",
-            Checking: "check",
-        }  # fmt: skip
         return Status(
             t_ns=inputs.now_ns,
             step=state.step,
             lifecycle=str(state.lifecycle),
             model=str(state.readiness),
             model_epoch=self._epoch(),
-            source=names[type(source)],
-            goal=intake.goal_of(source),
+            source=SOURCES[type(source)],
+            goal=source.id if isinstance(source, Awaiting) else goals.goal_of(source),
             law=source.law if isinstance(source, Servoing) else "",
             level=_level(reasons),
             reasons=reasons,

@@ -25,6 +25,7 @@ from stereoservo.runtime.estimate import ModelArrays
 from stereoservo.runtime.ports import FloatArray, IntArray
 
 LAW_STEPS = 80
+NEAR = 1e-5  # of a step in the basis: least squares goes on from there
 LAW_GAIN = 0.3  # of the way still to be made, a step
 REFINEMENTS = 12
 REFINE_DAMPING = 1e-12
@@ -75,18 +76,20 @@ def goal_pose(
         )
         D = _onwards(basis, twist, D)
         moved = transform_points(D, points)
+        if float(np.abs(twist).max()) < NEAR:
+            break
     return refined_pose(arrays, basis, points, D, set_points, wanted)
 
 
 def refined_pose(
     arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
-    wanted: FloatArray,
+    wanted: FloatArray, refinements: int = REFINEMENTS,
 ) -> GoalPose:  # fmt: skip
     """Least squares on all set-points, from a ``displacement`` (4, 4) near by; ``basis`` (k, 4, 4) of displacements."""
     D = displacement
     moved = transform_points(D, points)
     weights = np.repeat(wanted.reshape(-1), 2)
-    for _ in range(REFINEMENTS):
+    for _ in range(refinements):
         pixels, _ = project_points(arrays.matrices, moved)
         jacobian = image_jacobian(basis, arrays.matrices, moved).reshape(-1, basis.shape[0])
         step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, REFINE_DAMPING)

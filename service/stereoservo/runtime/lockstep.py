@@ -35,6 +35,9 @@ from stereoservo.runtime.recorder import CHECKPOINT_EVERY_S, FlightRecorder
 from stereoservo.runtime.settings import CoreSettings, core_settings
 from stereoservo.runtime.state import encode_state
 
+REPLY_TIMEOUT_S = 60.0
+"""Of virtual time: a goal is planned before it is answered."""
+
 
 class LockstepTimeoutError(Exception):
     """What was waited for did not happen in the given virtual time; carries the last status."""
@@ -186,12 +189,14 @@ class LockstepCell:
     # -- for the one who drives it --------------------------------------------------------------------------
 
     def submit(self, command: Command, operator: str = "lockstep") -> Event:
-        """Send a command and step until its reply."""
+        """Send a command and step until its reply. Raises LockstepTimeoutError."""
         self._request_number += 1
         number = self._request_number
         self._requests.append(Request(number, operator, command))
-        outputs = self.step()
-        return next(event for event in outputs.events if event.kind == "reply" and event.request == number)
+        since = self.events[-1].seq if self.events else 0
+        return self.wait_for(
+            lambda event: event.kind == "reply" and event.request == number, REPLY_TIMEOUT_S, since
+        )
 
     def raise_stop(self) -> None:
         """Raise the stop slot."""

@@ -42,12 +42,15 @@ class Present:
 
 @dataclass(frozen=True)
 class Motion:
-    """What a source wants: joint velocity (n,), whether it may go on without features, whether it has finished."""
+    """What a source wants: joint velocity (n,), whether it may not go on without features, whether it has finished,
+    and whether because its goal is ``reached``.
+    """
 
     velocity: FloatArray
     needs_features: bool = False
     speed_scale: float = 1.0
     finished: bool = False
+    reached: bool = False
     error_px: float | None = None
     task_error: FloatArray = field(default_factory=lambda: np.zeros(0))
     reasons: tuple[Reason, ...] = ()
@@ -77,7 +80,7 @@ def joint_move(move: JointMove, present: Present) -> Motion:
     worst = int(np.abs(move.target - present.q).argmax())
     if move.settled >= ARRIVED_STEPS:
         present.emit("goal_reached", id=move.id, message="joints at target")
-        return Motion(np.zeros_like(present.q), finished=True)
+        return Motion(np.zeros_like(present.q), finished=True, reached=True)
     elapsed_s = (present.now_ns - move.started_ns) * 1e-9
     if elapsed_s > move.time_limit_s:
         name = present.settings.joint_names[worst]

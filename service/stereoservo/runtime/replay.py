@@ -153,7 +153,7 @@ def _messages(path: Path) -> Iterator[tuple[str, bytes]]:
                     yield topic, record.data
     except OSError as error:
         raise RecordingError(path, steps, f"cannot be read: {error.strerror}") from error
-    except (McapError, EOFError, ValueError, KeyError, struct.error) as error:
+    except (McapError, EOFError, ValueError, KeyError, RuntimeError, struct.error) as error:
         raise RecordingError(
             path, steps, f"is truncated or damaged ({type(error).__name__}: {error})"
         ) from error

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from stereoservo.control.faces import NOT_CHOSEN, choose_face, find_faces, law_scene
+from stereoservo.control.gains import GainCurve, gain_at
 from stereoservo.control.law import JacobianChoice, Options, Scene, Task
 from stereoservo.control.laws import LAWS
 from stereoservo.control.reasons import Reason
@@ -18,11 +22,13 @@ from stereoservo.runtime.commands import (
     JacobianName,
     PointTarget,
 )
-from stereoservo.runtime.estimate import ModelArrays, chain_at, points_now
+from stereoservo.runtime.estimate import MODEL_SIGMA_PX, ModelArrays, chain_at, points_now
 from stereoservo.runtime.motion import Motion, Present
+from stereoservo.runtime.plan_following import on_the_way
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.refusal import RefusalError
-from stereoservo.runtime.state import Servoing
+from stereoservo.runtime.state import LawRun, Servoing
+from stereoservo.runtime.streaming import feed_forward, follow
 from stereoservo.runtime.targets import (
     MIN_MARKERS,
     Aim,
@@ -48,7 +54,12 @@ def place_now(present: Present) -> Place:
     assert arrays is not None
     assert prediction is not None
     H = chain_at(arrays, present.q + present.state.correction)[0]
-    return Place(present.settings, arrays, transform_points(H, arrays.marker_points), prediction.operators)
+    points = transform_points(H, arrays.marker_points)
+    seen = (
+        np.zeros((len(present.settings.cameras), len(points))) if present.weights is None else present.weights
+    )
+    faces = find_faces(points, arrays.matrices, MODEL_SIGMA_PX, arrays.camera_centres, seen)
+    return Place(present.settings, arrays, points, prediction.operators, faces)
 
 
 def start_servoing(
@@ -64,27 +75,11 @@ def start_servoing(
     if name not in LAWS:
         raise RefusalError("NO_SUCH_LAW", f"no law {name!r}; laws: {', '.join(LAWS)}", subject=name)
     aim = aim_at(target, place, LAWS[name].needs_pose, model.epoch)
-    used = _used_cameras(goal, aim, present)
-    gain = goal.gain or settings.gain
-    near, far, slope = (
-        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
-    )
     weights, body, centre_target = _centre(goal.centre, aim, place, present, model.epoch)
     source = Servoing(
-        goal=goal,
+        **run_fields(goal, present, used_cameras(goal, aim.wanted, present)),
         law=name,
-        points=goal.points or settings.points,
-        gain_near=near,
-        gain_far=far,
-        gain_slope=slope,
         jacobian=int(JACOBIANS[goal.jacobian or "mean"]),
-        tolerance_px=goal.tolerance_px or settings.tolerance_px,
-        hold_frames=goal.hold_frames or settings.hold_frames,
-        time_limit_s=goal.time_limit_s or settings.time_limit_s,
-        started_ns=present.now_ns,
-        lease_s=goal.lease_s,
-        lease_until_ns=0,
-        used=used,
         set_points=aim.set_points,
         wanted=aim.wanted,
         rates=np.zeros_like(aim.set_points),
@@ -94,22 +89,46 @@ def start_servoing(
         centre_weights=weights,
         centre_body=body,
         centre_target=centre_target,
-        face=aim.face,
-        last_frames=sum(e.frames for e in present.state.cameras),
+        faces=place.faces,
+        choice=NOT_CHOSEN._replace(triple=aim.face),
     )
     source.renew_lease(present.now_ns)
     return source
 
 
-def _used_cameras(goal: Goal, aim: Aim, present: Present) -> FloatArray:
-    """(c,) 1 for cameras whose images the law may use."""
+def run_fields(goal: Goal, present: Present, used: FloatArray) -> dict[str, Any]:
+    """Fields of a `LawRun` before its first step: what the goal says, or else the cell."""
+    settings = present.settings
+    gain = goal.gain or settings.gain
+    near, far, slope = (
+        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
+    )
+    return {
+        "goal": goal,
+        "points": goal.points or settings.points,
+        "gain_near": near,
+        "gain_far": far,
+        "gain_slope": slope,
+        "tolerance_px": goal.tolerance_px or settings.tolerance_px,
+        "hold_frames": goal.hold_frames or settings.hold_frames,
+        "time_limit_s": goal.time_limit_s or settings.time_limit_s,
+        "started_ns": present.now_ns,
+        "lease_s": goal.lease_s,
+        "lease_until_ns": 0,
+        "used": used,
+        "last_frames": sum(e.frames for e in present.state.cameras),
+    }
+
+
+def used_cameras(goal: Goal, wanted: FloatArray, present: Present) -> FloatArray:
+    """(c,) 1 for cameras that the law may use. Raises RefusalError where they show too few ``wanted`` (c, m)."""
     c = len(present.settings.cameras)
     if goal.cameras is None:
         return np.ones(c)
     used = np.zeros(c)
     for name in goal.cameras:
         used[camera_index(name, present.settings)] = 1.0
-    shown = int((aim.wanted * used[:, None]).max(axis=0).sum())
+    shown = int((wanted * used[:, None]).max(axis=0).sum())
     if shown < MIN_MARKERS:
         raise RefusalError(
             "TOO_FEW_MARKERS",
@@ -155,34 +174,64 @@ def _centre(
 
 def servo_step(source: Servoing, present: Present) -> Motion:
     """One step of a law: error, joint velocity, and whether the goal is reached or out of time."""
-    arrays, prediction, weights, pixels = present.arrays, present.prediction, present.weights, present.pixels
-    if arrays is None or prediction is None or weights is None or pixels is None:
+    arrays, prediction, pixels = present.arrays, present.prediction, present.pixels
+    if arrays is None or prediction is None or present.weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")
-    zero = np.zeros_like(present.q)
-    source.moved_s += present.dt_s
-    usable = weights * source.used[:, None]
+    usable = present.weights * source.used[:, None]
+    streamed = follow(source, present, arrays) if source.stream is not None else False
     active = usable * source.wanted
-    visible = int((active > 0.0).sum())
     distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
-    error_px = float(np.where(active > 0.0, distance, 0.0).max()) if visible else None
+    error_px = float(np.where(active > 0.0, distance, 0.0).max()) if bool((active > 0.0).any()) else None
+    seen = int((active.max(axis=0) > 0.0).sum())
+    ended = run_ended(source, present, error_px, seen, may_end=not streamed)
+    if ended is not None:
+        return ended
+    law = LAWS[source.law]
+    scene, task = choose(source, present, *scene_and_task(source, present, arrays, usable))
+    if source.law == "trajectory":
+        if source.plan is None and source.pose_known:
+            hint = "the way is planned from where the arm comes to rest"
+            waits = Reason("PLANNING", "slow", hint=hint)
+            return Motion(np.zeros_like(present.q), error_px=error_px, reasons=(waits,))
+        if source.plan is not None:
+            task = on_the_way(source, present, scene, task)
+    step = law.step(scene, task, options(source, present, error_px))
+    velocity = step.velocity
+    if streamed:
+        velocity = velocity + feed_forward(source, present, active)
+    return Motion(
+        velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
+        reasons=law.reasons(step),
+    )  # fmt: skip
+
+
+def run_ended(
+    source: LawRun, present: Present, error_px: float | None, seen: int, *, may_end: bool = True
+) -> Motion | None:
+    """What a law's step comes to where it is out of time, sees too little, or is there; None: it goes on.
+
+    ``seen``: markers of the goal that are seen. ``may_end``: off for a goal that moves still.
+    """
+    source.moved_s += present.dt_s
+    source.error_px = error_px
+    zero = np.zeros_like(present.q)
     if source.moved_s > source.time_limit_s:
         return _out_of_time(source, present, error_px)
-    seen = int((active.max(axis=0) > 0.0).sum())
     if seen < MIN_MARKERS:
         reason = Reason(
             "TOO_FEW_MARKERS", "hold", "", float(seen), float(MIN_MARKERS), "markers",
             "bring the goal's markers back into view",
         )  # fmt: skip
         return Motion(zero, needs_features=True, error_px=error_px, reasons=(reason,))
-    if _reached(source, present, error_px):
+    if _settled(source, present, error_px) and may_end:
         present.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
-        return Motion(zero, finished=True, error_px=error_px)
-    law = LAWS[source.law]
-    step = law.step(*scene_and_task(source, present, arrays, usable), options(source, present, error_px))
-    return Motion(
-        step.velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
-        reasons=law.reasons(step),
-    )  # fmt: skip
+        return Motion(zero, finished=True, reached=True, error_px=error_px)
+    return None
+
+
+def composition_of(arrays: ModelArrays) -> int:
+    """How the arm's joints compose, for laws and plans."""
+    return int(Composition.TIP_FIRST if arrays.tip_first else Composition.BASE_FIRST)
 
 
 def scene_and_task(
@@ -197,7 +246,7 @@ def scene_and_task(
     )
     scene = Scene(
         prediction.operators,
-        int(Composition.TIP_FIRST if arrays.tip_first else Composition.BASE_FIRST),
+        composition_of(arrays),
         arrays.matrices,
         arrays.camera_centres,
         points,
@@ -207,32 +256,57 @@ def scene_and_task(
     task = Task(
         source.set_points,
         source.wanted,
-        source.rates,
+        np.zeros_like(source.rates),
         source.target_points,
         np.full(len(points), 1.0 if source.pose_known else 0.0),
-        centre_now(source, present, arrays, points),
+        centre_of(source, present.q + present.state.correction, arrays, points),
         source.centre_target,
-        source.face,
+        source.choice.triple,
     )
     return scene, task
 
 
-def centre_now(source: Servoing, present: Present, arrays: ModelArrays, points: FloatArray) -> FloatArray:
-    """The goal's centre (4,) as it is now, of a body whose markers are at ``points`` (m, 4)."""
+def choose(source: Servoing, present: Present, scene: Scene, task: Task) -> tuple[Scene, Task]:
+    """The scene and the task on the face that the law works on now; a change of it is told."""
+    assert present.arrays is not None
+    if not source.pose_known:
+        return scene, task
+    before = source.choice
+    choice = choose_face(source.faces, scene, task, before)
+    if choice.cameras == 0:
+        return (
+            scene,
+            task,
+        )  # nobody sees three markers of one face: on with the former, carried by the kinematics
+    source.choice = choice
+    if choice.changed and before.cameras > 0 and choice.face != before.face:
+        ids = ", ".join(str(present.arrays.marker_ids[int(i)]) for i in choice.triple)
+        present.emit(
+            "goal_face",
+            id=source.goal.id,
+            name=ids,
+            message=f"works on the face of markers {ids} from here on",
+        )
+    return law_scene(scene, choice), task._replace(face=choice.triple)
+
+
+def centre_of(source: Servoing, joints: FloatArray, arrays: ModelArrays, points: FloatArray) -> FloatArray:
+    """The goal's centre (4,) of a body whose markers are at ``points`` (m, 4), with the arm at ``joints`` (n,)."""
     if bool((source.centre_weights != 0.0).any()):
         middle: FloatArray = (source.centre_weights[:, None] * points).sum(axis=0)
         return middle
-    H = chain_at(arrays, present.q + present.state.correction)[0]
-    moved: FloatArray = transform_points(H, source.centre_body[None])[0]
+    moved: FloatArray = transform_points(chain_at(arrays, joints)[0], source.centre_body[None])[0]
     return moved
 
 
-def options(source: Servoing, present: Present, error_px: float | None) -> Options:
+def options(source: LawRun, present: Present, error_px: float | None) -> Options:
     """How the law goes there in this step."""
-    return Options(gain=source.gain_near, dt_s=present.dt_s, jacobian=source.jacobian)
+    gain = gain_at(GainCurve(source.gain_near, source.gain_far, source.gain_slope), error_px)
+    jacobian = source.jacobian if isinstance(source, Servoing) else int(JacobianChoice.CURRENT)
+    return Options(gain=gain, dt_s=present.dt_s, jacobian=jacobian)
 
 
-def _out_of_time(source: Servoing, present: Present, error_px: float | None) -> Motion:
+def _out_of_time(source: LawRun, present: Present, error_px: float | None) -> Motion:
     reason = Reason(
         "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
         "no error was measured" if error_px is None
@@ -244,7 +318,7 @@ def _out_of_time(source: Servoing, present: Present, error_px: float | None) -> 
     return Motion(np.zeros_like(present.q), finished=True, error_px=error_px)
 
 
-def _reached(source: Servoing, present: Present, error_px: float | None) -> bool:
+def _settled(source: LawRun, present: Present, error_px: float | None) -> bool:
     """Whether the error stayed below the tolerance for ``hold_frames`` frames of every camera on average."""
     frames = sum(e.frames for e in present.state.cameras)
     new, cameras = frames - source.last_frames, len(present.state.cameras)

@@ -7,12 +7,16 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from stereoservo.control.faces import FaceChoice, Faces
+from stereoservo.control.filters import ClientClock, TargetTrack
 from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime.commands import Goal
+from stereoservo.runtime.commands import Goal, Request
 from stereoservo.runtime.cycle import Lifecycle, ModelReadiness, decode_array, encode_array
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.settings import CoreSettings
+from stereoservo.trajectory.plan import Plan
+from stereoservo.trajectory.planning import Planning
 
 STATE_VERSION = 3
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
@@ -52,6 +56,14 @@ class Holding(msgspec.Struct, tag="hold"):
     """No motion."""
 
 
+class Awaiting(msgspec.Struct, tag="acknowledge"):
+    """No motion: goal ``id`` is reached, and the queue waits until a client acknowledges it."""
+
+    id: str
+    acknowledge_s: float
+    until_ns: int
+
+
 class Jogging(msgspec.Struct, tag="jog", eq=False):
     """Joint velocities until the dead man's lease runs out."""
 
@@ -82,31 +94,75 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
     speed_scale: float
     started_ns: int
     time_limit_s: float
+    start: FloatArray
+    """Where it set out from (n,)."""
+    acknowledge_s: float | None = None
     settled: int = 0
 
 
-class Servoing(Leased, tag="law", eq=False, kw_only=True):
-    """A law drives the arm to set-points.
+class Watch(msgspec.Struct, eq=False):
+    """What of a law's run tells whether it gets on; see ``progress``.
 
-    ``used`` (c,) 1 for cameras whose images the law may use. ``set_points`` (c, m, 2) ideal pixels with ``wanted``
-    (c, m) 1 or 0, and their velocities ``rates`` [px/s]. ``target_points`` (m, 4): all markers at the goal, where
-    ``pose_known``; ``target_known`` (m,): those that fixed it; ``face`` (3,): three that span it. The centre is the
-    affine middle of the markers by ``centre_weights`` (m,), or, where these are zero, the point ``centre_body`` (4,) of
-    the body in the chain's zero; ``centre_target`` (4,) at the goal. Gains [1/s] as in `commands.AdaptiveGain`.
+    ``first_px``: the error at its beginning; ``least_px``: the smallest so far, improved for the last time after
+    ``least_s`` of motion. ``reasons``: what was found when it was last looked at.
+    """
+
+    first_px: float = 0.0
+    least_px: float = 0.0
+    least_s: float = 0.0
+    reasons: list[Reason] = []
+
+
+class Stream(msgspec.Struct, eq=False):
+    """A goal that a client moves: its filtered set-points, in the client's time, and what it said last, when.
+
+    ``set_points`` (c, m, 2): ideal pixels, as they were last said.
+    """
+
+    track: TargetTrack
+    clock: ClientClock
+    updated_ns: int
+    set_points: FloatArray
+
+
+class LawRun(Leased, eq=False, kw_only=True):
+    """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
+
+    Gains [1/s] as in `commands.AdaptiveGain`. ``moved_s``: how long it has been allowed to move; ``held``: frames that
+    the error has been inside its tolerance.
     """
 
     goal: Goal
-    law: str
     points: str
     gain_near: float
     gain_far: float
     gain_slope: float
-    jacobian: int
     tolerance_px: float
     hold_frames: int
     time_limit_s: float
     started_ns: int
     used: FloatArray
+    moved_s: float = 0.0
+    held: int = 0
+    last_frames: int = 0
+    error_px: float | None = None
+    watch: Watch = msgspec.field(default_factory=Watch)
+
+
+class Servoing(LawRun, tag="law", eq=False, kw_only=True):
+    """A law drives the arm to set-points.
+
+    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0, and their velocities ``rates`` [px/s].
+    ``target_points`` (m, 4): all markers at the goal, where ``pose_known``; ``target_known`` (m,): those that fixed it;
+    ``faces`` of the body, and the ``choice`` of the one that the law works on. The centre is the affine middle of the
+    markers by ``centre_weights`` (m,), or, where these are zero, the point ``centre_body`` (4,) of the body in the
+    chain's zero; ``centre_target`` (4,) at the goal. ``stream``: where the goal moves, once a client has moved it. Law
+    ``trajectory`` follows its ``plan`` for a body that was at ``start_points`` (m, 4), at ``plan_s`` of it.
+    ``goal_joints`` (n,): where a plan ends.
+    """
+
+    law: str
+    jacobian: int
     set_points: FloatArray
     wanted: FloatArray
     rates: FloatArray
@@ -116,10 +172,31 @@ class Servoing(Leased, tag="law", eq=False, kw_only=True):
     centre_weights: FloatArray
     centre_body: FloatArray
     centre_target: FloatArray
-    face: IntArray
-    moved_s: float = 0.0
-    held: int = 0
-    last_frames: int = 0
+    faces: Faces
+    choice: FaceChoice
+    stream: Stream | None = None
+    plan: Plan | None = None
+    plan_s: float = 0.0
+    start_points: FloatArray | None = None
+    goal_joints: FloatArray | None = None
+
+
+class Incidence(LawRun, tag="incidence", eq=False, kw_only=True):
+    """Incidences of the body with the scene, and a second task in their null space.
+
+    ``kinds`` (k,), ``markers`` (k, 3), ``fixed`` (k, 3, 4) as in `control.incidence.IncidenceTask`; ``names`` (k,) for
+    people. Second task: ``joints`` (n,) where ``joints_wanted`` (n,) is 1; ``set_points`` (c, m, 2) ideal pixels where
+    ``wanted`` (c, m) is 1.
+    """
+
+    kinds: IntArray
+    markers: IntArray
+    fixed: FloatArray
+    names: tuple[str, ...]
+    joints: FloatArray
+    joints_wanted: FloatArray
+    set_points: FloatArray
+    wanted: FloatArray
 
 
 class Sums(msgspec.Struct, eq=False, kw_only=True):
@@ -212,7 +289,25 @@ class Teaching(Sums, eq=False):
     started_ns: int
 
 
-Source = Holding | Jogging | JointMove | Servoing | Trials | Checking
+Purpose = Literal["reply", "queue", "ahead", "again"]
+
+
+class PlanJob(msgspec.Struct, eq=False, kw_only=True):
+    """A goal that is being planned, and the ``source`` that it comes to.
+
+    ``purpose``: to answer ``request``; the next one of the queue; the one after this, ahead; the active one anew. From
+    ``joints`` (n,) with the body at ``points`` (m, 4).
+    """
+
+    request: int
+    purpose: Purpose
+    source: Servoing
+    planning: Planning
+    joints: FloatArray
+    points: FloatArray
+
+
+Source = Holding | Awaiting | Jogging | JointMove | Servoing | Incidence | Trials | Checking
 
 
 class CoreState(msgspec.Struct, eq=False):
@@ -233,6 +328,13 @@ class CoreState(msgspec.Struct, eq=False):
     cameras: list[CameraEstimate]
     source: Source
     queue: list[Goal]
+    planning: PlanJob | None
+    waiting: list[Request]
+    """Answered once the goal that is being planned has its answer."""
+    ahead: Servoing | None
+    """The next goal of the queue, planned from where the active one ends."""
+    not_ahead: str
+    """Id of a queued goal that cannot be planned ahead of its turn."""
     teaching: Teaching | None
     held: bool
     stopped: bool
@@ -267,6 +369,10 @@ def initial_state(settings: CoreSettings) -> CoreState:
         cameras=[camera_estimate(0) for _ in settings.cameras],
         source=Holding(),
         queue=[],
+        planning=None,
+        waiting=[],
+        ahead=None,
+        not_ahead="",
         teaching=None,
         held=False,
         stopped=False,

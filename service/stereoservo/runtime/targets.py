@@ -12,6 +12,7 @@ from math import isfinite
 
 import numpy as np
 
+from stereoservo.control.faces import Faces, sights_along
 from stereoservo.kinematics.kernels import (
     BoolArray,
     invert4,
@@ -49,6 +50,8 @@ class Place:
     arrays: ModelArrays
     points: FloatArray
     operators: FloatArray
+    faces: Faces
+    """Of the body, where it is now."""
 
 
 @dataclass(frozen=True)
@@ -309,6 +312,8 @@ def _aim(place: Place, targets: FloatArray, known: BoolArray, *, only_known: boo
     pixels, _ = project_points(arrays.matrices, pose.points)
     shown = in_view(place, pixels) * (wanted if only_known else 1.0)
     _enough_in_view(place, pixels, shown, known)
+    shown = shown * _turned_to(place, pose.displacement)
+    _enough_shown(place, shown)
     return Aim(
         np.where(shown[..., None] > 0.0, pixels, 0.0), shown, pose.points, pose.displacement,
         known.astype(np.float64), True, face,
@@ -339,6 +344,34 @@ def _enough_in_view(place: Place, pixels: FloatArray, shown: FloatArray, known: 
         f"marker {place.arrays.marker_ids[lost]} would be at ({u:.0f}, {v:.0f}), its image is "
         f"{camera.width}x{camera.height}",
         subject=camera.name, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
+    )  # fmt: skip
+
+
+def _turned_to(place: Place, displacement: FloatArray) -> FloatArray:
+    """(c, m) 1 where a marker's face is turned to the camera after ``displacement``; 1 where no side of it is known."""
+    faces = place.faces
+    found = np.ones((len(place.arrays.camera_centres), len(place.points)))
+    if not bool((faces.sided > 0.0).any()):
+        return found
+    fronts = sights_along(faces, place.points, displacement[None], place.arrays.camera_centres).fronts[0]
+    told = faces.members[faces.sided > 0.0].max(axis=0) > 0.0
+    for c in range(len(found)):
+        turned = (faces.members * fronts[:, c : c + 1]).max(axis=0) > 0.0
+        found[c] = np.where(told & ~turned, 0.0, 1.0)
+    return found
+
+
+def _enough_shown(place: Place, shown: FloatArray) -> None:
+    best = int(shown.sum(axis=-1).argmax())
+    count = int(shown[best].sum())
+    if count >= MIN_MARKERS:
+        return
+    camera = place.settings.cameras[best].name
+    raise RefusalError(
+        "FACE_HIDDEN",
+        f"at the goal camera {camera!r} would see the front of {count} markers, the others of less; {MIN_MARKERS} are "
+        "needed: the body turns its back",
+        subject=camera, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
     )  # fmt: skip
 
 

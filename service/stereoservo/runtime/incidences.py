@@ -1,0 +1,305 @@
+"""Incidences as a goal: points, lines and planes of the body onto ones of the scene (2.5.3), as a motion source."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import numpy as np
+
+from stereoservo.control.incidence import (
+    KINDS,
+    IncidenceStatus,
+    IncidenceTask,
+    SecondTask,
+    image_task,
+    incidence_reasons,
+    incidence_step,
+    joint_task,
+    no_second_task,
+)
+from stereoservo.control.law import Scene
+from stereoservo.kinematics.kernels import project_points, triangulate
+from stereoservo.runtime.commands import Feature, Goal, IncidenceTarget, JointTarget
+from stereoservo.runtime.estimate import ModelArrays, points_now, with_unit_height
+from stereoservo.runtime.motion import Motion, Present
+from stereoservo.runtime.ports import FloatArray
+from stereoservo.runtime.refusal import RefusalError
+from stereoservo.runtime.servoing import composition_of, options, run_ended, run_fields, used_cameras
+from stereoservo.runtime.state import Incidence
+from stereoservo.runtime.targets import (
+    FINITE_HEIGHT,
+    Place,
+    camera_index,
+    ideal_pixel,
+    marker_index,
+    of_this_model,
+    raw_set_points,
+)
+
+FEATURES = ("point", "line", "plane")
+SPAN_PX = 5.0
+"""Least distance in an image between markers, or from their line, that span a line or a plane."""
+FLAT = 1e-6
+"""Sine below which points of a fixed feature coincide, or lie on a line."""
+SECOND_AT_REST = 5e-3
+"""Joint velocity [rad/s or m/s] below which a second task has come as far as it gets."""
+
+
+def start_incidence(goal: Goal, target: IncidenceTarget, present: Present, place: Place) -> Incidence:
+    """The state of the incidence law before its first step. Raises RefusalError naming what makes it unusable."""
+    model = present.state.model
+    assert model is not None
+    if len(present.settings.cameras) < 2:
+        raise RefusalError(
+            "TOO_FEW_CAMERAS", "distances in space need the images of two cameras; the cell has one",
+            value=1.0, threshold=2.0, unit="cameras",
+        )  # fmt: skip
+    of_this_model(target.model_epoch, model.epoch)
+    k, n = len(target.incidences), len(present.q)
+    kinds, markers = np.zeros(k, np.int64), np.full((k, 3), -1, np.int64)
+    fixed = np.zeros((k, 3, 4))
+    names = []
+    for i, spec in enumerate(target.incidences):
+        name = f"incidence {i + 1} ({spec.kind})"
+        moving, standing = (FEATURES.index(word) for word in spec.kind.split("-on-"))
+        own = _moving(spec.moving, moving, name, place)
+        kinds[i] = KINDS.index(spec.kind)
+        markers[i, : len(own)] = own
+        fixed[i] = _fixed(spec.fixed, standing, name, place, target.model_epoch)
+        names.append(name)
+    joints, joints_wanted = np.zeros(n), np.zeros(n)
+    c, m = len(present.settings.cameras), len(place.points)
+    set_points, wanted = np.zeros((c, m, 2)), np.zeros((c, m))
+    if isinstance(target.secondary, JointTarget):
+        for joint, position in target.secondary.positions.items():
+            j = joint_index(joint, present)
+            joints[j], joints_wanted[j] = position, 1.0
+    elif target.secondary is not None:
+        of_this_model(target.secondary.model_epoch, model.epoch)
+        set_points, wanted = raw_set_points(target.secondary, place)
+    source = Incidence(
+        **run_fields(goal, present, used_cameras(goal, np.ones((c, m)), present)),
+        kinds=kinds, markers=markers, fixed=fixed, names=tuple(names), joints=joints, joints_wanted=joints_wanted,
+        set_points=set_points, wanted=wanted,
+    )  # fmt: skip
+    _drivable(source, present, place)
+    source.renew_lease(present.now_ns)
+    return source
+
+
+def joint_index(name: str, present: Present) -> int:
+    """Index of a joint. Raises RefusalError."""
+    names = present.settings.joint_names
+    if name not in names:
+        raise RefusalError("NO_SUCH_JOINT", f"no joint {name!r}; joints: {', '.join(names)}", subject=name)
+    return names.index(name)
+
+
+def _one_way(feature: Feature, name: str, which: str) -> None:
+    ways = [w for w in ("markers", "points", "pixels") if getattr(feature, w)]
+    if len(ways) != 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: its {which} feature is given by {' and '.join(ways) or 'nothing'}; give one of markers, points, "
+            "pixels",
+        )
+
+
+def _moving(feature: Feature, dimension: int, name: str, place: Place) -> list[int]:
+    """Indices of the markers that span the moving feature."""
+    _one_way(feature, name, "moving")
+    if not feature.markers:
+        raise RefusalError("FEATURE_UNCLEAR", f"{name}: what moves is given by markers of the body")
+    own = [marker_index(marker, place.arrays) for marker in feature.markers]
+    if len(set(own)) != dimension + 1 or len(own) != dimension + 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} different markers, got "
+            f"{list(feature.markers)}",
+            value=float(len(set(own))), threshold=float(dimension + 1), unit="markers",
+        )  # fmt: skip
+    pixels, _ = project_points(place.arrays.matrices, np.ascontiguousarray(place.points[own]))
+    width = 0.0
+    for image in pixels:
+        edges = image[1:] - image[0]
+        lengths = np.sqrt((edges * edges).sum(axis=-1))
+        if dimension == 1:
+            width = max(width, float(lengths[0]))
+        elif dimension == 2:
+            area = abs(float(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]))
+            width = max(width, area / max(float(lengths.max()), 1e-9))
+    if dimension > 0 and not width > SPAN_PX:
+        raise RefusalError(
+            "COLLINEAR_MARKERS" if dimension == 2 else "FEATURE_UNCLEAR",
+            f"{name}: markers {list(feature.markers)} span no {FEATURES[dimension]}: {width:.1f} px apart",
+            value=width, threshold=SPAN_PX, unit="px",
+        )  # fmt: skip
+    return own
+
+
+def _fixed(feature: Feature, dimension: int, name: str, place: Place, model_epoch: int | None) -> FloatArray:
+    """(3, 4): a point of height 1 of the fixed feature, then its directions of height 0."""
+    _one_way(feature, name, "fixed")
+    if feature.markers:
+        raise RefusalError(
+            "FEATURE_UNCLEAR", f"{name}: markers move with the body; what stands is given by points or pixels"
+        )
+    if feature.points:
+        if model_epoch is None:
+            raise RefusalError(
+                "FRAME_UNKNOWN", f"{name}: points need the goal's model_epoch, in whose frame they are"
+            )
+        points = np.array(feature.points, dtype=np.float64)
+    else:
+        points = _triangulated(feature, name, place)
+    if len(points) != dimension + 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} points, got {len(points)}",
+            value=float(len(points)), threshold=float(dimension + 1), unit="points",
+        )  # fmt: skip
+    form = _base_and_directions(points, place.arrays)
+    if form is None:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: the points of what stands coincide, lie on one line, at infinity, or are not finite; they span "
+            f"no {FEATURES[dimension]}",
+        )
+    return form
+
+
+def _triangulated(feature: Feature, name: str, place: Place) -> FloatArray:
+    arrays, cameras = place.arrays, place.settings.cameras
+    counts = {len(pixels) for pixels in feature.pixels.values()}
+    if len(feature.pixels) < 2 or len(counts) != 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: pixels of the same points in two or more cameras are needed, got "
+            + ", ".join(f"{len(p)} in {c!r}" for c, p in feature.pixels.items()),
+        )
+    count = counts.pop()
+    pixels, weights = np.zeros((len(cameras), count, 2)), np.zeros((len(cameras), count))
+    for camera_name, points in feature.pixels.items():
+        c = camera_index(camera_name, place.settings)
+        for i, (u, v) in enumerate(points):
+            pixels[c, i] = ideal_pixel(cameras[c], arrays.lenses[c], f"{name}, point {i + 1}", u, v)
+            weights[c, i] = 1.0
+    found, ok = triangulate(arrays.matrices, pixels, weights, 5)
+    if not bool(np.asarray(ok).all()):
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: its pixels' rays do not meet in points; are the cameras' pixels swapped?",
+        )
+    scaled: FloatArray = with_unit_height(found, arrays.plane_at_infinity)
+    return scaled
+
+
+def _base_and_directions(points: FloatArray, arrays: ModelArrays) -> FloatArray | None:
+    """The span of ``points`` (d, 4), finite or at infinity, as `control.incidence.IncidenceTask` has it, or None."""
+    form = np.zeros((3, 4))
+    heights = (points * arrays.plane_at_infinity).sum(axis=-1)
+    size = np.sqrt((points * points).sum(axis=-1) * float((arrays.plane_at_infinity**2).sum()))
+    if not (bool(np.isfinite(size).all()) and bool((size > 0.0).all())):
+        return None
+    finite = np.abs(heights) > FINITE_HEIGHT * size
+    if not bool(finite.any()):
+        return None
+    first = int(np.flatnonzero(finite)[0])
+    form[0] = points[first] / heights[first]
+    row = 1
+    for i in range(len(points)):
+        if i == first:
+            continue
+        direction = points[i] / heights[i] - form[0] if finite[i] else points[i]
+        length = float(np.sqrt((direction * direction).sum()))
+        if not length > FLAT * float(np.sqrt((form[0] * form[0]).sum())):
+            return None
+        direction = direction / length
+        for before in form[1:row]:
+            direction = direction - float((direction * before).sum()) * before
+        length = float(np.sqrt((direction * direction).sum()))
+        if not length > FLAT:
+            return None
+        form[row] = direction / length
+        row += 1
+    return form
+
+
+def _drivable(source: Incidence, present: Present, place: Place) -> None:
+    """Raises RefusalError for incidences that no motion of the arm brings nearer."""
+    assert present.weights is not None
+    assert present.pixels is not None
+    scene = _scene(source, present, place.arrays, place.points, present.weights)
+    step = incidence_step(scene, _task(source), options(source, present, None))
+    bad = tuple(
+        reason
+        for reason in incidence_reasons(step, _task(source), source.names)
+        if reason.code != "INCIDENCE_UNSEEN"
+    )
+    if bad:
+        first = bad[0]
+        raise RefusalError(
+            first.code, f"{first.subject}: {first.hint}", subject=first.subject, value=first.value,
+            threshold=first.threshold, unit=first.unit, further=bad[1:],
+        )  # fmt: skip
+
+
+def incidence_motion(source: Incidence, present: Present) -> Motion:
+    """One step: the incidences, and the second task in what they leave free."""
+    arrays, prediction, weights, pixels = present.arrays, present.prediction, present.weights, present.pixels
+    if arrays is None or prediction is None or weights is None or pixels is None:
+        raise AssertionError("a law runs only with a model")
+    usable = weights * source.used[:, None]
+    points = points_now(
+        arrays, present.q, prediction, pixels, usable, present.state.correction, source.points
+    )
+    scene = _scene(source, present, arrays, points, usable)
+    task, how = _task(source), options(source, present, source.error_px)
+    second = _second(source, present, scene, how.gain)
+    step = incidence_step(scene, task, how, second)
+    error_px = float(step.error_px.max())
+    resting = bool((np.abs(step.velocity) < SECOND_AT_REST).all())
+    ended = run_ended(
+        source, present, error_px if isfinite(error_px) else None, int((usable.max(axis=0) > 0.0).sum()),
+        may_end=len(second.rates) == 0 or resting,
+    )  # fmt: skip
+    if ended is not None:
+        return ended
+    still = bool((step.status == int(IncidenceStatus.NOT_FINITE)).any())
+    return Motion(
+        np.zeros_like(present.q) if still else step.velocity, True, source.goal.speed_scale, error_px=source.error_px,
+        task_error=step.error_px, reasons=incidence_reasons(step, task, source.names),
+    )  # fmt: skip
+
+
+def _task(source: Incidence) -> IncidenceTask:
+    return IncidenceTask(source.kinds, source.markers, source.fixed, source.tolerance_px)
+
+
+def _scene(
+    source: Incidence, present: Present, arrays: ModelArrays, points: FloatArray, weights: FloatArray
+) -> Scene:
+    prediction, pixels = present.prediction, present.pixels
+    assert prediction is not None
+    assert pixels is not None
+    return Scene(
+        prediction.operators,
+        composition_of(arrays),
+        arrays.matrices,
+        arrays.camera_centres,
+        points,
+        pixels,
+        weights,
+    )
+
+
+def _second(source: Incidence, present: Present, scene: Scene, gain: float) -> SecondTask:
+    if bool((source.joints_wanted > 0.0).any()):
+        return joint_task(
+            present.q, source.joints, source.joints_wanted, present.settings.limits.velocity_max, gain
+        )
+    if bool((source.wanted > 0.0).any()):
+        return image_task(
+            scene.operators, scene.matrices, scene.points, source.set_points, source.wanted, gain
+        )
+    return no_second_task(len(present.q))
