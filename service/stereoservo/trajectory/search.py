@@ -45,6 +45,8 @@ MOST_FOLLOWED = 120
 """Ways that the arm is taken along before the search ends."""
 GOAL_MISSED = 30
 """What a way counts that ends beside the goal, for want of freedoms: few others will do better."""
+GOAL_BEYOND = 90
+"""What it counts that the goal itself is beyond a joint's limit, unless joints turn there another way."""
 
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
 """What the ``index`` of an approach NOT_REACHABLE names."""
@@ -253,6 +255,7 @@ def _go_on_from_goal_joints(p: Planning, missed: bool) -> None:
     if broken >= 0:
         p.table = table
         p.goal_failure = approach(p, broken)
+        p.followed += GOAL_BEYOND
         next_way(p)
     elif p.request.bend or p.rank < RIGID_FREEDOMS:
         p.joint_step = (p.joints - p.request.joints) / (SAMPLES - 1.0)

@@ -28,17 +28,22 @@ def _next_paces(
     for j in range(slope.shape[0]):
         if not math.isfinite(limits[j]):
             continue
-        # slope (x⁺ − x)/2 + bow (x⁺ + x)/2 within the limit
-        ahead = 0.5 * (slope[j] + bow[j])
-        now = 0.5 * (bow[j] - slope[j]) * pace
-        if ahead > 0.0:
-            largest = min(largest, (limits[j] - now) / ahead)
-            least = max(least, (-limits[j] - now) / ahead)
-        elif ahead < 0.0:
-            largest = min(largest, (-limits[j] - now) / ahead)
-            least = max(least, (limits[j] - now) / ahead)
-        elif abs(now) > limits[j]:
-            largest = -1.0
+        # q' (x⁺ − x)/2 + q'' x within the limit at the begin, likewise with x⁺ at the end
+        for end in range(2):
+            if end == 0:
+                rate = slope[j] - 0.5 * bow[j]
+                ahead, now = 0.5 * rate, (bow[j] - 0.5 * rate) * pace
+            else:
+                rate = slope[j] + 0.5 * bow[j]
+                ahead, now = 0.5 * rate + bow[j], -0.5 * rate * pace
+            if ahead > 0.0:
+                largest = min(largest, (limits[j] - now) / ahead)
+                least = max(least, (-limits[j] - now) / ahead)
+            elif ahead < 0.0:
+                largest = min(largest, (-limits[j] - now) / ahead)
+                least = max(least, (limits[j] - now) / ahead)
+            elif abs(now) > limits[j]:
+                largest = -1.0
     return least, largest
 
 
@@ -69,9 +74,9 @@ def sample_times(
         for j in range(n):
             steepest = 0.0
             if k > 0:
-                steepest = abs(slopes[k - 1, j])
+                steepest = max(abs(slopes[k - 1, j]), abs(slopes[k - 1, j] + 0.5 * bows[k - 1, j]))
             if k < K - 1:
-                steepest = max(steepest, abs(slopes[k, j]))
+                steepest = max(steepest, abs(slopes[k, j]), abs(slopes[k, j] - 0.5 * bows[k, j]))
             if steepest > 0.0 and math.isfinite(velocity_max[j]):
                 ceilings[k] = min(ceilings[k], (velocity_max[j] / steepest) ** 2)
     if even:
