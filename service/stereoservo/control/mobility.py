@@ -95,12 +95,11 @@ def mobility(
     named = _rigid_motions(E)
     fields = _motions(E, named, points)
     _refuse_line(fields)
-    rank, values, V, made = _drivable(E, operators, points, units)
+    rank, capacity, values, V, made = _drivable(E, operators, points, units)
     shares = np.linalg.norm(made.T @ (fields / np.linalg.norm(fields, axis=0)), axis=0)
     missing = tuple(
         Freedom(_describe(E, X, points, camera), X, 0.0) for X in _left_over(named, fields, made, rank)
     )
-    capacity = min(n, _closure(np.stack([_twist(E, X) for X in operators]))) if n else 0
     block = joints_to_block(_motions(E, operators, points), units, capacity, WEAK) if n else np.zeros(0)
     J = image_jacobian(operators, matrices, points) * units
     pixels = np.sqrt(((J @ V) ** 2).sum(axis=(0, 1, 2)) / (J.shape[0] * J.shape[1]))
@@ -140,7 +139,7 @@ def missing_freedom(
     n = operators.shape[0]
     E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
     field = _motions(E, wanted[None], points)[:, 0]
-    _, _, _, made = _drivable(E, operators, points, np.ones(n))
+    *_, made = _drivable(E, operators, points, np.ones(n))
     left = field - made @ (made.T @ field)
     size = float(np.linalg.norm(field))
     if float(np.linalg.norm(left)) <= tolerance * size:
@@ -170,14 +169,16 @@ def _left_over(named: FloatArray, fields: FloatArray, made: FloatArray, rank: in
 
 def _drivable(
     E: FloatArray, operators: FloatArray, points: FloatArray, units: FloatArray
-) -> tuple[int, FloatArray, FloatArray, FloatArray]:
-    """`drivable_freedoms`, and the motions that they make of the points as orthonormal columns (3m, rank)."""
+) -> tuple[int, int, FloatArray, FloatArray, FloatArray]:
+    """`drivable_freedoms`, at most the arm's capacity, and what they make of the points as orthonormal columns."""
     n = operators.shape[0]
     if not n:
-        return 0, np.zeros(0), np.zeros((0, 0)), np.zeros((3 * len(points), 0))
+        return 0, 0, np.zeros(0), np.zeros((0, 0)), np.zeros((3 * len(points), 0))
     rows = _motions(E, operators, points)
     rank, values, V = drivable_freedoms(rows, units)
-    return rank, values, V, (rows * units) @ V[:, :rank] / values[:rank]
+    capacity = min(n, _closure(np.stack([_twist(E, X) for X in operators])))
+    rank = min(rank, capacity)
+    return rank, capacity, values, V, (rows * units) @ V[:, :rank] / values[:rank]
 
 
 def _rigid_motions(E: FloatArray) -> FloatArray:

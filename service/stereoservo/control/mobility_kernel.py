@@ -21,7 +21,7 @@ BoolArray = npt.NDArray[np.bool_]
 LOST = 1e-3
 """Singular value, relative to the largest, below which a freedom is lost; the operators are estimates."""
 
-EQUAL = 1e-6
+EQUAL = 0.05
 """Difference of two joints' parts in a lost freedom that decides nothing: the one nearer to the base is taken."""
 
 
@@ -119,17 +119,15 @@ def joints_to_block(rows: FloatArray, unit: FloatArray, capacity: int, least: fl
                 strong += 1
         if left - strong <= max(n - capacity, 0) or strong == 0:
             break
-        chosen = -1
+        parts = np.zeros(left)
         most = 0.0
         for k in range(left):
-            part = 0.0
             for i in range(strong, left):
-                part += V[k, i] * V[k, i]
-            if part > most + EQUAL:
-                most = part
-                chosen = k
-        if chosen < 0:
-            break
+                parts[k] += V[k, i] * V[k, i]
+            most = max(most, parts[k])
+        chosen = 0
+        while parts[chosen] < most - EQUAL:
+            chosen += 1
         blocked[index[chosen]] = True
     return blocked
 

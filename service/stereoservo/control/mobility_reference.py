@@ -36,7 +36,7 @@ def joints_to_block_reference(rows: FloatArray, unit: FloatArray, capacity: int,
         if strong == 0 or len(free) - strong <= max(n - capacity, 0):
             break
         parts = (vectors[strong:] ** 2).sum(axis=0)
-        free.pop(int(np.flatnonzero(parts > parts.max() - EQUAL)[0]))
+        free.pop(int(np.flatnonzero(parts >= parts.max() - EQUAL)[0]))
     blocked = np.ones(n, dtype=np.bool_)
     blocked[free] = False
     return blocked
