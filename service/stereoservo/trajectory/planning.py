@@ -26,7 +26,7 @@ from stereoservo.trajectory.search import (
     plan_on,
     stay,
 )
-from stereoservo.trajectory.sights import read_surroundings
+from stereoservo.trajectory.sights import own, read_surroundings
 from stereoservo.trajectory.ways import NUMBERS, pose_on_way
 
 __all__ = [
@@ -62,9 +62,11 @@ def start_planning(request: PlanRequest) -> Planning:
     """What can be decided at once, and the state from which `plan_on` goes on. Raises PlanRequestError."""
     r = request
     _check(r)
-    operators = np.ascontiguousarray(r.operators)
-    heights = np.concatenate([r.points, r.targets, r.camera_centres, r.centre[None], r.centre_target[None]])
-    frame = motion_frame(operators, plane_at_infinity(operators, heights), r.centre, r.camera_centres)
+    operators, centre, eyes = own(r.operators), own(r.centre), own(r.camera_centres)
+    heights = own(
+        np.concatenate([r.points, r.targets, r.camera_centres, r.centre[None], r.centre_target[None]])
+    )
+    frame = motion_frame(operators, plane_at_infinity(operators, heights), centre, eyes)
     inverse = invert4(frame)
     if not np.isfinite(inverse).all():
         raise PlanRequestError(
@@ -82,7 +84,7 @@ def start_planning(request: PlanRequest) -> Planning:
     at_goal = pose_on_way(whole, 1.0)
     surroundings, refusal = read_surroundings(r, frame, inverse, body, goal)
     kinds = np.stack(turnings(rotation, face_normal(body, surroundings.faces)))
-    local = np.stack([conjugated(inverse, np.ascontiguousarray(G), frame) for G in operators])
+    local = np.stack([conjugated(inverse, G, frame) for G in operators])
     n = len(r.joints)
     planning = Planning(
         request=request,
@@ -128,7 +130,7 @@ def _check(request: PlanRequest) -> None:
 
 
 def _in_frame(inverse: FloatArray, points: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(transform_points(inverse, np.ascontiguousarray(points))[:, :3])
+    return own(transform_points(inverse, own(points))[:, :3])
 
 
 def _useful(kinds: FloatArray) -> tuple[bool, ...]:

@@ -30,6 +30,7 @@ from stereoservo.trajectory.rooms import (
     empty_table,
     moved,
 )
+from stereoservo.trajectory.sights import own
 from stereoservo.trajectory.time_scaling import sample_times
 from stereoservo.trajectory.ways import pose_on_way
 
@@ -268,8 +269,8 @@ def _finish(p: Planning) -> None:
     r = p.request
     times = sample_times(
         p.all_joints,
-        r.speed_scale * r.limits.velocity_max,
-        r.speed_scale * r.limits.acceleration_max,
+        own(r.speed_scale * r.limits.velocity_max),
+        own(r.speed_scale * r.limits.acceleration_max),
         r.profile == "exponential",
     )
     candidate = CANDIDATES[p.candidate]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import transform_points
@@ -31,6 +32,11 @@ YIELD = 1e-6
 """Of margins [px or rad] to what the ends have."""
 
 
+def own(values: npt.ArrayLike) -> FloatArray:
+    """A writable, contiguous copy: kernels are compiled by these properties too, and no loop may wait for that."""
+    return np.array(values, dtype=np.float64, order="C", copy=True)
+
+
 def read_surroundings(
     request: PlanRequest, frame: FloatArray, inverse: FloatArray, body: FloatArray, goal: FloatArray
 ) -> tuple[Surroundings, Approach | None]:
@@ -40,25 +46,25 @@ def read_surroundings(
     """
     r, limits = request, request.limits
     cameras = np.stack([_moved_camera(P, frame) for P in r.matrices])
-    eyes = np.ascontiguousarray(transform_points(inverse, np.ascontiguousarray(r.camera_centres))[:, :3])
-    faces = np.ascontiguousarray(r.faces, dtype=np.int64).reshape(-1, 3)
+    eyes = own(transform_points(inverse, own(r.camera_centres))[:, :3])
+    faces = np.array(r.faces, dtype=np.int64, order="C", copy=True).reshape(-1, 3)
     sides, grazing = _kept_sights(body, goal, faces, eyes)
     surroundings = Surroundings(
         body=body,
-        kept=np.ascontiguousarray(r.kept, dtype=np.float64),
+        kept=own(r.kept),
         cameras=cameras,
         eyes=eyes,
-        sizes=np.ascontiguousarray(limits.sizes, dtype=np.float64),
-        lenses=np.ascontiguousarray(limits.lenses, dtype=np.float64),
+        sizes=own(limits.sizes),
+        lenses=own(limits.lenses),
         margins=np.full(len(cameras), float(limits.view_margin_px)),
         depths=cameras[:, 2, 3].copy(),
         faces=faces,
         sides=sides,
         grazing=grazing,
         # a joint beyond its limit may come back
-        lower=np.minimum(limits.position_min, r.joints),
-        upper=np.maximum(limits.position_max, r.joints),
-        keep_outs=np.ascontiguousarray(limits.keep_outs, dtype=np.float64).reshape(-1, len(r.joints), 2),
+        lower=own(np.minimum(limits.position_min, r.joints)),
+        upper=own(np.maximum(limits.position_max, r.joints)),
+        keep_outs=own(limits.keep_outs).reshape(-1, len(r.joints), 2),
     )
     refusal = _refusal(surroundings, body, goal)
     if refusal is None:
@@ -69,8 +75,7 @@ def read_surroundings(
 
 
 def _moved_camera(P: FloatArray, frame: FloatArray) -> FloatArray:
-    camera: FloatArray = np.ascontiguousarray((P[:, :, None] * frame[None, :, :]).sum(axis=1))
-    return camera
+    return own((P[:, :, None] * frame[None, :, :]).sum(axis=1))
 
 
 def _image_rooms(surroundings: Surroundings, points: FloatArray) -> FloatArray:
