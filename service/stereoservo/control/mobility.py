@@ -92,7 +92,7 @@ def mobility(
     n = operators.shape[0]
     units = np.ones(n) if unit is None else np.asarray(unit, dtype=np.float64)
     E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
-    named = _rigid_motions(E)
+    named = rigid_motions(E)
     fields = _motions(E, named, points)
     _refuse_line(fields)
     rank, capacity, values, V, made = _drivable(E, operators, points, units)
@@ -144,7 +144,7 @@ def missing_freedom(
     size = float(np.linalg.norm(field))
     if float(np.linalg.norm(left)) <= tolerance * size:
         return None
-    named = _rigid_motions(E)
+    named = rigid_motions(E)
     _refuse_line(_motions(E, named, points))
     twist = np.linalg.pinv(_motions(E, named, points)) @ left
     rest = np.tensordot(twist, named, axes=1)
@@ -181,7 +181,7 @@ def _drivable(
     return rank, capacity, values, V, (rows * units) @ V[:, :rank] / values[:rank]
 
 
-def _rigid_motions(E: FloatArray) -> FloatArray:
+def rigid_motions(E: FloatArray) -> FloatArray:
     """Generators (6, 4, 4) of `FREEDOMS` in the frame that ``E`` (4, 4) maps the body's frame to."""
     local = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
     motions: FloatArray = E @ local @ np.linalg.inv(E)
@@ -213,7 +213,7 @@ def _refuse_line(fields: FloatArray) -> None:
 
 def _describe(E: FloatArray, X: FloatArray, points: FloatArray, camera: str) -> str:
     """A motion in words: its components by how far they move the body's points."""
-    sizes = np.linalg.norm(_motions(E, _rigid_motions(E), points), axis=0) * np.abs(_twist(E, X))
+    sizes = np.linalg.norm(_motions(E, rigid_motions(E), points), axis=0) * np.abs(_twist(E, X))
     order = [i for i in np.argsort(-sizes, kind="stable").tolist() if sizes[i] > NAMED * sizes.max()]
     return " together with ".join(FREEDOMS[i] for i in order) + f" of {camera}"
 
