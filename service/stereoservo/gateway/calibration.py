@@ -94,9 +94,11 @@ class Calibration:
         except (CalibrationError, OSError) as error:
             self._failed(self._fit_id, str(error), getattr(error, "code", ""))
             return
-        self._log.add(
-            "fit_started", message=f"{self._job.stops} stops", id=self._fit_id, progress=0.0, origin="gateway"
-        )
+        message = f"{self._job.stops} stops"
+        if self._job.standing:
+            markers = ", ".join(str(marker) for marker in self._job.standing)
+            message += f"; markers {markers} stood still: they are not of the body, and left out"
+        self._log.add("fit_started", message=message, id=self._fit_id, progress=0.0, origin="gateway")
 
     def _start_check(self, *, reset: bool) -> None:
         if self._check is not None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereoservo.kinematics.calibration.standing import standing_markers
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialCamera, TrialData
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.settings import CameraSettings, CoreSettings
@@ -18,6 +19,7 @@ class CalibrationJob:
         self._settings = settings
         self.id = ""
         self._stops: list[Event] = []
+        self.standing: tuple[int, ...] = ()
 
     @property
     def stops(self) -> int:
@@ -34,7 +36,7 @@ class CalibrationJob:
         self._stops.append(event)
 
     def trials(self) -> TrialData:
-        """All stops as trial data, markers that no camera ever saw left out.
+        """All stops as trial data; markers that no camera ever saw, or that stood still (``standing``), left out.
 
         Raises CalibrationError (``too_few_stops``) where there is no stop.
         """
@@ -63,6 +65,9 @@ class CalibrationJob:
                     systematic = settings.cameras[where[0]].systematic_px ** 2
                     noise = 0.5 * np.trace(covariance) - systematic
                     sigmas[where] = np.sqrt(factors[sample.camera] * noise + systematic)
+        still = standing_markers(pixels, sigmas)
+        self.standing = tuple(marker for marker, stands in zip(markers, still, strict=True) if stands)
+        markers = tuple(marker for marker in markers if marker not in self.standing)
         return TrialData(
             joint_names=settings.joint_names,
             joint_kinds=settings.joint_kinds,
@@ -73,8 +78,8 @@ class CalibrationJob:
             marker_ids=markers,
             positions=np.array([_joints(event) for event in self._stops]),
             trials=np.array([event.trial for event in self._stops], dtype=np.int64),
-            pixels=pixels,
-            sigmas=sigmas,
+            pixels=pixels[:, :, ~still],
+            sigmas=sigmas[:, :, ~still],
             images=images,
         )
 
