@@ -27,7 +27,8 @@ from stereoservo.control.faces_kernel import (
     marker_information,
     off_plane,
     plane_minors,
-    triangle_spreads,
+    triangle_altitudes,
+    turned_average,
 )
 from stereoservo.control.law import IntArray, Scene, Task
 from stereoservo.geometry.homogeneous import FloatArray
@@ -81,13 +82,15 @@ def find_faces(
     sigma_px: float,
     camera_centres: FloatArray,
     seen: FloatArray,
+    operators: FloatArray | None = None,
     limit: float = IN_PLANE,
 ) -> Faces:
     """The faces of a body of markers ``points`` (m, 4), heights 1, of which the cameras see ``seen`` (c, m) there.
 
     ``matrices`` (k, 3, 4): the views that fix the markers; cameras that saw the body in several poses are views
     ``P H_i``. Likewise ``camera_centres`` (c, 4), ``H_i⁻¹O``, with ``seen``: the more, the surer. ``sigma_px`` [px],
-    ``limit`` deviations from a plane.
+    ``limit`` deviations from a plane. ``operators`` (n, 4, 4) of an arm that turns the body, at any configuration: they
+    make lengths comparable that one view foreshortens.
 
     Regular bodies have coplanar markers that are no face: chamfers, diagonals. Groups of four and more come first,
     those that no camera sees in part before others, those of many markers before few, round before narrow, as long as
@@ -117,14 +120,16 @@ def find_faces(
         raise ValueError(
             f"the views do not fix markers {lost}: give two cameras, or views of one in several poses (P H)"
         )
-    spreads = triangle_spreads(points, information, triples)
-    order = np.argsort(-spreads, kind="stable")
-    order = order[spreads[order] >= SPANS]
+    turns = np.zeros((0, 4, 4)) if operators is None else np.ascontiguousarray(operators, dtype=np.float64)
+    form = turned_average(information, turns)
+    altitudes = triangle_altitudes(points, form, triples)
+    order = np.argsort(-altitudes, kind="stable")
+    order = order[altitudes[order] >= SPANS]
     groups = _groups(
         triples[order],
-        spreads[order],
+        altitudes[order],
         off_plane(points, covariances, triples[order]),
-        marker_distances(points, information),
+        marker_distances(points, form),
         seen,
         limit,
     )
@@ -162,7 +167,7 @@ class _Group(NamedTuple):
 
 def _groups(
     triples: IntArray,
-    spreads: FloatArray,
+    altitudes: FloatArray,
     deviations: FloatArray,
     distances: FloatArray,
     seen: FloatArray,
@@ -170,7 +175,7 @@ def _groups(
 ) -> list[_Group]:
     """Coplanar groups, from the triples that tell their planes best on."""
     groups: list[_Group] = []
-    for triple, spread, deviation in zip(triples.tolist(), spreads, deviations, strict=True):
+    for triple, altitude, deviation in zip(triples.tolist(), altitudes, deviations, strict=True):
         if any(len(group.markers) > 3 and group.markers.issuperset(triple) for group in groups):
             continue
         inside = np.abs(deviation) <= limit
@@ -179,7 +184,7 @@ def _groups(
             _Group(
                 frozenset(np.flatnonzero(inside).tolist()),
                 (triple[0], triple[1], triple[2]),
-                float(spread) / float(distances[np.ix_(inside, inside)].max()),
+                float(altitude) / float(distances[np.ix_(inside, inside)].max()),
                 int((deviation > limit).sum()),
                 int((deviation < -limit).sum()),
                 bool(((shares == 0.0) | (shares == 1.0)).all()),
@@ -230,13 +235,24 @@ def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT
     """The three markers on which a law shall work now.
 
     Of one face, seen in most cameras; among these, of largest image area in units of the noise, which prefers what is
-    spread, near and frontal. Only markers that have a point now (finite) and at the goal (``target_known``). The
-    former choice stays until a marker of it is hidden, more cameras see another, or another is twice as large. Where no
-    camera sees three markers of one face, any three do.
+    spread, near and frontal. A face whose front some camera has at the goal too counts for more. Only markers that have
+    a point now (finite) and at the goal (``target_known``). The former choice stays until a marker of it is hidden,
+    more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
+    do.
     """
     usable = (task.target_known > 0.0) & np.isfinite(scene.points).all(axis=1)
+    goal = faces_fronting(
+        task.target_points, faces.triples, faces.sided, np.eye(4)[None], scene.camera_centres
+    )[0]
+    lasting = np.where(faces.sided > 0.0, goal.max(axis=1, initial=0.0), 0.0)
     face, found, cameras = choose_triangle(
-        faces.members, usable.astype(np.float64), scene.pixels, scene.weights, before.face, before.triple
+        faces.members,
+        lasting,
+        usable.astype(np.float64),
+        scene.pixels,
+        scene.weights,
+        before.face,
+        before.triple,
     )
     if cameras == 0:
         return FaceChoice(-2, before.triple, 0, np.zeros(len(scene.camera_centres)), before.cameras > 0)

@@ -8,12 +8,17 @@ import numpy as np
 
 from stereoservo.control.law import IntArray
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import invert4, kernel
+from stereoservo.kinematics.kernels import invert4, kernel, multiply4_into
 
 LEAST_ALTITUDE = 10.0
 """Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
 CLEARLY_BETTER = 2.0
 """Ratio of image areas from which on another triangle takes over."""
+LASTING = 8.0
+"""How many times its area a triangle counts that shows its front at the goal too."""
+
+AVERAGING_ROUNDS = 3
+"""How often an arm's turns are averaged over, one joint after another."""
 
 
 @kernel
@@ -60,6 +65,45 @@ def marker_covariances(points: FloatArray, information: FloatArray) -> FloatArra
             for k in range(4):
                 covariances[p, i, k] /= trace
     return covariances
+
+
+@kernel
+def turned_average(information: FloatArray, operators: FloatArray) -> FloatArray:
+    """The markers' mean information, averaged over the turns that an arm's revolute ``operators`` (n, 4, 4) make.
+
+    As a form on differences of points (height 0), which displacements only turn: with two axes or more that are not
+    parallel it becomes the same in all directions, as no single view is. (4, 4).
+    """
+    mean = np.zeros((4, 4))
+    for p in range(information.shape[0]):
+        for i in range(4):
+            for k in range(4):
+                mean[i, k] += information[p, i, k] / information.shape[0]
+    square, turn, product = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
+    for _ in range(AVERAGING_ROUNDS):
+        for j in range(operators.shape[0]):
+            multiply4_into(operators[j], operators[j], square)
+            if not -(square[0, 0] + square[1, 1] + square[2, 2] + square[3, 3]) > 1.0:
+                continue  # prismatic: no turn
+            total = np.zeros((4, 4))
+            # a form is of second degree in sine and cosine: five samples average it exactly
+            for sample in range(5):
+                angle = 2.0 * math.pi * sample / 5.0
+                for i in range(4):
+                    for k in range(4):
+                        turn[i, k] = (
+                            math.sin(angle) * operators[j, i, k] + (1.0 - math.cos(angle)) * square[i, k]
+                        )
+                    turn[i, i] += 1.0
+                multiply4_into(mean, turn, product)
+                for i in range(4):
+                    for k in range(4):
+                        for x in range(4):
+                            total[i, k] += 0.2 * turn[x, i] * product[x, k]
+            for i in range(4):
+                for k in range(4):
+                    mean[i, k] = total[i, k]
+    return mean
 
 
 @kernel
@@ -118,8 +162,8 @@ def _own(S: FloatArray, a: FloatArray) -> float:
 
 
 @kernel
-def marker_distances(points: FloatArray, information: FloatArray) -> FloatArray:
-    """How far marker k lies from marker i (m, m) as the views see it, in deviations of marker i."""
+def marker_distances(points: FloatArray, form: FloatArray) -> FloatArray:
+    """Distances (m, m) of markers, heights 1, by a form (4, 4) on their differences."""
     markers = points.shape[0]
     out = np.zeros((markers, markers))
     way = np.empty(4)
@@ -127,13 +171,13 @@ def marker_distances(points: FloatArray, information: FloatArray) -> FloatArray:
         for k in range(markers):
             for x in range(4):
                 way[x] = points[k, x] - points[i, x]
-            out[i, k] = math.sqrt(max(0.0, _form(way, information[i], way)))
+            out[i, k] = math.sqrt(max(0.0, _form(way, form, way)))
     return out
 
 
 @kernel
-def triangle_spreads(points: FloatArray, information: FloatArray, triples: IntArray) -> FloatArray:
-    """Least altitude (t,) of the triangles as the views see it: deviations from a corner to the opposite side."""
+def triangle_altitudes(points: FloatArray, form: FloatArray, triples: IntArray) -> FloatArray:
+    """Least altitudes (t,) of triangles, by a form (4, 4) on differences of points."""
     out = np.empty(triples.shape[0])
     along, off = np.empty(4), np.empty(4)
     for t in range(triples.shape[0]):
@@ -143,10 +187,9 @@ def triangle_spreads(points: FloatArray, information: FloatArray, triples: IntAr
             for x in range(4):
                 off[x] = points[j, x] - points[i, x]
                 along[x] = points[k, x] - points[j, x]
-            S = information[i]
-            length = _form(along, S, along)
-            mixed = _form(along, S, off)
-            left = _form(off, S, off) - (mixed * mixed / length if length > 0.0 else 0.0)
+            length = _form(along, form, along)
+            mixed = _form(along, form, off)
+            left = _form(off, form, off) - (mixed * mixed / length if length > 0.0 else 0.0)
             out[t] = min(out[t], math.sqrt(max(0.0, left)))
     return out
 
@@ -203,6 +246,7 @@ def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArr
 @kernel
 def choose_triangle(
     members: FloatArray,
+    lasting: FloatArray,
     usable: FloatArray,
     pixels: FloatArray,
     weights: FloatArray,
@@ -230,6 +274,8 @@ def choose_triangle(
                     if not (usable[k] > 0.0 and (f == faces or members[f, k] > 0.0)):
                         continue
                     count, area = triangle_sight(i, j, k, pixels, weights)
+                    if f < faces and lasting[f] > 0.0:
+                        area *= LASTING
                     if count > best_count or (count == best_count and area > best_area):
                         best_face, best_count, best_area = (f if f < faces else -1), count, area
                         best[0], best[1], best[2] = i, j, k
@@ -239,6 +285,8 @@ def choose_triangle(
             good = good and usable[triple_now[corner]] > 0.0
         if good:
             count, area = triangle_sight(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
+            if face_now >= 0 and lasting[face_now] > 0.0:
+                area *= LASTING
             if count > 0 and count >= best_count and best_area <= CLEARLY_BETTER * area:
                 return face_now, triple_now.copy(), count
     return best_face, best, best_count
