@@ -39,7 +39,7 @@ def beside(first: Branches, second: Branches) -> Branches:
     k = max(len(first.steps), len(second.steps))
 
     def wide(left: npt.NDArray, right: npt.NDArray) -> npt.NDArray:  # type: ignore[type-arg]
-        parts = [np.broadcast_to(part, (k, part.shape[1])) for part in (left, right)]
+        parts = [part if len(part) == k else np.repeat(part, k, axis=0) for part in (left, right)]
         return np.concatenate(parts, axis=1)
 
     return Branches(

@@ -8,11 +8,30 @@ import numpy as np
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.kernels import KindArray, chain_forward_into, kernel, transform_points_into
+from stereoservo.kinematics.kernels import (
+    KindArray,
+    chain_forward,
+    chain_forward_into,
+    kernel,
+    transform_points_into,
+)
 
 ITERATIONS = 60
 LONGEST = 0.7
 """Largest change of a joint in one step [rad or m]."""
+IDLE = 1e-20
+"""Damping that is always there, as a share of what the operators could do to the points: what rounding alone seems to
+move, a joint that the goal leaves free, stays where it is.
+"""
+
+
+@kernel
+def _sum_of_squares(A: FloatArray) -> float:
+    total = 0.0
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            total += A[i, k] * A[i, k]
+    return total
 
 
 @kernel
@@ -84,6 +103,7 @@ def descend(
     g = np.empty(n)
     step = np.empty(n)
     trial = np.empty(n)
+    weight = _sum_of_squares(generators.reshape(n * 4, 4)) * _sum_of_squares(points) / n
     for a in range(s):
         q = ends[a]
         chain_forward_into(generators, kinds, zero, q, H, operators, tip_first)
@@ -112,7 +132,7 @@ def descend(
             won = False
             small = False
             while share < 1e8:
-                if _solve_damped(A, g, share * trace / n, L, step):
+                if _solve_damped(A, g, share * trace / n + IDLE * weight, L, step):
                     longest = 0.0
                     for j in range(n):
                         longest = max(longest, abs(step[j]))
@@ -163,6 +183,12 @@ def descended(
     return ends, np.asarray(np.sqrt(errors) / np.linalg.norm(targets), dtype=np.float64)
 
 
-def residual_jacobian(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
-    """``∂(H(q)M)/∂q`` (4m, n) of ``points`` (m, 4) at the zero, by configuration ``q`` (n,) (5.38)."""
-    return chain.point_jacobian_zero_reference(q, points).reshape(-1, chain.joints)
+def linearised(
+    chain: ProjectiveChain, points: FloatArray, q: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``points`` (m, 4) moved to ``q`` (n,), ``∂(H(q)M)/∂q`` (4m, n) (5.38), and the operators (n, 4, 4) there."""
+    H, operators = chain_forward(
+        chain.generators, chain.kind_codes, chain.zero, np.ascontiguousarray(q), chain.tip_first
+    )
+    moved: FloatArray = points @ H.T
+    return moved, (moved @ operators.transpose(0, 2, 1)).reshape(len(operators), -1).T, operators

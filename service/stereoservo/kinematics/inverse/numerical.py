@@ -6,7 +6,7 @@ import numpy as np
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.inverse.descent import descended, residual_jacobian
+from stereoservo.kinematics.inverse.descent import descended, linearised
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError, distinct, nearest_turns
 
 BATCH = 64
@@ -111,7 +111,7 @@ class _Known:
 
 
 def _twins(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
-    weakest = np.linalg.svd(residual_jacobian(chain, points, q))[2][-1]
+    weakest = np.linalg.svd(linearised(chain, points, q)[1])[2][-1]
     steps = np.concatenate([TWINS, -TWINS])
     return np.asarray(q + steps[:, None] * weakest, dtype=np.float64)
 

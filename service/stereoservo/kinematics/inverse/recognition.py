@@ -158,7 +158,7 @@ def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
     return Recognition("numerical", False, tuple(judge.evidence.values()))
 
 
-def tested(arm: ProjectiveChain | CellModel, condition: Condition, joints: tuple[int, ...]) -> Evidence:
+def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tuple[int, ...]) -> Evidence:
     """One condition on revolute ``joints``: two ``parallel``, two or more with a ``common_point``, or prismatic ones
     that are ``independent``.
     """

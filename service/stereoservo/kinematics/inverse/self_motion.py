@@ -6,7 +6,7 @@ import numpy as np
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.inverse.descent import residual_jacobian
+from stereoservo.kinematics.inverse.descent import linearised
 
 NO_MOTION = 1e-6
 """Singular value of the joints' Jacobian, as a share of the largest, below which a direction moves nothing."""
@@ -20,10 +20,9 @@ def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -
 
     Joints are weighed as they move the points, so that units do not matter.
     """
-    J = residual_jacobian(chain, points, q)
+    moved, J, operators = linearised(chain, points, q)
     sizes = np.linalg.norm(J, axis=0)
-    moved = points @ chain.displacement(q).T
-    most = np.linalg.norm(chain.operators_at(q), axis=(1, 2)) * float(np.linalg.norm(moved))
+    most = np.linalg.norm(operators, axis=(1, 2)) * float(np.linalg.norm(moved))
     idle = sizes <= NO_MOTION * most
     weights = np.where(idle, 1.0, sizes)
     _, singular, rows = np.linalg.svd(np.where(idle, 0.0, J) / weights)
@@ -41,11 +40,11 @@ def corrected(
     norm = float(np.linalg.norm(targets))
     residual = np.inf
     for _ in range(CORRECTIONS):
-        error = (points @ chain.displacement(q).T - targets).ravel()
+        moved, J, _ = linearised(chain, points, q)
+        error = (moved - targets).ravel()
         residual = float(np.linalg.norm(error)) / norm
         if residual <= 0.01 * tolerance or not np.isfinite(residual):
             break
-        J = residual_jacobian(chain, points, q)
         step = -np.linalg.lstsq(J, error, rcond=NO_MOTION)[0]
         q = q + step * min(1.0, 0.2 / max(float(np.abs(step).max()), 1e-300))
     return q, residual

@@ -14,7 +14,7 @@ from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.inverse import goals, numerical
 from stereoservo.kinematics.inverse.arm import arm
 from stereoservo.kinematics.inverse.branches import Branches, together
-from stereoservo.kinematics.inverse.descent import descended, residual_jacobian
+from stereoservo.kinematics.inverse.descent import descended, linearised
 from stereoservo.kinematics.inverse.prismatic import prismatic_joints
 from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
 from stereoservo.kinematics.inverse.revolute import turn_between
@@ -201,7 +201,7 @@ def _rank(problem: _Problem) -> int:
     """Freedoms of the goal that the joints drive, where they drive most of them."""
     most = 0
     for q in numerical.even_starts(problem.chain, problem.limits, 4):
-        J = residual_jacobian(problem.chain, problem.points, q)
+        J = linearised(problem.chain, problem.points, q)[1]
         singular = np.linalg.svd(J, compute_uv=False)
         most = max(most, int((singular > NO_MOTION * max(float(singular[0]), 1e-300)).sum()))
     return most
