@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.inverse.recognition import recognise
+from stereoservo.kinematics.inverse.goals import fixed_planes
+from stereoservo.kinematics.inverse.recognition import chain_of, recognise
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
+from stereoservo_sim import synthetic
+from stereoservo_sim.exact_model import exact_model
 from stereoservo_sim.experiments import arm_families
 from stereoservo_sim.experiments.arm_families import PUMA_ROWS, aligned_wrist, from_rows
 from stereoservo_sim.experiments.inverse_kinematics import differences, hide
@@ -208,6 +211,7 @@ def test_a_collineation_that_is_no_displacement_is_out_of_reach(puma):
         ({"displacement": np.eye(3)}, "shape"),
         ({"points": np.ones((1, 4)), "targets": np.ones((1, 4))}, "shape"),
         ({"displacement": None, "points": np.ones((2, 4)), "targets": np.ones((1, 4))}, "shape"),
+        ({"displacement": None, "points": np.zeros((1, 4)), "targets": np.ones((1, 4))}, "degenerate"),
         ({"displacement": None, "points": np.ones((0, 4)), "targets": np.ones((0, 4))}, "shape"),
         ({"seed": np.zeros(5)}, "shape"),
         ({"seed": np.full(6, np.inf)}, "not_finite"),
@@ -228,6 +232,38 @@ def test_a_point_at_infinity_is_refused(puma):
     with pytest.raises(InverseKinematicsError) as refused:
         inverse_kinematics(puma.chain, points=far[None], targets=far[None])
     assert refused.value.code == "degenerate"
+
+
+def test_heights_need_no_luck_where_a_pencil_of_planes_stays_fixed():
+    """Parallel axes: whatever plane of the pencil a point lies on, another one tells its height."""
+    arm = hide(arm_families.parallel_pair(np.random.default_rng(3)), np.random.default_rng(4))
+    planes = fixed_planes(arm.chain.generators)
+    assert planes.shape == (2, 4)
+    q = np.array([0.5, 1.0])
+    for plane in planes:
+        point = np.linalg.svd(np.stack([plane, np.eye(4)[0]]))[2][2]
+        assert abs(plane @ point) < 1e-12
+        target = -2.0 * arm.chain.displacement(arm.chain.zero + q) @ point
+        found = inverse_kinematics(arm.chain, points=point[None], targets=target[None])
+        assert differences(arm.axes, q[None], found.joints - arm.chain.zero)[0] < 1e-9
+
+
+def test_two_points_off_the_centre_tell_a_wrist():
+    arm = hide(arm_families.square_wrist(np.random.default_rng(3)), np.random.default_rng(4))
+    q = np.array([0.5, 1.0, -0.7])
+    points = np.array([[0.5, 0.1, 0.3, 1], [-0.2, 0.6, 0.1, 1]]) @ arm.frame.T
+    targets = points @ arm.chain.displacement(arm.chain.zero + q).T
+    found = inverse_kinematics(arm.chain, points=points, targets=targets)
+    assert (found.case, len(found.joints)) == ("wrist", 2)
+    assert differences(arm.axes, q[None], found.joints - arm.chain.zero)[0] < 1e-9
+
+
+def test_pan_and_tilt_with_the_cameras_on_it():
+    chain = chain_of(exact_model(synthetic.pan_tilt()))
+    q = chain.zero + np.array([0.3, -0.2])
+    found = inverse_kinematics(chain, displacement=chain.displacement(q))
+    assert found.case == "two_revolute"
+    assert found.joints == pytest.approx(q[None], abs=1e-9)
 
 
 def test_prismatic_joints_without_closed_form_need_limits():

@@ -18,6 +18,8 @@ PLANE_TOLERANCE = 1e-12
 RANK_TOLERANCE = 1e-6
 FIT_STEPS = 60
 STARTS = 24
+CANDIDATES = 64
+"""Planes of a pencil that are tried."""
 SETTLED = 1e-14
 WHOLE_GROUP = 6
 """Dimension of the algebra of all rigid motions."""
@@ -37,10 +39,26 @@ def finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> Float
     return array
 
 
-def fixed_plane(generators: FloatArray) -> FloatArray:
-    """A plane (4,) that all ``generators`` (n, 4, 4) leave where it is, ``aᵀĤ_j = 0``, at unit norm."""
+def fixed_planes(generators: FloatArray) -> FloatArray:
+    """Planes (k, 4), orthonormal, that span all that ``generators`` (n, 4, 4) leave where they are, ``aᵀĤ_j = 0``.
+
+    One, or where axes are parallel or joints few a pencil or bundle; at least the one that comes nearest to it.
+    """
     unit = generators / np.linalg.norm(generators, axis=(1, 2), keepdims=True)
-    return np.asarray(np.linalg.svd(np.concatenate(list(unit), axis=1))[0][:, 3], dtype=np.float64)
+    U, singular, _ = np.linalg.svd(np.concatenate(list(unit), axis=1))
+    rank = min(3, int((singular > RANK_TOLERANCE * singular[0]).sum()))
+    return np.asarray(U[:, rank:].T, dtype=np.float64)
+
+
+def clear_plane(planes: FloatArray, points: FloatArray) -> FloatArray:
+    """Of the span of ``planes`` (k, 4) one (4,) that keeps away from all ``points`` (m, 4), as far as they let it."""
+    if len(planes) == 1:
+        return np.asarray(planes[0], dtype=np.float64)
+    heights = planes @ (points / np.linalg.norm(points, axis=1, keepdims=True)).T
+    candidates = np.random.default_rng(0).normal(size=(CANDIDATES, len(planes)))
+    candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
+    clearest = int(np.argmax(np.abs(candidates @ heights).min(axis=1)))
+    return np.asarray(candidates[clearest] @ planes, dtype=np.float64)
 
 
 def scaled_displacement(generators: FloatArray, H: FloatArray) -> FloatArray:
@@ -58,7 +76,7 @@ def scaled_displacement(generators: FloatArray, H: FloatArray) -> FloatArray:
             f"det H is {determinant:.3g} (at unit norm); a displacement has a positive determinant",
             determinant=determinant,
         )
-    plane = fixed_plane(generators)
+    plane = fixed_planes(generators)[-1]
     scale = float(plane @ H @ plane)
     if not abs(scale) > 1e-9 * size:
         raise InverseKinematicsError(
@@ -81,7 +99,11 @@ def equal_heights(
             f"points {points.shape}, targets {targets.shape}; one target for each of one or more points is needed",
             shape=targets.shape,
         )
-    plane = fixed_plane(generators)
+    for name, array in (("points", points), ("targets", targets)):
+        zero = np.flatnonzero(~(np.linalg.norm(array, axis=1) > 0.0))
+        if len(zero):
+            raise InverseKinematicsError("degenerate", f"{name} {zero.tolist()} are zero vectors, no points")
+    plane = clear_plane(fixed_planes(generators), np.concatenate([points, targets]))
     for name, array in (("points", points), ("targets", targets)):
         low = np.flatnonzero(~(np.abs(array @ plane) > PLANE_TOLERANCE * np.linalg.norm(array, axis=1)))
         if len(low):
