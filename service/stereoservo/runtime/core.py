@@ -9,7 +9,7 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import following, goals, intake
+from stereoservo.runtime import following, goals, intake, progress
 from stereoservo.runtime.check import check_step
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
@@ -357,9 +357,13 @@ class ServoCore:
     def _epoch(self) -> int:
         return 0 if self.state.model is None else self.state.model.epoch
 
-    def _reasons(self, motion: Motion, safety: SafetyResult) -> tuple[Reason, ...]:
+    def _reasons(self, present: Present, motion: Motion, safety: SafetyResult) -> tuple[Reason, ...]:
         state = self.state
         found = [*state.fault, *safety.reasons, *motion.reasons]
+        if isinstance(state.source, LawRun) and not (state.held or state.stopped):
+            found.extend(progress.watch(state.source, present, tuple(found)))
+        if state.planning is not None:
+            found.append(progress.planning_reason(state.planning))
         if state.stopped:
             found.append(Reason("STOPPED", "hold", hint="resume to go on"))
         elif state.held:
@@ -370,8 +374,9 @@ class ServoCore:
 
     def _status(self, inputs: StepInputs, present: Present, motion: Motion, safety: SafetyResult) -> Status:
         state = self.state
-        reasons = self._reasons(motion, safety)
+        reasons = self._reasons(present, motion, safety)
         source = state.source
+        done, left_s = progress.share_and_seconds(source, present)
         return Status(
             t_ns=inputs.now_ns,
             step=state.step,
@@ -395,6 +400,8 @@ class ServoCore:
             visible={
                 c.name: e.last_visible for c, e in zip(self.settings.cameras, state.cameras, strict=True)
             },
+            progress=done,
+            seconds_left=left_s,
         )
 
 

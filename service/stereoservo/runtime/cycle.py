@@ -150,6 +150,9 @@ class Status(msgspec.Struct, frozen=True, eq=False):
     """Law-specific: cartesian3 (tau, theta_r [rad], theta_p [rad]); empty otherwise."""
     innovation_px: dict[str, float]
     visible: dict[str, int]
+    progress: float | None = None
+    """Share [0, 1] of the goal's way that is done."""
+    seconds_left: float | None = None
 
 
 class StepOutputs(msgspec.Struct, frozen=True, eq=False):

@@ -7,9 +7,8 @@ import numpy as np
 from stereoservo.control.law import Scene, Task
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.runtime.motion import Present
-from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.state import Servoing
-from stereoservo.trajectory.tracking import advance, pace, sample_plan
+from stereoservo.trajectory.tracking import advance, sample_plan
 
 LARGEST_LAG_PX = 20.0
 """Distance behind its way at which the body is waited for."""
@@ -23,12 +22,8 @@ def on_the_way(source: Servoing, present: Present, scene: Scene, task: Task) -> 
     plan, start = source.plan, source.start_points
     assert plan is not None
     assert start is not None
-    sample = sample_plan(plan, source.plan_s)
-    pixels, rates = _pixels_and_rates(
-        scene.matrices,
-        transform_points(sample.displacement, start),
-        transform_points(sample.displacement_rate, start),
-    )
+    here = sample_plan(plan, source.plan_s).displacement
+    pixels, _ = project_points(scene.matrices, transform_points(here, start))
     length_s = float(plan.times[-1])
     share = min(1.0, source.plan_s / length_s) if length_s > 0.0 else 1.0
     goal_pixels, _ = project_points(scene.matrices, source.target_points)
@@ -38,14 +33,7 @@ def on_the_way(source: Servoing, present: Present, scene: Scene, task: Task) -> 
     apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
     lag = float(np.where(scene.weights * wanted > 0.0, apart, 0.0).max()) / LARGEST_LAG_PX
     source.plan_s = advance(plan, source.plan_s, present.dt_s, lag)
-    return task._replace(set_points=set_points, wanted=wanted, rates=pace(lag) * rates)
-
-
-def _pixels_and_rates(
-    matrices: FloatArray, points: FloatArray, speeds: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Ideal pixels (c, m, 2) of points (m, 4) and their rates [px/s] at ``speeds`` (m, 4)."""
-    image = (matrices[:, None] * points[None, :, None, :]).sum(axis=-1)
-    moving = (matrices[:, None] * speeds[None, :, None, :]).sum(axis=-1)
-    pixels: FloatArray = image[..., :2] / image[..., 2:]
-    return pixels, (moving[..., :2] - pixels * moving[..., 2:]) / image[..., 2:]
+    # What the set-points move by in the step that begins: its mean is what a velocity held so long can do.
+    there = sample_plan(plan, source.plan_s).displacement
+    ahead, _ = project_points(scene.matrices, transform_points(there, start))
+    return task._replace(set_points=set_points, wanted=wanted, rates=(ahead - pixels) / present.dt_s)

@@ -10,6 +10,7 @@ from stereoservo.control.faces import NOT_CHOSEN, choose_face, find_faces, law_s
 from stereoservo.control.gains import GainCurve, gain_at
 from stereoservo.control.law import JacobianChoice, Options, Scene, Task
 from stereoservo.control.laws import LAWS
+from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import invert4, transform_points
@@ -46,6 +47,10 @@ JACOBIANS: dict[JacobianName, JacobianChoice] = {
     "mean": JacobianChoice.MEAN,
     "fixed-depth": JacobianChoice.FIXED_DEPTH,
 }
+
+RIGID_FREEDOMS = 6
+SELF_MOTION_RATE = 0.5
+"""[1/s], of a joint's half range: how fast self-motion takes it from a limit."""
 
 
 def place_now(present: Present) -> Place:
@@ -199,10 +204,22 @@ def servo_step(source: Servoing, present: Present) -> Motion:
     velocity = step.velocity
     if streamed:
         velocity = velocity + feed_forward(source, present, active)
+    if len(velocity) > RIGID_FREEDOMS:
+        velocity = velocity + away_from_limits(present)
     return Motion(
         velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
         reasons=law.reasons(step),
     )  # fmt: skip
+
+
+def away_from_limits(present: Present) -> FloatArray:
+    """Self-motion (n,) of a redundant arm that takes its joints from their limits; the body stays where it is."""
+    assert present.prediction is not None
+    limits = present.settings.limits
+    rows = np.ascontiguousarray(present.prediction.jacobian).reshape(-1, len(present.q))
+    return self_motion_from_limits(
+        rows, present.q, limits.position_min, limits.position_max, SELF_MOTION_RATE
+    )
 
 
 def run_ended(
@@ -272,6 +289,8 @@ def choose(source: Servoing, present: Present, scene: Scene, task: Task) -> tupl
     if not source.pose_known:
         return scene, task
     before = source.choice
+    if before.cameras > 0 and not present.observations:  # nothing has been seen since
+        return law_scene(scene, before), task
     choice = choose_face(source.faces, scene, task, before)
     if choice.cameras == 0:
         return (
