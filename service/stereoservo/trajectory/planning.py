@@ -42,6 +42,8 @@ __all__ = [
 
 PRESENT = 1e-6
 """Distance of all points from their goals, relative to the cameras' distance, at which there is nothing to do."""
+TURNS = 1e-6
+"""Size of a joint's rotation block, in the motion frame, from which on it turns."""
 COLLINEAR = 1e-6
 """Square of the sine, seen from the middle, below which all markers are on one line."""
 
@@ -108,6 +110,7 @@ def start_planning(request: PlanRequest) -> Planning:
         all_displacements=np.zeros((SAMPLES, 4, 4)),
         table=empty_table(),
         joint_step=np.zeros(n),
+        turns=(np.abs(local[:, :3, :3]).max(axis=(1, 2)) > TURNS).astype(np.float64),
     )
     if refusal is not None:
         planning.finished, planning.failure = True, (refusal,)

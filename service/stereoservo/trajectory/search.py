@@ -2,7 +2,8 @@
 
 ``IMAGES``: a way in closed form, in the images alone. ``FOLLOWS``: the arm along it. Where the arm cannot follow the
 way that was asked for, ``LOOKS`` takes it along once more without limits, to learn the joints at the goal, and
-``JOINTS`` tries the way that is straight in these.
+``JOINTS`` tries the way that is straight in these. When all else has failed, ``SEEKS`` finds other joints at the goal
+(`seeking`), and ``JOINTS`` tries these.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.composition import Composition
 from stereoservo.trajectory.bending import CANDIDATES, Candidate, name_of, other_profile, way_of
 from stereoservo.trajectory.following import check_way, follow_joints, follow_way, pixels_apart
 from stereoservo.trajectory.motion_frame import conjugated, turn_between
@@ -30,6 +32,7 @@ from stereoservo.trajectory.rooms import (
     empty_table,
     moved,
 )
+from stereoservo.trajectory.seeking import SEEDS, joints_from_seed, seed_joints
 from stereoservo.trajectory.sights import own
 from stereoservo.trajectory.time_scaling import sample_times
 from stereoservo.trajectory.ways import pose_on_way
@@ -42,6 +45,8 @@ WORK_OF_ARM = 16
 """Work of one sample of the arm, in samples of the closed form in the images."""
 WORK_OF_WAY = 8
 """Work of setting up one way, likewise."""
+WORK_OF_SEED = 20 * WORK_OF_ARM
+"""Work of seeking the goal from one seed, likewise."""
 MOST_FOLLOWED = 120
 """Ways that the arm is taken along before the search ends."""
 GOAL_MISSED = 30
@@ -51,8 +56,6 @@ GOAL_BEYOND = 90
 
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
 """What the ``index`` of an approach NOT_REACHABLE names."""
-TURNS = 1e-6
-"""Size of a joint's rotation block, in the motion frame, from which on it turns."""
 
 
 class Stage(IntEnum):
@@ -62,6 +65,7 @@ class Stage(IntEnum):
     FOLLOWS = 1
     LOOKS = 2
     JOINTS = 3
+    SEEKS = 4
 
 
 class Planning(msgspec.Struct, eq=False):
@@ -94,12 +98,14 @@ class Planning(msgspec.Struct, eq=False):
     all_displacements: FloatArray
     table: FloatArray
     joint_step: FloatArray
+    turns: FloatArray
     candidate: int = -1
     stage: int = int(Stage.IMAGES)
     sample: int = 0
     followed: int = 0
     tried: int = 0
     looked: bool = False
+    seeds: int = 0
     goal_failure: Approach | None = None
     asked_failure: Approach | None = None
     best_failure: Approach | None = None
@@ -113,6 +119,10 @@ def plan_on(planning: Planning, samples: int) -> None:
     p = planning
     work = max(1, samples) * WORK_OF_ARM
     while work > 0 and not p.finished:
+        if p.stage == Stage.SEEKS:
+            _seek(p)
+            work -= WORK_OF_SEED
+            continue
         cost = 1 if p.stage == Stage.IMAGES else WORK_OF_ARM
         count = max(1, min(SAMPLES - p.sample, work // cost))
         broken, reached = _samples(p, p.sample + count)
@@ -145,8 +155,33 @@ def next_way(planning: Planning) -> None:
         p.way = way
         p.tried += 1
         return
+    if p.request.bend and p.request.composition != Composition.SIMULTANEOUS:
+        p.stage = int(Stage.SEEKS)
+    else:
+        _give_up(p)
+
+
+def _give_up(p: Planning) -> None:
     p.finished = True
     p.failure = tuple(f for f in (p.goal_failure, p.asked_failure, p.best_failure) if f is not None)
+
+
+def _seek(p: Planning) -> None:
+    """The goal's joints from the next seed; where they keep the limits, the way that is straight in them is next."""
+    if p.seeds >= SEEDS:
+        _give_up(p)
+        return
+    s = p.surroundings
+    start = own(p.request.joints)
+    seed = seed_joints(p.seeds, start, s.lower, s.upper)
+    p.seeds += 1
+    joints, arrived = joints_from_seed(
+        seed, p.goal, s.body, int(p.request.composition), s.lower, s.upper, p.turns, p.start_operators, start
+    )
+    if arrived and int(check_joints(joints, 1.0, s, empty_table())) < 0:
+        p.goal_failure = None  # of one posture, not of the goal
+        p.joint_step = (joints - start) / (SAMPLES - 1.0)
+        start_arm(p, Stage.JOINTS)
 
 
 def stay(planning: Planning) -> None:
@@ -223,6 +258,8 @@ def _fail(p: Planning, kind: int) -> None:
     if p.stage == Stage.FOLLOWS and kind in (JOINT_LIMIT, KEEP_OUT, NOT_REACHABLE) and not p.looked:
         p.looked = True
         start_arm(p, Stage.LOOKS)
+    elif p.seeds > 0:
+        p.stage, p.sample = int(Stage.SEEKS), 0
     else:
         next_way(p)
 
@@ -258,7 +295,7 @@ def _go_on_from_goal_joints(p: Planning, missed: bool) -> None:
         p.goal_failure = approach(p, broken)
         p.followed += GOAL_BEYOND
         next_way(p)
-    elif p.request.bend or p.rank < RIGID_FREEDOMS:
+    elif p.request.composition != Composition.SIMULTANEOUS and (p.request.bend or p.rank < RIGID_FREEDOMS):
         p.joint_step = (p.joints - p.request.joints) / (SAMPLES - 1.0)
         start_arm(p, Stage.JOINTS)
     else:
@@ -320,7 +357,7 @@ def approach(planning: Planning, kind: int) -> Approach:
     unit = ("", "", "px", "deg", "of its depth now", "px")[kind]
     if kind in (JOINT_LIMIT, KEEP_OUT):
         joint = index if kind == JOINT_LIMIT else 0
-        unit = "rad" if float(np.abs(planning.start_operators[joint, :3, :3]).max()) > TURNS else "m"
+        unit = "rad" if planning.turns[joint] > 0.0 else "m"
     return Approach(
         what=KINDS[kind],
         index=index,
