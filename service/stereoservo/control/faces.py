@@ -18,14 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.control.face_choice_kernel import choose_face_step, faces_fronting
 from stereoservo.control.faces_kernel import (
-    choose_triangle,
-    faces_fronting,
-    kept_cameras,
+    coplanar_groups,
+    covering_groups,
     marker_covariances,
     marker_distances,
     marker_information,
-    off_plane,
     plane_minors,
     triangle_altitudes,
     turned_average,
@@ -125,110 +124,33 @@ def find_faces(
     altitudes = triangle_altitudes(points, form, triples)
     order = np.argsort(-altitudes, kind="stable")
     order = order[altitudes[order] >= SPANS]
-    groups = _groups(
-        triples[order],
-        altitudes[order],
-        off_plane(points, covariances, triples[order]),
-        marker_distances(points, form),
-        seen,
-        limit,
+    members, facts, roundness = coplanar_groups(
+        points, covariances, triples[order], altitudes[order], marker_distances(points, form), seen, limit
     )
-    chosen = _cover(groups, m)
-    oriented = [_outward(group, points, centres, seen) for group in chosen]
-    members = np.zeros((len(chosen), m))
-    for f, group in enumerate(chosen):
-        members[f, list(group.markers)] = 1.0
-    return Faces(
-        np.array([triple for triple, _ in oriented], dtype=np.int64).reshape(-1, 3),
-        members,
-        np.array([float(known) for _, known in oriented]),
-        points,
+    rank = np.lexsort((-roundness, -facts[:, 3], -facts[:, 6]))
+    members, facts = members[rank], facts[rank]
+    chosen = covering_groups(members, facts)
+    members, facts = members[chosen], facts[chosen]
+    sides = np.array(
+        [_side(group, fact, points, centres, seen) for group, fact in zip(members, facts, strict=True)],
+        np.int64,
     )
+    outward = facts[:, :3].copy()
+    outward[sides < 0] = outward[sides < 0][:, [0, 2, 1]]
+    return Faces(outward, members.astype(np.float64), np.abs(sides).astype(np.float64), points)
 
 
-class _Group(NamedTuple):
-    """Markers in one plane: ``above`` and ``below`` of it lie so many others; ``whole``: no camera sees only part.
-
-    ``roundness``: the altitude of its widest triangle over the longest way in it.
-    """
-
-    markers: frozenset[int]
-    triple: tuple[int, int, int]
-    roundness: float
-    above: int
-    below: int
-    whole: bool
-
-    @property
-    def bounds(self) -> bool:
-        """Whether it has no marker on one of its sides."""
-        return self.above == 0 or self.below == 0
-
-
-def _groups(
-    triples: IntArray,
-    altitudes: FloatArray,
-    deviations: FloatArray,
-    distances: FloatArray,
-    seen: FloatArray,
-    limit: float,
-) -> list[_Group]:
-    """Coplanar groups, from the triples that tell their planes best on."""
-    groups: list[_Group] = []
-    for triple, altitude, deviation in zip(triples.tolist(), altitudes, deviations, strict=True):
-        if any(len(group.markers) > 3 and group.markers.issuperset(triple) for group in groups):
-            continue
-        inside = np.abs(deviation) <= limit
-        shares = (seen[:, inside] > 0.0).mean(axis=1)
-        groups.append(
-            _Group(
-                frozenset(np.flatnonzero(inside).tolist()),
-                (triple[0], triple[1], triple[2]),
-                float(altitude) / float(distances[np.ix_(inside, inside)].max()),
-                int((deviation > limit).sum()),
-                int((deviation < -limit).sum()),
-                bool(((shares == 0.0) | (shares == 1.0)).all()),
-            )
-        )
-    return groups
-
-
-def _cover(groups: list[_Group], m: int) -> list[_Group]:
-    """Groups that are faces: each brings markers that no better one has."""
-
-    def rank(group: _Group) -> tuple[bool, int, float]:
-        return group.whole, len(group.markers), group.roundness
-
-    flat = sorted((g for g in groups if len(g.markers) > 3), key=rank, reverse=True)
-    passes = (
-        ([g for g in flat if g.bounds], 3),
-        ([g for g in flat if not g.bounds], 3),
-        (sorted((g for g in groups if g.bounds), key=rank, reverse=True), 1),
-    )
-    chosen: list[_Group] = []
-    left = set(range(m))
-    for candidates, least in passes:
-        for group in candidates:
-            if len(left & group.markers) >= least:
-                chosen.append(group)
-                left -= group.markers
-    return chosen
-
-
-def _outward(
-    group: _Group, points: FloatArray, centres: FloatArray, seen: FloatArray
-) -> tuple[tuple[int, int, int], bool]:
-    """The group's three markers in outward order, and whether anything tells it."""
-    i, j, k = group.triple
-    plane = plane_minors(points[i], points[j], points[k])
-    inside = sorted(group.markers)
+def _side(
+    members: IntArray, facts: IntArray, points: FloatArray, centres: FloatArray, seen: FloatArray
+) -> int:
+    """1 where a group's triple is in outward order, -1 where it is not, 0 where nothing tells."""
+    plane = plane_minors(points[facts[0]], points[facts[1]], points[facts[2]])
     votes = 0
     for eye, row in zip(centres, seen, strict=True):
-        if (row[inside] > 0.0).sum() >= 3:
+        if ((row > 0.0) & (members > 0)).sum() >= 3:
             votes += 1 if float((plane * eye).sum()) > 0.0 else -1
     # what cameras see outweighs where the rest of the body is
-    side = votes if votes != 0 else (group.below > 0) - (group.above > 0)
-    return ((i, j, k) if side >= 0 else (i, k, j)), side != 0
+    return int(np.sign(votes)) if votes != 0 else int(facts[5] > 0) - int(facts[4] > 0)
 
 
 def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT_CHOSEN) -> FaceChoice:
@@ -240,39 +162,12 @@ def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT
     more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
     do.
     """
-    usable = (task.target_known > 0.0) & np.isfinite(scene.points).all(axis=1)
-    goal = faces_fronting(
-        task.target_points, faces.triples, faces.sided, np.eye(4)[None], scene.camera_centres
-    )[0]
-    lasting = np.where(faces.sided > 0.0, goal.max(axis=1, initial=0.0), 0.0)
-    face, found, cameras = choose_triangle(
-        faces.members,
-        lasting,
-        usable.astype(np.float64),
-        scene.pixels,
-        scene.weights,
-        before.face,
-        before.triple,
-    )
-    if cameras == 0:
-        return FaceChoice(-2, before.triple, 0, np.zeros(len(scene.camera_centres)), before.cameras > 0)
-    triple = _ordered(faces, face, found, scene)
-    kept = kept_cameras(1.0, scene.points[triple], task.target_points[triple], scene.camera_centres)
-    changed = before.cameras > 0 and set(triple.tolist()) != set(before.triple.tolist())
-    return FaceChoice(int(face), triple, int(cameras), kept, changed)
-
-
-def _ordered(faces: Faces, face: int, triple: IntArray, scene: Scene) -> IntArray:
-    """``triple`` in outward order; where the face has no known side, the side that most cameras see is its front."""
-    i, j, k = (int(x) for x in triple)
-    if face >= 0 and faces.sided[face] > 0.0:
-        first = plane_minors(*faces.body[faces.triples[face]])
-        side = float((first * plane_minors(faces.body[i], faces.body[j], faces.body[k])).sum())
-    else:
-        plane = plane_minors(scene.points[i], scene.points[j], scene.points[k])
-        sees = (scene.weights[:, [i, j, k]] > 0.0).all(axis=1)
-        side = float(np.where(sees, np.sign((scene.camera_centres * plane).sum(axis=1)), 0.0).sum())
-    return np.array((i, j, k) if side >= 0.0 else (i, k, j), dtype=np.int64)
+    face, triple, cameras, kept = choose_face_step(
+        *faces, scene.points, scene.pixels, scene.weights, task.target_points, task.target_known,
+        scene.camera_centres, before.face, before.triple,
+    )  # fmt: skip
+    changed = before.cameras > 0 and (cameras == 0 or set(triple.tolist()) != set(before.triple.tolist()))
+    return FaceChoice(face, triple, cameras, kept, changed)
 
 
 def law_scene(scene: Scene, choice: FaceChoice) -> Scene:

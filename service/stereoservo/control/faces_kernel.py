@@ -1,4 +1,4 @@
-"""Faces in numba: what the loop runs of `control.faces`, without BLAS. Read that first."""
+"""Finding faces in numba, without BLAS: the steps of `control.faces.find_faces`. Read that first."""
 
 from __future__ import annotations
 
@@ -9,13 +9,6 @@ import numpy as np
 from stereoservo.control.law import IntArray
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import invert4, kernel, multiply4_into
-
-LEAST_ALTITUDE = 10.0
-"""Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
-CLEARLY_BETTER = 2.0
-"""Ratio of image areas from which on another triangle takes over."""
-LASTING = 8.0
-"""How many times its area a triangle counts that shows its front at the goal too."""
 
 AVERAGING_ROUNDS = 3
 """How often an arm's turns are averaged over, one joint after another."""
@@ -120,7 +113,7 @@ def plane_minors(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
 
 
 @kernel
-def _dot(a: FloatArray, b: FloatArray) -> float:
+def dot4(a: FloatArray, b: FloatArray) -> float:
     total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     return total
 
@@ -135,25 +128,107 @@ def _form(a: FloatArray, S: FloatArray, b: FloatArray) -> float:
 
 
 @kernel
-def off_plane(points: FloatArray, covariances: FloatArray, triples: IntArray) -> FloatArray:
-    """``det[M_i M_j M_k M_l]`` in deviations of itself (t, m), for every triple and marker l; 0 for its own markers."""
+def off_plane(points: FloatArray, covariances: FloatArray, i: int, j: int, k: int) -> FloatArray:
+    """``det[M_i M_j M_k M_l]`` in deviations of itself (m,), for every marker l; 0 for the three themselves."""
+    out = np.zeros(points.shape[0])
+    plane = plane_minors(points[i], points[j], points[k])
+    for other in range(points.shape[0]):
+        if other in (i, j, k):
+            continue
+        # the determinant is linear in each point: its derivative is the plane of the other three
+        variance = (
+            _own(covariances[other], plane)
+            + _own(covariances[i], plane_minors(points[j], points[k], points[other]))
+            + _own(covariances[j], plane_minors(points[i], points[k], points[other]))
+            + _own(covariances[k], plane_minors(points[i], points[j], points[other]))
+        )
+        out[other] = dot4(plane, points[other]) / math.sqrt(variance)
+    return out
+
+
+@kernel
+def coplanar_groups(
+    points: FloatArray,
+    covariances: FloatArray,
+    triples: IntArray,
+    altitudes: FloatArray,
+    distances: FloatArray,
+    seen: FloatArray,
+    limit: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Groups of markers in one plane, from the triples that tell their planes best on.
+
+    Triples (t, 3) with ``altitudes`` (t,), the largest first; those inside a group of four that was found are passed
+    over. Members (g, m) 1 or 0; facts (g, 7): the triple, markers in it, others above and below, and whether no camera
+    of ``seen`` (c, m) sees only part; roundness (g,): altitude over the longest of ``distances`` (m, m) in it.
+    """
     count, markers = triples.shape[0], points.shape[0]
-    out = np.zeros((count, markers))
+    members = np.zeros((count, markers), np.int64)
+    facts = np.zeros((count, 7), np.int64)
+    roundness = np.zeros(count)
+    groups = 0
     for t in range(count):
         i, j, k = triples[t]
-        plane = plane_minors(points[i], points[j], points[k])
-        for other in range(markers):
-            if other in (i, j, k):
+        known = False
+        for g in range(groups):
+            if facts[g, 3] > 3 and members[g, i] + members[g, j] + members[g, k] == 3:
+                known = True
+                break
+        if known:
+            continue
+        deviations = off_plane(points, covariances, i, j, k)
+        facts[groups, 0], facts[groups, 1], facts[groups, 2] = i, j, k
+        for p in range(markers):
+            if abs(deviations[p]) <= limit:
+                members[groups, p] = 1
+                facts[groups, 3] += 1
+            elif deviations[p] > 0.0:
+                facts[groups, 4] += 1
+            else:
+                facts[groups, 5] += 1
+        longest = 0.0
+        for p in range(markers):
+            for other in range(markers):
+                if members[groups, p] == 1 and members[groups, other] == 1:
+                    longest = max(longest, distances[p, other])
+        facts[groups, 6] = 1
+        for c in range(seen.shape[0]):
+            sights = 0
+            for p in range(markers):
+                if members[groups, p] == 1 and seen[c, p] > 0.0:
+                    sights += 1
+            if 0 < sights < facts[groups, 3]:
+                facts[groups, 6] = 0
+        roundness[groups] = altitudes[t] / longest
+        groups += 1
+    return members[:groups], facts[:groups], roundness[:groups]
+
+
+@kernel
+def covering_groups(members: IntArray, facts: IntArray) -> IntArray:
+    """Which groups, in the order of their rank, are faces: they bring markers that none before has.
+
+    First those of four and more with nothing on one side, then those of four and more at all, three new markers each;
+    then any with nothing on one side, one new marker each.
+    """
+    groups, markers = members.shape
+    left = np.ones(markers, np.int64)
+    chosen = np.empty(groups, np.int64)
+    found = 0
+    for step in range(3):
+        for g in range(groups):
+            bounds = facts[g, 4] == 0 or facts[g, 5] == 0
+            if (step == 0 and not bounds) or (step < 2 and facts[g, 3] < 4) or (step == 2 and not bounds):
                 continue
-            # the determinant is linear in each point: its derivative is the plane of the other three
-            variance = (
-                _own(covariances[other], plane)
-                + _own(covariances[i], plane_minors(points[j], points[k], points[other]))
-                + _own(covariances[j], plane_minors(points[i], points[k], points[other]))
-                + _own(covariances[k], plane_minors(points[i], points[j], points[other]))
-            )
-            out[t, other] = _dot(plane, points[other]) / math.sqrt(variance)
-    return out
+            new = 0
+            for p in range(markers):
+                new += left[p] * members[g, p]
+            if new >= (3 if step < 2 else 1):
+                chosen[found] = g
+                found += 1
+                for p in range(markers):
+                    left[p] *= 1 - members[g, p]
+    return chosen[:found]
 
 
 @kernel
@@ -191,113 +266,4 @@ def triangle_altitudes(points: FloatArray, form: FloatArray, triples: IntArray) 
             mixed = _form(along, form, off)
             left = _form(off, form, off) - (mixed * mixed / length if length > 0.0 else 0.0)
             out[t] = min(out[t], math.sqrt(max(0.0, left)))
-    return out
-
-
-@kernel
-def faces_fronting(
-    points: FloatArray,
-    triples: IntArray,
-    sided: FloatArray,
-    displacements: FloatArray,
-    camera_centres: FloatArray,
-) -> FloatArray:
-    """1 (K, f, c) where a face of the body, moved by ``displacements`` (K, 4, 4), shows its front; else 0.
-
-    ``points`` (m, 4) now, of height 1 like ``camera_centres`` (c, 4); ``triples`` (f, 3) in outward order; a face whose
-    outward side is not known, ``sided`` (f,) 0, counts as seen from both.
-    """
-    samples, faces, cameras = displacements.shape[0], triples.shape[0], camera_centres.shape[0]
-    out = np.ones((samples, faces, cameras))
-    moved = np.empty((3, 4))
-    for s in range(samples):
-        for f in range(faces):
-            if not sided[f] > 0.0:
-                continue
-            for corner in range(3):
-                for i in range(4):
-                    moved[corner, i] = _dot(displacements[s, i], points[triples[f, corner]])
-            plane = plane_minors(moved[0], moved[1], moved[2])
-            for c in range(cameras):
-                if not _dot(plane, camera_centres[c]) > 0.0:
-                    out[s, f, c] = 0.0
-    return out
-
-
-@kernel
-def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
-    """Cameras that see a triangle well, and its areas there, in squared deviations of its worst marker, summed."""
-    count, area = 0, 0.0
-    for c in range(weights.shape[0]):
-        weight = min(weights[c, i], weights[c, j], weights[c, k])
-        if not weight > 0.0:
-            continue
-        ux, uy = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
-        vx, vy = pixels[c, k, 0] - pixels[c, i, 0], pixels[c, k, 1] - pixels[c, i, 1]
-        wx, wy = vx - ux, vy - uy
-        double = abs(ux * vy - uy * vx)
-        longest = math.sqrt(max(ux * ux + uy * uy, vx * vx + vy * vy, wx * wx + wy * wy))
-        if double * weight >= LEAST_ALTITUDE * longest and longest > 0.0:
-            count += 1
-            area += 0.5 * double * weight * weight
-    return count, area
-
-
-@kernel
-def choose_triangle(
-    members: FloatArray,
-    lasting: FloatArray,
-    usable: FloatArray,
-    pixels: FloatArray,
-    weights: FloatArray,
-    face_now: int,
-    triple_now: IntArray,
-) -> tuple[int, IntArray, int]:
-    """Face (-1: across faces), its three markers and the cameras that see them (0: there are none).
-
-    See `control.faces.choose_face`; the order of the markers is not yet outward.
-    """
-    faces, markers = members.shape
-    best = np.zeros(3, np.int64)
-    best_face, best_count, best_area = -1, 0, 0.0
-    # faces first; across faces only where none is seen
-    for f in range(faces + 1):
-        if f == faces and best_count > 0:
-            break
-        for i in range(markers):
-            if not (usable[i] > 0.0 and (f == faces or members[f, i] > 0.0)):
-                continue
-            for j in range(i + 1, markers):
-                if not (usable[j] > 0.0 and (f == faces or members[f, j] > 0.0)):
-                    continue
-                for k in range(j + 1, markers):
-                    if not (usable[k] > 0.0 and (f == faces or members[f, k] > 0.0)):
-                        continue
-                    count, area = triangle_sight(i, j, k, pixels, weights)
-                    if f < faces and lasting[f] > 0.0:
-                        area *= LASTING
-                    if count > best_count or (count == best_count and area > best_area):
-                        best_face, best_count, best_area = (f if f < faces else -1), count, area
-                        best[0], best[1], best[2] = i, j, k
-    if face_now >= -1 and (face_now >= 0 or best_face < 0):
-        good = True
-        for corner in range(3):
-            good = good and usable[triple_now[corner]] > 0.0
-        if good:
-            count, area = triangle_sight(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
-            if face_now >= 0 and lasting[face_now] > 0.0:
-                area *= LASTING
-            if count > 0 and count >= best_count and best_area <= CLEARLY_BETTER * area:
-                return face_now, triple_now.copy(), count
-    return best_face, best, best_count
-
-
-@kernel
-def kept_cameras(side: float, now: FloatArray, then: FloatArray, camera_centres: FloatArray) -> FloatArray:
-    """1 (c,) for cameras before whose eyes the plane of three points has its front both ``now`` and ``then`` (3, 4)."""
-    out = np.zeros(camera_centres.shape[0])
-    plane, plane_then = plane_minors(now[0], now[1], now[2]), plane_minors(then[0], then[1], then[2])
-    for c in range(camera_centres.shape[0]):
-        if side * _dot(plane, camera_centres[c]) > 0.0 and side * _dot(plane_then, camera_centres[c]) > 0.0:
-            out[c] = 1.0
     return out
