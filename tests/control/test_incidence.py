@@ -11,7 +11,6 @@ from stereoservo.control.incidence import (
     KINDS,
     IncidenceStatus,
     as_law_step,
-    check_moving,
     image_task,
     incidence_reasons,
     incidence_step,
@@ -381,6 +380,7 @@ def test_degenerate_input_is_refused_where_it_enters(virtual):
         ("point-on-line", [0], at_infinity, "degenerate"),
         ("point-on-volume", [0], goal[:1], "shape"),
         ("point-on-point", [0], np.full((1, 4), np.nan), "not_finite"),
+        ("point-on-point", [0], np.zeros((1, 4)), "not_finite"),
     ):
         with pytest.raises(GeometryError) as refused:
             build(kind, own, fixed)
@@ -392,21 +392,29 @@ def test_degenerate_input_is_refused_where_it_enters(virtual):
 
     scene = scene_of(world)
     good = build("plane-on-plane", [0, 1, 2], goal[:3])
-    check_moving(scene.points, scene.matrices, good)
-    collinear = scene.points.copy()
-    collinear[2] = 0.5 * (collinear[0] + collinear[1])
-    with pytest.raises(GeometryError, match="span no plane"):
-        check_moving(collinear, scene.matrices, good)
-    with pytest.raises(GeometryError, match="two or more"):
-        check_moving(scene.points, scene.matrices[:1], good)
     unknown = scene.points.copy()
     unknown[1] = np.nan
-    with pytest.raises(GeometryError, match="not known"):
-        check_moving(unknown, scene.matrices, good)
     step = incidence_step(scene._replace(points=unknown), good, Options(2.0))
     assert not step.velocity.any()
     assert step.status[0] == IncidenceStatus.NOT_FINITE
     assert incidence_reasons(step, good, ("plate",))[0].code == "INCIDENCE_UNSEEN"
+
+
+def test_where_it_is_already_nothing_moves(virtual):
+    rng = np.random.default_rng(18)
+    T0, _ = virtual.random_task(rng, 60, 0.1)
+    world = virtual.free_arm(rng, T0)
+    there = world.hidden(world.markers())
+    task = incidence_task(
+        ["plane-on-plane", "line-on-line"],
+        [[2, 1, 0], [1, 0]],
+        [there[:3], there[:2]],
+        world.infinity,
+        TOLERANCE,
+    )
+    step = incidence_step(scene_of(world), task, Options(2.0, DT))
+    assert (step.status == IncidenceStatus.DONE).all()
+    assert np.abs(step.velocity).max() < 1e-9
 
 
 def test_fixed_feature_behind_the_cameras_is_approached(virtual):

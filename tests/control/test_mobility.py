@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from stereoservo.control.body_frame import body_frame
 from stereoservo.control.mobility import FREEDOMS, missing_freedom, mobility
 from stereoservo.control.mobility_kernel import (
     drivable_freedoms,
@@ -23,7 +24,6 @@ from stereoservo.control.mobility_reference import (
     point_jacobian_reference,
     self_motion_reference,
 )
-from stereoservo.geometry.body_frame import body_frame
 from stereoservo.geometry.errors import GeometryError
 
 SEVEN = ((0, -90, 0.34), (0, 90, 0), (0, 90, 0.4), (0, -90, 0), (0, -90, 0.4), (0, 90, 0), (0, 0, 0.126))

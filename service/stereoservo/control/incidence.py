@@ -20,7 +20,6 @@ from stereoservo.control.mobility_kernel import limit_pull
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.geometry.subspaces import basis
 from stereoservo.kinematics.kernels import image_jacobian
 
 IntArray = npt.NDArray[np.int64]
@@ -36,8 +35,10 @@ KINDS = (
 """By their codes 0 to 5; the words of the wire."""
 
 FEATURES = ("point", "line", "plane")
-FLAT_PX = 0.5
-"""Distance [px] below which a moving feature's points span no line or plane."""
+FINITE = 1e-6
+"""Height of a point at unit norm, relative to the plane's, below which it lies at infinity."""
+FLAT = 1e-6
+"""Sine below which points of a fixed feature coincide or are collinear."""
 
 
 class IncidenceStatus(IntEnum):
@@ -125,62 +126,54 @@ def incidence_task(
             )
         at[i, :needed] = own
         dimension = kernels.fixed_dimension(int(codes[i]))
-        forms[i, : dimension + 1] = _base_and_directions(kind, points, dimension, plane_at_infinity)
+        forms[i] = feature_form(points, dimension, plane_at_infinity, kind)
     return IncidenceTask(codes, at, forms, float(tolerance_px))
 
 
-def _base_and_directions(kind: str, points: FloatArray, dimension: int, infinity: FloatArray) -> FloatArray:
+def feature_form(
+    points: FloatArray, dimension: int, plane_at_infinity: FloatArray, name: str = "incidence"
+) -> FloatArray:
+    """A fixed feature (3, 4) as `IncidenceTask` has it: a finite point of ``points`` and directions, zero rows below.
+
+    ``points`` (dimension + 1, 4), of any height, some at infinity. No LAPACK, no BLAS: the core takes goals. Raises
+    GeometryError, naming ``name``, for another number of points, points that span less, features wholly at infinity.
+    """
+    what = FEATURES[dimension]
     points = np.atleast_2d(np.asarray(points, dtype=np.float64))
     if points.shape != (dimension + 1, 4):
         raise GeometryError(
-            "shape",
-            f"{kind}: the fixed {FEATURES[dimension]} has shape {points.shape}; ({dimension + 1}, 4) is needed",
+            "shape", f"{name}: the fixed {what} has shape {points.shape}; ({dimension + 1}, 4) is needed"
         )
-    span = basis(points)
-    if len(span) <= dimension:
+    sizes = np.sqrt((points * points).sum(axis=1) * (plane_at_infinity * plane_at_infinity).sum())
+    if not (np.isfinite(sizes).all() and (sizes > 0.0).all()):
+        raise GeometryError("not_finite", f"{name}: points of the fixed {what} are zero or not finite")
+    heights = (points * plane_at_infinity).sum(axis=1)
+    finite = np.abs(heights) > FINITE * sizes
+    if not finite.any():
         raise GeometryError(
-            "degenerate",
-            f"{kind}: the {dimension + 1} points of the fixed {FEATURES[dimension]} span only a "
-            f"{FEATURES[len(span) - 1]}",
+            "degenerate", f"{name}: the fixed {what} lies at infinity; one finite point is needed"
         )
-    heights = span @ infinity
-    size = float(np.linalg.norm(heights))
-    if not size > 1e-9 * float(np.linalg.norm(infinity)):
-        raise GeometryError("degenerate", f"{kind}: the fixed {FEATURES[dimension]} lies at infinity")
-    mean = (points @ infinity)[:, None]
-    finite = np.abs(mean[:, 0]) > 1e-6 * np.linalg.norm(points, axis=1) * np.linalg.norm(infinity)
-    base = (points[finite] / mean[finite]).mean(axis=0) if finite.any() else span.T @ heights / size**2
-    # Directions: the combinations of the span without height.
-    free = np.linalg.svd(heights[None])[2][1:]
-    form: FloatArray = np.concatenate([base[None], free @ span])
-    return form
-
-
-def check_moving(points: FloatArray, matrices: FloatArray, task: IncidenceTask) -> None:
-    """Refuse markers that span no line or plane: ``points`` (m, 4) of height 1, ``matrices`` (c, 3, 4), c >= 2.
-
-    Raises GeometryError, naming the incidence: for points that coincide or are collinear within `FLAT_PX` pixels, that
-    are not known, and for fewer than two cameras, which see no distance along their rays.
-    """
-    if len(matrices) < 2:
-        raise GeometryError(
-            "too_few", f"{len(matrices)} camera; distances in space need the images of two or more"
-        )
-    for k, kind in enumerate(task.kinds):
-        count = kernels.moving_count(int(kind))
-        own = points[task.markers[k, :count]]
-        A = kernels.pixel_gradients(matrices, own[0])
-        edges = (own[1:] - own[0]) @ A.T
-        if not (np.isfinite(own).all() and np.isfinite(A).all()):
-            raise GeometryError("not_finite", f"incidence {k} ({KINDS[kind]}): a marker's point is not known")
-        widths = np.linalg.svd(edges, compute_uv=False) if count > 1 else np.ones(1)
-        if not widths[-1] > FLAT_PX:
+    first = int(finite.argmax())
+    form = np.zeros((3, 4))
+    form[0] = points[first] / heights[first]
+    row = 1
+    for i in range(len(points)):
+        if i == first:
+            continue
+        direction = points[i] / heights[i] - form[0] if finite[i] else points[i]
+        size = float(np.sqrt((direction * direction).sum()))
+        independent = size > FLAT * float(np.sqrt((form[0] * form[0]).sum())) or not finite[i]
+        for before in form[1:row]:
+            direction = direction - float((direction * before).sum()) * before
+        left = float(np.sqrt((direction * direction).sum()))
+        if not (independent and left > FLAT * size):
             raise GeometryError(
                 "degenerate",
-                f"incidence {k} ({KINDS[kind]}): its markers {task.markers[k, :count].tolist()} span no "
-                f"{FEATURES[count - 1]} ({widths[-1]:.3g} px, more than {FLAT_PX} px are needed)",
-                width=float(widths[-1]),
+                f"{name}: the points of the fixed {what} coincide or are collinear; they span no {what}",
             )
+        form[row] = direction / left
+        row += 1
+    return form
 
 
 def no_second_task(n: int) -> SecondTask:

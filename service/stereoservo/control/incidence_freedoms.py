@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 
+from stereoservo.control.body_frame import body_frame
 from stereoservo.control.incidence import IncidenceTask, incidence_step
 from stereoservo.control.incidence_kernel import METRIC_FLOOR
 from stereoservo.control.law import Options, Scene
 from stereoservo.control.mobility import REACH, Freedom, missing_freedom, rigid_motions
 from stereoservo.control.mobility_kernel import point_jacobian
-from stereoservo.geometry.body_frame import body_frame
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.kernels import invert4
 
 DEAR = 10.0
 """Cost of a motion that no joint makes, relative to one that joints make, so that these are used first."""
@@ -39,8 +40,8 @@ def incidence_freedoms(
     rigid = np.ascontiguousarray(rigid_motions(E))
     operators = np.concatenate([scene.operators, rigid])
     free = scene._replace(operators=operators, composition=Composition.SIMULTANEOUS)
-    form = np.ascontiguousarray(np.linalg.inv(E)[:3])
-    cost = np.linalg.norm(point_jacobian(operators, scene.points, form), axis=0)
+    form = np.ascontiguousarray(invert4(E)[:3])
+    cost = np.sqrt((point_jacobian(operators, scene.points, form) ** 2).sum(axis=0))
     cost = np.maximum(cost, METRIC_FLOOR * cost.max(initial=1.0))
     cost[len(scene.operators) :] *= DEAR
     options = Options(1.0)
@@ -56,7 +57,7 @@ def incidence_freedoms(
         if not needed or math.sqrt(1.0 - step.share**2) <= tolerance:
             found.append(None)
             continue
-        wanted = np.tensordot(body.velocity[len(scene.operators) :], rigid, axes=1)
+        wanted = (body.velocity[len(scene.operators) :, None, None] * rigid).sum(axis=0)
         found.append(
             missing_freedom(
                 scene.operators, scene.matrices, scene.points, plane_at_infinity, wanted,

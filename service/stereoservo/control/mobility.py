@@ -1,7 +1,8 @@
 """Which freedoms an arm has here, in the words of what the cameras see (thesis 7.3.3, 8; errata, deficient arms).
 
 A numerical criterion on the Jacobian of the body's points, in right-angled coordinates whose unit is the body's radius.
-Planning and refusals ask here, with numpy; the loop calls `mobility_kernel`.
+Planning and refusals ask here, the loop calls `mobility_kernel`. No LAPACK, no BLAS: the core refuses goals in these
+words.
 """
 
 from __future__ import annotations
@@ -10,12 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoservo.control.mobility_kernel import drivable_freedoms, joints_to_block, point_jacobian
-from stereoservo.geometry.body_frame import body_frame
+from stereoservo.control.body_frame import body_frame
+from stereoservo.control.mobility_kernel import (
+    drivable_freedoms,
+    joints_to_block,
+    least_squares,
+    multiply,
+    point_jacobian,
+)
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.geometry.velocities import twist_matrix
-from stereoservo.kinematics.kernels import image_jacobian
+from stereoservo.kinematics.kernels import image_jacobian, invert4
+from stereoservo.kinematics.linear_kernels import right_singular
 
 FREEDOMS = (
     "translation across the image, sideways",
@@ -86,7 +94,7 @@ def mobility(
     """The freedoms of an arm: ``operators`` (n, 4, 4) at the current configuration, ``points`` (m, 4) of height 1.
 
     ``matrices`` (c, 3, 4), whose first camera names the motions; ``unit`` (n,) [rad or m]: what of each joint's motion
-    is as much, None: 1. Without ``H_projective_to_euclidean`` right angles are estimated (`geometry.body_frame`).
+    is as much, None: 1. Without ``H_projective_to_euclidean`` right angles are estimated (`body_frame`).
     Raises GeometryError for points on one line, which do not show all freedoms, and as `body_frame` does.
     """
     n = operators.shape[0]
@@ -96,13 +104,13 @@ def mobility(
     fields = _motions(E, named, points)
     _refuse_line(fields)
     rank, capacity, values, V, made = _drivable(E, operators, points, units)
-    shares = np.linalg.norm(made.T @ (fields / np.linalg.norm(fields, axis=0)), axis=0)
+    shares = _lengths(multiply(made.T, fields / _lengths(fields)))
     missing = tuple(
         Freedom(_describe(E, X, points, camera), X, 0.0) for X in _left_over(named, fields, made, rank)
     )
     block = joints_to_block(_motions(E, operators, points), units, capacity, WEAK) if n else np.zeros(0)
     J = image_jacobian(operators, matrices, points) * units
-    pixels = np.sqrt(((J @ V) ** 2).sum(axis=(0, 1, 2)) / (J.shape[0] * J.shape[1]))
+    pixels = _lengths(multiply(J.reshape(-1, n), V)) / np.sqrt(J.shape[0] * J.shape[1])
     return Mobility(
         rank=rank,
         capacity=capacity,
@@ -138,32 +146,40 @@ def missing_freedom(
         raise GeometryError("not_finite", f"the wanted motion is not finite: {np.asarray(wanted).tolist()}")
     n = operators.shape[0]
     E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
-    field = _motions(E, wanted[None], points)[:, 0]
-    *_, made = _drivable(E, operators, points, np.ones(n))
-    left = field - made @ (made.T @ field)
-    size = float(np.linalg.norm(field))
-    if float(np.linalg.norm(left)) <= tolerance * size:
-        return None
     named = rigid_motions(E)
-    _refuse_line(_motions(E, named, points))
-    twist = np.linalg.pinv(_motions(E, named, points)) @ left
-    rest = np.tensordot(twist, named, axes=1)
-    share = float(np.linalg.norm(made.T @ field)) / size
-    return Freedom(_describe(E, rest, points, camera), rest, share)
+    fields = _motions(E, named, points)
+    _refuse_line(fields)
+    field = _motions(E, wanted[None], points)
+    *_, made = _drivable(E, operators, points, np.ones(n))
+    done = multiply(made.T, field)
+    left = field - multiply(made, done)
+    size = float(_lengths(field)[0])
+    if float(_lengths(left)[0]) <= tolerance * size:
+        return None
+    rest = _combined(least_squares(fields, left[:, 0].copy()), named)
+    return Freedom(_describe(E, rest, points, camera), rest, float(_lengths(done)[0]) / size)
+
+
+def _lengths(columns: FloatArray) -> FloatArray:
+    lengths: FloatArray = np.sqrt((columns * columns).sum(axis=0))
+    return lengths
+
+
+def _combined(factors: FloatArray, generators: FloatArray) -> FloatArray:
+    total: FloatArray = (factors[:, None, None] * generators).sum(axis=0)
+    return total
 
 
 def _left_over(named: FloatArray, fields: FloatArray, made: FloatArray, rank: int) -> list[FloatArray]:
     """Generators of the freedoms that are not ``made`` (3m, rank): those nearest to the named ones, strongest first."""
-    body = np.linalg.qr(fields)[0]
-    rest = fields / np.linalg.norm(fields, axis=0)
-    rest = rest - made @ (made.T @ rest)
+    rest = fields / _lengths(fields)
+    rest = rest - multiply(made, multiply(made.T, rest))
     generators = []
     for _ in range(len(named) - rank):
-        strongest = rest[:, int(np.linalg.norm(rest, axis=0).argmax())]
-        strongest = body @ (body.T @ strongest)
-        twist = np.linalg.pinv(fields) @ strongest
-        generators.append(np.tensordot(twist / np.abs(twist).max(), named, axes=1))
-        rest = rest - np.outer(strongest, strongest @ rest) / float(strongest @ strongest)
+        twist = least_squares(fields, np.ascontiguousarray(rest[:, int(_lengths(rest).argmax())]))
+        strongest = multiply(fields, twist[:, None])
+        generators.append(_combined(twist / np.abs(twist).max(), named))
+        rest = rest - multiply(strongest, multiply(strongest.T, rest)) / float((strongest * strongest).sum())
     return generators
 
 
@@ -178,31 +194,31 @@ def _drivable(
     rank, values, V = drivable_freedoms(rows, units)
     capacity = min(n, _closure(np.stack([_twist(E, X) for X in operators])))
     rank = min(rank, capacity)
-    return rank, capacity, values, V, (rows * units) @ V[:, :rank] / values[:rank]
+    return rank, capacity, values, V, multiply(rows * units, V[:, :rank]) / values[:rank]
 
 
 def rigid_motions(E: FloatArray) -> FloatArray:
     """Generators (6, 4, 4) of `FREEDOMS` in the frame that ``E`` (4, 4) maps the body's frame to."""
     local = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
-    motions: FloatArray = E @ local @ np.linalg.inv(E)
-    return motions
+    inverse = invert4(E)
+    return np.stack([multiply(multiply(E, X), inverse) for X in local])
 
 
 def _twist(E: FloatArray, X: FloatArray) -> FloatArray:
     """Components (6,) of a motion ``X`` (4, 4) along `FREEDOMS`."""
-    local = np.linalg.solve(E, X @ E)
+    local = multiply(multiply(invert4(E), X), E)
     odd = 0.5 * (local[:3, :3] - local[:3, :3].T)
     return np.array([*local[:3, 3], odd[2, 1], odd[0, 2], odd[1, 0]])
 
 
 def _motions(E: FloatArray, generators: FloatArray, points: FloatArray) -> FloatArray:
     """`point_jacobian` (3m, k) of generators (k, 4, 4) in the body's frame."""
-    form = np.ascontiguousarray(np.linalg.inv(E)[:3])
+    form = np.ascontiguousarray(invert4(E)[:3])
     return point_jacobian(np.ascontiguousarray(generators), np.ascontiguousarray(points), form)
 
 
 def _refuse_line(fields: FloatArray) -> None:
-    singular = np.linalg.svd(fields, compute_uv=False)
+    _, singular = right_singular(fields)
     if not singular[-1] > 1e-3 * singular[0]:
         raise GeometryError(
             "degenerate",
@@ -213,22 +229,22 @@ def _refuse_line(fields: FloatArray) -> None:
 
 def _describe(E: FloatArray, X: FloatArray, points: FloatArray, camera: str) -> str:
     """A motion in words: its components by how far they move the body's points."""
-    sizes = np.linalg.norm(_motions(E, rigid_motions(E), points), axis=0) * np.abs(_twist(E, X))
+    sizes = _lengths(_motions(E, rigid_motions(E), points)) * np.abs(_twist(E, X))
     order = [i for i in np.argsort(-sizes, kind="stable").tolist() if sizes[i] > NAMED * sizes.max()]
     return " together with ".join(FREEDOMS[i] for i in order) + f" of {camera}"
 
 
 def _closure(twists: FloatArray) -> int:
     """Freedoms that joints (n, 6), of components as `_twist` gives, have together as they move: brackets included."""
-    twists = twists[np.linalg.norm(twists, axis=1) > 0.0]
+    twists = twists[_lengths(twists.T) > 0.0]
     if not len(twists):
         return 0
     v, w = twists[:, :3], twists[:, 3:]
-    turning = np.linalg.norm(w, axis=1) > PARALLEL * np.linalg.norm(v, axis=1) / 1e3
-    arms = np.linalg.norm(v[turning], axis=1) / np.linalg.norm(w[turning], axis=1)
+    turning = _lengths(w.T) > PARALLEL * _lengths(v.T) / 1e3
+    arms = _lengths(v[turning].T) / _lengths(w[turning].T)
     length = max(float(np.sqrt((arms**2).mean())), 1.0) if turning.any() else 1.0
     scaled = np.hstack([v / length, w])
-    basis = _independent(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))
+    basis = _independent(scaled / _lengths(scaled.T)[:, None])
     while True:
         brackets = [
             np.concatenate([np.cross(a[3:], b[:3]) - np.cross(b[3:], a[:3]), np.cross(a[3:], b[3:])])
@@ -242,5 +258,5 @@ def _closure(twists: FloatArray) -> int:
 
 
 def _independent(vectors: FloatArray) -> FloatArray:
-    _, values, rows = np.linalg.svd(vectors, full_matrices=False)
-    return np.ascontiguousarray(rows[values > PARALLEL * values[0]])
+    V, values = right_singular(vectors)
+    return np.ascontiguousarray(V.T[values > PARALLEL * values[0]])

@@ -25,12 +25,45 @@ EQUAL = 0.05
 """Difference of two joints' parts in a lost freedom that decides nothing: the one nearer to the base is taken."""
 
 
+def multiply(A: FloatArray, B: FloatArray) -> FloatArray:
+    """``A B`` (r, c) of small matrices (r, k) and (k, c), transposed ones and slices too: one compiled kernel."""
+    return _multiply(np.ascontiguousarray(A), np.ascontiguousarray(B))
+
+
+@kernel
+def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
+    out = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            for k in range(A.shape[1]):
+                out[i, j] += A[i, k] * B[k, j]
+    return out
+
+
+@kernel
+def least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Least ``x`` (n,) of least ``|A x - b|`` for ``A`` (r, n), ``b`` (r,); singular values below `LOST` left out."""
+    V, values = right_singular(A)
+    n = values.shape[0]
+    x = np.zeros(n)
+    for i in range(n):
+        if not values[i] > LOST * values[0]:
+            break
+        along = 0.0
+        for r in range(A.shape[0]):
+            for j in range(n):
+                along += A[r, j] * V[j, i] * b[r]
+        for j in range(n):
+            x[j] += V[j, i] * along / (values[i] * values[i])
+    return x
+
+
 @kernel
 def point_jacobian(operators: FloatArray, points: FloatArray, form: FloatArray) -> FloatArray:
     """Jacobian (3m, n) of points (m, 4) of height 1: ``form (Ĥ_j M)``, over the root of m.
 
     ``form`` (3, 4) maps differences of points to right-angled coordinates: the upper rows of the inverse of
-    `geometry.body_frame.body_frame`, which hold as long as the model does, whatever the pose.
+    `body_frame.body_frame`, which hold as long as the model does, whatever the pose.
     """
     n, m = operators.shape[0], points.shape[0]
     rows = np.empty((3 * m, n))
@@ -188,10 +221,10 @@ def self_motion_from_limits(
 ) -> FloatArray:
     """A joint velocity (n,) that leaves the body where it is and drives joints from their limits towards the middle.
 
-    ``rows`` (r, n): `point_jacobian`. ``positions``, ``lower``, ``upper`` (n,) [rad or m], infinite for a joint without
-    limits; ``rate`` [1/s]: no joint is faster than half its range times ``rate`` (without limits: 1 rad or m times it).
-    The pull rises with the cube of the way from the middle. A motion fades out as it comes to move the body; an arm
-    without self-motions rests.
+    ``rows`` (r, n): `point_jacobian`, or an image Jacobian. ``positions``, ``lower``, ``upper`` (n,) [rad or m],
+    infinite for a joint without limits; ``rate`` [1/s]: no joint is faster than half its range times ``rate`` (without
+    limits: 1 rad or m times it). The pull rises with the cube of the way from the middle. A motion fades out as it
+    comes to move the body; an arm without self-motions rests.
     """
     n = positions.shape[0]
     pull, half = limit_pull(positions, lower, upper)
