@@ -21,7 +21,8 @@ ARRIVED = 1e-7
 """Distance of a point from its place, as a share of the cameras' distance: below a thousandth of a pixel."""
 SETTLED = 1e-6
 """Largest joint step [rad or frame lengths] at which an arm that cannot follow is as near as it comes."""
-ITERATIONS = 8
+ITERATIONS, LENIENT_ITERATIONS = 8, 3
+"""At most, where the arm must arrive, and where it goes as near as it comes."""
 DAMPING = 1e-9
 """Of the normal matrix, relative to its largest diagonal."""
 LARGEST_STEP = 0.3
@@ -128,6 +129,7 @@ def reach(
     joints: FloatArray,
     displacement: FloatArray,
     bias: FloatArray,
+    iterations: int,
 ) -> float:
     """Move the arm, in place, until its ``body`` (m, 3) is at ``wanted`` (m, 3), or as near as it comes.
 
@@ -140,7 +142,7 @@ def reach(
     undamped = np.empty((n, n))
     rest = np.zeros(n)
     worst = 0.0
-    for iteration in range(ITERATIONS):
+    for iteration in range(iterations):
         points = moved(displacement, body)
         worst = _normal_equations(operators, points, wanted, N, b)
         if worst <= ARRIVED and (iteration > 0 or not redundant):
@@ -215,13 +217,29 @@ def pixels_apart(cameras: FloatArray, kept: FloatArray, X: FloatArray, Y: FloatA
 
 
 @kernel
+def _places(way: FloatArray, share: float, body: FloatArray, rest: FloatArray) -> FloatArray:
+    """Where the points (m, 3) of the body belong at ``share`` of the way, ``rest`` (m, 3) made up for on it."""
+    points = moved(pose_on_way(way, share), body)
+    for p in range(points.shape[0]):
+        for i in range(3):
+            points[p, i] += share * rest[p, i]
+    return points
+
+
+@kernel
 def check_way(
-    way: FloatArray, first: int, last: int, samples: int, surroundings: Surroundings, table: FloatArray
+    way: FloatArray,
+    first: int,
+    last: int,
+    samples: int,
+    surroundings: Surroundings,
+    rest: FloatArray,
+    table: FloatArray,
 ) -> tuple[int, int]:
     """Samples ``first`` to before ``last`` of ``samples`` of the closed form: kind broken or −1, and where."""
     for k in range(first, last):
         share = k / (samples - 1.0)
-        points = moved(pose_on_way(way, share), surroundings.body)
+        points = _places(way, share, surroundings.body, rest)
         broken = check_view(points, share, surroundings, table, True)
         if broken >= 0:
             return broken, k
@@ -258,22 +276,12 @@ def follow_way(
     for k in range(first, last):
         share = k / (samples - 1.0)
         if k > 0:
-            wanted = moved(pose_on_way(way, share), s.body)
-            for p in range(wanted.shape[0]):
-                for i in range(3):
-                    wanted[p, i] += share * rest[p, i]
+            wanted = _places(way, share, s.body, rest)
+            firm = math.isfinite(tolerance) or k == samples - 1
             left = reach(
-                wanted,
-                s.body,
-                composition,
-                redundant,
-                s.lower,
-                s.upper,
-                operators,
-                joints,
-                displacement,
-                bias,
-            )
+                wanted, s.body, composition, redundant, s.lower, s.upper, operators, joints, displacement, bias,
+                ITERATIONS if firm else LENIENT_ITERATIONS,
+            )  # fmt: skip
             if left > ARRIVED:
                 apart, marker = pixels_apart(s.cameras, s.kept, moved(displacement, s.body), wanted)
                 if not apart <= tolerance:

@@ -218,7 +218,7 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
     """Samples of the present stage: kind of limit broken or −1, and up to where."""
     composition = int(p.request.composition)
     if p.stage == Stage.IMAGES:
-        broken, reached = check_way(p.way, p.sample, until, SAMPLES, p.surroundings, p.table)
+        broken, reached = check_way(p.way, p.sample, until, SAMPLES, p.surroundings, p.rest, p.table)
     elif p.stage == Stage.JOINTS:
         broken, reached = follow_joints(
             p.joint_step, p.sample, until, SAMPLES, p.surroundings, composition,

@@ -12,7 +12,7 @@ import numpy as np
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
-from stereoservo.trajectory.following import ARRIVED, move_arm, reach
+from stereoservo.trajectory.following import ARRIVED, ITERATIONS, move_arm, reach
 
 SEEDS = 32
 ROUNDS = 5
@@ -61,7 +61,9 @@ def joints_from_seed(
     move_arm(now, composition, seed - joints, at, displacement)
     left = math.inf
     for _ in range(ROUNDS):
-        left = reach(goal, body, composition, False, lower, upper, now, at, displacement, np.zeros(n))
+        left = reach(
+            goal, body, composition, False, lower, upper, now, at, displacement, np.zeros(n), ITERATIONS
+        )
         if left <= ARRIVED:
             break
     for j in range(n):

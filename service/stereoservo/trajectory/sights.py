@@ -28,8 +28,8 @@ GRAZING = math.radians(3.0)
 """Elevation of a camera over a face that a way keeps, unless its ends have less."""
 THICK = 0.05
 """Distance of a body's middle from a face, relative to the body's size, from which on it tells the face's outside."""
-YIELD = 1e-6
-"""Of margins [px or rad] to what the ends have."""
+YIELD_PX, YIELD_ANGLE = 0.02, 1e-4
+"""What margins leave below what the ends have [px], [rad]: more than the arm may be off there."""
 
 
 def own(values: npt.ArrayLike) -> FloatArray:
@@ -69,7 +69,7 @@ def read_surroundings(
     refusal = _refusal(surroundings, body, goal)
     if refusal is None:
         for points in (body, goal):
-            room = _image_rooms(surroundings, points) - YIELD
+            room = _image_rooms(surroundings, points) - YIELD_PX
             surroundings.margins[:] = np.minimum(surroundings.margins, np.maximum(room, 0.0))
     return surroundings, refusal
 
@@ -102,7 +102,7 @@ def _kept_sights(
             side = 1.0 if float((now + then).sum()) >= 0.0 else -1.0
         both = (side * now > 0.0) & (side * then > 0.0)
         sides[f] = np.where(both, side, 0.0)
-        grazing[f] = np.clip(np.minimum(side * now, side * then) - YIELD, 0.0, GRAZING)
+        grazing[f] = np.clip(np.minimum(side * now, side * then) - YIELD_ANGLE, 0.0, GRAZING)
     return sides, grazing
 
 
