@@ -1,18 +1,18 @@
 """Laws in the images of the cameras that see (8.26): one camera is enough.
 
 The Jacobian is developed around points that the kinematics carry along (8.29, 8.30), so that control goes on where
-a camera drops out; `with_resected_cameras` estimates the cameras anew from the body that they see (8.27, 8.28).
+a camera drops out; `control.moved_cameras` estimates the cameras anew from the body that they see (8.27, 8.28).
 ``image_velocity`` is the readable reference; the loop runs `control.image_kernel.image_step`, tested against it.
 """
 
 from __future__ import annotations
 
-from math import expm1
+from math import expm1, inf
 
 import numpy as np
 
 from stereoservo.control.damped import damped_least_squares_reference
-from stereoservo.control.image_kernel import image_step
+from stereoservo.control.image_kernel import image_step, limit_into
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.homogeneous import FloatArray
@@ -42,6 +42,14 @@ def image_velocity_step(
         scene.pixels, task.set_points, rates, scene.weights, task.wanted, held_gain(options), int(jacobian),
         options.damping,
     )  # fmt: skip
+    return limited(scene, task, options, velocity, conditioning)
+
+
+def limited(scene: Scene, task: Task, options: Options, velocity: FloatArray, conditioning: float) -> LawStep:
+    """The step of a law without components, its velocity scaled to the rates of ``options`` (in place)."""
+    if options.rotation_rate < inf or options.translation_rate < inf:
+        centre = task.centre if task.centre.any() else scene.points.mean(axis=0)
+        limit_into(scene.operators, centre, options.rotation_rate, options.translation_rate, velocity)
     return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, conditioning)
 
 

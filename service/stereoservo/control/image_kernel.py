@@ -20,7 +20,7 @@ FIXED_DEPTH = int(JacobianChoice.FIXED_DEPTH)
 
 
 @kernel
-def _velocities_into(operators: FloatArray, M: FloatArray, out: FloatArray) -> None:
+def velocities_into(operators: FloatArray, M: FloatArray, out: FloatArray) -> None:
     """``Ĥ_j M`` of one point (4,) into (n, 4)."""
     for j in range(operators.shape[0]):
         G = operators[j]
@@ -29,7 +29,7 @@ def _velocities_into(operators: FloatArray, M: FloatArray, out: FloatArray) -> N
 
 
 @kernel
-def _add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, rows: FloatArray) -> None:
+def add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, rows: FloatArray) -> None:
     """``share`` times ``J_G P Ĥ_j M`` (8.33) onto (2, n), for velocities ``Ĥ_j M`` (n, 4); NaN at depth 0."""
     d = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
     scale = 1.0 / d if d != 0.0 else math.nan
@@ -78,9 +78,9 @@ def image_step_into(
             continue
         kind = choice if target_known[p] > 0.0 else 0
         if kind in (0, MEAN):
-            _velocities_into(operators, points[p], now)
+            velocities_into(operators, points[p], now)
         if kind in (DESIRED, MEAN):
-            _velocities_into(operators, target_points[p], then)
+            velocities_into(operators, target_points[p], then)
         for c in range(cameras):
             w = weights[c, p] * wanted[c, p]
             if not w > 0.0:
@@ -90,10 +90,10 @@ def image_step_into(
                 rows[0, j] = 0.0
                 rows[1, j] = 0.0
             if kind == MEAN:
-                _add_rows(P, points[p], now, 0.5, rows)
-                _add_rows(P, target_points[p], then, 0.5, rows)
+                add_rows(P, points[p], now, 0.5, rows)
+                add_rows(P, target_points[p], then, 0.5, rows)
             elif kind == DESIRED:
-                _add_rows(P, target_points[p], then, 1.0, rows)
+                add_rows(P, target_points[p], then, 1.0, rows)
             elif kind == FIXED_DEPTH:
                 # On the ray of the present point, at the depth of the target: P maps the centre to nothing.
                 M, T = points[p], target_points[p]
@@ -102,10 +102,10 @@ def image_step_into(
                 for i in range(4):
                     eye = camera_centres[c, i]
                     moved[i] = eye + (wanted_depth / depth) * (M[i] - eye)
-                _velocities_into(operators, moved, now)
-                _add_rows(P, moved, now, 1.0, rows)
+                velocities_into(operators, moved, now)
+                add_rows(P, moved, now, 1.0, rows)
             else:
-                _add_rows(P, points[p], now, 1.0, rows)
+                add_rows(P, points[p], now, 1.0, rows)
             w2 = w * w
             eu = gain * (set_points[c, p, 0] - pixels[c, p, 0]) + rates[c, p, 0]
             ev = gain * (set_points[c, p, 1] - pixels[c, p, 1]) + rates[c, p, 1]
@@ -147,3 +147,33 @@ def image_step(
         weights, wanted, gain, choice, damping, x,
     )  # fmt: skip
     return x, conditioning
+
+
+@kernel
+def limit_into(
+    operators: FloatArray, centre: FloatArray, rotation_rate: float, translation_rate: float, x: FloatArray
+) -> None:
+    """Scale a velocity ``x`` (n,) so that the body turns no faster than [rad/s], its centre (4,) moves no faster than
+
+    [lengths of the frame's coordinates a second].
+    """
+    square, speed = 0.0, 0.0
+    twist = np.zeros((4, 4))
+    for j in range(x.shape[0]):
+        for i in range(4):
+            for k in range(4):
+                twist[i, k] += x[j] * operators[j, i, k]
+    for i in range(4):
+        s = 0.0
+        for k in range(4):
+            square -= 0.5 * twist[i, k] * twist[k, i]
+            s += twist[i, k] * centre[k]
+        speed += s * s
+    factor = 1.0
+    turn, speed = math.sqrt(max(0.0, square)), math.sqrt(speed)
+    if turn > rotation_rate:
+        factor = rotation_rate / turn
+    if speed > translation_rate:
+        factor = min(factor, translation_rate / speed)
+    for j in range(x.shape[0]):
+        x[j] *= factor

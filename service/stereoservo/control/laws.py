@@ -36,5 +36,9 @@ LAWS: Mapping[str, Law] = {
     "trajectory": Law(trajectory, needs_pose=False, reasons=image_reasons),
 }
 
-CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {"stereo-block": stereo_block}
-"""Further laws of the literature, for comparison. `points.euclidean_points` makes one more, for a calibrated rig."""
+CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {
+    "stereo-block": stereo_block,
+}
+"""Further laws, for comparison and experiments. Two more need what this mapping has not: `points.euclidean_points` a
+metric frame, `moved_cameras.image_of_moved_cameras` LAPACK.
+"""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stereoservo.control.damped import damped_least_squares_reference
-from stereoservo.control.image import NO_COMPONENTS, NO_STATUS, held_gain
+from stereoservo.control.image import held_gain, limited
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.points_kernel import pixel_metrics, points_step
 from stereoservo.geometry.homogeneous import FloatArray
@@ -28,7 +28,7 @@ def points(scene: Scene, task: Task, options: Options) -> LawStep:
         scene.operators, scene.points, task.target_points, _seen(scene, task),
         pixel_metrics(scene.matrices, scene.points), held_gain(options), int(options.jacobian), options.damping,
     )  # fmt: skip
-    return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, conditioning)
+    return limited(scene, task, options, velocity, conditioning)
 
 
 def euclidean_points(
@@ -54,7 +54,7 @@ def euclidean_points(
             operators, X, X_star, (_seen(scene, task) > 0.0).astype(np.float64), metres, held_gain(options),
             int(jacobian), options.damping,
         )  # fmt: skip
-        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, conditioning)
+        return limited(scene, task, options, velocity, conditioning)
 
     return step
 

@@ -1,7 +1,7 @@
 """Image-based stereo servoing: stacked (thesis 8.36) and block by block (8.37).
 
 ``stereo_law`` is the readable reference of the bare step, `control.kernels.stereo_step`; the law runs
-`control.image_kernel.image_step`.
+`control.image_kernel.image_step`. `StereoCycle` makes a whole step from joints and pixels in one kernel call.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import numpy as np
 from stereoservo.control.damped import damped_least_squares_reference
 from stereoservo.control.image import NO_COMPONENTS, NO_STATUS, image
 from stereoservo.control.law import LawStep, Options, Scene, Task
+from stereoservo.control.stereo_kernel import stereo_cycle
 from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import KindArray
 
 DAMPING = 1e-6
 """Default damping, relative to the largest diagonal of the normal matrix."""
@@ -50,6 +52,53 @@ def stereo_law(
     )
     worst = float(np.sqrt((error**2).sum(axis=-1)).max(initial=0.0))
     return StereoStep(-gain * step, worst, conditioning)
+
+
+class StereoCycle:
+    """Joints and pixels to joint velocities in one call: kinematics (5.21), points, Jacobian, damped solve (8.36).
+
+    ``generators`` (n, 4, 4) with ``zero`` (n,), ``kinds`` (n,) 0 revolute or 1 prismatic, ``tip_first`` as in
+    `ProjectiveChain`; ``matrices`` (c, 3, 4); ``marker_points`` (m, 4) at the zero. Fixed for the life of the object.
+    """
+
+    def __init__(
+        self,
+        generators: FloatArray,
+        kinds: KindArray,
+        zero: FloatArray,
+        matrices: FloatArray,
+        marker_points: FloatArray,
+        tip_first: bool = False,
+    ) -> None:
+        self._chain = np.ascontiguousarray(np.stack([generators, generators @ generators]))
+        self._kinds, self._zero, self._tip_first = kinds, zero, tip_first
+        self._matrices, self._points = np.ascontiguousarray(matrices), np.ascontiguousarray(marker_points)
+
+    def step(
+        self,
+        q: FloatArray,
+        pixels: FloatArray,
+        set_points: FloatArray,
+        weights: FloatArray,
+        gain: float,
+        damping: float = DAMPING,
+        *,
+        target_points: FloatArray | None = None,
+        triangulations: int = -1,
+    ) -> tuple[FloatArray, float]:
+        """Velocity (n,) [rad/s or m/s] and conditioning at joints ``q`` (n,); the rest as in `stereo_law`.
+
+        Points are those of the joints (8.35), or, with ``triangulations`` >= 0 renormalised iterations, triangulated
+        (8.34) where two cameras see them. With ``target_points`` (m, 4) the Jacobian is the mean of here and there.
+        """
+        velocity = np.empty(self._zero.shape[0])
+        mean = target_points is not None
+        conditioning = stereo_cycle(
+            self._chain, self._kinds, self._zero, q, self._tip_first, self._matrices, self._points,
+            target_points if target_points is not None else self._points, pixels, set_points, weights, gain, damping,
+            mean, triangulations, velocity,
+        )  # fmt: skip
+        return velocity, conditioning
 
 
 def stereo(scene: Scene, task: Task, options: Options) -> LawStep:

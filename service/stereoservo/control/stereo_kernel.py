@@ -1,0 +1,192 @@
+"""One stereo control step in one call: kinematics, points, Jacobian, damped solve; what `stereo_cycle` runs.
+
+The arithmetic is that of `chain_forward`, `triangulate` and `image_step`, but no operator is ever formed: a joint's
+velocity of a point is ``H̄_{j−1} Ĥ_j (exp_j … exp_n M₀)``, vectors instead of matrices.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.control.linear_kernels import cholesky_solve
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.kernels import KindArray, invert4, kernel, triangulate_into
+
+
+@kernel
+def _factors_into(
+    chain: FloatArray,
+    kinds: KindArray,
+    zero: FloatArray,
+    q: FloatArray,
+    tip_first: bool,
+    E: FloatArray,
+    B: FloatArray,
+) -> None:
+    """``exp_j`` (n, 4, 4) in the order of the chain, and what stands left of each: ``H̄`` (n + 1, 4, 4)."""
+    n = q.shape[0]
+    for i in range(4):
+        for k in range(4):
+            B[0, i, k] = 1.0 if i == k else 0.0
+    for nth in range(n):
+        j = n - 1 - nth if tip_first else nth
+        step = q[j] - zero[j]
+        first, second = step, 0.0
+        if kinds[j] == 0:
+            half = math.sin(0.5 * step)
+            first, second = math.sin(step), 2.0 * half * half
+        for i in range(4):
+            for k in range(4):
+                E[nth, i, k] = first * chain[0, j, i, k] + second * chain[1, j, i, k]
+            E[nth, i, i] += 1.0
+        for i in range(4):
+            for k in range(4):
+                B[nth + 1, i, k] = (
+                    B[nth, i, 0] * E[nth, 0, k]
+                    + B[nth, i, 1] * E[nth, 1, k]
+                    + B[nth, i, 2] * E[nth, 2, k]
+                    + B[nth, i, 3] * E[nth, 3, k]
+                )
+
+
+@kernel
+def _add_point(
+    chain: FloatArray,
+    E: FloatArray,
+    B: FloatArray,
+    tip_first: bool,
+    matrices: FloatArray,
+    M: FloatArray,
+    M0: FloatArray,
+    p: int,
+    share: float,
+    g: FloatArray,
+    rows: FloatArray,
+) -> None:
+    """``share`` times ``J_G P Ĥ_j|_Q M`` of point ``p`` in all cameras (c, 2, n) onto ``rows``.
+
+    ``M`` (m, 4) now, ``M0`` (m, 4) at the chain's zero; ``g`` (c, 2, 4): scratch.
+    """
+    n, cameras = E.shape[0], matrices.shape[0]
+    m0, m1, m2, m3 = M[p, 0], M[p, 1], M[p, 2], M[p, 3]
+    for c in range(cameras):
+        d = matrices[c, 2, 0] * m0 + matrices[c, 2, 1] * m1 + matrices[c, 2, 2] * m2 + matrices[c, 2, 3] * m3
+        scale = 1.0 / d if d != 0.0 else math.nan
+        for r in range(2):
+            x = (
+                matrices[c, r, 0] * m0
+                + matrices[c, r, 1] * m1
+                + matrices[c, r, 2] * m2
+                + matrices[c, r, 3] * m3
+            )
+            pixel = x * scale
+            for i in range(4):
+                g[c, r, i] = share * (matrices[c, r, i] - pixel * matrices[c, 2, i]) * scale
+    z0, z1, z2, z3 = M0[p, 0], M0[p, 1], M0[p, 2], M0[p, 3]
+    for back in range(n):
+        nth = n - 1 - back
+        j = back if tip_first else nth
+        y0 = E[nth, 0, 0] * z0 + E[nth, 0, 1] * z1 + E[nth, 0, 2] * z2 + E[nth, 0, 3] * z3
+        y1 = E[nth, 1, 0] * z0 + E[nth, 1, 1] * z1 + E[nth, 1, 2] * z2 + E[nth, 1, 3] * z3
+        y2 = E[nth, 2, 0] * z0 + E[nth, 2, 1] * z1 + E[nth, 2, 2] * z2 + E[nth, 2, 3] * z3
+        y3 = E[nth, 3, 0] * z0 + E[nth, 3, 1] * z1 + E[nth, 3, 2] * z2 + E[nth, 3, 3] * z3
+        z0, z1, z2, z3 = y0, y1, y2, y3
+        y0 = chain[0, j, 0, 0] * z0 + chain[0, j, 0, 1] * z1 + chain[0, j, 0, 2] * z2 + chain[0, j, 0, 3] * z3
+        y1 = chain[0, j, 1, 0] * z0 + chain[0, j, 1, 1] * z1 + chain[0, j, 1, 2] * z2 + chain[0, j, 1, 3] * z3
+        y2 = chain[0, j, 2, 0] * z0 + chain[0, j, 2, 1] * z1 + chain[0, j, 2, 2] * z2 + chain[0, j, 2, 3] * z3
+        y3 = chain[0, j, 3, 0] * z0 + chain[0, j, 3, 1] * z1 + chain[0, j, 3, 2] * z2 + chain[0, j, 3, 3] * z3
+        v0 = B[nth, 0, 0] * y0 + B[nth, 0, 1] * y1 + B[nth, 0, 2] * y2 + B[nth, 0, 3] * y3
+        v1 = B[nth, 1, 0] * y0 + B[nth, 1, 1] * y1 + B[nth, 1, 2] * y2 + B[nth, 1, 3] * y3
+        v2 = B[nth, 2, 0] * y0 + B[nth, 2, 1] * y1 + B[nth, 2, 2] * y2 + B[nth, 2, 3] * y3
+        v3 = B[nth, 3, 0] * y0 + B[nth, 3, 1] * y1 + B[nth, 3, 2] * y2 + B[nth, 3, 3] * y3
+        for c in range(cameras):
+            rows[c, 0, j] += g[c, 0, 0] * v0 + g[c, 0, 1] * v1 + g[c, 0, 2] * v2 + g[c, 0, 3] * v3
+            rows[c, 1, j] += g[c, 1, 0] * v0 + g[c, 1, 1] * v1 + g[c, 1, 2] * v2 + g[c, 1, 3] * v3
+
+
+@kernel
+def _apply_into(H: FloatArray, M: FloatArray, out: FloatArray) -> None:
+    for p in range(M.shape[0]):
+        for i in range(4):
+            out[p, i] = H[i, 0] * M[p, 0] + H[i, 1] * M[p, 1] + H[i, 2] * M[p, 2] + H[i, 3] * M[p, 3]
+
+
+@kernel
+def stereo_cycle(
+    chain: FloatArray,
+    kinds: KindArray,
+    zero: FloatArray,
+    q: FloatArray,
+    tip_first: bool,
+    matrices: FloatArray,
+    marker_points: FloatArray,
+    target_points: FloatArray,
+    pixels: FloatArray,
+    set_points: FloatArray,
+    weights: FloatArray,
+    gain: float,
+    damping: float,
+    mean: bool,
+    triangulations: int,
+    velocity: FloatArray,
+) -> float:
+    """`stereo.StereoCycle.step` into ``velocity`` (n,); returns the conditioning."""
+    n, cameras, markers = q.shape[0], matrices.shape[0], marker_points.shape[0]
+    E, B = np.empty((n, 4, 4)), np.empty((n + 1, 4, 4))
+    _factors_into(chain, kinds, zero, q, tip_first, E, B)
+    M, M0 = np.empty((markers, 4)), marker_points
+    _apply_into(B[n], marker_points, M)
+    back = B[n]
+    if triangulations >= 0 or mean:
+        back = invert4(B[n])
+    if triangulations >= 0:
+        found, ok = np.empty((markers, 4)), np.empty(markers, dtype=np.bool_)
+        triangulate_into(matrices, pixels, weights, triangulations, found, ok)
+        M0 = np.empty((markers, 4))
+        for p in range(markers):
+            if ok[p]:
+                for i in range(4):
+                    M[p, i] = found[p, i]
+        _apply_into(back, M, M0)
+    T0 = M0
+    if mean:
+        T0 = np.empty((markers, 4))
+        _apply_into(back, target_points, T0)
+    N, b = np.zeros((n, n)), np.zeros(n)
+    rows, g = np.empty((cameras, 2, n)), np.empty((cameras, 2, 4))
+    for p in range(markers):
+        seen = False
+        for c in range(cameras):
+            seen = seen or weights[c, p] > 0.0
+            for j in range(n):
+                rows[c, 0, j] = 0.0
+                rows[c, 1, j] = 0.0
+        if not seen:
+            continue
+        _add_point(chain, E, B, tip_first, matrices, M, M0, p, 0.5 if mean else 1.0, g, rows)
+        if mean:
+            _add_point(chain, E, B, tip_first, matrices, target_points, T0, p, 0.5, g, rows)
+        for c in range(cameras):
+            w = weights[c, p]
+            if not w > 0.0:
+                continue
+            w2 = w * w
+            eu = w2 * (set_points[c, p, 0] - pixels[c, p, 0])
+            ev = w2 * (set_points[c, p, 1] - pixels[c, p, 1])
+            for i in range(n):
+                wu = w2 * rows[c, 0, i]
+                wv = w2 * rows[c, 1, i]
+                b[i] += rows[c, 0, i] * eu + rows[c, 1, i] * ev
+                for k in range(i + 1):
+                    N[i, k] += wu * rows[c, 0, k] + wv * rows[c, 1, k]
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, N[i, i])
+    for i in range(n):
+        N[i, i] += damping * largest
+    conditioning = cholesky_solve(N, b, velocity)
+    for i in range(n):
+        velocity[i] *= gain
+    return conditioning
