@@ -371,8 +371,10 @@ def test_body_frame_is_right_angled_and_faces_the_camera(virtual):
 def test_kernels_are_their_references(seed, n, rank):
     rng = np.random.default_rng(seed)
     rank = min(n, rank)
-    rows = rng.normal(size=(12, rank)) @ rng.normal(size=(rank, n))
-    unit = rng.uniform(0.3, 3, n)
+    left = np.linalg.qr(rng.normal(size=(12, rank)))[0]
+    right = np.linalg.qr(rng.normal(size=(n, rank)))[0]
+    rows = left * rng.uniform(0.1, 1, rank) @ right.T
+    unit = rng.uniform(0.5, 2, n)
     found, values, V = drivable_freedoms(rows, unit)
     expected, expected_values, expected_V = drivable_freedoms_reference(rows, unit)
     assert found == expected

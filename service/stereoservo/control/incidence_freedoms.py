@@ -10,7 +10,7 @@ from stereoservo.control.body_frame import body_frame
 from stereoservo.control.incidence import IncidenceTask, incidence_step
 from stereoservo.control.incidence_kernel import METRIC_FLOOR
 from stereoservo.control.law import Options, Scene
-from stereoservo.control.mobility import REACH, Freedom, missing_freedom, rigid_motions
+from stereoservo.control.mobility import REACH, Freedom, attainable_motions, missing_freedom, rigid_motions
 from stereoservo.control.mobility_kernel import point_jacobian
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.composition import Composition
@@ -27,17 +27,23 @@ def incidence_freedoms(
     H_projective_to_euclidean: FloatArray | None = None,
     camera: str = "the first camera",
     tolerance: float = REACH,
+    anywhere: bool = False,
 ) -> tuple[Freedom | None, ...]:
     """For each incidence by itself the freedom that it lacks here, None where the arm brings it nearer in all respects.
 
-    To first order, as the arm stands: a freedom that is lost at a singularity counts as missing. What the body would
-    have to do besides all that the arm can is named; ``tolerance``: part of the residual that may be left. Raises
-    GeometryError as `mobility.mobility` does.
+    To first order, as the arm stands: a freedom that is lost at a singularity counts as missing. ``anywhere``: only
+    one that the arm lacks wherever it stands (a SCARA's tilts, the turns of slides). What the body would have to do
+    besides all that the arm can is named; ``tolerance``: part of the residual that may be left, besides the task's
+    own. Raises GeometryError as `mobility.mobility` does.
     """
     E = body_frame(
         scene.operators, scene.matrices, scene.points, plane_at_infinity, H_projective_to_euclidean
     )
     rigid = np.ascontiguousarray(rigid_motions(E))
+    if anywhere:
+        scene = scene._replace(
+            operators=attainable_motions(E, scene.operators), composition=Composition.SIMULTANEOUS
+        )
     operators = np.concatenate([scene.operators, rigid])
     free = scene._replace(operators=operators, composition=Composition.SIMULTANEOUS)
     form = np.ascontiguousarray(invert4(E)[:3])
@@ -54,7 +60,8 @@ def incidence_freedoms(
         body = incidence_step(free, alone, options, metric=cost)
         # On a ridge, or at its goal, nothing tells the motion that is needed.
         needed = step.error_px[0] > task.tolerance_px and body.share > 1.0 - tolerance
-        if not needed or math.sqrt(1.0 - step.share**2) <= tolerance:
+        unmade = math.sqrt(1.0 - step.share**2)
+        if not needed or unmade <= tolerance or unmade * step.error_px[0] <= task.tolerance_px:
             found.append(None)
             continue
         wanted = (body.velocity[len(scene.operators) :, None, None] * rigid).sum(axis=0)

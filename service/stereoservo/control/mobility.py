@@ -192,7 +192,7 @@ def _drivable(
         return 0, 0, np.zeros(0), np.zeros((0, 0)), np.zeros((3 * len(points), 0))
     rows = _motions(E, operators, points)
     rank, values, V = drivable_freedoms(rows, units)
-    capacity = min(n, _closure(np.stack([_twist(E, X) for X in operators])))
+    capacity = min(n, len(_closure(np.stack([_twist(E, X) for X in operators]))))
     rank = min(rank, capacity)
     return rank, capacity, values, V, multiply(rows * units, V[:, :rank]) / values[:rank]
 
@@ -234,11 +234,20 @@ def _describe(E: FloatArray, X: FloatArray, points: FloatArray, camera: str) -> 
     return " together with ".join(FREEDOMS[i] for i in order) + f" of {camera}"
 
 
-def _closure(twists: FloatArray) -> int:
-    """Freedoms that joints (n, 6), of components as `_twist` gives, have together as they move: brackets included."""
+def attainable_motions(E: FloatArray, operators: FloatArray) -> FloatArray:
+    """Generators (k, 4, 4) of all motions that the arm has anywhere, k <= 6: its operators and their brackets."""
+    if not len(operators):
+        return np.zeros((0, 4, 4))
+    named = rigid_motions(E)
+    motions = [_combined(twist, named) for twist in _closure(np.stack([_twist(E, X) for X in operators]))]
+    return np.stack(motions) if motions else np.zeros((0, 4, 4))
+
+
+def _closure(twists: FloatArray) -> FloatArray:
+    """Basis (k, 6) of what joints (n, 6), of components as `_twist` gives, have together as they move."""
     twists = twists[_lengths(twists.T) > 0.0]
     if not len(twists):
-        return 0
+        return twists
     v, w = twists[:, :3], twists[:, 3:]
     turning = _lengths(w.T) > PARALLEL * _lengths(v.T) / 1e3
     arms = _lengths(v[turning].T) / _lengths(w[turning].T)
@@ -253,7 +262,8 @@ def _closure(twists: FloatArray) -> int:
         ]
         grown = _independent(np.vstack([basis, *brackets]))
         if len(grown) == len(basis):
-            return len(basis)
+            motions: FloatArray = basis * np.array([length] * 3 + [1.0] * 3)
+            return motions
         basis = grown
 
 
