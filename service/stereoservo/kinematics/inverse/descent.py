@@ -19,6 +19,8 @@ from stereoservo.kinematics.kernels import (
 ITERATIONS = 60
 LONGEST = 0.7
 """Largest change of a joint in one step [rad or m]."""
+STALLED = 1e-10
+"""Share of the error by which a step has to lower it for another one to follow."""
 IDLE = 1e-20
 """Damping that is always there, as a share of what the operators could do to the points: what rounding alone seems to
 move, a joint that the goal leaves free, stays where it is.
@@ -144,7 +146,7 @@ def descend(
                     reached = _squared_error(moved, targets)
                     if reached < error:
                         won = True
-                        small = longest < 1e-15
+                        small = longest < 1e-15 or error - reached < STALLED * error
                         error = reached
                         for j in range(n):
                             q[j] = trial[j]

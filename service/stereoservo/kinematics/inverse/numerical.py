@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
@@ -92,22 +93,28 @@ class _Known:
         """Take in those of ``ends`` (s, n) that solve the problem, each worth ``count`` hits; which are new."""
         fresh = []
         solved = left <= self.tolerance
-        for q, residual in zip(ends[solved], left[solved], strict=True):
-            apart = np.array([np.abs(self._apart(q, known)).max() for known in self.joints])
-            i = int(np.argmin(apart)) if len(apart) else 0
-            if len(apart) and apart[i] <= CLOSE:
-                self.hits[i] += count
-                if residual < self.residuals[i]:
-                    self.joints[i], self.residuals[i] = q, float(residual)
+        ends, left = ends[solved], left[solved]
+        while len(ends):
+            # All descents that came to where the best of those left did; a pair of solutions is farther apart.
+            best = int(np.argmin(left))
+            here = self._near(ends, ends[best])
+            known = self._near(np.array(self.joints).reshape(-1, ends.shape[1]), ends[best])
+            if known.any():
+                i = int(np.argmax(known))
+                self.hits[i] += count * int(here.sum())
+                if left[best] < self.residuals[i]:
+                    self.joints[i], self.residuals[i] = ends[best], float(left[best])
             else:
                 fresh.append(len(self.joints))
-                self.joints.append(q)
-                self.residuals.append(float(residual))
-                self.hits.append(count)
+                self.joints.append(ends[best])
+                self.residuals.append(float(left[best]))
+                self.hits.append(count * int(here.sum()))
+            ends, left = ends[~here], left[~here]
         return fresh
 
-    def _apart(self, q: FloatArray, known: FloatArray) -> FloatArray:
-        return nearest_turns(self.kinds, known - q, np.zeros(len(q)))
+    def _near(self, rows: FloatArray, q: FloatArray) -> npt.NDArray[np.bool_]:
+        apart = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
+        return np.asarray(np.abs(apart).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
 
 
 def _twins(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:

@@ -5,7 +5,8 @@ In every stratum: operators and points suffice (thesis 6). Nothing here knows a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +44,17 @@ WITNESSES = 4
 """Points of a goal that are tried in the cases that work on a single one."""
 POLISH = 1e-9
 """Damping of the refinement of a candidate: next to none."""
+RIGID = 3
+"""Points from which on a goal tells whether it is a rigid motion."""
+ROUNDING = 1e-9
+
+Solver = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], Branches]
+SINGLE_POINT: dict[Case, Solver] = {"two_revolute": two_general, "two_parallel": two_parallel, "arm": arm}
+WHOLE_ROTATION: dict[Case, Callable[[FloatArray, FloatArray, FloatArray], Branches]] = {
+    "wrist": wrist,
+    "arm_with_wrist": arm_with_wrist,
+    "gantry_with_wrist": gantry_with_wrist,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +71,7 @@ class _Problem:
 
 
 def inverse_kinematics(
-    arm: ProjectiveChain | CellModel,
+    mechanism: ProjectiveChain | CellModel,
     *,
     displacement: FloatArray | None = None,
     points: FloatArray | None = None,
@@ -81,9 +93,10 @@ def inverse_kinematics(
     Raises InverseKinematicsError for goals that are no motion of this kind of arm (mirrored, another body), for shapes
     that do not fit and for what is not finite. Out of reach and out of limits are answers, not errors.
     """
-    chain = chain_of(arm)
+    chain = chain_of(mechanism)
     problem = _problem(chain, displacement, points, targets, seed, limits, tolerance)
-    known = recognise(arm) if recognition is None else recognition
+    known = recognise(mechanism) if recognition is None else recognition
+    problem = replace(problem, displacement=_displacement(problem, known))
     branches = _closed_form(problem, known)
     if branches is None:
         return _searched(problem)
@@ -122,10 +135,20 @@ def _problem(
         return _Problem(chain, np.eye(4), np.ascontiguousarray(H.T), H, seed, limits, tolerance)
     if displacement is None and points is not None and targets is not None:
         at_zero, at_goal = goals.equal_heights(chain.generators, points, targets)
-        misfit = max(tolerance, 1e-9)
-        between = goals.displacement_between(chain.generators, at_zero, at_goal, misfit=misfit)
-        return _Problem(chain, at_zero, at_goal, between, seed, limits, tolerance)
+        return _Problem(chain, at_zero, at_goal, None, seed, limits, tolerance)
     raise InverseKinematicsError("shape", "give a displacement, or points and targets: one goal is needed")
+
+
+def _displacement(problem: _Problem, known: Recognition) -> FloatArray | None:
+    """What the goal's points say of the whole displacement, where the case asks for it or they are of a rigid body."""
+    if problem.displacement is not None:
+        return problem.displacement
+    if len(problem.points) < RIGID and not known.inverted and known.case not in WHOLE_ROTATION:
+        return None
+    misfit = max(problem.tolerance, ROUNDING)
+    return goals.displacement_between(
+        problem.chain.generators, problem.points, problem.targets, misfit=misfit
+    )
 
 
 def _closed_form(problem: _Problem, known: Recognition) -> Branches | None:
@@ -157,21 +180,15 @@ def _candidates(
     targets: FloatArray,
     seed: FloatArray,
 ) -> Branches | None:
-    single_point = {"two_revolute": two_general, "two_parallel": two_parallel, "arm": arm}
-    whole_rotation = {
-        "wrist": wrist,
-        "arm_with_wrist": arm_with_wrist,
-        "gantry_with_wrist": gantry_with_wrist,
-    }
     if case == "prismatic":
         return prismatic_joints(G, points, targets)
     if case == "revolute":
         return turn_between(G[0], points, targets, float(seed[0]))
-    if case in single_point:
+    if case in SINGLE_POINT:
         pairs = zip(points[:WITNESSES], targets[:WITNESSES], strict=True)
-        return together([single_point[case](G, A, goal, seed) for A, goal in pairs])
-    if case in whole_rotation and H is not None:
-        return whole_rotation[case](G, H, seed)
+        return together([SINGLE_POINT[case](G, A, goal, seed) for A, goal in pairs])
+    if case in WHOLE_ROTATION and H is not None:
+        return WHOLE_ROTATION[case](G, H, seed)
     return None
 
 
