@@ -6,13 +6,21 @@ import json
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stereoservo.gateway.client import Client, ClientError, EventWatch, RefusedError
 from stereoservo.gateway.messages import Reply, decode
-from stereoservo.runtime.commands import FeatureTarget
+from stereoservo.geometry.cameras import project
+from stereoservo.geometry.distortion import distort
+from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.model import load_model
+from stereoservo.runtime.commands import DisplacementTarget, FeatureTarget
 from stereoservo.runtime.daemon import DaemonProcess
 from stereoservo.runtime.directories import CellDirectories
 
@@ -111,6 +119,98 @@ def test_home_jog_and_cli_verbs(client: Client) -> None:
     code, aborted = cli("goal", CELL, "park", "--time-limit", "0.001", "--tolerance", "0.0001")
     assert code == 1
     assert aborted["error"]["code"] == "goal_aborted"  # type: ignore[index]
+
+
+# -- goals of other kinds -----------------------------------------------------------------------------------
+
+
+class Model:
+    """The daemon's own model: what it says of the body at joints that the test names."""
+
+    def __init__(self, client: Client) -> None:
+        info = client.info().model
+        assert info is not None
+        self.model = load_model(Path(info.path))
+        self.chain = ProjectiveChain(self.model.joint_kinds, self.model.generators, self.model.zero)
+
+    def displacement(self, start: FloatArray, end: FloatArray) -> DisplacementTarget:
+        """From the pose at ``start`` to that at ``end`` (n,)."""
+        there = self.chain.displacement(end) @ np.linalg.inv(self.chain.displacement(start))
+        return DisplacementTarget(tuple(there.ravel().tolist()), self.model.epoch)
+
+    def seen(self, q: FloatArray, markers: tuple[int, ...]) -> FeatureTarget:
+        """Set-points of the body at ``q`` (n,)."""
+        rows = [self.model.marker_ids.index(marker) for marker in markers]
+        points = self.model.marker_points[rows] @ self.chain.displacement(q).T
+        return FeatureTarget(
+            {
+                camera.name: dict(
+                    zip(
+                        markers,
+                        map(tuple, distort(camera.lens, project(camera.matrix, points)).tolist()),
+                        strict=True,
+                    )
+                )
+                for camera in self.model.cameras
+            }
+        )
+
+
+def joints_of(client: Client) -> FloatArray:
+    """Joints now (n,)."""
+    return np.array(list(client.status().joints.values()))
+
+
+OFFSET = np.array([0.06, -0.04, 0.05, 0.05, -0.04, 0.06])
+
+
+def test_a_displacement_is_checked_driven_streamed_and_acknowledged(client: Client, tmp_path: Path) -> None:
+    client.goal("park", law="cartesian3", tolerance_px=0.5, hold_frames=3).reached(60.0)
+    model, start = Model(client), joints_of(client)
+    wanted = client.make_goal(
+        model.displacement(start, start + OFFSET), law="cartesian3", tolerance_px=0.5, hold_frames=3, acknowledge_s=30.0
+    )  # fmt: skip
+    # What it would do, by the library and by the command line, and nothing moves.
+    plan = client.check(wanted).plan
+    assert plan is not None
+    assert plan.seconds > 0.0
+    assert np.abs([way[-1] for way in plan.joints.values()] - (start + OFFSET)).max() < 0.02
+    assert {approach.code for approach in plan.approaches} & {"JOINT_LIMIT", "FIELD_OF_VIEW"}
+    path = tmp_path / "move.json"
+    path.write_text(json.dumps({"matrix": wanted.target.matrix, "model_epoch": model.model.epoch}))  # type: ignore[union-attr]
+    done = subprocess.run(
+        [sys.executable, "-m", "stereoservo.cli.main", "goal", CELL, "--displacement", str(path), "--law", "cartesian3",
+         "--check", "--json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert json.loads(done.stdout)["plan"]["way"] == plan.way
+    assert np.abs(joints_of(client) - start).max() < 1e-3
+    # Driven; the next one waits until it is acknowledged.
+    handle = client.send(wanted)
+    back = client.goal("park", law="cartesian3", tolerance_px=0.5, hold_frames=3, mode="queue")
+    handle.reached(60.0)
+    there = joints_of(client)
+    assert np.abs(there - (start + OFFSET)).max() < 0.02
+    assert not back.progress().active
+    handle.acknowledge()
+    back.reached(60.0)
+    # The same way again, as set-points that a client streams, always ahead of the arm.
+    seen = park_points(client)
+    markers = tuple(sorted(seen["left"].keys() & seen["right"].keys()))
+
+    def at(share: float) -> FeatureTarget:
+        return model.seen(start + share * OFFSET, markers)
+
+    def stream() -> Iterator[tuple[float | None, FeatureTarget]]:
+        for k in range(60):
+            time.sleep(0.02)
+            yield 0.02 * k, at(0.4 + 0.6 * k / 59)
+
+    moving = client.goal(at(0.4), law="cartesian3", tolerance_px=0.5, hold_frames=3, lease_s=3.0)
+    assert moving.stream(stream()) == 60
+    assert moving.reached(30.0).error_px is not None
+    assert np.abs(joints_of(client) - (start + OFFSET)).max() < 0.02
 
 
 def test_looking_around_with_a_wildcard_reads_everything_and_stops_nothing(client: Client) -> None:

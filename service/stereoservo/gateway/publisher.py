@@ -162,8 +162,8 @@ def state_message(
         differences=state.differences,
         last_event=last_event,
         notes=notes,
-        progress=_number(getattr(status, "progress", None)),
-        seconds_left=_number(getattr(status, "seconds_left", None)),
+        progress=_number(status.progress),
+        seconds_left=_number(status.seconds_left),
     )
 
 
