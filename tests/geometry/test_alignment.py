@@ -162,7 +162,7 @@ def test_points_that_leave_the_map_open_are_refused_with_the_reason(make_rig, fa
     X = ones(np.asarray(spots) + cell.middle)
     pixels = cell.rig.pixels(X)
     with pytest.raises(GeometryError, match=text):
-        align(family, cell.frame(family), cell.frame(family), triangulate(cell.Ps, pixels), pixels)
+        align(family, cell.frame(family), cell.frame(family), triangulate(cell.Ps, pixels), pixels, 0.01)
 
 
 def test_points_seen_by_one_camera_only_still_help(make_rig):

@@ -36,7 +36,9 @@ Family = Literal["rigid", "similar", "affine", "projective"]
 POINTS_NEEDED: dict[Family, int] = {"rigid": 3, "similar": 3, "affine": 4, "projective": 5}
 """Points in general position that determine a map of the family."""
 ITERATIONS = 30
-CONVERGED = 1e-11
+HALVINGS = 8
+CONVERGED = 1e-9
+"""Step, in units of the points' spread, at which the fit ends."""
 STRAIGHT = 1e-6
 """Second singular value of points on one line, relative to the first."""
 
@@ -167,7 +169,8 @@ def align(
     local = _local(family, move_points(up_new, M_new[both])) @ up_new
     generators = np.linalg.inv(local) @ _algebra(family) @ local
     T = _descend(T, generators, views)
-    whitened, J = views.linearised(T, generators)
+    whitening = views.whitening(T)
+    whitened, J = views.residuals(T, whitening), views.slopes(T, generators, whitening)
     _, singular, rows = np.linalg.svd(J, full_matrices=False)
     k = len(generators)
     if len(singular) < k or not singular[k - 1] > 1e-10 * singular[0]:
@@ -188,27 +191,38 @@ class _Views:
     weights: FloatArray
     covariance: FloatArray | None
 
-    def linearised(self, T: FloatArray, generators: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (r,) and their derivatives (r, k) by ``exp(Σ x Ĝ) T`` at x = 0."""
+    def whitening(self, T: FloatArray) -> FloatArray:
+        """``(n, 2c, 2c)`` at the map ``T`` (4, 4): the points' own covariance goes along with it."""
+        return pixel_whitening(self.Ps, T, self.M, self.weights, self.covariance)
+
+    def residuals(self, T: FloatArray, whitening: FloatArray) -> FloatArray:
+        """Whitened residuals (r,)."""
+        difference = project_many(self.Ps, self.M @ T.T) - self.pixels
+        flat = difference.transpose(1, 0, 2).reshape(len(self.M), -1, 1)
+        whitened: FloatArray = (whitening @ flat).ravel()
+        return whitened
+
+    def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
+        """Derivatives (r, k) of the residuals by ``exp(Σ x Ĝ) T`` at x = 0."""
         moved = self.M @ T.T
-        whitening = pixel_whitening(self.Ps, T, self.M, self.weights, self.covariance)
-        difference = (project_many(self.Ps, moved) - self.pixels).transpose(1, 0, 2).reshape(len(moved), -1)
         by_point = projection_jacobian_many(self.Ps, moved)
-        slopes = np.einsum("cnij,kjl,nl->ncik", by_point, generators, moved)
-        slopes = slopes.reshape(len(moved), -1, len(generators))
-        residuals: FloatArray = np.einsum("nij,nj->ni", whitening, difference).ravel()
-        return residuals, (whitening @ slopes).reshape(-1, len(generators))
+        by_map = np.einsum("cnij,knj->ncik", by_point, moved @ generators.transpose(0, 2, 1))
+        slopes: FloatArray = (whitening @ by_map.reshape(len(moved), -1, len(generators))).reshape(
+            -1, len(generators)
+        )
+        return slopes
 
 
 def _descend(T: FloatArray, generators: FloatArray, views: _Views) -> FloatArray:
-    """Gauss-Newton on the group, steps halved until the error falls."""
+    """Gauss-Newton on the group; the whitening follows the solution, and is fixed within a step."""
     for _ in range(ITERATIONS):
-        residuals, J = views.linearised(T, generators)
-        step = -np.linalg.lstsq(J, residuals, rcond=1e-12)[0]
+        whitening = views.whitening(T)
+        residuals = views.residuals(T, whitening)
+        step = -np.linalg.lstsq(views.slopes(T, generators, whitening), residuals, rcond=1e-12)[0]
         cost = residuals @ residuals
-        for _ in range(12):
+        for _ in range(HALVINGS):
             trial: FloatArray = expm(np.tensordot(step, generators, axes=1)) @ T
-            after, _ = views.linearised(trial, generators)
+            after = views.residuals(trial, whitening)
             if after @ after <= cost * (1.0 + 1e-12):
                 T = trial
                 break
