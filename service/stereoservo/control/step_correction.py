@@ -17,6 +17,9 @@ ITERATIONS = 6
 CONVERGED = 1e-12
 """Of the joints' step: below it another iteration changes nothing."""
 
+SLACK = 1.0 + 1e-9
+"""What the squared error may grow by: near its least value it does not tell steps apart."""
+
 BRACKETS = 6
 """Terms of the series of how exp turns a sum's operators; a step is small."""
 
@@ -38,7 +41,7 @@ def corrected_step(
         moved = points @ displacement(operators, composition, found).T
         residual = wanted - moved
         error = float((residual**2).sum())
-        if not error < before:
+        if not error <= SLACK * before:
             break
         best, before = found, error
         turned = step_operators(operators, composition, found)

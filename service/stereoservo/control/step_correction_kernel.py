@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereoservo.control.linear_kernels import cholesky_solve
-from stereoservo.control.step_correction import BRACKETS, CONVERGED, DAMPING, ITERATIONS
+from stereoservo.control.step_correction import BRACKETS, CONVERGED, DAMPING, ITERATIONS, SLACK
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import exp_twist, kernel, multiply4_into
 
@@ -135,7 +135,7 @@ def corrected_step(
                     s += H[i, k] * points[p, k]
                 moved[p, i] = s
                 error += (wanted[p, i] - s) ** 2
-        if not error < before:
+        if not error <= SLACK * before:
             break
         before = error
         for j in range(n):

@@ -11,7 +11,7 @@ import numpy as np
 from stereoservo.control.damped import damped_least_squares_reference
 from stereoservo.control.image import held_gain, image_jacobian_at, image_velocity, limited
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
-from stereoservo.control.step_correction import CONVERGED, ITERATIONS, step_operators
+from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, step_operators
 from stereoservo.control.trajectory_kernel import trajectory_step
 from stereoservo.geometry.cameras import project_many
 from stereoservo.geometry.homogeneous import FloatArray
@@ -50,7 +50,7 @@ def trajectory_velocity(scene: Scene, task: Task, options: Options) -> tuple[Flo
         moved = scene.points @ displacement(scene.operators, composition, found).T
         residual = np.where(seen, goal - project_many(scene.matrices, moved), 0.0)
         error = float((weights[..., None] ** 2 * residual**2).sum())
-        if not error < before:
+        if not error <= SLACK * before:
             break
         best, before = found, error
         J = image_jacobian_at(scene._replace(operators=turned, points=moved), task, JacobianChoice.CURRENT)

@@ -8,7 +8,7 @@ import numpy as np
 
 from stereoservo.control.image_kernel import add_rows, image_step_into, velocities_into
 from stereoservo.control.linear_kernels import cholesky_solve
-from stereoservo.control.step_correction import CONVERGED, ITERATIONS
+from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK
 from stereoservo.control.step_correction_kernel import step_into
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
@@ -85,7 +85,7 @@ def trajectory_step(
                 if w > 0.0:
                     for r in range(2):
                         error += (w * (goal[c, p, r] - seen[c, p, r])) ** 2
-        if not error < before:
+        if not error <= SLACK * before:
             break
         before = error
         for j in range(n):

@@ -5,15 +5,19 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from stereoservo.control.kernels import stereo_step
-from stereoservo.control.stereo import stereo_law
-from stereoservo.geometry.cameras import project_many
+from stereoservo.control.law import Law, LawStep, Options, Scene, Task
+from stereoservo.control.laws import LAWS
+from stereoservo.control.stereo import StereoCycle, stereo_law
+from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward, image_jacobian, project_points, transform_points
 from stereoservo.runtime.commands import Enable, FeatureTarget, Goal, LawName, Request, RunGoal
 from stereoservo.runtime.core import ServoCore
@@ -32,6 +36,8 @@ RATE_HZ, FRAME_EVERY = 250.0, 10
 """Of the loop, and steps between images."""
 WARM_UP = 100
 """Steps of the core that do not count."""
+PLANNING = 5000
+"""Steps in which a goal must be answered."""
 
 
 def stereo_problem() -> dict[str, Any]:
@@ -70,6 +76,37 @@ def with_kernels(p: dict[str, Any]) -> FloatArray:
     return velocity
 
 
+def in_one_call(p: dict[str, Any]) -> Callable[[int], object]:
+    """The same step, in one kernel call from joints and pixels to velocities."""
+    cycle = StereoCycle(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["Ps"], p["markers"])
+    H, _ = chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"])
+    pixels, _ = project_points(p["Ps"], transform_points(H, p["markers"]))
+    q, set_points, weights = p["q"], p["set_points"], np.ones((2, 4))
+    return lambda _: cycle.step(q, pixels, set_points, weights, GAIN, DAMPING)
+
+
+def law_calls(p: dict[str, Any]) -> dict[str, Callable[[int], object]]:
+    """One step of every law on the same problem, as the loop calls it: scene and task at hand."""
+    H, operators = chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"])
+    points = transform_points(H, p["markers"])
+    pixels, _ = project_points(p["Ps"], points)
+    centres = np.array([camera_centre(P) / camera_centre(P)[3] for P in p["Ps"]])
+    ones = np.ones((2, 4))
+    scene = Scene(operators, int(Composition.BASE_FIRST), p["Ps"], centres, points, pixels, ones)
+    turned = transform_points(chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"] + 0.1)[0],
+                              p["markers"])  # fmt: skip
+    task = Task(
+        project_points(p["Ps"], turned)[0], ones, np.zeros((2, 4, 2)), turned, np.ones(4), points.mean(axis=0),
+        turned.mean(axis=0), np.arange(3),
+    )  # fmt: skip
+    options = Options(GAIN, 1.0 / RATE_HZ)
+    return {name: partial(_law_step, law, scene, task, options) for name, law in LAWS.items()}
+
+
+def _law_step(law: Law, scene: Scene, task: Task, options: Options, _: int) -> LawStep:
+    return law.step(scene, task, options)
+
+
 def with_reference(p: dict[str, Any]) -> FloatArray:
     """The same by the readable numpy reference."""
     chain = ProjectiveChain(("revolute",) * 6, p["generators"], np.zeros(6))
@@ -84,6 +121,7 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     """Microseconds of a control step and of a core step under each Cartesian and image law."""
     problem = stereo_problem()
     count = max(200, 100 * repetitions)
+    fused = timed(in_one_call(problem), count, warm_up=20)[0]
     kernels = timed(lambda _: with_kernels(problem), count, warm_up=20)[0]
     reference = timed(lambda _: with_reference(problem), count, warm_up=5)[0]
     progress("control step", 1, 3)
@@ -93,8 +131,16 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
         core[law] = summary(core_steps(law, count, seed), 1e6)
         progress("control step", 2 + k, 3)
     return {
-        "stereo_step_us": {"kernels": summary(kernels, 1e6), "numpy_reference": summary(reference, 1e6)},
+        "stereo_step_us": {
+            "one_call": summary(fused, 1e6),
+            "kernels": summary(kernels, 1e6),
+            "numpy_reference": summary(reference, 1e6),
+        },
         "reference_over_kernels": float(np.median(reference) / np.median(kernels)),
+        "kernels_over_one_call": float(np.median(kernels) / np.median(fused)),
+        "law_step_us": {
+            name: summary(timed(call, count, warm_up=20)[0], 1e6) for name, call in law_calls(problem).items()
+        },
         "core_step_us": core,
         "core": {
             "joints": 6,
@@ -120,9 +166,12 @@ def core_steps(law: LawName, count: int, seed: int) -> list[float]:
         }
     )
     run = RunGoal(Goal(str(uuid.UUID(int=seed + 1)), target, law=law, gain=0.2))
-    replies = [
-        event for event in loop.step(requests=(Request(2, "bench", run),)).events if event.kind == "reply"
-    ]
+    outputs = loop.step(requests=(Request(2, "bench", run),))
+    for _ in range(PLANNING):  # it is planned, a slice a step, before it is answered
+        replies = [event for event in outputs.events if event.kind == "reply"]
+        if replies:
+            break
+        outputs = loop.step()
     if not (replies and replies[0].accepted):
         raise RuntimeError(f"the core did not take the bench's goal: {[event.message for event in replies]}")
     for _ in range(WARM_UP):
