@@ -21,7 +21,7 @@ from stereoservo_sim.experiments import arm_families
 from stereoservo_sim.experiments.inverse_kinematics import hide
 
 SEEDS = st.integers(0, 10**6)
-COUNT = settings(max_examples=40, deadline=None)
+COUNT = settings(max_examples=25, deadline=None)
 
 
 def drawn(make, seed):
