@@ -51,16 +51,17 @@ class Views:
             model.marker_points,
         )
 
-    def set(self, camera: str, marker: int, raw: tuple[float, float], sigma: float) -> None:
-        """Enter a raw pixel; cameras and markers that are not of these views are passed over."""
-        if camera not in self.cameras or marker not in self.ids:
+    def enter(self, camera: str, seen: Mapping[int, tuple[tuple[float, float], float]]) -> None:
+        """Enter raw pixels with their deviations; cameras and markers that are not of these views are passed over."""
+        known = [marker for marker in seen if marker in self.ids]
+        if camera not in self.cameras or not known:
             return
-        c, k = self.cameras.index(camera), self.ids.index(marker)
-        ideal = undistort(self.lenses[c], np.array(raw))
-        self.pixels[c, k] = ideal
-        if np.isfinite(ideal).all():
-            bend = float(np.sqrt(abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal)))))
-            self.sigmas[c, k] = sigma / bend
+        c, rows = self.cameras.index(camera), [self.ids.index(marker) for marker in known]
+        ideal = undistort(self.lenses[c], np.array([seen[marker][0] for marker in known]))
+        bend = np.sqrt(np.abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal))))
+        sigmas = np.array([seen[marker][1] for marker in known]) / bend
+        self.pixels[c, rows] = ideal
+        self.sigmas[c, rows] = np.where(np.isfinite(sigmas), sigmas, np.inf)
 
     def of(self, ids: Sequence[int]) -> Views:
         """The same of some markers, in their order; those that are not there are unseen."""
@@ -96,8 +97,7 @@ def sights_views(sights: Sights, model: CellModel, ids: Sequence[int]) -> Views:
     """What is seen now of some markers."""
     views = Views.empty(model, ids)
     for camera, seen in sights.items():
-        for marker, sight in seen.items():
-            views.set(camera, marker, sight.pixel, sight.sigma)
+        views.enter(camera, {marker: (sight.pixel, sight.sigma) for marker, sight in seen.items()})
     return views
 
 
@@ -120,8 +120,11 @@ def taught_views(goal: TaughtGoal) -> Views:
     )
     for seen in (goal.target.set_points, goal.others):
         for camera, points in seen.items():
-            for marker, pixel in points.items():
-                views.set(camera, marker, pixel, goal.sigmas.get(camera, {}).get(marker, UNKNOWN_SIGMA_PX))
+            known = goal.sigmas.get(camera, {})
+            views.enter(
+                camera,
+                {marker: (pixel, known.get(marker, UNKNOWN_SIGMA_PX)) for marker, pixel in points.items()},
+            )
     return views
 
 
