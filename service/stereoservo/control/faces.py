@@ -13,13 +13,13 @@ camera centres O of height 1, ``aᵀO > 0`` where the front is seen (7.4.2).
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from stereoservo.control.face_choice_kernel import choose_face_step, faces_fronting
 from stereoservo.control.faces_kernel import (
+    all_triples,
     coplanar_groups,
     covering_groups,
     marker_covariances,
@@ -109,7 +109,6 @@ def find_faces(
         raise ValueError("points must be finite; give the markers of the model, all of them")
     if not 0.0 < sigma_px < np.inf:
         raise ValueError(f"sigma_px is {sigma_px}; a positive finite number of pixels is needed")
-    triples = np.array(list(combinations(range(m), 3)), dtype=np.int64).reshape(-1, 3)
     if m < 3:
         return Faces(np.zeros((0, 3), np.int64), np.zeros((0, m)), np.zeros(0), points)
     information = marker_information(points, np.ascontiguousarray(matrices, dtype=np.float64), sigma_px)
@@ -121,6 +120,7 @@ def find_faces(
         )
     turns = np.zeros((0, 4, 4)) if operators is None else np.ascontiguousarray(operators, dtype=np.float64)
     form = turned_average(information, turns)
+    triples = all_triples(m)
     altitudes = triangle_altitudes(points, form, triples)
     order = np.argsort(-altitudes, kind="stable")
     order = order[altitudes[order] >= SPANS]

@@ -51,12 +51,13 @@ def marker_covariances(points: FloatArray, information: FloatArray) -> FloatArra
         for i in range(4):
             for k in range(4):
                 filled[i, k] = (information[p, i, k] + trace * points[p, i] * points[p, k] / square) / trace
-        covariances[p] = invert4(filled)
+        inverse = invert4(filled)
+        good = True
         for i in range(4):
-            if not 0.0 < covariances[p, i, i] < 1e12:
-                covariances[p] = math.nan
+            good = good and 0.0 < inverse[i, i] < 1e12
+        for i in range(4):
             for k in range(4):
-                covariances[p, i, k] /= trace
+                covariances[p, i, k] = inverse[i, k] / trace if good else math.nan
     return covariances
 
 
@@ -130,19 +131,43 @@ def _form(a: FloatArray, S: FloatArray, b: FloatArray) -> float:
 @kernel
 def off_plane(points: FloatArray, covariances: FloatArray, i: int, j: int, k: int) -> FloatArray:
     """``det[M_i M_j M_k M_l]`` in deviations of itself (m,), for every marker l; 0 for the three themselves."""
-    out = np.zeros(points.shape[0])
-    plane = plane_minors(points[i], points[j], points[k])
-    for other in range(points.shape[0]):
+    markers = points.shape[0]
+    out = np.zeros(markers)
+    four = np.empty(4, np.int64)
+    four[0], four[1], four[2] = i, j, k
+    for other in range(markers):
         if other in (i, j, k):
             continue
+        four[3] = other
         # the determinant is linear in each point: its derivative is the plane of the other three
-        variance = (
-            _own(covariances[other], plane)
-            + _own(covariances[i], plane_minors(points[j], points[k], points[other]))
-            + _own(covariances[j], plane_minors(points[i], points[k], points[other]))
-            + _own(covariances[k], plane_minors(points[i], points[j], points[other]))
-        )
-        out[other] = dot4(plane, points[other]) / math.sqrt(variance)
+        variance = 0.0
+        determinant = 0.0
+        for left_out in range(4):
+            x, y, z = (
+                four[0 if left_out > 0 else 1],
+                four[1 if left_out > 1 else 2],
+                four[2 if left_out > 2 else 3],
+            )
+            plane = plane_minors(points[x], points[y], points[z])
+            covariance = covariances[four[left_out]]
+            for r in range(4):
+                for c in range(4):
+                    variance += plane[r] * covariance[r, c] * plane[c]
+            determinant = dot4(plane, points[four[left_out]])
+        out[other] = determinant / math.sqrt(variance)
+    return out
+
+
+@kernel
+def all_triples(markers: int) -> IntArray:
+    """Every three of so many markers (t, 3), ascending."""
+    out = np.empty((markers * (markers - 1) * (markers - 2) // 6, 3), np.int64)
+    t = 0
+    for i in range(markers):
+        for j in range(i + 1, markers):
+            for k in range(j + 1, markers):
+                out[t, 0], out[t, 1], out[t, 2] = i, j, k
+                t += 1
     return out
 
 
@@ -166,12 +191,15 @@ def coplanar_groups(
     members = np.zeros((count, markers), np.int64)
     facts = np.zeros((count, 7), np.int64)
     roundness = np.zeros(count)
-    groups = 0
+    larger = np.zeros(count, np.int64)  # groups of four and more
+    inside = np.zeros(markers, np.int64)
+    groups, many = 0, 0
     for t in range(count):
         i, j, k = triples[t]
         known = False
-        for g in range(groups):
-            if facts[g, 3] > 3 and members[g, i] + members[g, j] + members[g, k] == 3:
+        for nth in range(many):
+            g = larger[nth]
+            if members[g, i] + members[g, j] + members[g, k] == 3:
                 known = True
                 break
         if known:
@@ -181,25 +209,28 @@ def coplanar_groups(
         for p in range(markers):
             if abs(deviations[p]) <= limit:
                 members[groups, p] = 1
+                inside[facts[groups, 3]] = p
                 facts[groups, 3] += 1
             elif deviations[p] > 0.0:
                 facts[groups, 4] += 1
             else:
                 facts[groups, 5] += 1
         longest = 0.0
-        for p in range(markers):
-            for other in range(markers):
-                if members[groups, p] == 1 and members[groups, other] == 1:
-                    longest = max(longest, distances[p, other])
+        for first in range(facts[groups, 3]):
+            for second in range(facts[groups, 3]):
+                longest = max(longest, distances[inside[first], inside[second]])
         facts[groups, 6] = 1
         for c in range(seen.shape[0]):
             sights = 0
-            for p in range(markers):
-                if members[groups, p] == 1 and seen[c, p] > 0.0:
+            for nth in range(facts[groups, 3]):
+                if seen[c, inside[nth]] > 0.0:
                     sights += 1
             if 0 < sights < facts[groups, 3]:
                 facts[groups, 6] = 0
         roundness[groups] = altitudes[t] / longest
+        if facts[groups, 3] > 3:
+            larger[many] = groups
+            many += 1
         groups += 1
     return members[:groups], facts[:groups], roundness[:groups]
 
@@ -229,11 +260,6 @@ def covering_groups(members: IntArray, facts: IntArray) -> IntArray:
                 for p in range(markers):
                     left[p] *= 1 - members[g, p]
     return chosen[:found]
-
-
-@kernel
-def _own(S: FloatArray, a: FloatArray) -> float:
-    return _form(a, S, a)
 
 
 @kernel
