@@ -27,8 +27,11 @@ from stereoservo_sim.tasks.calibrations import Knowledge
 FloatArray = npt.NDArray[np.float64]
 PointsName = Literal["predicted", "triangulated"]
 
-FILTER_S = 0.5
-"""Over which innovations are averaged; at the start over all frames there have been."""
+FILTER_S, REST_FILTER_S = 0.5, 2.0
+"""Over which innovations are averaged, moving and at rest, where no error of the kinematics comes in; at the start over
+all frames there have been."""
+REST_PX_S = 5.0
+"""A body whose markers go slower in all images is at rest."""
 DAMPING = 1e-9
 FIRST_ROUNDS = 5
 
@@ -41,15 +44,19 @@ class Estimate:
         self._triangulates = source == "triangulated" or knowledge.points is None
         self._dt_s = dt_s
         self._frames = 0
+        self._rests = True
         self.points = np.zeros((0, 4)) if knowledge.points is None else knowledge.points
         self.pixels = np.zeros((0, 0, 2))
         self._residual = np.zeros((0, 0, 2))
 
     def moved(self, operators: FloatArray, step: FloatArray) -> None:
         """The joints have moved by ``step`` (n,), with ``operators`` (n, 4, 4) before it."""
+        before, _ = project_points(self._knowledge.matrices, self.points)
         self.points = transform_points(
             displace(operators, int(self._knowledge.composition), step), self.points
         )
+        after, _ = project_points(self._knowledge.matrices, self.points)
+        self._rests = bool(np.abs(after - before).max() < REST_PX_S * self._dt_s)
 
     def seen(self, pixels: FloatArray, weights: FloatArray) -> None:
         """A frame of every camera: pixels (c, m, 2), weights (c, m), 0 where a marker is not seen."""
@@ -61,8 +68,9 @@ class Estimate:
             self._residual = np.zeros_like(pixels)
             for _ in range(FIRST_ROUNDS):
                 self.points = corrected(basis, matrices, self.points, pixels, weights, 1.0)
-        self._frames += 1
-        share = max(1.0 / self._frames, self._dt_s / (FILTER_S + self._dt_s))
+        memory_s = REST_FILTER_S if self._rests else FILTER_S
+        self._frames = min(self._frames, round(memory_s / self._dt_s)) + 1
+        share = 1.0 / self._frames
         self.points = corrected(basis, matrices, self.points, pixels, weights, share)
         predicted, _ = project_points(matrices, self.points)
         # What no displacement explains is averaged marker by marker.
