@@ -77,6 +77,10 @@ def resolve(wanted: TaughtTarget, goal: TaughtGoal, model: CellModel | None, sig
     )
     if wanted.relative_to == "cameras" and not goal.tool:
         _require_same_mounting(goal, model, names, moved)
+    elif not goal.tool and not same:
+        note += (
+            f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
+        )
     return Resolved(FeatureTarget(set_points, model.epoch), f"{said}; {note}")
 
 

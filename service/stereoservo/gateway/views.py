@@ -58,10 +58,11 @@ class Views:
             return
         c, rows = self.cameras.index(camera), [self.ids.index(marker) for marker in known]
         ideal = undistort(self.lenses[c], np.array([seen[marker][0] for marker in known]))
-        bend = np.sqrt(np.abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal))))
-        sigmas = np.array([seen[marker][1] for marker in known]) / bend
-        self.pixels[c, rows] = ideal
-        self.sigmas[c, rows] = np.where(np.isfinite(sigmas), sigmas, np.inf)
+        there = np.flatnonzero(np.isfinite(ideal).all(axis=1))  # the others lie beyond the lens's fold
+        bend = np.sqrt(np.abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal[there]))))
+        kept = [rows[k] for k in there]
+        self.pixels[c, kept] = ideal[there]
+        self.sigmas[c, kept] = np.array([seen[known[k]][1] for k in there]) / bend
 
     def of(self, ids: Sequence[int]) -> Views:
         """The same of some markers, in their order; those that are not there are unseen."""
