@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.mobility_kernel import multiply
+from stereoservo.control.mobility_kernel import cross, multiply
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray, plane_of_points
 from stereoservo.kinematics.kernels import symmetric_eigen4
 from stereoservo.kinematics.linear_kernels import null_direction
 
 FOCAL_PX = 1000.0
-"""Scale of the pixels; it conditions the estimate."""
+"""A usual focal length."""
 
 GUESS = 1e-3
-"""Weight of a principal point where the body is seen, which decides only what nothing else does."""
+"""Weight of a usual focal length and of a principal point where the body is: they decide what nothing else does."""
 
 
 def body_frame(
@@ -112,11 +112,12 @@ def _estimated_metric(
         # Body at the origin, pixels in parts of a usual focal length
         centred = np.array([[1, 0, -m[0] / m[2]], [0, 1, -m[1] / m[2]], [0, 0, FOCAL_PX]])
         H = multiply(multiply(centred, P), flat)
-        columns = np.stack([np.cross(H[1], H[2]), np.cross(H[2], H[0]), np.cross(H[0], H[1])], axis=1)
+        columns = np.stack([cross(H[1], H[2]), cross(H[2], H[0]), cross(H[0], H[1])], axis=1)
         inverse = columns / np.cbrt(abs(float((H[0] * columns[:, 0]).sum()))) ** 2
         images = [multiply(multiply(inverse.T, S), inverse) for S in _SYMMETRIC]
         rows.append(np.array([[w[0, 1] for w in images], [w[0, 0] - w[1, 1] for w in images]]))
-        rows.append(GUESS * np.array([[w[0, 2] for w in images], [w[1, 2] for w in images]]))
+        guesses = [[w[0, 2] for w in images], [w[1, 2] for w in images], [w[2, 2] - w[0, 0] for w in images]]
+        rows.append(GUESS * np.array(guesses))
     q, _, _, _ = null_direction(np.concatenate(rows))
     Q = (q[:, None, None] * _SYMMETRIC).sum(axis=0)
     Q = Q if Q[0, 0] + Q[1, 1] + Q[2, 2] > 0.0 else -Q

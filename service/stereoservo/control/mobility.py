@@ -13,6 +13,7 @@ import numpy as np
 
 from stereoservo.control.body_frame import body_frame
 from stereoservo.control.mobility_kernel import (
+    brackets,
     drivable_freedoms,
     joints_to_block,
     least_squares,
@@ -255,12 +256,7 @@ def _closure(twists: FloatArray) -> FloatArray:
     scaled = np.hstack([v / length, w])
     basis = _independent(scaled / _lengths(scaled.T)[:, None])
     while True:
-        brackets = [
-            np.concatenate([np.cross(a[3:], b[:3]) - np.cross(b[3:], a[:3]), np.cross(a[3:], b[3:])])
-            for i, a in enumerate(basis)
-            for b in basis[:i]
-        ]
-        grown = _independent(np.vstack([basis, *brackets]))
+        grown = _independent(brackets(basis))
         if len(grown) == len(basis):
             motions: FloatArray = basis * np.array([length] * 3 + [1.0] * 3)
             return motions

@@ -41,6 +41,32 @@ def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 @kernel
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a x b`` (3,)."""
+    out = np.empty(3)
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+    return out
+
+
+@kernel
+def brackets(twists: FloatArray) -> FloatArray:
+    """Twists (k, 6), ``v`` before ``w``, and below them the brackets of all pairs, (k + k(k - 1)/2, 6)."""
+    k = twists.shape[0]
+    out = np.empty((k + k * (k - 1) // 2, 6))
+    row = k
+    for i in range(k):
+        out[i] = twists[i]
+        for j in range(i):
+            a, b = twists[i], twists[j]
+            out[row, :3] = cross(a[3:], b[:3]) - cross(b[3:], a[:3])
+            out[row, 3:] = cross(a[3:], b[3:])
+            row += 1
+    return out
+
+
+@kernel
 def least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
     """Least ``x`` (n,) of least ``|A x - b|`` for ``A`` (r, n), ``b`` (r,); singular values below `LOST` left out."""
     V, values = right_singular(A)

@@ -11,13 +11,16 @@ from stereoservo.control.incidence import (
     IncidenceStatus,
     IncidenceTask,
     SecondTask,
+    feature_form,
     image_task,
     incidence_reasons,
     incidence_step,
     joint_task,
     no_second_task,
 )
+from stereoservo.control.incidence_freedoms import incidence_freedoms
 from stereoservo.control.law import Scene
+from stereoservo.geometry.errors import GeometryError
 from stereoservo.kinematics.kernels import project_points, triangulate
 from stereoservo.runtime.commands import Feature, Goal, IncidenceTarget, JointTarget
 from stereoservo.runtime.estimate import ModelArrays, points_now, with_unit_height
@@ -27,7 +30,6 @@ from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.servoing import composition_of, options, run_ended, run_fields, used_cameras
 from stereoservo.runtime.state import Incidence
 from stereoservo.runtime.targets import (
-    FINITE_HEIGHT,
     Place,
     camera_index,
     ideal_pixel,
@@ -39,8 +41,8 @@ from stereoservo.runtime.targets import (
 FEATURES = ("point", "line", "plane")
 SPAN_PX = 5.0
 """Least distance in an image between markers, or from their line, that span a line or a plane."""
-FLAT = 1e-6
-"""Sine below which points of a fixed feature coincide, or lie on a line."""
+MAKEABLE = 0.999
+"""Share of the residual that joints can take away, above which the arm has the freedoms it needs."""
 SECOND_AT_REST = 5e-3
 """Joint velocity [rad/s or m/s] below which a second task has come as far as it gets."""
 
@@ -158,14 +160,10 @@ def _fixed(feature: Feature, dimension: int, name: str, place: Place, model_epoc
             f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} points, got {len(points)}",
             value=float(len(points)), threshold=float(dimension + 1), unit="points",
         )  # fmt: skip
-    form = _base_and_directions(points, place.arrays)
-    if form is None:
-        raise RefusalError(
-            "FEATURE_UNCLEAR",
-            f"{name}: the points of what stands coincide, lie on one line, at infinity, or are not finite; they span "
-            f"no {FEATURES[dimension]}",
-        )
-    return form
+    try:
+        return feature_form(points, dimension, place.arrays.plane_at_infinity, name)
+    except GeometryError as error:
+        raise RefusalError("FEATURE_UNCLEAR", str(error)) from error
 
 
 def _triangulated(feature: Feature, name: str, place: Place) -> FloatArray:
@@ -194,43 +192,14 @@ def _triangulated(feature: Feature, name: str, place: Place) -> FloatArray:
     return scaled
 
 
-def _base_and_directions(points: FloatArray, arrays: ModelArrays) -> FloatArray | None:
-    """The span of ``points`` (d, 4), finite or at infinity, as `control.incidence.IncidenceTask` has it, or None."""
-    form = np.zeros((3, 4))
-    heights = (points * arrays.plane_at_infinity).sum(axis=-1)
-    size = np.sqrt((points * points).sum(axis=-1) * float((arrays.plane_at_infinity**2).sum()))
-    if not (bool(np.isfinite(size).all()) and bool((size > 0.0).all())):
-        return None
-    finite = np.abs(heights) > FINITE_HEIGHT * size
-    if not bool(finite.any()):
-        return None
-    first = int(np.flatnonzero(finite)[0])
-    form[0] = points[first] / heights[first]
-    row = 1
-    for i in range(len(points)):
-        if i == first:
-            continue
-        direction = points[i] / heights[i] - form[0] if finite[i] else points[i]
-        length = float(np.sqrt((direction * direction).sum()))
-        if not length > FLAT * float(np.sqrt((form[0] * form[0]).sum())):
-            return None
-        direction = direction / length
-        for before in form[1:row]:
-            direction = direction - float((direction * before).sum()) * before
-        length = float(np.sqrt((direction * direction).sum()))
-        if not length > FLAT:
-            return None
-        form[row] = direction / length
-        row += 1
-    return form
-
-
 def _drivable(source: Incidence, present: Present, place: Place) -> None:
     """Raises RefusalError for incidences that no motion of the arm brings nearer."""
     assert present.weights is not None
     assert present.pixels is not None
     scene = _scene(source, present, place.arrays, place.points, present.weights)
     step = incidence_step(scene, _task(source), options(source, present, None))
+    if step.share < MAKEABLE:
+        _has_freedoms(source, scene, place)
     bad = tuple(
         reason
         for reason in incidence_reasons(step, _task(source), source.names)
@@ -242,6 +211,23 @@ def _drivable(source: Incidence, present: Present, place: Place) -> None:
             first.code, f"{first.subject}: {first.hint}", subject=first.subject, value=first.value,
             threshold=first.threshold, unit=first.unit, further=bad[1:],
         )  # fmt: skip
+
+
+def _has_freedoms(source: Incidence, scene: Scene, place: Place) -> None:
+    """Raises RefusalError for an incidence that needs a freedom which the arm lacks wherever it stands."""
+    camera = f"camera {place.settings.cameras[0].name}"
+    try:
+        lacking = incidence_freedoms(
+            scene, _task(source), place.arrays.plane_at_infinity, camera=camera, anywhere=True
+        )
+    except GeometryError:
+        return  # arm and cameras tell no right angles, so there are no words: the law itself will tell
+    for name, freedom in zip(source.names, lacking, strict=True):
+        if freedom is not None:
+            raise RefusalError(
+                "INCIDENCE_NOT_DRIVABLE", f"{name}: the arm lacks a freedom that it needs: {freedom.name}",
+                subject=name,
+            )  # fmt: skip
 
 
 def incidence_motion(source: Incidence, present: Present) -> Motion:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereoservo.control.incidence_rehearsal import rehearse_incidences
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
 from stereoservo.runtime.commands import Command, FeatureTarget, Goal, LawName, PointSource, Request, RunGoal
@@ -16,6 +17,7 @@ from stereoservo.runtime.core import ServoCore
 from stereoservo.runtime.cycle import ModelUpdate, StepInputs
 from stereoservo.runtime.ports import CameraObservation, FloatArray, JointState
 from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings
+from stereoservo.trajectory.rehearsal import rehearse_planning
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 600.0
 JOINTS = tuple(f"j{k}" for k in range(1, 7))
@@ -27,6 +29,8 @@ LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
 def warm_up() -> None:
     """Run each law on the made-up cell."""
+    rehearse_incidences()
+    rehearse_planning()
     model = _model()
     pixels = np.stack(
         [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
