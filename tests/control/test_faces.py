@@ -97,8 +97,9 @@ def test_small_bodies(virtual):
         find_faces(points, world.matrices, 0.0, world.camera_centres, np.ones((2, 4)))
     with pytest.raises(ValueError, match="needed"):
         find_faces(points, world.matrices, SIGMA, world.camera_centres, np.ones((2, 3)))
-    with pytest.raises(ValueError, match="do not fix markers"):
-        find_faces(points, world.matrices[:1], SIGMA, world.camera_centres[:1], np.ones((1, 4)))
+    lone = (points, world.matrices[:1], SIGMA, world.camera_centres[:1], np.ones((1, 4)))
+    assert find_faces(*lone).markers() == [], "one camera in one pose fixes no marker"
+    assert find_faces(*lone, world.operators()).markers() == [(0, 1, 2, 3)], "known from the arm's motions"
     # one camera, the body in three poses: views P H
     steps = [np.eye(4), upright(virtual, 20) @ np.linalg.inv(T), upright(virtual, -20, 30) @ np.linalg.inv(T)]
     moved = [world.frame @ step @ np.linalg.inv(world.frame) for step in steps]

@@ -26,12 +26,18 @@ from stereoservo.control.faces_kernel import (
     marker_distances,
     marker_information,
     plane_minors,
+    trial_views,
     triangle_altitudes,
     turned_average,
 )
 from stereoservo.control.law import IntArray, Scene, Task
 from stereoservo.geometry.homogeneous import FloatArray
 
+FLAT_PX = 0.05
+"""A good ``sigma_px`` for the markers of a calibrated model on plates flat to some tenths of a millimetre.
+
+Larger ones take in markers of the next face that stand near the common edge.
+"""
 IN_PLANE = 4.0
 """Standard deviations up to which a marker is in a plane."""
 SPANS = 10.0
@@ -88,14 +94,16 @@ def find_faces(
 
     ``matrices`` (k, 3, 4): the views that fix the markers; cameras that saw the body in several poses are views
     ``P H_i``. Likewise ``camera_centres`` (c, 4), ``H_i⁻¹O``, with ``seen``: the more, the surer. ``sigma_px`` [px],
-    ``limit`` deviations from a plane. ``operators`` (n, 4, 4) of an arm that turns the body, at any configuration: they
-    make lengths comparable that one view foreshortens.
+    ``limit`` deviations from a plane. ``operators`` (n, 4, 4) of an arm that moves the body, as it stands: the markers
+    count as known from views a small motion of each joint away too, as calibration had them, and lengths become
+    comparable that one view foreshortens.
 
     Regular bodies have coplanar markers that are no face: chamfers, diagonals. Groups of four and more come first,
     those that no camera sees in part before others, those of many markers before few, round before narrow, as long as
     they bring three new markers; then what is left takes part in planes with no marker on one side. Markers inside the
-    body, on no such plane, belong to no face. Fewer than three markers, or all on one line, have none. Raises
-    ValueError for arrays that do not fit, for numbers that are not finite and where the views do not fix a marker.
+    body, on no such plane, belong to no face. Fewer than three markers, or all on one line, have none, nor
+    have markers of which the views do not fix one. Raises ValueError for arrays that do not fit and for numbers that
+    are not finite.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     seen = np.ascontiguousarray(seen, dtype=np.float64)
@@ -109,16 +117,16 @@ def find_faces(
         raise ValueError("points must be finite; give the markers of the model, all of them")
     if not 0.0 < sigma_px < np.inf:
         raise ValueError(f"sigma_px is {sigma_px}; a positive finite number of pixels is needed")
-    if m < 3:
-        return Faces(np.zeros((0, 3), np.int64), np.zeros((0, m)), np.zeros(0), points)
-    information = marker_information(points, np.ascontiguousarray(matrices, dtype=np.float64), sigma_px)
-    covariances = marker_covariances(points, information)
-    if not np.isfinite(covariances).all():
-        lost = np.flatnonzero(~np.isfinite(covariances).all(axis=(1, 2))).tolist()
-        raise ValueError(
-            f"the views do not fix markers {lost}: give two cameras, or views of one in several poses (P H)"
-        )
     turns = np.zeros((0, 4, 4)) if operators is None else np.ascontiguousarray(operators, dtype=np.float64)
+    given = np.ascontiguousarray(matrices, dtype=np.float64)
+    views = trial_views(points, given, turns)
+    # further views stand for other directions, not for more sights: what is systematic does not average out
+    information = marker_information(
+        points, views, sigma_px * float(np.sqrt(len(views) / max(1, len(given))))
+    )
+    covariances = marker_covariances(points, information)
+    if m < 3 or not np.isfinite(covariances).all():
+        return Faces(np.zeros((0, 3), np.int64), np.zeros((0, m)), np.zeros(0), points)
     form = turned_average(information, turns)
     triples = all_triples(m)
     altitudes = triangle_altitudes(points, form, triples)

@@ -8,10 +8,61 @@ import numpy as np
 
 from stereoservo.control.law import IntArray
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import invert4, kernel, multiply4_into
+from stereoservo.kinematics.kernels import exp_twist, invert4, kernel, multiply4_into
 
 AVERAGING_ROUNDS = 3
 """How often an arm's turns are averaged over, one joint after another."""
+
+
+TRIAL_TURN = 0.3
+"""How far [rad], and a third of it [m], joints are moved to and fro for the views that calibration had."""
+NEAREST, FARTHEST = 0.5, 2.0
+"""Depths, relative to those now, that a marker may have in such a view."""
+
+
+@kernel
+def dot4(a: FloatArray, b: FloatArray) -> float:
+    """``aᵀb`` of (4,)."""
+    total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    return total
+
+
+@kernel
+def trial_views(points: FloatArray, matrices: FloatArray, operators: FloatArray) -> FloatArray:
+    """``P exp(±s Ĥ_j)`` (k, 3, 4) besides the cameras ``P`` themselves, where all markers stay well before them."""
+    cameras, n = matrices.shape[0], operators.shape[0]
+    views = np.empty((cameras * (2 * n + 1), 3, 4))
+    count = 0
+    moved = np.empty((3, 4))
+    for step in range(2 * n + 1):
+        H = np.zeros((4, 4))
+        if step == 0:
+            for i in range(4):
+                H[i, i] = 1.0
+        else:
+            j = (step - 1) // 2
+            trace = 0.0
+            for i in range(4):
+                for k in range(4):
+                    trace += operators[j, i, k] * operators[j, k, i]
+            size = TRIAL_TURN if trace < -1.0 else TRIAL_TURN / 3.0
+            H = exp_twist((size if step % 2 == 1 else -size) * operators[j])
+        for c in range(cameras):
+            for r in range(3):
+                for k in range(4):
+                    moved[r, k] = 0.0
+                    for i in range(4):
+                        moved[r, k] += matrices[c, r, i] * H[i, k]
+            good = True
+            for p in range(points.shape[0]):
+                ratio = dot4(moved[2], points[p]) / dot4(matrices[c, 2], points[p])
+                good = good and NEAREST < ratio < FARTHEST
+            if good:
+                for r in range(3):
+                    for k in range(4):
+                        views[count, r, k] = moved[r, k]
+                count += 1
+    return views[:count].copy()
 
 
 @kernel
@@ -111,12 +162,6 @@ def plane_minors(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
     a[2] = -(r[0] * yw - r[1] * xw + r[3] * xy)
     a[3] = r[0] * yz - r[1] * xz + r[2] * xy
     return a
-
-
-@kernel
-def dot4(a: FloatArray, b: FloatArray) -> float:
-    total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    return total
 
 
 @kernel
