@@ -7,18 +7,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics, Mount
-from stereoservo.runtime.commands import Command, Request
+from stereoservo.runtime.commands import (
+    Command,
+    DisplacementTarget,
+    Goal,
+    PointTarget,
+    Request,
+    RunGoal,
+    Target,
+)
 from stereoservo.runtime.core import ServoCore
 from stereoservo.runtime.cycle import Event, ModelUpdate, StepInputs, StepOutputs
 from stereoservo.runtime.ports import CameraObservation, JointState
 from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings, TrialSettings
 
+TERMINAL = {"goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted"}
 NAMES = ("j1", "j2", "j3", "j4", "j5", "j6")
 ROWS = ((0, -90, 0.42), (0.40, 0, 0), (0, 90, 0), (0, -90, 0.80), (0, 90, 0), (0, 0, 0.085))
 BASE = np.array([0.1, -1.0, 1.9, 0.3, 0.8, 0.2])
@@ -279,6 +289,61 @@ class Bench:
             name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])}
             for c, name in enumerate(("left", "right"))
         }
+
+    def goal(self, target: Target, **options: Any) -> RunGoal:
+        """A goal with an id of its own."""
+        return RunGoal(Goal(f"{self.seq + 1:08x}", target, **options))
+
+    def ended(self, seconds: float = 20.0) -> Event:
+        """Step until a goal ends."""
+        return self.until(lambda e: e.kind in TERMINAL, seconds)
+
+    def projective(self, points: np.ndarray) -> np.ndarray:
+        """Euclidean points (m, 3) in the model's frame, height 1."""
+        model = self.truth.model
+        homogeneous = np.column_stack([points, np.ones(len(points))])
+        found = homogeneous @ np.linalg.inv(model.projective_to_euclidean).T
+        return found / (found @ model.plane_at_infinity)[:, None]
+
+    def points_target(self, q: np.ndarray) -> PointTarget:
+        """The body's points at ``q``, each with a scale of its own."""
+        points = self.projective(self.truth.points(q))
+        return PointTarget({i: tuple((M * (1.0 + 0.5 * i)).tolist()) for i, M in enumerate(points)}, 7)
+
+    def displacement_to(self, q: np.ndarray) -> np.ndarray:
+        """Euclidean (4, 4) that takes the body from where it is to where it is at ``q``, by its points alone."""
+        A, B = self.truth.points(self.q), self.truth.points(q)
+        a, b = A.mean(axis=0), B.mean(axis=0)
+        U, _, Vt = np.linalg.svd((A - a).T @ (B - b))
+        R = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+        H = np.eye(4)
+        H[:3, :3], H[:3, 3] = R, b - R @ a
+        return H
+
+    def displacement_target(self, H: np.ndarray, scale: float = -3.0) -> DisplacementTarget:
+        """A Euclidean displacement in the model's frame, scaled by any number."""
+        E = self.truth.model.projective_to_euclidean
+        matrix = scale * np.linalg.inv(E) @ H @ E
+        return DisplacementTarget(tuple(matrix.ravel().tolist()), model_epoch=7)
+
+    def basis_target(self, H: np.ndarray, ids: tuple[int, int, int, int, int]) -> DisplacementTarget:
+        """The same without a model: in the basis of five markers as they are now."""
+        points = np.column_stack([self.truth.points(self.q), np.ones(8)])[list(ids)].T
+        E = points[:, :4] * np.linalg.solve(points[:, :4], points[:, 4])
+        return DisplacementTarget(tuple((0.2 * np.linalg.inv(E) @ H @ E).ravel().tolist()), basis=ids)
+
+    def turned(self, axis: str, degrees: float) -> np.ndarray:
+        """Euclidean (4, 4): the body turned about its middle, about an axis of the flange."""
+        points = self.truth.points(self.q)
+        x, y = points[1] - points[0], points[3] - points[0]
+        frame = np.column_stack([x, y, np.cross(x, y)])
+        u = frame[:, "xyz".index(axis)] / np.linalg.norm(frame[:, "xyz".index(axis)])
+        c = points.mean(axis=0)
+        K = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
+        R = np.eye(3) + np.sin(np.radians(degrees)) * K + (1 - np.cos(np.radians(degrees))) * K @ K
+        H = np.eye(4)
+        H[:3, :3], H[:3, 3] = R, c - R @ c
+        return H
 
     def error_px(self, q: np.ndarray) -> float:
         return float(np.abs(self.truth.pixels(self.q) - self.truth.pixels(q)).max())

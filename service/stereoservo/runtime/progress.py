@@ -18,12 +18,14 @@ from stereoservo.runtime.state import JointMove, LawRun, PlanJob, Servoing, Sour
 
 STUCK_S = 3.0
 """Time of motion without a smaller error after which a law is said to be stuck."""
-SMALLER = 0.98
-"""Of the least error so far, below which it counts as smaller."""
+AVERAGED_S = 0.5
+"""Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
+SMALLER = 0.95
+"""Of the least mean error so far, below which it counts as smaller."""
 LOOK_EVERY_S = 0.2
 NEAR_LIMIT = 0.087
 """Room to a limit less its margin [rad or m] below which it is told: five degrees."""
-NEAR_SINGULAR = 30.0 * ILL_CONDITIONED
+NEAR_SINGULAR = 2.0 * ILL_CONDITIONED
 FEW_MARKERS = 4
 TAIL = 10.0
 """Times its tolerance, below which an error decays in the gain's tail."""
@@ -33,7 +35,8 @@ NOISE_SIGMAS = 3.0
 
 CAUSES = (
     "KEEP_OUT", "JOINT_LIMIT", "INCIDENCES_CONTRADICT", "INCIDENCE_NOT_DRIVABLE", "NOT_REACHABLE", "NO_FACE",
-    "FEATURES_STALE", "TOO_FEW_MARKERS", "VISIBILITY_WAIT", "JACOBIAN_ILL_CONDITIONED", "NEAR_SINGULAR", "VELOCITY_SCALED",
+    "FEATURES_STALE", "TOO_FEW_MARKERS", "VISIBILITY_WAIT", "JACOBIAN_ILL_CONDITIONED", "NEAR_SINGULAR",
+    "VELOCITY_SCALED",
 )  # fmt: skip
 """What may hold a law up, the most probable first."""
 
@@ -78,8 +81,10 @@ def watch(source: LawRun, present: Present, told: tuple[Reason, ...]) -> tuple[R
     error = source.error_px
     if error is not None:
         seen.first_px = max(seen.first_px, error)
-        if seen.least_px == 0.0 or error < SMALLER * seen.least_px or error <= source.tolerance_px:
-            seen.least_px, seen.least_s = max(error, 1e-9), source.moved_s
+        share = present.dt_s / (present.dt_s + AVERAGED_S)
+        seen.mean_px = error if seen.mean_px == 0.0 else seen.mean_px + share * (error - seen.mean_px)
+        if seen.least_px == 0.0 or seen.mean_px < SMALLER * seen.least_px or error <= source.tolerance_px:
+            seen.least_px, seen.least_s = max(seen.mean_px, 1e-9), source.moved_s
     every = max(1, round(LOOK_EVERY_S / present.dt_s))
     if present.state.step % every == 0:
         seen.reasons = _look(source, present, told)
@@ -168,13 +173,14 @@ def _stuck(source: LawRun, present: Present, told: tuple[Reason, ...]) -> Reason
     codes = {reason.code: reason for reason in reversed(told)}
     cause = next((codes[code] for code in CAUSES if code in codes), None)
     noise = _noise_px(source, present)
-    if cause is not None:
-        why = f"most probably {cause.code} {cause.subject}".rstrip() + f": {cause.hint}"
-    elif error <= NOISE_SIGMAS * noise:
+    if error <= NOISE_SIGMAS * noise:
+        cause = None
         why = (
             f"most probably the tolerance of {source.tolerance_px:g} px is below what the images allow: a marker has "
             f"a deviation of {noise:.3f} px; widen it"
         )
+    elif cause is not None:
+        why = f"most probably {cause.code} {cause.subject}".rstrip() + f": {cause.hint}"
     elif isinstance(source, Servoing) and source.law not in ("cartesian3", "cartesian2", "trajectory"):
         why = f"most probably law {source.law!r} rests in a minimum beside the goal: take cartesian3 or trajectory"
     else:

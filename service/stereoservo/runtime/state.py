@@ -103,11 +103,12 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
 class Watch(msgspec.Struct, eq=False):
     """What of a law's run tells whether it gets on; see ``progress``.
 
-    ``first_px``: the error at its beginning; ``least_px``: the smallest so far, improved for the last time after
-    ``least_s`` of motion. ``reasons``: what was found when it was last looked at.
+    ``first_px``: the largest error so far; ``mean_px`` of late; ``least_px``: the smallest such mean, improved for the
+    last time after ``least_s`` of motion. ``reasons``: what was found when it was last looked at.
     """
 
     first_px: float = 0.0
+    mean_px: float = 0.0
     least_px: float = 0.0
     least_s: float = 0.0
     reasons: list[Reason] = []

@@ -32,6 +32,8 @@ from stereoservo.runtime.settings import CameraSettings, CoreSettings
 MIN_MARKERS = 3
 MIN_FACE_AREA_PX2 = 100.0
 MAX_GOAL_RESIDUAL_PX = 5.0
+RIGID_SHARE = 0.1
+"""Of the body's extent that goals in points or matrices may differ by from a rigid displacement, for their noise."""
 SINGULAR = 1e-9
 """Determinant, relative to the fourth power of its largest entry, below which a matrix is no displacement."""
 COPLANAR = 1e-3
@@ -303,12 +305,18 @@ def _aim(place: Place, targets: FloatArray, known: BoolArray, *, only_known: boo
     ``only_known``: these are the markers that the error is taken over; else all that are in view.
     """
     arrays = place.arrays
+    if _mirrored(place.points, targets, known):
+        raise RefusalError(
+            "MIRRORED_GOAL",
+            "the points are those of the marker body's mirror image: are left and right, or ids, swapped?",
+        )
     _in_front(place, targets, known)
     pixels, _ = project_points(arrays.matrices, targets)
     wanted = np.repeat(known[None, :].astype(np.float64), len(arrays.matrices), axis=0)
     set_points = np.where(wanted[..., None] > 0.0, pixels, 0.0)
     face = _face(set_points, wanted, known, arrays)
     pose = _body_at(place, targets, known, face, set_points, wanted)
+    _keeps_its_shape(pose.points, targets, known)
     pixels, _ = project_points(arrays.matrices, pose.points)
     shown = in_view(place, pixels) * (wanted if only_known else 1.0)
     _enough_in_view(place, pixels, shown, known)
@@ -345,6 +353,21 @@ def _enough_in_view(place: Place, pixels: FloatArray, shown: FloatArray, known: 
         f"{camera.width}x{camera.height}",
         subject=camera.name, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
     )  # fmt: skip
+
+
+def _keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> None:
+    """Raises RefusalError for points or matrices that stretch or shear the body, along the cameras' rays too."""
+    middle = body.sum(axis=0) / len(body)
+    extent = float(np.sqrt(((body - middle) ** 2).sum(axis=-1).max()))
+    apart = np.where(known, np.sqrt(((body - targets) ** 2).sum(axis=-1)), 0.0)
+    share = float(apart.max()) / extent
+    if not share <= RIGID_SHARE:
+        raise RefusalError(
+            "NOT_RIGID",
+            f"the goal is no rigid displacement of the marker body: it differs from the nearest by {share:.2f} of the "
+            f"body's extent; up to {RIGID_SHARE} is accepted",
+            value=share, threshold=RIGID_SHARE, unit="of the body's extent",
+        )  # fmt: skip
 
 
 def _turned_to(place: Place, displacement: FloatArray) -> FloatArray:

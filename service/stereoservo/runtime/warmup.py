@@ -7,12 +7,24 @@ cameras' lenses bend, so that the lens's kernels run too.
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 
 from stereoservo.control.incidence_rehearsal import rehearse_incidences
+from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
-from stereoservo.runtime.commands import Command, FeatureTarget, Goal, LawName, PointSource, Request, RunGoal
+from stereoservo.runtime.commands import (
+    Command,
+    FeatureTarget,
+    Goal,
+    LawName,
+    PointSource,
+    Request,
+    RunGoal,
+    UpdateGoal,
+)
 from stereoservo.runtime.core import ServoCore
 from stereoservo.runtime.cycle import ModelUpdate, StepInputs
 from stereoservo.runtime.ports import CameraObservation, FloatArray, JointState
@@ -23,6 +35,7 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 600.0
 JOINTS = tuple(f"j{k}" for k in range(1, 7))
 CAMERAS = ("left", "right")
 MARKERS = tuple(range(6))
+STEPS = 40  # the plan of a short way is done in a third of them
 PERIOD_NS = 4_000_000
 LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
@@ -35,9 +48,11 @@ def warm_up() -> None:
     pixels = np.stack(
         [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
     )
-    law: LawName
-    points: PointSource
-    for law, points in (("stereo", "triangulated"), ("stereo", "predicted"), ("cartesian3", "predicted")):
+    seven = np.ones(7)  # a redundant arm's self-motion
+    self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
+    runs: list[tuple[LawName, PointSource]] = [("stereo", "triangulated")]
+    runs.extend((law, "predicted") for law in get_args(LawName))
+    for law, points in runs:
         core = ServoCore(_settings())
         target = FeatureTarget(
             {
@@ -48,11 +63,14 @@ def warm_up() -> None:
                 for c, name in enumerate(CAMERAS)
             }
         )
-        for step in range(1, 9):
+        goal_id = "00000000-0000"
+        for step in range(1, STEPS):
             now_ns = 1_000_000_000 + step * PERIOD_NS
             command: Command | None = None
             if step == 5:
-                command = RunGoal(Goal("00000000-0000", target, law=law, points=points))
+                command = RunGoal(Goal(goal_id, target, law=law, points=points))
+            elif step == STEPS - 5:
+                command = UpdateGoal(goal_id, target)
             core.step(
                 StepInputs(
                     now_ns=now_ns,
