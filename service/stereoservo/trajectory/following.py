@@ -23,6 +23,8 @@ SETTLED = 1e-6
 """Largest joint step [rad or frame lengths] at which an arm that cannot follow is as near as it comes."""
 ITERATIONS, LENIENT_ITERATIONS = 8, 3
 """At most, where the arm must arrive, and where it goes as near as it comes."""
+STRIDE, STRIDE_PX = 0.1, 2.0
+"""Joint step of a sample [rad or frame lengths] from which on what lies between is looked at; how far it may be off."""
 DAMPING = 1e-9
 """Of the normal matrix, relative to its largest diagonal."""
 LARGEST_STEP = 0.3
@@ -227,6 +229,37 @@ def _places(way: FloatArray, share: float, body: FloatArray, rest: FloatArray) -
 
 
 @kernel
+def _astray_between(
+    operators: FloatArray,
+    composition: int,
+    joints: FloatArray,
+    displacement: FloatArray,
+    joints_before: FloatArray,
+    displacement_before: FloatArray,
+    surroundings: Surroundings,
+) -> tuple[float, int]:
+    """How far [px] the body is off its way half-way between two samples, and which marker: near singularities joints
+    run while the body hardly moves, and what lies between is not what was meant.
+    """
+    n = joints.shape[0]
+    back = np.empty(n)
+    stride = 0.0
+    for j in range(n):
+        back[j] = 0.5 * (joints_before[j] - joints[j])
+        stride = max(stride, 2.0 * abs(back[j]))
+    if not stride > STRIDE:
+        return 0.0, 0
+    half = np.empty((4, 4))
+    multiply4_into(displace(operators, composition, back), displacement, half)
+    middle = moved(displacement, surroundings.body)
+    before = moved(displacement_before, surroundings.body)
+    for p in range(middle.shape[0]):
+        for i in range(3):
+            middle[p, i] = 0.5 * (middle[p, i] + before[p, i])
+    return pixels_apart(surroundings.cameras, surroundings.kept, moved(half, surroundings.body), middle)
+
+
+@kernel
 def check_way(
     way: FloatArray,
     first: int,
@@ -282,13 +315,25 @@ def follow_way(
                 wanted, s.body, composition, redundant, s.lower, s.upper, operators, joints, displacement, bias,
                 ITERATIONS if firm else LENIENT_ITERATIONS,
             )  # fmt: skip
+            apart, marker, limit = 0.0, 0, tolerance
             if left > ARRIVED:
                 apart, marker = pixels_apart(s.cameras, s.kept, moved(displacement, s.body), wanted)
-                if not apart <= tolerance:
-                    table[5, 0], table[5, 1] = tolerance - apart, tolerance - apart
-                    table[5, 2], table[5, 3] = apart, tolerance
-                    table[5, 4], table[5, 5], table[5, 6] = -1.0, marker, share
-                    return 5, k
+            if apart <= limit:
+                limit = STRIDE_PX
+                apart, marker = _astray_between(
+                    operators,
+                    composition,
+                    joints,
+                    displacement,
+                    all_joints[k - 1],
+                    all_displacements[k - 1],
+                    s,
+                )
+            if not apart <= limit:
+                table[5, 0], table[5, 1] = limit - apart, limit - apart
+                table[5, 2], table[5, 3] = apart, limit
+                table[5, 4], table[5, 5], table[5, 6] = -1.0, marker, share
+                return 5, k
         for j in range(joints.shape[0]):
             all_joints[k, j] = joints[j]
         for i in range(4):

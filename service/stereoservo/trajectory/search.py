@@ -171,17 +171,10 @@ def _seek(p: Planning) -> None:
     if p.seeds >= SEEDS:
         _give_up(p)
         return
-    s = p.surroundings
-    start = own(p.request.joints)
-    seed = seed_joints(p.seeds, start, s.lower, s.upper)
+    joints, arrived = _from_seed(p, p.seeds)
     p.seeds += 1
-    joints, arrived = joints_from_seed(
-        seed, p.goal, s.body, int(p.request.composition), s.lower, s.upper, p.turns, p.start_operators, start
-    )
-    if arrived and int(check_joints(joints, 1.0, s, empty_table())) < 0:
-        p.goal_failure = None  # of one posture, not of the goal
-        p.joint_step = (joints - start) / (SAMPLES - 1.0)
-        start_arm(p, Stage.JOINTS)
+    if arrived and int(check_joints(joints, 1.0, p.surroundings, empty_table())) < 0:
+        _straight_to(p, joints)
 
 
 def stay(planning: Planning) -> None:
@@ -285,21 +278,41 @@ def _end(p: Planning) -> None:
 
 
 def _go_on_from_goal_joints(p: Planning, missed: bool) -> None:
-    if missed:
-        next_way(p)
-        return
-    table = empty_table()
-    broken = int(check_joints(p.joints, 1.0, p.surroundings, table))
-    if broken >= 0:
-        p.table = table
-        p.goal_failure = approach(p, broken)
-        p.followed += GOAL_BEYOND
-        next_way(p)
-    elif p.request.composition != Composition.SIMULTANEOUS and (p.request.bend or p.rank < RIGID_FREEDOMS):
-        p.joint_step = (p.joints - p.request.joints) / (SAMPLES - 1.0)
-        start_arm(p, Stage.JOINTS)
-    else:
-        next_way(p)
+    """The asked way's joints at the goal are known, or it is missed: the nearer of these and of a direct step there."""
+    start, s = own(p.request.joints), p.surroundings
+    found, table = [], empty_table()
+    if not missed:
+        broken = int(check_joints(p.joints, 1.0, s, table))
+        if broken < 0:
+            found.append(p.joints)
+        else:
+            p.table = table
+            p.goal_failure = approach(p, broken)
+            p.followed += GOAL_BEYOND
+    if p.request.composition != Composition.SIMULTANEOUS and (p.request.bend or p.rank < RIGID_FREEDOMS):
+        joints, arrived = _from_seed(p, 0)
+        if arrived and int(check_joints(joints, 1.0, s, empty_table())) < 0:
+            found.append(joints)
+        if found:
+            nearest = min(found, key=lambda q: float(np.abs(q - start).max()))
+            _straight_to(p, nearest)
+            return
+    next_way(p)
+
+
+def _from_seed(p: Planning, nth: int) -> tuple[FloatArray, bool]:
+    s, start = p.surroundings, own(p.request.joints)
+    seed = seed_joints(nth, start, s.lower, s.upper)
+    joints, arrived = joints_from_seed(
+        seed, p.goal, s.body, int(p.request.composition), s.lower, s.upper, p.turns, p.start_operators, start
+    )
+    return joints, bool(arrived)
+
+
+def _straight_to(p: Planning, joints: FloatArray) -> None:
+    p.goal_failure = None  # of another posture, not of the goal
+    p.joint_step = (joints - p.request.joints) / (SAMPLES - 1.0)
+    start_arm(p, Stage.JOINTS)
 
 
 def _finish(p: Planning) -> None:
