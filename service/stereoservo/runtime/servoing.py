@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.faces import NOT_CHOSEN, choose_face, find_faces, law_scene
+from stereoservo.control.faces import FLAT_PX, NOT_CHOSEN, choose_face, find_faces, law_scene
 from stereoservo.control.gains import GainCurve, gain_at
 from stereoservo.control.law import JacobianChoice, Options, Scene, Task
 from stereoservo.control.laws import LAWS
@@ -23,7 +23,7 @@ from stereoservo.runtime.commands import (
     JacobianName,
     PointTarget,
 )
-from stereoservo.runtime.estimate import MODEL_SIGMA_PX, ModelArrays, chain_at, points_now
+from stereoservo.runtime.estimate import ModelArrays, chain_at, points_now
 from stereoservo.runtime.motion import Motion, Present
 from stereoservo.runtime.plan_following import on_the_way
 from stereoservo.runtime.ports import FloatArray
@@ -63,7 +63,7 @@ def place_now(present: Present) -> Place:
     seen = (
         np.zeros((len(present.settings.cameras), len(points))) if present.weights is None else present.weights
     )
-    faces = find_faces(points, arrays.matrices, MODEL_SIGMA_PX, arrays.camera_centres, seen)
+    faces = find_faces(points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators)
     return Place(present.settings, arrays, points, prediction.operators, faces)
 
 
