@@ -278,9 +278,14 @@ def show_random_rigs(answer: dict[str, Any], console: Console) -> None:
 def run_inverse_kinematics_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
     """``inverse-kinematics`` from its options; ``seeds`` poses a family, 100 by default."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.inverse_kinematics import POSES, run_inverse_kinematics
+    from stereoservo_sim.experiments.inverse_kinematics import (
+        POSES,
+        draw_inverse_kinematics,
+        run_inverse_kinematics,
+    )
 
-    return run_inverse_kinematics(seeds=options.seeds or POSES, seed=options.seed, progress=progress)
+    answer = run_inverse_kinematics(seeds=options.seeds or POSES, seed=options.seed, progress=progress)
+    return _with_plots(answer, draw_inverse_kinematics, options.plot)
 
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -7,10 +7,13 @@ whether all solutions are found and how far their joints are off.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.inverse.recognition import Recognition, recognise
@@ -32,6 +35,7 @@ SAME = 1e-5
 SOLVED = 1e-8
 FAR = 5.0
 """Way [m] by which a goal is moved out of reach."""
+LEAST_DRAWN = 1e-17
 WALK = 0.3
 """Motion [rad] along a self-motion that has to leave the goal reached."""
 
@@ -206,3 +210,29 @@ def _shares(poses: int, arms: int | None = None) -> list[int]:
     """How many of ``poses`` each arm gets."""
     arms = max(1, min(ARMS, poses // 5)) if arms is None else arms
     return [poses // arms + (i < poses % arms) for i in range(arms)]
+
+
+def draw_inverse_kinematics(answer: dict[str, Any], folder: Path) -> list[Path]:
+    """Joint errors of each family against the metric solver: median and worst."""
+    rows = [row for row in answer["rows"] if row["worst_joint_error"] is not None]
+    folder.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    places = np.arange(len(rows))
+    for key, label, colour in (
+        ("median_joint_error", "median", "#0072b2"),
+        ("worst_joint_error", "worst", "#d55e00"),
+    ):
+        axis.plot([max(row[key], LEAST_DRAWN) for row in rows], places, "o", color=colour, label=label)
+    axis.set_yticks(places, [f"{row['family']} ({row['found_share']:.0%})" for row in rows], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xscale("log")
+    axis.set_xlabel(
+        f"joint error [rad or m] over {answer['seeds']} poses; in brackets: share of solutions found",
+        fontsize=8,
+    )
+    axis.legend(fontsize=8)
+    path = folder / "inverse-kinematics.png"
+    figure.savefig(path, dpi=110)
+    return [path]

@@ -276,6 +276,9 @@ def test_prismatic_joints_without_closed_form_need_limits():
     with pytest.raises(InverseKinematicsError) as refused:
         inverse_kinematics(arm.chain, displacement=H)
     assert refused.value.code == "limits"
+    with pytest.raises(InverseKinematicsError) as refused:
+        inverse_kinematics(arm.chain, displacement=H, limits=np.tile([-np.inf, np.inf], (2, 1)))
+    assert refused.value.code == "limits"
     limits = np.array([[-9.0, 9.0], [-3.0, 3.0]])
     found = inverse_kinematics(arm.chain, displacement=H, limits=limits)
     assert found.joints == pytest.approx((arm.chain.zero + q)[None], abs=1e-9)
@@ -300,7 +303,7 @@ def test_cameras_on_the_tip_see_the_inverse_motion_and_find_the_same_joints(puma
 
 
 def test_a_wrist_first_arm_is_solved_by_its_inverse(puma):
-    """The same mechanism held at its other end: spherical joint first, two parallel axes last but one."""
+    """The same mechanism held at its other end; out of reach, the first joint to fail is the elbow, from that end."""
     chain = ProjectiveChain(puma.chain.kinds, puma.chain.generators[::-1].copy(), puma.chain.zero)
     known = recognise(chain)
     assert (known.case, known.inverted) == ("arm_with_wrist", True)
@@ -308,6 +311,35 @@ def test_a_wrist_first_arm_is_solved_by_its_inverse(puma):
     found = inverse_kinematics(chain, displacement=chain.displacement(q))
     assert len(found.joints) in (4, 8)
     assert np.abs(found.joints - q).max(axis=1).min() < 1e-9
+    away = np.eye(4)
+    away[:3, 3] = 3.0, 0.2, 0.1
+    short = inverse_kinematics(chain, displacement=chain.displacement(q) @ in_frame(puma, away)).shortfall
+    assert short.joint == 3
+    assert short.excess > 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "stratum", "count"),
+    [("scara", "affine", 2), ("mixed", "metric", 1), ("parallel", "projective", 2)],
+)
+def test_arms_of_few_joints_are_searched_in_their_stratum(name, stratum, count):
+    """An elbow left and right for the parallel ones; a goal that the missing freedoms forbid is out of reach."""
+    chain = chain_of(exact_model(getattr(synthetic, name)(), stratum=stratum))
+    n, rng = chain.joints, np.random.default_rng(8)
+    limits = np.array([[-7.0, 7.0] if kind == "revolute" else [-0.5, 0.5] for kind in chain.kinds])
+    for _ in range(3):
+        q = np.where(
+            [kind == "revolute" for kind in chain.kinds], rng.uniform(-2, 2, n), rng.uniform(-0.3, 0.3, n)
+        )
+        H = chain.displacement(q)
+        found = inverse_kinematics(chain, displacement=H, limits=limits)
+        assert (found.case, found.outcome, len(found.joints)) == ("numerical", "isolated", count)
+        assert np.abs(found.joints - q).max(axis=1).min() < 1e-8
+    tilted = chain_of(exact_model(synthetic.rx90())).generators[4]
+    away = H @ (np.eye(4) + np.sin(0.3) * tilted + (1 - np.cos(0.3)) * tilted @ tilted)
+    found = inverse_kinematics(chain, displacement=away, limits=limits)
+    assert found.outcome == "unreachable"
+    assert found.shortfall.residual > 1e-4
 
 
 def test_seven_joints_stay_near_the_seed_and_tell_their_spare_motion():

@@ -10,7 +10,12 @@ from stereoservo_sim.commands.reproduce import EXPERIMENTS
 from stereoservo_sim.experiments import euclidean_inverse as metric
 from stereoservo_sim.experiments import euclidean_search
 from stereoservo_sim.experiments.arm_families import FAMILIES, PUMA_ROWS, from_rows, offset
-from stereoservo_sim.experiments.inverse_kinematics import differences, family_row, hide
+from stereoservo_sim.experiments.inverse_kinematics import (
+    differences,
+    draw_inverse_kinematics,
+    family_row,
+    hide,
+)
 from stereoservo_sim.synthetic import OFFSET_ROWS, RX90_ROWS
 
 SEARCHED = ("offset wrist", "six revolute, general", "seven revolute")
@@ -84,7 +89,7 @@ def test_sixteen_solutions():
     assert differences(axes, metric_ones, found.joints - arm.chain.zero).max() < CLOSE
 
 
-def test_reproduce_prints_one_finite_json_object_and_the_same_for_the_same_seed(app):
+def test_reproduce_prints_one_finite_json_object_and_the_same_for_the_same_seed(app, tmp_path):
     runs = [
         CliRunner().invoke(app, ["inverse-kinematics", "--seeds", "2", "--seed", "5", "--json"])
         for _ in range(2)
@@ -97,6 +102,8 @@ def test_reproduce_prints_one_finite_json_object_and_the_same_for_the_same_seed(
     assert answer["seed"] == 5
     for row in answer["rows"]:
         check(row, 2)
+    (picture,) = draw_inverse_kinematics(answer, tmp_path)
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_another_seed_draws_other_arms():

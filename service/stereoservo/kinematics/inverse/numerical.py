@@ -31,10 +31,10 @@ def even_starts(chain: ProjectiveChain, limits: FloatArray | None, count: int, s
     n = chain.joints
     ranges = np.array([[z - np.pi, z + np.pi] for z in chain.zero])
     slides = [j for j, kind in enumerate(chain.kinds) if kind == "prismatic"]
-    if slides and limits is None:
+    if slides and (limits is None or not np.isfinite(limits[slides]).all()):
         raise InverseKinematicsError(
             "limits",
-            f"prismatic joints {slides} need limits for a search, and a chain of this geometry has no closed form",
+            f"prismatic joints {slides} need finite limits: a chain without a closed form is searched",
             joints=slides,
         )
     if limits is not None:

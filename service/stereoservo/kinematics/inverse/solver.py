@@ -104,7 +104,7 @@ def inverse_kinematics(
     ends, left = descended(chain, problem.points, problem.targets, starts, damping=POLISH)
     solved = left <= tolerance
     if not solved.any():
-        return _unreachable(problem, known.case, ends, left, branches)
+        return _unreachable(problem, known, ends, left, branches)
     return _answer(problem, known.case, ends[solved], left[solved])
 
 
@@ -272,16 +272,15 @@ def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray)
 
 
 def _unreachable(
-    problem: _Problem, case: Case, ends: FloatArray, left: FloatArray, branches: Branches
+    problem: _Problem, known: Recognition, ends: FloatArray, left: FloatArray, branches: Branches
 ) -> InverseSolutions:
     """The joint named is the first, in the order in which the case is solved, that fails in every branch."""
     nearest = int(np.argmin(left))
-    failing = (branches.excess > problem.tolerance).all(axis=0)
-    joint, excess = None, None
-    if failing.any():
-        joint = int(np.flatnonzero(failing)[0])
-        excess = float(branches.excess[:, joint].min())
-    return _nothing(problem, case, Shortfall(ends[nearest], float(left[nearest]), joint, excess))
+    failing = np.flatnonzero(branches.excess.min(axis=0) > problem.tolerance)
+    order = problem.chain.order[::-1] if known.inverted else problem.chain.order
+    joint = next((j for j in order if j in failing), None)
+    excess = None if joint is None else float(branches.excess[:, joint].min())
+    return _nothing(problem, known.case, Shortfall(ends[nearest], float(left[nearest]), joint, excess))
 
 
 def _nothing(problem: _Problem, case: Case, shortfall: Shortfall) -> InverseSolutions:
