@@ -38,7 +38,7 @@ class Seen(NamedTuple):
     bases: FloatArray
 
 
-RANK = 1e-3
+RANK = 2e-4
 """Singular value of the scaled task Jacobian, relative to the largest, below which a direction is left alone."""
 
 STATIONARY = 0.02
