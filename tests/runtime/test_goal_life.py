@@ -370,3 +370,20 @@ def test_joint_near_its_limit_and_few_markers_are_told(benches: Any) -> None:
         told |= {(r.code, r.subject) for r in bench.step().status.reasons}
     assert ("NEAR_LIMIT", "j6") in told
     assert ("FEW_MARKERS", "") in told
+
+
+def test_law_hands_over_to_the_face_that_is_seen(bench: Any) -> None:
+    bench.ready()
+    goal_q = bench.q + DISPLACED
+    command = bench.goal(features(bench, goal_q))
+    assert bench.reply(command).accepted
+    bench.run(0.3)
+    before = set(bench.core.state.source.choice.triple.tolist())
+    bench.marker_mask[list(before)] = False
+    event = bench.until(lambda e: e.kind == "goal_face", 2.0)
+    assert event.id == command.goal.id
+    chosen = {int(i) for i in event.name.split(", ")}
+    assert len(chosen) == 3
+    assert not chosen & before
+    assert bench.ended().kind == "goal_reached"
+    assert bench.error_px(goal_q) < 0.3
