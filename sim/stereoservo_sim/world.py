@@ -157,23 +157,23 @@ def hand_cell() -> SimulatedCell:
 
 DEMO_GOALS: dict[str, FloatArray] = {
     "near": np.array([-0.01, -1.44, -0.16, 1.13, 0.17, -0.79]),
-    "roll": np.array([-0.18, -1.44, -0.36, 0.36, 1.07, -2.44]),
+    "roll": np.array([-0.192416, -1.27605, -0.515402, 0.079712, 0.702957, 3.181643]),
     "far": np.array([0.20, -1.52, -0.57, 0.33, 0.61, -1.82]),
 }
 """Configurations [rad] worth going to. Both cameras see every marker at them and on the way between any
 two of them or the base, along straight lines in joint space and in Cartesian space.
 
-From the base: ``near`` is 29 degrees and 0.12 m away, ``roll`` 132 degrees (nearly about the line of
-sight) and 0.13 m, ``far`` 94 degrees and 0.37 m.
+From the base: ``near`` is 29 degrees and 0.12 m away, ``roll`` 180 degrees about the line of
+sight and 0.14 m, ``far`` 94 degrees and 0.37 m.
 """
 
 HAND_GOALS: dict[str, FloatArray] = {
     "near": np.array([0.24, -1.18, -0.45, 1.05, 0.61, -1.47]),
-    "roll": np.array([0.28, -1.37, 0.0, 1.20, 0.70, 0.95]),
+    "roll": np.array([-0.111708, -1.3627, -0.281001, 0.358958, 0.572148, 2.901605]),
     "far": np.array([0.37, -1.41, -0.39, 0.52, 1.19, -1.96]),
 }
-"""The same for :func:`hand_cell`: the body as the carried rig sees it turns by 33, 124 and 82 degrees and moves by
-0.18, 0.18 and 0.39 m.
+"""The same for :func:`hand_cell`: the body as the carried rig sees it turns by 33, 180 and 82 degrees and moves by
+0.18, 0.14 and 0.39 m.
 """
 
 

@@ -65,7 +65,7 @@ def faked(name: str) -> dict[str, Any]:
     return tree
 
 
-@pytest.mark.parametrize(("law", "goal"), [("stereo", "near"), ("cartesian3", "roll"), ("cartesian3", "far")])
+@pytest.mark.parametrize(("law", "goal"), [("stereo", "near"), ("cartesian2", "roll"), ("cartesian3", "far")])
 @pytest.mark.parametrize("name", ["wide", "eye_in_hand"])
 def test_goal_is_reached_with_an_exact_model(tmp_path: Path, name: str, law: Any, goal: str) -> None:
     file = check_cell(faked(name))

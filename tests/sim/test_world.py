@@ -107,7 +107,7 @@ def test_goals_are_seen_at_the_ends_and_on_the_way(start, end):
 
 
 def test_goals_lie_inside_the_limits_and_are_as_far_as_documented():
-    expected = {"near": (29, 0.12), "roll": (132, 0.13), "far": (94, 0.37)}
+    expected = {"near": (29, 0.12), "roll": (180, 0.14), "far": (94, 0.37)}
     line_of_sight = CELL.rig.world_to_rig[2, :3]
     for name, q in DEMO_GOALS.items():
         for limit, value in zip(FILE.safety.limit, q, strict=True):
@@ -117,7 +117,7 @@ def test_goals_lie_inside_the_limits_and_are_as_far_as_documented():
         assert np.rad2deg(np.linalg.norm(turn)) == pytest.approx(degrees, abs=1)
         assert np.linalg.norm(centres[1] - centres[0]) == pytest.approx(metres, abs=0.01)
         if name == "roll":
-            assert abs(turn @ line_of_sight) > 0.95 * np.linalg.norm(turn)
+            assert abs(turn @ line_of_sight) > 0.99 * np.linalg.norm(turn)
 
 
 def test_a_face_turned_away_is_not_seen():

@@ -19,8 +19,10 @@ from stereoservo.runtime.commands import (
     FeatureTarget,
     Goal,
     Home,
-    JointTarget,
+    PlanReport,
     RunGoal,
+    Target,
+    TaughtTarget,
     Teach,
 )
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelUpdate
@@ -118,14 +120,23 @@ class LockstepOperator:
         self.taught[name] = feature_target(event, self._epoch)
         return event
 
-    def goal(
-        self, target: FeatureTarget | JointTarget | str, *, timeout_s: float = 120.0, **options: object
-    ) -> Event:
+    def goal(self, target: Target | str, *, timeout_s: float = 120.0, **options: object) -> Event:
         """Run a goal (a taught one by its name) to its end. Raises LockstepRefusalError when it is refused."""
-        resolved = self.taught[target] if isinstance(target, str) else target
-        goal = Goal(str(next(self._ids)), resolved, **options)  # type: ignore[arg-type]
+        goal = self._goal(target, **options)
         reply = self._submit(RunGoal(goal))
         return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, reply.seq)
+
+    def planned(self, target: Target | str, **options: object) -> PlanReport:
+        """What a goal that is planned would do; nothing moves. Raises LockstepRefusalError when it is refused."""
+        reply = self._submit(RunGoal(self._goal(target, check=True, **options)))
+        if reply.plan is None:
+            raise ValueError(f"goals of this kind are not planned: {target}")
+        return reply.plan
+
+    def _goal(self, target: Target | str, **options: object) -> Goal:
+        named = target.name if isinstance(target, TaughtTarget) else target
+        resolved = self.taught[named] if isinstance(named, str) else named
+        return Goal(str(next(self._ids)), resolved, **options)  # type: ignore[arg-type]
 
     def home(self) -> Event:
         """Move home. Raises LockstepRefusalError."""

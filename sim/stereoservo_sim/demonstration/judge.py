@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo.runtime.calibration_job import CalibrationJob
+from stereoservo.runtime.commands import LAWS
 from stereoservo.runtime.cycle import Event, StepInputs, StepOutputs
 from stereoservo.runtime.replay import ReplayResult, replay
 from stereoservo.runtime.settings import CoreSettings
@@ -135,7 +136,7 @@ def judge_goal(
 def _flown(name: str, flight: Flight) -> tuple[Event, Event]:
     """Start and end of the visual goal that came after all teaching: the n-th taught is the n-th flown."""
     taught = [e.name for e in flight.events if e.kind == "taught"]
-    begun = [e for e in flight.events if e.kind == "goal_started" and e.name in ("stereo", "cartesian3")]
+    begun = [e for e in flight.events if e.kind == "goal_started" and e.name in LAWS]
     order = taught.index(name)
     if order >= len(begun):
         raise LookupError(f"goal {name!r} was never started; visual goals started: {len(begun)}")

@@ -6,11 +6,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from stereoservo.gateway.client import Client
 from stereoservo.gateway.messages import EventMessage
 from stereoservo.kinematics.model import load_model
-from stereoservo.runtime.commands import JointTarget
-from stereoservo_sim.demonstration.scenario import Calibrated
+from stereoservo.runtime.commands import JointTarget, LawName
+from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
 
 
 class LiveDemonstrator:
@@ -47,9 +50,19 @@ class LiveDemonstrator:
         """Move home."""
         self._client.home().reached()
 
-    def servo(self, name: str, law: str) -> str:
-        """Run a taught goal to its end, under a lease."""
-        result = self._client.goal(name, law=law, lease_s=2.0).wait()
+    def joints(self) -> npt.NDArray[np.float64]:
+        """Measured joint positions (n,)."""
+        return np.array(list(self._client.status().joints.values()))
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that the goal's plan needs."""
+        plan = self._client.check(self._client.make_goal(target, law=law)).plan
+        assert plan is not None  # a goal of the images is planned
+        return plan.seconds
+
+    def servo(self, target: VisualTarget, law: LawName) -> str:
+        """Run a goal to its end, under a lease."""
+        result = self._client.goal(target, law=law, lease_s=2.0).wait()
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
     def rest(self, seconds: float) -> None:

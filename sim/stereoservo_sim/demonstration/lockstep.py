@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from stereoservo.runtime.commands import JointTarget
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.runtime.commands import JointTarget, LawName
 from stereoservo.runtime.lockstep import LockstepCell
 from stereoservo.runtime.lockstep_operator import LockstepOperator
-from stereoservo_sim.demonstration.scenario import Calibrated
+from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
 
 
 class LockstepDemonstrator:
@@ -43,9 +46,17 @@ class LockstepDemonstrator:
         """Move home."""
         self._operator.home()
 
-    def servo(self, name: str, law: str) -> str:
-        """Run a taught goal to its end."""
-        event = self._operator.goal(name, law=law)
+    def joints(self) -> npt.NDArray[np.float64]:
+        """Measured joint positions (n,), a step later."""
+        return self._cell.step().status.positions
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that the goal's plan needs."""
+        return self._operator.planned(target, law=law).seconds
+
+    def servo(self, target: VisualTarget, law: LawName) -> str:
+        """Run a goal to its end."""
+        event = self._operator.goal(target, law=law)
         return (
             "reached"
             if event.kind == "goal_reached"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.commands import DisplacementTarget, LawName, TaughtTarget
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -20,14 +22,23 @@ JUDGE_S = 1.2  # rest after a goal, of which one second is judged
 
 @dataclass(frozen=True)
 class ShownGoal:
-    """A goal of the demonstration, one of ``world.goals_of``, and the law that reaches it again."""
+    """A goal of the demonstration, one of ``world.goals_of``, the law that reaches it again, and how it is stated.
+
+    ``taught``: by its name, the pixels that were shown. ``displacement``: by what the body has to do from where it is,
+    a projective 4x4 in the model's frame, without a pixel of the goal.
+    """
 
     name: str
-    law: str
+    law: LawName
+    stated: Literal["taught", "displacement"] = "taught"
 
 
-GOALS = (ShownGoal("near", "stereo"), ShownGoal("roll", "cartesian3"), ShownGoal("far", "cartesian3"))
-"""From home: about 27, 130 and 90 degrees of rotation, 0.15, 0.15 and 0.38 m; see ``world``."""
+GOALS = (
+    ShownGoal("near", "stereo"),
+    ShownGoal("roll", "cartesian3"),
+    ShownGoal("far", "trajectory", "displacement"),
+)
+"""From home: 29, 180 and 94 degrees of rotation, 0.12, 0.14 and 0.37 m; see ``world``."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,9 @@ class Calibrated:
 
     model: CellModel
     seconds: float
+
+
+VisualTarget = TaughtTarget | DisplacementTarget
 
 
 class Operator(Protocol):
@@ -51,8 +65,16 @@ class Operator(Protocol):
 
     def home(self) -> None: ...
 
-    def servo(self, name: str, law: str) -> str:
-        """Run a taught goal; gives its outcome: ``reached`` or what else ended it, with the message."""
+    def joints(self) -> FloatArray:
+        """Measured joint positions (n,) [rad]."""
+        ...
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that a goal would need, by a check that moves nothing."""
+        ...
+
+    def servo(self, target: VisualTarget, law: LawName) -> str:
+        """Run a goal; gives its outcome: ``reached`` or what else ended it, with the message."""
         ...
 
     def rest(self, seconds: float) -> None: ...
@@ -80,8 +102,19 @@ def perform(
     for goal in GOALS:
         operator.home()
         operator.rest(REST_S)
-        tell(f"goal {goal.name!r} with law {goal.law}")
-        outcomes[goal.name] = operator.servo(goal.name, goal.law)
+        target: VisualTarget = TaughtTarget(goal.name)
+        if goal.stated == "displacement":
+            target = displacement_to(calibrated.model, operator.joints(), configurations[goal.name])
+        seconds = operator.planned_s(target, goal.law)
+        tell(f"goal {goal.name!r}, stated as {goal.stated}, with law {goal.law}: planned {seconds:.1f} s")
+        outcomes[goal.name] = operator.servo(target, goal.law)
         operator.rest(JUDGE_S)
         tell(f"goal {goal.name!r}: {outcomes[goal.name]}")
     return calibrated, outcomes
+
+
+def displacement_to(model: CellModel, joints: FloatArray, goal: FloatArray) -> DisplacementTarget:
+    """What the marker body has to do from where it is at ``joints`` (n,) to where it is at ``goal`` (n,)."""
+    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
+    H = chain.displacement(goal) @ np.linalg.inv(chain.displacement(joints))
+    return DisplacementTarget(tuple(H.ravel().tolist()), model_epoch=model.epoch)
