@@ -39,7 +39,7 @@ from stereoservo_sim.tasks.task_file import AlignmentTask
 FloatArray = npt.NDArray[np.float64]
 CalibrationName = Literal["self", "exact", "coarse"]
 
-STOPS, FRAMES = 31, 25
+STOPS, FRAMES = 41, 25
 """Of a joint's trial motion, and averaged at a stop."""
 LEAST_SIGMA_PX = 1e-3
 """Noise of the trials' averages where the images have none: a fit weighs by it."""

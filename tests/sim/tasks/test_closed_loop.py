@@ -11,11 +11,11 @@ from rich.console import Console
 from stereoservo.cli.main import invoke
 from stereoservo_sim.commands.simulate import _show
 from stereoservo_sim.tasks.calibrations import calibrate
-from stereoservo_sim.tasks.campaign import run_campaign, summary
+from stereoservo_sim.tasks.campaign import default_jobs, run_campaign, summary
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, run_task
 from stereoservo_sim.tasks.hard_tasks import shipped_tasks_path
 from stereoservo_sim.tasks.judge import line_deviations, sight
-from stereoservo_sim.tasks.task_file import AlignmentTask, tasks_text
+from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks, tasks_text
 
 SETTINGS = LoopSettings()
 
@@ -149,11 +149,11 @@ def test_rx90_unreachable_tasks_stay_outside_the_rate(public_kind):
 
 def test_results_do_not_depend_on_the_number_of_jobs(public_kind):
     tasks = public_kind[:6]
-    one, two = (run_campaign(tasks, LoopSettings(noise_px=0.2, seed=3), jobs) for jobs in (1, 2))
+    one, two = (run_campaign(tasks, LoopSettings(noise_px=0.2, seed=3, gain=2.0), jobs) for jobs in (1, 2))
     assert one["tasks"] == two["tasks"]
-    other = run_campaign(tasks[:1], LoopSettings(noise_px=0.2, seed=4), 1)
+    other = run_campaign(tasks[:1], LoopSettings(noise_px=0.2, seed=4, gain=2.0), 1)
     assert other["tasks"][0] != one["tasks"][0]
-    alone = run_campaign(tasks[4:5], LoopSettings(noise_px=0.2, seed=3), 1)
+    alone = run_campaign(tasks[4:5], LoopSettings(noise_px=0.2, seed=3, gain=2.0), 1)
     assert alone["tasks"][0] == one["tasks"][4]
 
 
@@ -216,3 +216,39 @@ def test_errors_leave_with_a_code_and_one_object(capsys, arguments, words):
     assert code != 0
     assert words in json.loads(out)["error"]["message"]
     assert "Traceback" not in err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["cartesian3", "cartesian2", "trajectory"])
+def test_1000_of_1000(drawn, law):
+    """Wilson 95 %: 99.6 % or more."""
+    answer = run_campaign(drawn(2001, 1000), LoopSettings(law=law), default_jobs())
+    assert answer["solved"] == 1000, answer["reasons"]
+    assert answer["back_face"] == answer["out_of_view"] == 0
+    assert answer["line_deviation_mm"]["max"] <= 1.0
+    assert answer["error_over_floor"]["mean"] < 2.0
+
+
+@pytest.mark.slow
+def test_stereo_with_the_mean_jacobian_solves_what_the_calibrated_reference_does(drawn):
+    """99.4 % of 1000 others in the reference: not fewer than three deviations of a binomial below it."""
+    answer = run_campaign(drawn(2001, 1000), LoopSettings(law="stereo"), default_jobs())
+    assert answer["solved"] >= 994 - 3 * np.sqrt(1000 * 0.994 * 0.006)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["cartesian3", "trajectory"])
+def test_at_250_hz_the_middle_keeps_to_its_line(public_kind, law):
+    answer = run_campaign(public_kind, LoopSettings(law=law, rate_hz=250.0), default_jobs())
+    assert answer["solved"] == len(public_kind)
+    assert answer["line_deviation_mm"]["max"] <= 0.2
+
+
+@pytest.mark.slow
+def test_hard_tasks_are_solved_by_bending_the_way_or_refused():
+    tasks = read_tasks(shipped_tasks_path())
+    planned = run_campaign(tasks, LoopSettings(law="trajectory"), default_jobs())
+    straight = run_campaign(tasks, LoopSettings(law="cartesian3"), default_jobs())
+    assert planned["failed_moving"] == 0
+    assert planned["solved"] > straight["solved"]
+    assert straight["failed_moving"] > 0  # the file is hard
