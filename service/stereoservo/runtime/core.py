@@ -9,7 +9,7 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import following, goals, intake, progress
+from stereoservo.runtime import ending, following, going_on, intake, progress
 from stereoservo.runtime.check import check_step
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
@@ -110,14 +110,14 @@ class ServoCore:
         self._watch_following(present)
         teach_step(present)
         self._watch_model(present)
-        goals.go_on(present)
+        going_on.go_on(present)
         intake.answer_waiting(present)
         motion = self._move(present)
         safety = self._safety(inputs, present, motion)
         active = state.lifecycle == Lifecycle.ACTIVE
         state.command = safety.limited.copy() if active else np.zeros_like(q)
         if motion.finished:
-            goals.finish(motion, present)
+            going_on.finish(motion, present)
         state.step += 1
         return StepOutputs(
             command=state.command.copy() if active else None,
@@ -241,8 +241,8 @@ class ServoCore:
 
     def _stop(self, present: Present) -> None:
         reason = Reason("STOPPED", "hold", hint="resume, then send the goal again")
-        goals.end_source(present, "goal_aborted", (reason,), "stopped")
-        goals.end_queue(present, (reason,), "stopped")
+        ending.end_source(present, "goal_aborted", (reason,), "stopped")
+        ending.end_queue(present, (reason,), "stopped")
         present.state.stopped = True
         present.emit("stopped", message="stop: the arm brakes and holds", reasons=(reason,))
 
@@ -253,8 +253,8 @@ class ServoCore:
         reason = following.watch(self.state, self.settings, present.q, present.dt_s)
         if reason is None or self.state.lifecycle != Lifecycle.ACTIVE:
             return  # an arm that is off may be moved by hand
-        goals.end_source(present, "goal_aborted", (reason,), reason.hint)
-        goals.end_queue(present, (reason,), reason.hint)
+        ending.end_source(present, "goal_aborted", (reason,), reason.hint)
+        ending.end_queue(present, (reason,), reason.hint)
         self.state.fault = [reason]
         self.state.lifecycle = Lifecycle.FAULT
         self.state.driver_request = "deactivate"
@@ -282,7 +282,7 @@ class ServoCore:
             )  # fmt: skip
             present.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
             if isinstance(state.source, LawRun):
-                goals.end_source(present, "goal_aborted", (reason,), reason.hint)
+                ending.end_source(present, "goal_aborted", (reason,), reason.hint)
             return
 
     def _move(self, present: Present) -> Motion:
@@ -292,16 +292,16 @@ class ServoCore:
         if state.lifecycle != Lifecycle.ACTIVE:
             if not isinstance(state.source, Holding):
                 reason = Reason("NOT_ACTIVE", "hold", hint=f"the cell became {state.lifecycle}")
-                goals.end_source(
+                ending.end_source(
                     present, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}"
                 )
-                goals.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
+                ending.end_queue(present, (reason,), f"the cell became {state.lifecycle}")
             return rest
         source = state.source
         if isinstance(source, LawRun | JointMove | Visiting) and source.lease_expired(present.now_ns):
             hint = "the client did not renew its lease: is it alive?"
             reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
-            goals.end_source(present, "goal_aborted", (reason,), reason.hint)
+            ending.end_source(present, "goal_aborted", (reason,), reason.hint)
             return rest
         if state.held or state.stopped:
             return rest
@@ -384,7 +384,7 @@ class ServoCore:
             model=str(state.readiness),
             model_epoch=self._epoch(),
             source=SOURCES[type(source)],
-            goal=source.id if isinstance(source, Awaiting) else goals.goal_of(source),
+            goal=source.id if isinstance(source, Awaiting) else ending.goal_of(source),
             law=source.law if isinstance(source, Servoing) else "",
             level=_level(reasons),
             reasons=reasons,

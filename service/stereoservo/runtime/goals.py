@@ -1,10 +1,6 @@
-"""The life of goals: accepted, queued, begun, handed over, acknowledged, ended. Each accepted one ends exactly once."""
+"""What clients ask of goals: run, check, queue, renew, move, cancel, acknowledge."""
 
 from __future__ import annotations
-
-from typing import Literal
-
-import numpy as np
 
 from stereoservo.control.reasons import Reason
 from stereoservo.runtime.commands import (
@@ -19,15 +15,13 @@ from stereoservo.runtime.commands import (
     TaughtTarget,
     UpdateGoal,
 )
-from stereoservo.runtime.cycle import Lifecycle, ModelReadiness
+from stereoservo.runtime.cycle import ModelReadiness
+from stereoservo.runtime.ending import drop_plan, end_queue, end_source, goal_of, may_move
 from stereoservo.runtime.incidences import start_incidence
 from stereoservo.runtime.joint_goals import joint_goal, joint_report
-from stereoservo.runtime.motion import Motion, Present
+from stereoservo.runtime.motion import Present
 from stereoservo.runtime.planned import (
-    NotPlanned,
     begin_plan,
-    go_on_planning,
-    plan_report,
     unplanned_report,
 )
 from stereoservo.runtime.refusal import RefusalError
@@ -38,91 +32,16 @@ from stereoservo.runtime.state import (
     Incidence,
     JointMove,
     LawRun,
-    PlanJob,
     Servoing,
     Source,
     Visiting,
 )
 from stereoservo.runtime.streaming import update
-from stereoservo.runtime.targets import Place
+from stereoservo.runtime.target_checks import Place
 
 QUEUE_LENGTH = 16
-AT_REST = 1e-3
-"""[rad/s or m/s]"""
-MOVED_SINCE = 0.01
-"""Joint motion [rad or m] since a plan was begun from which on a way that is followed is planned anew."""
 
 Accepted = tuple[str, PlanReport | None]
-
-
-def goal_of(source: Source) -> str:
-    """Id of the goal that a source works on, or ''."""
-    if isinstance(source, LawRun):
-        return source.goal.id
-    return source.id if isinstance(source, JointMove | Visiting) else ""
-
-
-# -- ends -----------------------------------------------------------------------------------------------------
-
-
-def end_source(
-    present: Present,
-    kind: Literal["goal_aborted", "goal_cancelled", "goal_preempted"],
-    reasons: tuple[Reason, ...],
-    message: str,
-) -> None:
-    """End the active source with its one terminal event; the arm then holds."""
-    source = present.state.source
-    present.state.source = Holding()
-    present.state.ahead = None
-    if isinstance(source, Visiting):
-        present.emit("calibration_aborted", id=source.id, message=message, reasons=reasons)
-    elif goal_of(source):
-        present.emit(kind, id=goal_of(source), message=message, reasons=reasons)
-
-
-def end_queue(present: Present, reasons: tuple[Reason, ...], message: str) -> None:
-    """Every queued goal ends with a terminal event too, and what is being planned is not begun."""
-    state = present.state
-    job = state.planning
-    if job is not None and not job.source.goal.check:
-        drop_plan(present, reasons, message)
-    queued, state.queue = state.queue, []
-    for goal in queued:
-        present.emit("goal_cancelled", id=goal.id, message=message, reasons=reasons)
-
-
-def drop_plan(present: Present, reasons: tuple[Reason, ...], message: str) -> None:
-    """Stop planning: who waits for the answer is refused, a goal that was accepted already ends."""
-    state = present.state
-    job, state.planning = state.planning, None
-    if job is None:
-        return
-    goal = job.source.goal
-    if job.purpose == "reply":
-        hint = f"{message} while it was planned"
-        told = reasons or (Reason("CANCELLED", "info", goal.id, hint=hint),)
-        present.emit("reply", request=job.request, accepted=False, id=goal.id, message=hint, reasons=told)
-    elif job.purpose == "queue":
-        present.emit("goal_cancelled", id=goal.id, message=message, reasons=reasons)
-
-
-def may_move(present: Present) -> None:
-    """Raises RefusalError where the arm may not move now."""
-    state = present.state
-    if state.lifecycle != Lifecycle.ACTIVE:
-        raise RefusalError(
-            "NOT_ACTIVE",
-            f"the cell is {state.lifecycle}; "
-            f"{'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first",
-        )
-    if state.stopped:
-        raise RefusalError("STOPPED", "the cell was stopped; resume it first")
-    if state.held:
-        raise RefusalError("HELD", "the cell is held; resume it first")
-
-
-# -- requests -------------------------------------------------------------------------------------------------
 
 
 def run_goal(goal: Goal, request: Request, present: Present) -> Accepted | None:
@@ -140,7 +59,7 @@ def run_goal(goal: Goal, request: Request, present: Present) -> Accepted | None:
         state.planning = begin_plan(source, present, place, present.q, "reply", request.request)
         return None
     report = joint_report(source, present) if isinstance(source, JointMove) else unplanned_report(source)
-    return _accept(goal, source, report, present)
+    return accept(goal, source, report, present)
 
 
 def somebody_waits(present: Present) -> bool:
@@ -169,7 +88,8 @@ def _enqueue(goal: Goal, present: Present) -> str:
     return f"queued as number {len(state.queue)}; it is planned when its turn comes"
 
 
-def _accept(goal: Goal, source: Source, report: PlanReport | None, present: Present) -> Accepted:
+def accept(goal: Goal, source: Source, report: PlanReport | None, present: Present) -> Accepted:
+    """Begin a goal in place of the active one, or answer its check. Raises RefusalError where none may move."""
     if goal.check:
         try:
             may_move(present)
@@ -300,9 +220,6 @@ def acknowledge(command: AcknowledgeGoal, present: Present) -> str:
     return "acknowledged"
 
 
-# -- every step -----------------------------------------------------------------------------------------------
-
-
 def begin(source: Source, present: Present) -> None:
     """Make ``source`` the active one."""
     if isinstance(source, LawRun):
@@ -320,160 +237,3 @@ def begin(source: Source, present: Present) -> None:
         else "joints"
     )
     present.emit("goal_started", id=goal_of(source), name=law)
-
-
-def finish(motion: Motion, present: Present) -> None:
-    """A source has finished: the arm holds, or waits to be acknowledged."""
-    source = present.state.source
-    wait_s = None
-    if isinstance(source, LawRun):
-        wait_s = source.goal.acknowledge_s
-    elif isinstance(source, JointMove):
-        wait_s = source.acknowledge_s
-    if motion.reached and wait_s is not None:
-        until_ns = present.now_ns + int(wait_s * 1e9)
-        present.state.source = Awaiting(goal_of(source), wait_s, until_ns)
-    else:
-        present.state.source = Holding()
-
-
-def go_on(present: Present) -> None:
-    """One step's share of planning, and what follows from it: replies, the next goal, a hand-over."""
-    state = present.state
-    if isinstance(state.source, Awaiting) and present.now_ns > state.source.until_ns:
-        _not_acknowledged(state.source, present)
-    if state.planning is not None:
-        _plan_on(state.planning, present)
-    if state.planning is None:
-        _next_plan(present)
-    _hand_over(present)
-
-
-def _not_acknowledged(source: Awaiting, present: Present) -> None:
-    hint = f"goal {source.id} was reached and not acknowledged in {source.acknowledge_s:g} s: is its client alive?"
-    reason = Reason(
-        "NOT_ACKNOWLEDGED", "hold", source.id, source.acknowledge_s, source.acknowledge_s, "s", hint
-    )
-    present.state.source = Holding()
-    present.emit("warning", id=source.id, message=hint, reasons=(reason,))
-    end_queue(present, (reason,), hint)
-
-
-def _plan_on(job: PlanJob, present: Present) -> None:
-    state = present.state
-    if not go_on_planning(job):
-        return
-    state.planning = None
-    goal = job.source.goal
-    try:
-        trusted_model(present)
-        report = plan_report(job, present)
-        if job.purpose == "reply":
-            _fresh(job, present)
-            message, _ = _accept(goal, job.source, report, present)
-            present.emit(
-                "reply", request=job.request, accepted=True, id=goal.id, message=message, plan=report
-            )
-        elif job.purpose == "queue":
-            may_move(present)
-            begin(job.source, present)
-        elif job.purpose == "ahead":
-            state.ahead = job.source
-    except RefusalError as refusal:
-        _refused(job, refusal, present)
-
-
-def _fresh(job: PlanJob, present: Present) -> None:
-    """A way that is followed begins where the arm rests: one that has moved since plans anew when it rests."""
-    if job.source.plan is not None and bool((np.abs(present.q - job.joints) > MOVED_SINCE).any()):
-        job.source.plan = None
-
-
-def _refused(job: PlanJob, refusal: RefusalError, present: Present) -> None:
-    goal, state = job.source.goal, present.state
-    if job.purpose == "reply":
-        present.emit(
-            "reply", request=job.request, accepted=False, id=goal.id, message=str(refusal), reasons=refusal.reasons,
-            plan=refusal.plan if isinstance(refusal, NotPlanned) else None,
-        )  # fmt: skip
-    elif job.purpose == "queue":
-        present.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
-    elif job.purpose == "again" and state.source is job.source:
-        end_source(present, "goal_aborted", refusal.reasons, str(refusal))
-    elif job.purpose == "ahead":
-        state.not_ahead = goal.id  # planned again from where the arm comes to rest, and told then
-
-
-def _next_plan(present: Present) -> None:
-    """Plan what is to be planned without being asked: a way anew, the next goal, the one after this."""
-    state = present.state
-    source = state.source
-    if isinstance(source, Servoing) and source.law == "trajectory" and source.plan is None:
-        if bool((np.abs(state.command) < AT_REST).all()) and bool(
-            (np.abs(state.velocities) < 10 * AT_REST).all()
-        ):
-            state.planning = begin_plan(source, present, place_now(present), present.q, "again", -1)
-        return
-    while state.queue and isinstance(source, Holding):
-        goal = state.queue.pop(0)
-        try:
-            may_move(present)
-            prepared, place = prepare(goal, present)
-            if isinstance(prepared, Servoing) and prepared.pose_known and place is not None:
-                state.planning = begin_plan(prepared, present, place, present.q, "queue", -1)
-            else:
-                if isinstance(prepared, JointMove):
-                    joint_report(prepared, present)
-                begin(prepared, present)
-            return
-        except RefusalError as refusal:
-            present.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
-    if state.queue and _blends(source) and state.ahead is None and state.not_ahead != state.queue[0].id:
-        _plan_ahead(state.queue[0], source, present)
-
-
-def _blends(source: Source) -> bool:
-    return (
-        isinstance(source, Servoing)
-        and source.goal.blend_px is not None
-        and source.goal.acknowledge_s is None
-        and source.pose_known
-        and source.stream is None
-    )
-
-
-def _plan_ahead(goal: Goal, source: Source, present: Present) -> None:
-    """Plan the next goal from where this one ends, while the arm is still on its way there."""
-    state = present.state
-    assert isinstance(source, Servoing)
-    if source.goal_joints is None:
-        state.not_ahead = goal.id
-        return
-    now = place_now(present)
-    place = Place(now.settings, now.arrays, source.target_points, now.operators, now.faces)
-    try:
-        prepared, _ = prepare(goal, present, place)
-    except RefusalError:
-        state.not_ahead = goal.id  # told when its turn comes
-        return
-    if isinstance(prepared, Servoing) and prepared.pose_known:
-        state.planning = begin_plan(prepared, present, place, source.goal_joints, "ahead", -1)
-    else:
-        state.not_ahead = goal.id
-
-
-def _hand_over(present: Present) -> None:
-    """Leave a goal that blends into the next, near enough and with its way planned, without a stop."""
-    state = present.state
-    source, following = state.source, state.ahead
-    if following is None or not isinstance(source, Servoing) or source.goal.blend_px is None:
-        return
-    if not state.queue or state.queue[0].id != following.goal.id:
-        state.ahead = None
-        return
-    if state.held or source.error_px is None or source.error_px > source.goal.blend_px:
-        return
-    state.queue.pop(0)
-    message = f"handed over to goal {following.goal.id} at {source.error_px:.2f} px"
-    present.emit("goal_reached", id=source.goal.id, message=message, error_px=source.error_px)
-    begin(following, present)

@@ -29,14 +29,8 @@ from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.servoing import composition_of, options, run_ended, run_fields, used_cameras
 from stereoservo.runtime.state import Incidence
-from stereoservo.runtime.targets import (
-    Place,
-    camera_index,
-    ideal_pixel,
-    marker_index,
-    of_this_model,
-    raw_set_points,
-)
+from stereoservo.runtime.target_checks import Place
+from stereoservo.runtime.targets import camera_index, ideal_pixel, marker_index, of_this_model, raw_set_points
 
 FEATURES = ("point", "line", "plane")
 SPAN_PX = 5.0

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereoservo.control.reasons import Reason
-from stereoservo.runtime import goals
+from stereoservo.runtime import ending, goals
 from stereoservo.runtime.check import start_check
 from stereoservo.runtime.commands import (
     AcknowledgeGoal,
@@ -108,8 +108,8 @@ def _do(request: Request, command: Command, present: Present) -> str:
         return _enable(present)
     if isinstance(command, Disable):
         reason = Reason("DISABLED", "hold", hint="enable, then send the goal again")
-        goals.end_source(present, "goal_aborted", (reason,), "disabled")
-        goals.end_queue(present, (reason,), "disabled")
+        ending.end_source(present, "goal_aborted", (reason,), "disabled")
+        ending.end_queue(present, (reason,), "disabled")
         state.driver_request = "deactivate"
         return "the arm is stopped and its drives go off"
     if isinstance(command, Reset):
@@ -120,11 +120,11 @@ def _do(request: Request, command: Command, present: Present) -> str:
         return "resetting"
     if isinstance(command, Hold):
         state.held = True
-        present.emit("held", message=f"held by {request.operator}", id=goals.goal_of(state.source))
+        present.emit("held", message=f"held by {request.operator}", id=ending.goal_of(state.source))
         return "holding"
     if isinstance(command, Resume):
         state.held = state.stopped = False
-        present.emit("resumed", message=f"resumed by {request.operator}", id=goals.goal_of(state.source))
+        present.emit("resumed", message=f"resumed by {request.operator}", id=ending.goal_of(state.source))
         return "resumed from the measured state"
     if isinstance(command, RenewGoal):
         return goals.renew(command, present)
@@ -136,7 +136,7 @@ def _do(request: Request, command: Command, present: Present) -> str:
         return goals.cancel(command, present)
     if isinstance(command, Teach):
         return start_teaching(command, request, present)
-    goals.may_move(present)
+    ending.may_move(present)
     if isinstance(command, Jog):
         return _jog(command, present)
     if isinstance(command, Home):
@@ -203,7 +203,7 @@ def _enable(present: Present) -> str:
 def _jog(command: Jog, present: Present) -> str:
     state = present.state
     if not isinstance(state.source, Holding | Jogging):
-        active = goals.goal_of(state.source)
+        active = ending.goal_of(state.source)
         waits = f"a goal is active ({active})" if active else "a reached goal waits to be acknowledged"
         raise RefusalError("BUSY", f"{waits}: cancel it before jogging", subject=active)
     velocity = np.zeros_like(present.q)

@@ -22,7 +22,7 @@ from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.servoing import centre_of, composition_of
 from stereoservo.runtime.state import Incidence, PlanJob, Purpose, Servoing
-from stereoservo.runtime.targets import Place, in_view
+from stereoservo.runtime.target_checks import Place, in_view
 from stereoservo.trajectory.plan import Approach, Plan, PlanLimits, PlanRequest
 from stereoservo.trajectory.planning import (
     MISSING_FREEDOMS,

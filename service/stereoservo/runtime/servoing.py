@@ -30,16 +30,8 @@ from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.state import LawRun, Servoing
 from stereoservo.runtime.streaming import feed_forward, follow
-from stereoservo.runtime.targets import (
-    MIN_MARKERS,
-    Aim,
-    Place,
-    aim_at,
-    camera_index,
-    marker_index,
-    of_this_model,
-    of_unit_height,
-)
+from stereoservo.runtime.target_checks import MIN_MARKERS, Place
+from stereoservo.runtime.targets import Aim, aim_at, camera_index, marker_index, of_this_model, of_unit_height
 
 JACOBIANS: dict[JacobianName, JacobianChoice] = {
     "current": JacobianChoice.CURRENT,

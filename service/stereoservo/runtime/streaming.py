@@ -26,11 +26,9 @@ from stereoservo.runtime.motion import Present
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.state import Servoing, Stream
+from stereoservo.runtime.target_checks import MIN_MARKERS, Place, in_view
 from stereoservo.runtime.targets import (
     MAX_GOAL_RESIDUAL_PX,
-    MIN_MARKERS,
-    Place,
-    in_view,
     marker_index,
     of_this_model,
     of_unit_height,

@@ -12,7 +12,6 @@ from math import isfinite
 
 import numpy as np
 
-from stereoservo.control.faces import Faces, sights_along
 from stereoservo.kinematics.kernels import (
     BoolArray,
     invert4,
@@ -21,39 +20,34 @@ from stereoservo.kinematics.kernels import (
     transform_points,
     triangulate,
 )
-from stereoservo.kinematics.lens_kernel import distort_pixel, undistort_pixel
+from stereoservo.kinematics.lens_kernel import undistort_pixel
 from stereoservo.runtime.commands import DisplacementTarget, FeatureTarget, PointTarget
 from stereoservo.runtime.estimate import ModelArrays, with_unit_height
 from stereoservo.runtime.goal_pose import GoalPose, goal_pose
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.settings import CameraSettings, CoreSettings
+from stereoservo.runtime.target_checks import (
+    MIN_MARKERS,
+    Place,
+    determinant4,
+    enough_in_view,
+    enough_shown,
+    in_front,
+    in_view,
+    keeps_its_shape,
+    mirrored,
+    turned_to,
+)
 
-MIN_MARKERS = 3
 MIN_FACE_AREA_PX2 = 100.0
 MAX_GOAL_RESIDUAL_PX = 5.0
-RIGID_SHARE = 0.1
-"""Of the body's extent that goals in points or matrices may differ by from a rigid displacement, for their noise."""
 SINGULAR = 1e-9
 """Determinant, relative to the fourth power of its largest entry, below which a matrix is no displacement."""
 COPLANAR = 1e-3
 """Affine coordinate of a basis marker in the other four below which four of the five are taken for coplanar."""
-BODY_DEPTH = 0.02
-"""Volume of four markers, relative to the cube of their extent, from which a mirror image can be told."""
 FINITE_HEIGHT = 1e-9
 """Height ``|a∞ᵀM|`` relative to ``|a∞||M|`` below which a point lies at infinity."""
-
-
-@dataclass(frozen=True)
-class Place:
-    """From where a target counts: the body's ``points`` (m, 4) of height 1 and the arm's ``operators`` (n, 4, 4)."""
-
-    settings: CoreSettings
-    arrays: ModelArrays
-    points: FloatArray
-    operators: FloatArray
-    faces: Faces
-    """Of the body, where it is now."""
 
 
 @dataclass(frozen=True)
@@ -305,117 +299,27 @@ def _aim(place: Place, targets: FloatArray, known: BoolArray, *, only_known: boo
     ``only_known``: these are the markers that the error is taken over; else all that are in view.
     """
     arrays = place.arrays
-    if _mirrored(place.points, targets, known):
+    if mirrored(place.points, targets, known):
         raise RefusalError(
             "MIRRORED_GOAL",
             "the points are those of the marker body's mirror image: are left and right, or ids, swapped?",
         )
-    _in_front(place, targets, known)
+    in_front(place, targets, known)
     pixels, _ = project_points(arrays.matrices, targets)
     wanted = np.repeat(known[None, :].astype(np.float64), len(arrays.matrices), axis=0)
     set_points = np.where(wanted[..., None] > 0.0, pixels, 0.0)
     face = _face(set_points, wanted, known, arrays)
     pose = _body_at(place, targets, known, face, set_points, wanted)
-    _keeps_its_shape(pose.points, targets, known)
+    keeps_its_shape(pose.points, targets, known)
     pixels, _ = project_points(arrays.matrices, pose.points)
     shown = in_view(place, pixels) * (wanted if only_known else 1.0)
-    _enough_in_view(place, pixels, shown, known)
-    shown = shown * _turned_to(place, pose.displacement)
-    _enough_shown(place, shown)
+    enough_in_view(place, pixels, shown, known)
+    shown = shown * turned_to(place, pose.displacement)
+    enough_shown(place, shown)
     return Aim(
         np.where(shown[..., None] > 0.0, pixels, 0.0), shown, pose.points, pose.displacement,
         known.astype(np.float64), True, face,
     )  # fmt: skip
-
-
-def in_view(place: Place, pixels: FloatArray) -> FloatArray:
-    """(c, m) 1 where ideal ``pixels`` (c, m, 2) lie in the camera's image, 0 elsewhere."""
-    found = np.zeros(pixels.shape[:2])
-    for c, camera in enumerate(place.settings.cameras):
-        for i in range(pixels.shape[1]):
-            u, v = distort_pixel(place.arrays.lenses[c], pixels[c, i, 0], pixels[c, i, 1])
-            found[c, i] = -0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5
-    return found
-
-
-def _enough_in_view(place: Place, pixels: FloatArray, shown: FloatArray, known: BoolArray) -> None:
-    best = int(shown.sum(axis=-1).argmax())
-    count = int(shown[best].sum())
-    if count >= MIN_MARKERS:
-        return
-    camera = place.settings.cameras[best]
-    lost = int(np.flatnonzero(known & (shown[best] == 0.0))[0])
-    u, v = (float(x) for x in pixels[best, lost])
-    raise RefusalError(
-        "FIELD_OF_VIEW",
-        f"at the goal camera {camera.name!r} shows {count} of its markers, the others less; {MIN_MARKERS} are needed: "
-        f"marker {place.arrays.marker_ids[lost]} would be at ({u:.0f}, {v:.0f}), its image is "
-        f"{camera.width}x{camera.height}",
-        subject=camera.name, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
-    )  # fmt: skip
-
-
-def _keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> None:
-    """Raises RefusalError for points or matrices that stretch or shear the body, along the cameras' rays too."""
-    middle = body.sum(axis=0) / len(body)
-    extent = float(np.sqrt(((body - middle) ** 2).sum(axis=-1).max()))
-    apart = np.where(known, np.sqrt(((body - targets) ** 2).sum(axis=-1)), 0.0)
-    share = float(apart.max()) / extent
-    if not share <= RIGID_SHARE:
-        raise RefusalError(
-            "NOT_RIGID",
-            f"the goal is no rigid displacement of the marker body: it differs from the nearest by {share:.2f} of the "
-            f"body's extent; up to {RIGID_SHARE} is accepted",
-            value=share, threshold=RIGID_SHARE, unit="of the body's extent",
-        )  # fmt: skip
-
-
-def _turned_to(place: Place, displacement: FloatArray) -> FloatArray:
-    """(c, m) 1 where a marker's face is turned to the camera after ``displacement``; 1 where no side of it is known."""
-    faces = place.faces
-    found = np.ones((len(place.arrays.camera_centres), len(place.points)))
-    if not bool((faces.sided > 0.0).any()):
-        return found
-    fronts = sights_along(faces, place.points, displacement[None], place.arrays.camera_centres).fronts[0]
-    told = faces.members[faces.sided > 0.0].max(axis=0) > 0.0
-    for c in range(len(found)):
-        turned = (faces.members * fronts[:, c : c + 1]).max(axis=0) > 0.0
-        found[c] = np.where(told & ~turned, 0.0, 1.0)
-    return found
-
-
-def _enough_shown(place: Place, shown: FloatArray) -> None:
-    best = int(shown.sum(axis=-1).argmax())
-    count = int(shown[best].sum())
-    if count >= MIN_MARKERS:
-        return
-    camera = place.settings.cameras[best].name
-    raise RefusalError(
-        "FACE_HIDDEN",
-        f"at the goal camera {camera!r} would see the front of {count} markers, the others of less; {MIN_MARKERS} are "
-        "needed: the body turns its back",
-        subject=camera, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
-    )  # fmt: skip
-
-
-def _in_front(place: Place, targets: FloatArray, known: BoolArray) -> None:
-    """Raises RefusalError for a goal behind a camera that has the body before it now."""
-    for c, P in enumerate(place.arrays.matrices):
-        now = (place.points * P[2]).sum(axis=-1)
-        side = 1.0 if float(np.sign(now).sum()) >= 0.0 else -1.0
-        if not bool((side * now > 0.0).all()):
-            continue  # the body is about this camera's plane already: it tells nothing
-        then = side * (targets * P[2]).sum(axis=-1)
-        behind = np.flatnonzero(known & ~(then > 0.0))
-        if behind.size:
-            i, camera = int(behind[0]), place.settings.cameras[c].name
-            share = float(then[i] / (side * now[i]))
-            raise RefusalError(
-                "BEHIND_CAMERA",
-                f"at the goal marker {place.arrays.marker_ids[i]} lies behind camera {camera!r} "
-                f"(at {share:.2f} of its present depth; more than 0 is needed)",
-                subject=camera, value=share, threshold=0.0, unit="of the present depth",
-            )  # fmt: skip
 
 
 # -- the body -------------------------------------------------------------------------------------------------
@@ -462,7 +366,7 @@ def _body_at(
         f"{MAX_GOAL_RESIDUAL_PX} px is accepted)"
     )
     value = pose.worst_px if isfinite(pose.worst_px) else None
-    if _mirrored(place.points, targets, known):
+    if mirrored(place.points, targets, known):
         raise RefusalError(
             "MIRRORED_GOAL",
             f"no displacement of the marker body explains the goal, it is its mirror image: {said}",
@@ -474,34 +378,6 @@ def _body_at(
         "is it mirrored?",
         subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
     )  # fmt: skip
-
-
-def _mirrored(points: FloatArray, targets: FloatArray, known: BoolArray) -> bool:
-    """Whether the four markers of the greatest volume have turned inside out. False for a flat body: not to be told."""
-    best, found = 0.0, False
-    for four in combinations(np.flatnonzero(known).tolist(), 4):
-        now, then = points[list(four)], targets[list(four)]
-        extent = float(np.sqrt(((now[1:] - now[0]) ** 2).sum(axis=-1).max()))
-        scale = extent**3 * float(np.sqrt((now[0] * now[0]).sum()))
-        volume = determinant4(now) / scale if scale > 0.0 else 0.0
-        if abs(volume) > best:
-            best, found = abs(volume), determinant4(then) * volume < 0.0
-    return best > BODY_DEPTH and found
-
-
-def determinant4(A: FloatArray) -> float:
-    """Determinant of ``A`` (4, 4) by 2×2 minors."""
-    a, b, c, d = A
-    top = [a[i] * b[j] - a[j] * b[i] for i, j in combinations(range(4), 2)]
-    low = [c[i] * d[j] - c[j] * d[i] for i, j in combinations(range(4), 2)]
-    return float(
-        top[0] * low[5]
-        - top[1] * low[4]
-        + top[2] * low[3]
-        + top[3] * low[2]
-        - top[4] * low[1]
-        + top[5] * low[0]
-    )
 
 
 def _product(A: FloatArray, B: FloatArray) -> FloatArray:
