@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stereoservo.control.cartesian_kernel import cartesian_step
 from stereoservo.control.image import image_velocity
+from stereoservo.control.image_kernel import image_step, limit_into
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.laws import CLASSICAL, LAWS
+from stereoservo.control.laws_rehearsal import rehearse_laws
 from stereoservo.control.points import euclidean_points, points_velocity
+from stereoservo.control.points_kernel import points_step
 from stereoservo.control.trajectory import trajectory_velocity
+from stereoservo.control.trajectory_kernel import trajectory_step
 from stereoservo.kinematics.composition import Composition, displacement
 
 PERIOD = 0.04
@@ -310,3 +315,17 @@ def test_euclidean_points_are_the_pseudo_inverse_in_metres(virtual, seed):
         np.testing.assert_allclose(
             step.velocity, 0.7 * np.linalg.pinv(J) @ (Y - X)[:, :3].reshape(-1), atol=1e-8
         )
+
+
+def test_after_the_rehearsal_no_law_has_anything_to_compile(virtual):
+    rehearse_laws()
+    kernels = (image_step, points_step, cartesian_step, trajectory_step, limit_into)
+    compiled = [len(kernel.signatures) for kernel in kernels]
+    assert min(compiled) > 0
+    for world, composition in arms(virtual, 6)[2]:
+        T0, T_star, _ = arms(virtual, 6)
+        scene = scene_of(virtual, world, composition, T0)
+        for law in LAWS.values():
+            for dt_s in (0.0, PERIOD):
+                law.step(scene, task_of(virtual, world, scene, T_star), Options(1.0, dt_s, rotation_rate=0.1))
+    assert [len(kernel.signatures) for kernel in kernels] == compiled

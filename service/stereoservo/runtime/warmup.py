@@ -12,6 +12,7 @@ from typing import get_args
 import numpy as np
 
 from stereoservo.control.incidence_rehearsal import rehearse_incidences
+from stereoservo.control.laws_rehearsal import rehearse_laws
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
@@ -43,6 +44,7 @@ LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 def warm_up() -> None:
     """Run each law on the made-up cell."""
     rehearse_incidences()
+    rehearse_laws()
     rehearse_planning()
     model = _model()
     pixels = np.stack(
