@@ -35,9 +35,10 @@ def test_exponential_decays_by_a_constant_share():
 )
 def test_first_has_ended_when_last_has_hardly_begun(profile, early, late):
     own = shapes(profile, (1.0, 1.0, 1.0))
-    assert progress(own[early], 0.6) == 1.0
-    assert progress(own[late], 0.4) == 0.0
-    assert progress(own[late], 0.6) < 0.25
+    assert progress(own[early], 0.7) == 1.0
+    assert progress(own[late], 0.3) == 0.0
+    assert progress(own[early], 0.5) > 0.9
+    assert progress(own[late], 0.5) < 0.1
 
 
 def test_a_component_alone_waits_for_nothing():

@@ -1,8 +1,8 @@
 """How the components of a Cartesian motion share the way: ``μ(σ)``, monotone from 0 to 1 on [0, 1] (7.26, 7.4.3).
 
 Linear: all together, at an even pace. Exponential: as a feedback loop does, ``(1 − e^{−kσ})/(1 − e^{−k})``, scaled to
-end at 1 (errata). First and last: the component moves in the first or in the last three fifths; in the fifth in the
-middle one hands over to the other.
+end at 1 (errata). First and last: the component moves in the first or in the last seven tenths; in the middle one
+hands over to the other, slowly enough for accelerations.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ LINEAR, FIRST, LAST, EXPONENTIAL = 0.0, 1.0, 2.0, 3.0
 
 DECAY = 4.0
 """How many time constants an exponential motion lasts: what is left of it when linear scaling ends it is 2 %."""
-HANDS_OVER, ENDS = 0.4, 0.6
+HANDS_OVER, ENDS = 0.3, 0.7
 """Where a component that goes first begins to slow down, and has ended."""
 
 SHAPES: dict[Profile, tuple[float, float, float]] = {

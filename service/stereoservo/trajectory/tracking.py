@@ -27,14 +27,23 @@ class PlanSample(NamedTuple):
 
 
 @kernel
-def _rate(times: FloatArray, values: FloatArray, k: int, i: int) -> float:
-    """Rate at sample ``k`` of the parabola through it and its neighbours; 0 at the ends, where the plan rests."""
-    if k == 0 or k == times.shape[0] - 1:
+def _pace_at(times: FloatArray, k: int) -> float:
+    """Samples per second at sample ``k``: the mean at two neighbours is one over the time between (`time_scaling`)."""
+    before = 0.0
+    for i in range(k):
+        between = 1.0 / (times[i + 1] - times[i])
+        before = min(2.0 * between, max(0.0, 2.0 * between - before))
+    if k < times.shape[0] - 1:
+        before = min(before, 2.0 / (times[k + 1] - times[k]))
+    return before
+
+
+@kernel
+def _rate(pace: float, values: FloatArray, k: int, i: int) -> float:
+    """Rate at sample ``k``, where ``pace`` samples go by a second; 0 at the ends, where the plan rests."""
+    if k == 0 or k == values.shape[0] - 1:
         return 0.0
-    before, after = times[k] - times[k - 1], times[k + 1] - times[k]
-    first = (values[k, i] - values[k - 1, i]) / before
-    second = (values[k + 1, i] - values[k, i]) / after
-    rate: float = (first * after + second * before) / (before + after)
+    rate: float = 0.5 * (values[k + 1, i] - values[k - 1, i]) * pace
     return rate
 
 
@@ -60,10 +69,11 @@ def interpolate_into(
         else:
             high = middle
     h = times[high] - times[low]
+    pace_low, pace_high = _pace_at(times, low), _pace_at(times, high)
     x = (t_s - times[low]) / h
     for i in range(width):
         a, b = values[low, i], values[high, i]
-        u, v = h * _rate(times, values, low, i), h * _rate(times, values, high, i)
+        u, v = h * _rate(pace_low, values, low, i), h * _rate(pace_high, values, high, i)
         rise = b - a
         c2, c3 = 3.0 * rise - 2.0 * u - v, u + v - 2.0 * rise
         out[i] = a + x * (u + x * (c2 + x * c3))
