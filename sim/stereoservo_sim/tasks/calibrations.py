@@ -50,12 +50,17 @@ MAX_TURN, MAX_TRAVEL = np.radians(50.0), 0.25
 
 
 class Calibration(NamedTuple):
-    """An arm with its model; None where it is metric and wrong, a task's own. ``facts``: for the report."""
+    """An arm with its model; None where it is metric and wrong, a task's own. ``facts``: for the report.
+
+    ``focal_error`` (share), ``hand_eye_error_deg``: of a metric model.
+    """
 
     arm: ArmName
     cell: SyntheticCell
     model: CellModel | None
     facts: dict[str, object]
+    focal_error: float = FOCAL_ERROR
+    hand_eye_error_deg: float = HAND_EYE_ERROR_DEG
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +91,26 @@ class Knowledge:
 
 def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed: int) -> Calibration:
     """Once a file and seed. Raises CalibrationError where the trial motions give no model."""
-    cell = with_trial_ranges(free_cell() if arm == "free" else rx90_cell())
-    started = time.perf_counter()
+    cell = free_cell() if arm == "free" else rx90_cell()
     if calibration == "coarse":
-        return Calibration(
-            arm, cell, None, {"focal_error": FOCAL_ERROR, "hand_eye_error_deg": HAND_EYE_ERROR_DEG}
-        )
+        return metric_model(arm, cell, FOCAL_ERROR, HAND_EYE_ERROR_DEG)
     if calibration == "exact":
         return Calibration(arm, cell, exact_model(cell), {})
+    return self_calibrated(arm, cell, noise_px, seed)
+
+
+def metric_model(
+    arm: ArmName, cell: SyntheticCell, focal_error: float, hand_eye_error_deg: float
+) -> Calibration:
+    """Metric, with focal lengths too long by a share, and the arm turned about each task's own axis."""
+    facts: dict[str, object] = {"focal_error": focal_error, "hand_eye_error_deg": hand_eye_error_deg}
+    return Calibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
+
+
+def self_calibrated(arm: ArmName, cell: SyntheticCell, noise_px: float, seed: int) -> Calibration:
+    """From trial motions about the cell's home. Raises CalibrationError."""
+    started = time.perf_counter()
+    cell = with_trial_ranges(cell)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     sigma = max(noise_px / np.sqrt(FRAMES), LEAST_SIGMA_PX)
     result = fit_model(cell.trials(sigma, rng, STOPS), epoch=1)
@@ -169,11 +186,11 @@ def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _coarse(calibration: Calibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
     """Metric, in the rig's frame: focal lengths too long, the arm turned about the plate's middle at the start."""
-    matrices = camera_matrices(1.0 + FOCAL_ERROR)
+    matrices = camera_matrices(1.0 + calibration.focal_error)
     infinity = np.array([0.0, 0.0, 0.0, 1.0])
     centres = _camera_centres(matrices, infinity)
     middle = task.start[:3, 3]
-    turn = Rotation.from_rotvec(np.radians(HAND_EYE_ERROR_DEG) * task.error_axis).as_matrix()
+    turn = Rotation.from_rotvec(np.radians(calibration.hand_eye_error_deg) * task.error_axis).as_matrix()
     if reach is None:
         basis = cartesian_twists(middle, turn)
         return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, None)
