@@ -81,7 +81,8 @@ def simulate(
     noise_px: Annotated[float, typer.Option(help="Standard deviation of each pixel coordinate [px].")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of everything random.")] = 0,
     jobs: Annotated[
-        int, typer.Option(min=0, help="Processes; the results do not depend on it [0: one a processor].")
+        int,
+        typer.Option(min=0, max=256, help="Processes; the results do not depend on it [0: one a processor]."),
     ] = 0,
     drop_camera: Annotated[
         str | None,

@@ -22,7 +22,7 @@ from stereoservo.runtime.goal_pose import goal_pose
 from stereoservo_sim.tasks.arms import Arm, ArmName, FreeArm, SerialArm, rx90_reach
 from stereoservo_sim.tasks.calibrations import Calibration, CalibrationName, Knowledge, known_at_start
 from stereoservo_sim.tasks.estimate import Estimate, PointsName
-from stereoservo_sim.tasks.judge import error_px, line_deviations, noise_floor_px, sight
+from stereoservo_sim.tasks.judge import Sight, error_px, in_images, line_deviations, noise_floor_px, sight
 from stereoservo_sim.tasks.planned_way import LOOK_S, PlannedWay, RefusedError, planned_way
 from stereoservo_sim.tasks.setting import (
     DEFAULT_GAIN,
@@ -230,7 +230,7 @@ def _run(
     margin, back_face, out_of_view, reason, refused = np.inf, False, False, "", ""
     steps = 0
     for k in range(limit + 1):
-        truth = sight(arm.pose)
+        truth = sight(arm.pose, used)
         steps = k + 1
         poses[k], facing[k] = arm.pose, truth.facing
         margin = min(margin, truth.margin_px)
@@ -243,7 +243,7 @@ def _run(
         if k == limit or _settled(errors, k, window):
             break
         frame = truth.pixels + rng.normal(0.0, 1.0, truth.pixels.shape) * settings.noise_px
-        seen = _seen(truth.pixels.shape, settings, k * dt_s)
+        seen = _seen(truth, settings, k * dt_s)
         try:
             velocity = controller.step(frame, seen, arm.joints)
         except RefusedError as error:
@@ -263,8 +263,9 @@ def _run(
     return _judged(task, settings, trace, flags, margin, (reason, refused), window), trace
 
 
-def _seen(shape: tuple[int, ...], settings: LoopSettings, time_s: float) -> FloatArray:
-    seen = np.ones(shape[:2])
+def _seen(truth: Sight, settings: LoopSettings, time_s: float) -> FloatArray:
+    """(c, m): 1 for markers that lie in the image of a camera that is not dropped, else 0."""
+    seen = in_images(truth.pixels).astype(np.float64)
     if settings.drop_camera is not None:
         start, duration = settings.drop_camera
         if start <= time_s < start + duration:

@@ -26,7 +26,7 @@ EYES = camera_poses()[:, :3, 3].copy()
 
 
 class Sight(NamedTuple):
-    """What the cameras truly see of the plate: ``pixels`` (c, m, 2), and the worst over cameras and markers.
+    """What the cameras truly see of the plate: ``pixels`` (c, m, 2), and the worst over markers and cameras used.
 
     ``margin_px``: to the nearest border, negative out of view; ``depth_m``; ``facing``: cosine of the angle at which a
     camera sees the plate's normal, negative where it sees the back.
@@ -43,14 +43,20 @@ class Sight(NamedTuple):
         return self.margin_px >= 0.0 and self.depth_m > MIN_DEPTH
 
 
-def sight(pose: FloatArray) -> Sight:
-    """The plate at ``pose`` (4, 4), as all cameras see it."""
-    return Sight(*_sight(MATRICES, EYES, HOMOGENEOUS_MARKERS, pose))
+def sight(pose: FloatArray, cameras: int = len(MATRICES)) -> Sight:
+    """The plate at ``pose`` (4, 4), in all images; judged in those of the first ``cameras``."""
+    return Sight(*_sight(MATRICES, EYES, HOMOGENEOUS_MARKERS, pose, cameras))
+
+
+def in_images(pixels: FloatArray) -> npt.NDArray[np.bool_]:
+    """(c, m): which of the pixels (c, m, 2) are in their image."""
+    inside = (pixels >= 0.0) & (pixels < np.array([WIDTH, HEIGHT]))
+    return np.asarray(inside.all(axis=-1))
 
 
 @kernel
 def _sight(
-    matrices: FloatArray, eyes: FloatArray, markers: FloatArray, pose: FloatArray
+    matrices: FloatArray, eyes: FloatArray, markers: FloatArray, pose: FloatArray, used: int
 ) -> tuple[FloatArray, float, float, float]:
     cameras, count = matrices.shape[0], markers.shape[0]
     pixels = np.empty((cameras, count, 2))
@@ -67,10 +73,12 @@ def _sight(
                     x[i] += matrices[c, i, k] * X[k]
             u, v = x[0] / x[2], x[1] / x[2]
             pixels[c, p, 0], pixels[c, p, 1] = u, v
+            if c >= used:
+                continue
             nearest = min(nearest, x[2])
             # The last pixel that is in view lies just below the image's size.
             margin = min(margin, u, v, np.nextafter(WIDTH, 0.0) - u, np.nextafter(HEIGHT, 0.0) - v)
-    for c in range(eyes.shape[0]):
+    for c in range(used):
         along, length = 0.0, 0.0
         for i in range(3):
             way = eyes[c, i] - pose[i, 3]

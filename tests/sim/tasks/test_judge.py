@@ -44,6 +44,11 @@ def test_sight_is_that_of_independent_cameras():
         assert seen.facing == pytest.approx(facing.min(), abs=1e-12)
         inside = (pixels >= 0).all() and (pixels[..., 0] < 640).all() and (pixels[..., 1] < 480).all()
         assert seen.in_view == (inside and (depths > 0.01).all())
+        alone = sight(pose, 1)
+        left = pixels[0]
+        inside_left = (left >= 0).all() and (left < [640, 480]).all() and (depths[0] > 0.01).all()
+        assert alone.in_view == inside_left
+        assert alone.facing == pytest.approx(facing[0], abs=1e-12)
         outside += not inside
         behind += bool((facing <= 0).any())
     assert 50 < outside < 290
