@@ -34,6 +34,8 @@ ROTATION = "rotation of the body about its centre"
 STEP_OF_BOUND = 0.9
 """Of the way to a visibility bound, how much one step may make."""
 
+WAITS, NOT_REACHABLE = int(ComponentStatus.WAITS), int(ComponentStatus.NOT_REACHABLE)
+NO_FACE = int(ComponentStatus.NO_FACE)
 BLOCKED = 1e-3
 """Share of what is left below which a component that waits stands."""
 
@@ -83,6 +85,8 @@ def cartesian_law(
     """
     n, k = operators.shape[0], 2 if single else 3
     try:
+        if not np.isfinite([centre, centre_target]).all():
+            raise DegenerateFaceError("the centre is not known")
         parts = decompose(operators, points, targets, centre, centre_target, np.zeros((0, 4)))
     except DegenerateFaceError:
         status = np.full(k, int(ComponentStatus.NO_FACE), dtype=np.int64)
@@ -219,26 +223,26 @@ def cartesian_reasons(
 ) -> tuple[Reason, ...]:
     """What a step has to tell: components that the arm cannot make, or that wait. Empty when all move."""
     reasons = []
-    waiting = status == ComponentStatus.WAITS
-    stuck = bool(waiting[:2].all() and (allowed[:2] <= BLOCKED * task_error[:2]).all())
+    codes = status.tolist()  # plain numbers: comparing numpy's with an enumeration costs more than the law
+    stuck = all(code == WAITS for code in codes[:2]) and bool((allowed[:2] <= BLOCKED * task_error[:2]).all())
     for i, (component, unit) in enumerate(zip(components, units, strict=True)):
         left, may = float(task_error[i]), float(allowed[i])
-        if status[i] == ComponentStatus.NOT_REACHABLE:
+        if codes[i] == NOT_REACHABLE:
             hint = "the arm lacks this freedom here: leave the singularity by joints, or give another goal"
             # an angle can only be measured by the operator that the arm lacks
             value = left if component in (TRANSLATION, ROTATION) else None
             reasons.append(Reason("NOT_REACHABLE", "slow", component, value, None, unit, hint))
-        elif status[i] == ComponentStatus.WAITS and stuck:
+        elif codes[i] == WAITS and stuck:
             hint = (
                 "translation and turn wait for each other, or a camera would see the face's back: use the law "
                 "trajectory, whose way may bend, or another centre"
             )
             reasons.append(Reason("VISIBILITY_BLOCKED", "hold", component, left, may, unit, hint))
-        elif status[i] == ComponentStatus.WAITS:
+        elif codes[i] == WAITS:
             hint = "waits for the other components, so that the cameras keep seeing the face"
             reasons.append(Reason("VISIBILITY_WAIT", "info", component, left, may, unit, hint))
-        elif status[i] == ComponentStatus.NO_FACE:
-            hint = "the three points of the face lie on one line: choose others"
+        elif codes[i] == NO_FACE:
+            hint = "the three points of the face lie on one line, or are not known: choose others"
             reasons.append(Reason("NO_FACE", "hold", component, None, None, "", hint))
     return tuple(reasons)
 

@@ -35,7 +35,7 @@ NOISE_SIGMAS = 3.0
 
 CAUSES = (
     "KEEP_OUT", "JOINT_LIMIT", "INCIDENCES_CONTRADICT", "INCIDENCE_NOT_DRIVABLE", "NOT_REACHABLE", "NO_FACE",
-    "FEATURES_STALE", "TOO_FEW_MARKERS", "VISIBILITY_WAIT", "JACOBIAN_ILL_CONDITIONED", "NEAR_SINGULAR",
+    "FEATURES_STALE", "TOO_FEW_MARKERS", "VISIBILITY_BLOCKED", "VISIBILITY_WAIT", "JACOBIAN_ILL_CONDITIONED", "NEAR_SINGULAR",
     "VELOCITY_SCALED",
 )  # fmt: skip
 """What may hold a law up, the most probable first."""
@@ -88,7 +88,10 @@ def watch(source: LawRun, present: Present, told: tuple[Reason, ...]) -> tuple[R
     every = max(1, round(LOOK_EVERY_S / present.dt_s))
     if present.state.step % every == 0:
         seen.reasons = _look(source, present, told)
-    return tuple(reason for reason in seen.reasons if reason.code not in {r.code for r in told})
+    if not seen.reasons:
+        return ()
+    codes = {reason.code for reason in told}
+    return tuple(reason for reason in seen.reasons if reason.code not in codes)
 
 
 def _look(source: LawRun, present: Present, told: tuple[Reason, ...]) -> list[Reason]:
