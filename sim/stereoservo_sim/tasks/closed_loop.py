@@ -7,6 +7,7 @@ points are found from them with what the controller knows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,8 +15,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.control.law import JacobianChoice, Options, Scene, Task
-from stereoservo.control.laws import LAWS
+from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
+from stereoservo.control.laws import CLASSICAL, LAWS
+from stereoservo.control.points import euclidean_points
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo.runtime.estimate import ModelArrays
 from stereoservo.runtime.goal_pose import goal_pose
@@ -38,7 +40,7 @@ FloatArray = npt.NDArray[np.float64]
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
-"""Steps at 25 Hz over which an error must hold, and over which it is averaged; the same time at other rates."""
+"""Steps at 25 Hz over which an error at rest is averaged, after it has held for as many; the same time at other rates."""
 STILL_FALLING = 0.75
 """A mean error below this share of the one before it still falls: the task has not come to rest."""
 NEGLIGIBLE_PX = 1e-4
@@ -49,6 +51,8 @@ NEGLIGIBLE_PX = 1e-4
 class LoopSettings:
     """How tasks are run.
 
+    ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws that could correct
+    their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
     ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
     of the markers or the number of one.
     """
@@ -64,6 +68,8 @@ class LoopSettings:
     noise_px: float = 0.1
     seed: int = 0
     drop_camera: tuple[float, float] | None = None
+    first_order: bool = False
+    joint_speed: float | None = None
 
 
 class TaskResult(msgspec.Struct, frozen=True):
@@ -94,11 +100,17 @@ class TaskResult(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The way that a task went: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines."""
+    """The way that a task went: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines.
+
+    ``joints`` (k, n): the arm's readings. ``task_errors`` (k - 1, e): what the law saw of its components at each step,
+    NaN where it was not asked.
+    """
 
     poses: FloatArray
     errors_px: FloatArray
     facing: FloatArray
+    joints: FloatArray
+    task_errors: FloatArray
 
 
 def run_task(
@@ -124,10 +136,12 @@ class Controller:
     ) -> None:
         self._knowledge = knowledge
         self._dt_s = 1.0 / settings.rate_hz
-        self._law = LAWS[settings.law]
+        self._law = _law(settings.law, knowledge)
+        self._joint_speed = settings.joint_speed
+        self.task_error = np.full(len(LAWS[settings.law].components) if settings.law in LAWS else 0, np.nan)
         self._options = Options(
             gain=settings.gain,
-            dt_s=self._dt_s,
+            dt_s=0.0 if settings.first_order else self._dt_s,
             jacobian=JacobianChoice[settings.jacobian.upper().replace("-", "_")],
         )
         self.estimate = Estimate(knowledge, settings.points, self._dt_s)
@@ -166,7 +180,12 @@ class Controller:
             if self._way is None:
                 self._way = planned_way(scene, task, joints, self._limits)
             task = self._way.task_now(scene, task, self._dt_s)
-        return np.asarray(self._law.step(scene, task, self._options).velocity)
+        step = self._law(scene, task, self._options)
+        self.task_error = step.error
+        if self._joint_speed is None:
+            return np.asarray(step.velocity)
+        fastest = float(np.abs(step.velocity).max())
+        return np.asarray(step.velocity * (self._joint_speed / max(fastest, self._joint_speed)))
 
     def moved(self, velocity: FloatArray) -> None:
         """The arm's readings say that it moved at ``velocity`` for a step."""
@@ -192,6 +211,18 @@ class Controller:
             centre_target=self._middle @ targets,
             face=FACE,
         )
+
+
+def _law(name: str, knowledge: Knowledge) -> Callable[[Scene, Task, Options], LawStep]:
+    if name in LAWS:
+        return LAWS[name].step
+    if name in CLASSICAL:
+        return CLASSICAL[name]
+    if name == "euclidean-points" and not knowledge.plane_at_infinity[:3].any():
+        # The frame of a metric model is the rig's own.
+        return euclidean_points(np.eye(4))
+    known = ", ".join([*LAWS, *CLASSICAL, "euclidean-points (metric models)"])
+    raise ValueError(f"no law {name!r} for this model; known: {known}")
 
 
 def cameras_used(law: str) -> int:
@@ -227,12 +258,16 @@ def _run(
     used = cameras_used(settings.law)
     set_points = sight(task.goal).pixels
     poses, errors, facing = np.empty((limit + 1, 4, 4)), np.full(limit + 1, np.nan), np.empty(limit + 1)
+    joints, task_errors = (
+        np.empty((limit + 1, len(arm.joints))),
+        np.empty((limit, len(controller.task_error))),
+    )
     margin, back_face, out_of_view, reason, refused = np.inf, False, False, "", ""
     steps = 0
     for k in range(limit + 1):
         truth = sight(arm.pose, used)
         steps = k + 1
-        poses[k], facing[k] = arm.pose, truth.facing
+        poses[k], facing[k], joints[k] = arm.pose, truth.facing, arm.joints
         margin = min(margin, truth.margin_px)
         back_face |= truth.facing <= 0.0
         out_of_view |= not truth.in_view
@@ -249,6 +284,7 @@ def _run(
         except RefusedError as error:
             reason, refused = "REFUSED", error.reason
             break
+        task_errors[k] = controller.task_error
         if not np.isfinite(velocity).all():
             reason = "NO_COMMAND"
             break
@@ -258,7 +294,9 @@ def _run(
             break
         arm.move(velocity, dt_s)
         controller.moved(velocity)
-    trace = Trace(poses[:steps], errors[:steps], facing[:steps])
+    trace = Trace(
+        poses[:steps], errors[:steps], facing[:steps], joints[:steps], task_errors[: max(steps - 1, 0)]
+    )
     flags = (back_face, out_of_view)
     return _judged(task, settings, trace, flags, margin, (reason, refused), window), trace
 
@@ -274,16 +312,13 @@ def _seen(truth: Sight, settings: LoopSettings, time_s: float) -> FloatArray:
 
 
 def _settled(errors: FloatArray, k: int, window: int) -> bool:
-    """Whether the error has been small for a window, and does not fall any more."""
-    if k < window or not errors[k] < SUCCESS_PX or (k % max(window // 10, 1)):
+    """Whether the error has been small for two windows, and does not fall any more from one to the other."""
+    if k + 1 < 2 * window or not errors[k] < SUCCESS_PX or (k % max(window // 10, 1)):
         return False
-    last = errors[k - window + 1 : k + 1]
-    if not last.max() < SUCCESS_PX:
+    before, last = errors[k + 1 - 2 * window : k + 1 - window], errors[k + 1 - window : k + 1]
+    if not (before.max() < SUCCESS_PX and last.max() < SUCCESS_PX):
         return False
-    if last.mean() < NEGLIGIBLE_PX:
-        return True
-    before = errors[max(k - 2 * window, 0) : k - window + 1]
-    return bool(len(before) >= window and last.mean() > STILL_FALLING * before.mean())
+    return bool(last.mean() < NEGLIGIBLE_PX or last.mean() > STILL_FALLING * before.mean())
 
 
 def _judged(
@@ -348,4 +383,5 @@ def _unreachable(task: AlignmentTask, settings: LoopSettings) -> tuple[TaskResul
     result = TaskResult(
         task.id, settings.law, None, 0, None, False, False, None, None, None, None, None, "UNREACHABLE"
     )
-    return result, Trace(task.start[None], np.zeros(0), np.zeros(0))
+    none = np.zeros(0)
+    return result, Trace(task.start[None], none, none, np.zeros((0, 6)), np.zeros((0, 0)))
