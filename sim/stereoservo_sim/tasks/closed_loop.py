@@ -40,7 +40,7 @@ FloatArray = npt.NDArray[np.float64]
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
-"""Steps at 25 Hz over which an error at rest is averaged, after it has held for as many; the same time at other rates."""
+"""Steps at 25 Hz over which an error at rest is averaged, after it has held as long; other rates: the same time."""
 STILL_FALLING = 0.75
 """A mean error below this share of the one before it still falls: the task has not come to rest."""
 NEGLIGIBLE_PX = 1e-4
