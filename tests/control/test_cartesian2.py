@@ -237,7 +237,13 @@ def test_degenerate_tasks_have_an_answer(virtual, single):
     arguments[2] = np.full((3, 4), np.nan)
     unknown = assert_same(tuple(arguments))
     np.testing.assert_array_equal(unknown.velocity, np.zeros(6))
-    assert {int(s) for s in (*flat.status, *unknown.status)} == {int(ComponentStatus.NO_FACE)}
+    arguments = list(inputs(virtual, free, FREE, facing, facing, single, dt_s=PERIOD))
+    arguments[4] = np.full(4, np.nan)
+    nowhere = assert_same(tuple(arguments))
+    np.testing.assert_array_equal(nowhere.velocity, np.zeros(6))
+    assert {int(s) for s in (*flat.status, *unknown.status, *nowhere.status)} == {
+        int(ComponentStatus.NO_FACE)
+    }
 
 
 def test_an_arm_without_the_tilt_turns_what_it_can_and_says_so(virtual):

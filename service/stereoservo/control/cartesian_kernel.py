@@ -125,7 +125,10 @@ def cartesian_step(
     shown = np.full(count, NO_FACE)
     face = minors(points[0], points[1], points[2])
     target_face = minors(targets[0], targets[1], targets[2])
-    if is_flat(points, face) or is_flat(targets, target_face):
+    centres = 0.0
+    for k in range(4):
+        centres += abs(centre[k]) + abs(centre_target[k])
+    if is_flat(points, face) or is_flat(targets, target_face) or not math.isfinite(centres):
         return velocity, errors, allowed, shown
     basis = freedoms_of(operators)
     screws, generators = np.zeros((3, n)), np.zeros((3, 4, 4))
