@@ -116,6 +116,20 @@ def test_options_that_cannot_be_are_refused(bench: Any) -> None:
         assert (reply.accepted, reply.reasons[0].code) == (False, code), reply
 
 
+def test_one_camera_is_enough_for_laws_in_the_images_and_not_for_others(bench: Any) -> None:
+    bench.ready()
+    goal_q = bench.q + 0.4 * DISPLACED
+    one = FeatureTarget({"left": bench.features(goal_q)["left"]})
+    for law in ("cartesian3", "cartesian2", "points", "trajectory"):
+        reply = bench.reply(bench.goal(one, law=law))
+        assert (reply.accepted, reply.reasons[0].code) == (False, "TOO_FEW_MARKERS"), reply
+    reply = bench.reply(bench.goal(one, law="image", cameras=("left",), gain=3.0))
+    assert reply.accepted
+    assert "not planned" in reply.plan.way
+    assert bench.ended().kind == "goal_reached"
+    assert bench.error_px(goal_q) < 1.0
+
+
 def test_chosen_centre_stays_on_its_line(benches: Any) -> None:
     """A tool point far outside the body goes straight, ten times closer to its line than with the body's middle."""
 

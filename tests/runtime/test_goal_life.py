@@ -130,7 +130,10 @@ def test_state_amid_planning_streaming_and_queue_survives_serialisation(bench: A
     assert bench.reply(command).accepted
     assert bench.reply(bench.goal(features(bench, q), mode="queue")).accepted
     bench.step(UpdateGoal(command.goal.id, features(bench, q + 1.02 * DISPLACED)))
-    bench.step(bench.goal(features(bench, q), check=True))
+    bench.step(bench.goal(features(bench, q - 0.5 * DISPLACED), check=True), Home("0000cafe"))
+    state = bench.core.state
+    assert (state.planning is not None, len(state.waiting), len(state.queue)) == (True, 1, 1)
+    assert state.source.stream is not None
     twin = ServoCore(bench.settings, decode_state(encode_state(bench.core.state)))
     start = len(bench.log)
     bench.run(1.0)
@@ -210,6 +213,24 @@ def test_goal_that_nobody_acknowledges_ends_the_queue(bench: Any) -> None:
     event = bench.until(lambda e: e.id == second.goal.id and e.kind.startswith("goal_"), 5.0)
     assert (event.kind, event.reasons[0].code) == ("goal_cancelled", "NOT_ACKNOWLEDGED")
     assert np.abs(bench.run(0.5).command).max() == 0.0
+
+
+def test_queue_waits_in_hold(bench: Any) -> None:
+    bench.ready()
+    q = bench.q.copy()
+    first, second = (
+        bench.goal(features(bench, q)),
+        bench.goal(features(bench, q + 0.3 * DISPLACED), mode="queue"),
+    )
+    assert bench.reply(first).accepted
+    assert bench.reply(bench.goal(second.goal.target, mode="queue", gain=4.0)).accepted
+    assert bench.ended().id == first.goal.id
+    assert bench.reply(Hold()).accepted
+    bench.run(1.0)
+    assert not [e for e in bench.events if e.kind == "goal_aborted"]
+    assert bench.reply(Resume()).accepted
+    assert bench.ended().kind == "goal_reached"
+    assert bench.error_px(q + 0.3 * DISPLACED) < 0.3
 
 
 # -- streams --------------------------------------------------------------------------------------------------

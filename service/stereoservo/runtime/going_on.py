@@ -75,8 +75,7 @@ def _plan_on(job: PlanJob, present: Present) -> None:
                 "reply", request=job.request, accepted=True, id=goal.id, message=message, plan=report
             )
         elif job.purpose == "queue":
-            may_move(present)
-            begin(job.source, present)
+            begin(job.source, present)  # in hold, too: it waits to be resumed
         elif job.purpose == "ahead":
             state.ahead = job.source
     except RefusalError as refusal:
@@ -113,6 +112,8 @@ def _next_plan(present: Present) -> None:
             (np.abs(state.velocities) < 10 * AT_REST).all()
         ):
             state.planning = begin_plan(source, present, place_now(present), present.q, "again", -1)
+        return
+    if state.held:
         return
     while state.queue and isinstance(source, Holding):
         goal = state.queue.pop(0)

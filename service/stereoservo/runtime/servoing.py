@@ -71,7 +71,8 @@ def start_servoing(
     name = goal.law or settings.law
     if name not in LAWS:
         raise RefusalError("NO_SUCH_LAW", f"no law {name!r}; laws: {', '.join(LAWS)}", subject=name)
-    aim = aim_at(target, place, LAWS[name].needs_pose, model.epoch)
+    needs_pose = LAWS[name].needs_pose or name == "trajectory"  # a way is planned to a pose
+    aim = aim_at(target, place, needs_pose, model.epoch)
     weights, body, centre_target = _centre(goal.centre, aim, place, present, model.epoch)
     source = Servoing(
         **run_fields(goal, present, used_cameras(goal, aim.wanted, present)),
