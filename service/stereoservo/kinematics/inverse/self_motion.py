@@ -11,7 +11,10 @@ from stereoservo.kinematics.inverse.descent import linearised
 NO_MOTION = 1e-6
 """Singular value of the joints' Jacobian, as a share of the largest, below which a direction moves nothing."""
 PROBE = 0.05
-"""Motion [rad or m] after which a direction still has to leave the goal reached: a stretched elbow's does not."""
+PROBES = (0.2 * PROBE, -0.5 * PROBE, PROBE)
+"""Motions [rad or m] after which a direction still has to leave the goal reached: a stretched elbow's does not."""
+STRICTER = 0.02
+"""Share of the tolerance for that: before a wrist that is nearly aligned a stretched elbow hardly has to move."""
 CORRECTIONS = 20
 
 
@@ -59,10 +62,23 @@ def self_motions(
     """
     kept = []
     for direction in null_directions(chain, points, q):
-        ahead, residual = corrected(chain, points, targets, q + PROBE * direction, tolerance)
-        if residual <= tolerance and abs(float((ahead - q) @ direction)) > 0.5 * PROBE:
+        if all(_leads_on(chain, points, targets, q, probe * direction, tolerance) for probe in PROBES):
             kept.append(direction)
     return np.array(kept).reshape(-1, chain.joints)
+
+
+def _leads_on(
+    chain: ProjectiveChain,
+    points: FloatArray,
+    targets: FloatArray,
+    q: FloatArray,
+    step: FloatArray,
+    tolerance: float,
+) -> bool:
+    """Whether the goal is reached about ``step`` (n,) away from ``q`` (n,): to half of it, and on its way."""
+    ahead, residual = corrected(chain, points, targets, q + step, tolerance)
+    share = float((ahead - q) @ step) / float(step @ step)
+    return residual <= STRICTER * tolerance and 0.5 < share < 1.5
 
 
 def nearest_by_self_motion(
