@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -99,60 +100,6 @@ def show_real_franka(answer: dict[str, Any], console: Console) -> None:
         console.print(f"wrote {path}")
 
 
-def run_gripper_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``gripper`` from its options; 20 seeds by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.gripper import draw_gripper, run_gripper
-
-    answer = run_gripper(seeds=options.seeds or 20, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_gripper, options.plot)
-
-
-def run_grid_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``grid`` from its options; 20 seeds by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.grid import draw_grid, run_grid
-
-    answer = run_grid(seeds=options.seeds or 20, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_grid, options.plot)
-
-
-def run_pan_tilt_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``pan-tilt`` from its options; 20 seeds by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.pan_tilt import draw_pan_tilt, run_pan_tilt
-
-    answer = run_pan_tilt(seeds=options.seeds or 20, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_pan_tilt, options.plot)
-
-
-def run_homing_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``homing`` from its options; 10 seeds by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.homing import draw_homing, run_homing
-
-    answer = run_homing(seeds=options.seeds or 10, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_homing, options.plot)
-
-
-def run_house_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``house`` from its options; 50 seeds by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.house import draw_house, run_house
-
-    answer = run_house(seeds=options.seeds or 50, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_house, options.plot)
-
-
-def run_robot_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``robot`` from its options; 30 seeds by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.robot_report import draw_robot, run_robot
-
-    answer = run_robot(seeds=options.seeds or 30, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_robot, options.plot)
-
-
 def show_robot_tables(answer: dict[str, Any], console: Console) -> None:
     """Tables 5.1 to 5.4."""
     from stereoservo_sim.experiments.robot_report import show_robot
@@ -160,22 +107,14 @@ def show_robot_tables(answer: dict[str, Any], console: Console) -> None:
     show_robot(answer, console)
 
 
-def _with_plots(
-    answer: dict[str, Any], draw: Callable[[dict[str, Any], Path], list[Path]], folder: Path | None
-) -> dict[str, Any]:
-    """The answer with the pictures written, where any are asked for."""
-    if folder is not None:
-        answer["plots"] = [str(path) for path in draw(answer, folder)]
-    return answer
-
-
 def show_rows(answer: dict[str, Any], console: Console) -> None:
     """The rows as a table, a spread as its median and the 16th to 84th percentile; then the thesis's values.
 
-    More than ``LISTED`` rows are left to ``--json`` where a summary stands beside the thesis.
+    ``title`` says what else the rows are. More than ``LISTED`` rows are left to ``--json`` where a summary stands
+    beside the thesis.
     """
     rows = answer["rows"]
-    title = f"{answer['experiment']}: {answer['seeds']} seeds; medians (16 % to 84 %)"
+    title = answer.get("title") or f"{answer['experiment']}: {answer['seeds']} seeds; medians (16 % to 84 %)"
     if len(rows) > LISTED and answer.get("beside_thesis"):
         console.print(f"{title}; all {len(rows)} rows: --json, curves: --plot DIR")
     else:
@@ -252,17 +191,6 @@ def _cell(value: Any) -> str:
     return "-" if value is None else str(value)
 
 
-def run_random_rigs_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``random-rigs`` from its options; 12 cases by default, the first one's number is the seed."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.random_rigs import SEEDS, draw_random_rigs, run_random_rigs
-
-    answer = run_random_rigs(seeds=options.seeds or SEEDS, seed=options.seed, progress=progress)
-    if options.plot is not None:
-        answer["plots"] = [str(path) for path in draw_random_rigs(answer, options.plot)]
-    return answer
-
-
 def show_random_rigs(answer: dict[str, Any], console: Console) -> None:
     """The rate with its interval, rows, and what did not succeed."""
     show_rows(answer, console)
@@ -275,17 +203,51 @@ def show_random_rigs(answer: dict[str, Any], console: Console) -> None:
         console.print(f"case {case['seed']}: {case['outcome']} {case['code']} {case['message']}")
 
 
-def run_inverse_kinematics_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
-    """``inverse-kinematics`` from its options; ``seeds`` poses a family, 100 by default."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.experiments.inverse_kinematics import (
-        POSES,
-        draw_inverse_kinematics,
-        run_inverse_kinematics,
-    )
+def simulated(
+    name: str,
+    summary: str,
+    seeds: int | None,
+    show: Callable[[dict[str, Any], Console], None] | None = None,
+    module: str = "",
+) -> Experiment:
+    """An experiment in simulation: ``run_NAME`` and ``draw_NAME`` of ``module``, by default of its own name.
 
-    answer = run_inverse_kinematics(seeds=options.seeds or POSES, seed=options.seed, progress=progress)
-    return _with_plots(answer, draw_inverse_kinematics, options.plot)
+    Imported when it runs. ``seeds``: how many repetitions unless told, None where it has none.
+    """
+
+    def run(options: Options, progress: ProgressCall) -> dict[str, Any]:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        found = import_module(f"stereoservo_sim.experiments.{module or name}")
+        repetitions = {} if seeds is None else {"seeds": options.seeds or seeds}
+        answer: dict[str, Any] = getattr(found, f"run_{name}")(
+            **repetitions, seed=options.seed, progress=progress
+        )
+        if options.plot is not None:
+            answer["plots"] = [str(path) for path in getattr(found, f"draw_{name}")(answer, options.plot)]
+        return answer
+
+    takes = frozenset() if seeds is None else frozenset({"seeds"})
+    return Experiment(summary, takes, run, show or show_rows)
+
+
+def run_laws_command(options: Options, progress: ProgressCall) -> dict[str, Any]:
+    """``laws`` from its options."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.experiments.laws_compared import compare_laws, laws_report
+    from stereoservo_sim.experiments.laws_figures import draw_laws
+
+    comparison = compare_laws(options.seed, progress)
+    answer = laws_report(comparison)
+    if options.plot is not None:
+        answer["plots"] = [str(path) for path in draw_laws(comparison, options.plot)]
+    return answer
+
+
+def show_laws_table(answer: dict[str, Any], console: Console) -> None:
+    """A row a task and law."""
+    from stereoservo_sim.experiments.laws_compared import show_laws
+
+    show_laws(answer, console)
 
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -295,53 +257,55 @@ EXPERIMENTS: dict[str, Experiment] = {
         run_real_franka_command,
         show_real_franka,
     ),
-    "gripper": Experiment(
+    "gripper": simulated(
+        "gripper",
         "fig. 3.5: affine calibration from small translations of a gripper, over noise and number of motions",
-        frozenset({"seeds"}),
-        run_gripper_command,
-        show_rows,
+        20,
     ),
-    "grid": Experiment(
+    "grid": simulated(
+        "grid",
         "fig. 3.6: affine calibration before a grid, single motions beside cumulative estimates",
-        frozenset({"seeds"}),
-        run_grid_command,
-        show_rows,
+        20,
     ),
-    "pan-tilt": Experiment(
+    "pan-tilt": simulated(
+        "pan_tilt",
         "table 4.1, figs 4.8, 4.9: a pan-tilt head calibrates itself and predicts the image after a motion",
-        frozenset({"seeds"}),
-        run_pan_tilt_command,
-        show_pan_tilt,
+        20,
+        show=show_pan_tilt,
     ),
-    "homing": Experiment(
+    "homing": simulated(
+        "homing",
         "fig. 4.10: a pan-tilt head finds home from one point, its errors beside the Cramer-Rao bound",
-        frozenset({"seeds"}),
-        run_homing_command,
-        show_rows,
+        10,
     ),
-    "house": Experiment(
+    "house": simulated(
+        "house",
         "fig. 3.7: affine calibration from interest points of an unknown object, judged on the grid",
-        frozenset({"seeds"}),
-        run_house_command,
-        show_rows,
+        50,
     ),
-    "robot": Experiment(
+    "robot": simulated(
+        "robot",
         "tables 5.1 to 5.4: self-calibration of a 6R arm from a turned plate; images, axes, links, intrinsics",
-        frozenset({"seeds"}),
-        run_robot_command,
-        show_robot_tables,
+        30,
+        show=show_robot_tables,
+        module="robot_report",
     ),
-    "random-rigs": Experiment(
+    "random-rigs": simulated(
+        "random_rigs",
         "self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds",
-        frozenset({"seeds"}),
-        run_random_rigs_command,
-        show_random_rigs,
+        12,
+        show=show_random_rigs,
     ),
-    "inverse-kinematics": Experiment(
+    "inverse-kinematics": simulated(
+        "inverse_kinematics",
         "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
-        frozenset({"seeds"}),
-        run_inverse_kinematics_command,
-        show_rows,
+        100,
+    ),
+    "laws": Experiment(
+        "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
+        frozenset(),
+        run_laws_command,
+        show_laws_table,
     ),
 }
 """By the name given on the command line."""
