@@ -236,7 +236,7 @@ def test_queue_waits_in_hold(bench: Any) -> None:
 # -- streams --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", ["cartesian3", "stereo", "points"])
+@pytest.mark.parametrize("law", ["cartesian3", "stereo"])
 def test_moving_target_is_followed_closely(benches: Any, law: str) -> None:
     """Without feed-forward the lag is speed/gain; with it what is left is the target's acceleration over gain²."""
     bench = benches(2).ready()
@@ -245,7 +245,7 @@ def test_moving_target_is_followed_closely(benches: Any, law: str) -> None:
     command = bench.goal(features(bench, base), law=law, gain=gain)
     assert bench.reply(command).accepted
     worst, speeds, before, start = 0.0, [], None, bench.now_ns
-    for k in range(800):
+    for k in range(500):
         t = (bench.now_ns - start) * 1e-9
         q = base + reach * 0.5 * (1.0 - np.cos(omega * t)) * direction
         updates = []
@@ -257,7 +257,7 @@ def test_moving_target_is_followed_closely(benches: Any, law: str) -> None:
         if before is not None:
             speeds.append(np.linalg.norm(now - before, axis=-1).max() * bench.settings.rate_hz)
         before = now
-        if k > 200:
+        if k > 150:
             worst = max(worst, float(np.linalg.norm(bench.truth.pixels(bench.q) - now, axis=-1).max()))
     assert max(speeds) > 50.0
     lag = max(speeds) / gain
@@ -310,7 +310,7 @@ def test_stream_renews_the_lease(bench: Any) -> None:
 # -- drop-outs, hold, and what is told ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", ["stereo", "points", "cartesian2", "trajectory"])
+@pytest.mark.parametrize("law", ["stereo", "cartesian2", "trajectory"])
 def test_camera_that_drops_out_for_two_seconds_changes_nothing(benches: Any, law: str) -> None:
     bench = benches(4).ready()
     goal_q = bench.q + 0.8 * DISPLACED

@@ -285,11 +285,8 @@ def choose(source: Servoing, present: Present, scene: Scene, task: Task) -> tupl
     if before.cameras > 0 and not present.observations:  # nothing has been seen since
         return law_scene(scene, before), task
     choice = choose_face(source.faces, scene, task, before)
-    if choice.cameras == 0:
-        return (
-            scene,
-            task,
-        )  # nobody sees three markers of one face: on with the former, carried by the kinematics
+    if choice.cameras == 0:  # nobody sees three markers of one face: on with the former, by the kinematics
+        return scene, task
     source.choice = choice
     if choice.changed and before.cameras > 0 and choice.face != before.face:
         ids = ", ".join(str(present.arrays.marker_ids[int(i)]) for i in choice.triple)
