@@ -19,6 +19,8 @@ LOOK_S = 0.4
 """The controller looks at the plate for so long before it plans."""
 VIEW_MARGIN_PX = 2.0
 """Planned distance from the images' borders: for noise and what the body lags."""
+JOINT_MARGIN = 0.02
+"""Planned distance from the joints' limits [rad], likewise."""
 LARGEST_LAG_PX = 20.0
 """Distance behind its way at which the body is waited for."""
 SPEED_M, SPEED_RAD = 0.1, 0.6
@@ -84,8 +86,8 @@ def planned_way(scene: Scene, task: Task, joints: FloatArray, limits: FloatArray
         centre_target=task.centre_target,
         faces=FACE[None],
         limits=PlanLimits(
-            position_min=limits[:, 0].copy(),
-            position_max=limits[:, 1].copy(),
+            position_min=limits[:, 0] + JOINT_MARGIN,
+            position_max=limits[:, 1] - JOINT_MARGIN,
             velocity_max=speeds,
             acceleration_max=speeds / ACCELERATION_S,
             keep_outs=np.zeros((0, n, 2)),
