@@ -301,6 +301,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
         100,
     ),
+    "tasks-abc": simulated(
+        "tasks_abc",
+        "figs 8.6 to 8.12: three alignments by image-based stereo control, projective and coarse calibration",
+        12,
+    ),
     "laws": Experiment(
         "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
         frozenset(),
