@@ -52,8 +52,8 @@ THESIS = {
 }
 ASSUMPTIONS = [
     "the thesis prints no poses: angle and distance are chosen (A 40°, 0.15 m; B 100°, 0.10 m; C 60°, 0.25 m), the "
-    "rest is drawn by seed until the RX 90 reaches both ends, both cameras see them, the straight way keeps the plate in "
-    "view, and, as the thesis realized them, the law solves the task with an exact model",
+    "rest is drawn by seed until the RX 90 reaches both ends, both cameras see them, the straight way keeps the plate "
+    "in view, and, as the thesis realized them, the law solves the task with an exact model",
     "beside the thesis, 'B drawn': poses with B's angle and distance of which no success is required",
     f"coarse: metric, {FOCAL_ERROR:.0%} focal and {HAND_EYE_ERROR_DEG:g}° hand-eye error; points are triangulated, as "
     "it does not know the markers' places on the plate; the thesis does not say how coarse its calibration was",
