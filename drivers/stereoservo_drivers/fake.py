@@ -172,14 +172,21 @@ class FakeCameraDriver(SimulatedCamera):
 
     def describe(self) -> CameraDescription:
         """Size, rate, marker ids; delivers observations."""
-        return self.describe_as("observations", tuple(int(i) for i in self.cell.body.ids))
+        part = self.cell.workpiece
+        ids = self.cell.body.ids if part is None else np.append(self.cell.body.ids, part.body.ids)
+        return self.describe_as("observations", tuple(int(i) for i in ids))
 
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
     ) -> CameraObservation:
         """The markers that this camera sees with the arm at ``q`` (n,)."""
         pixels, _ = self.cell.in_world(self.camera, q).image_of(self.cell.marker_positions(q))
-        seen = self.cell.visible(q, self.camera)
+        seen, ids = self.cell.visible(q, self.camera), self.cell.body.ids
+        part, pose = self.cell.workpiece, self.workpiece_pose()
+        if part is not None and pose is not None:
+            beside, _ = self.cell.in_world(self.camera, q).image_of(part.marker_positions(pose))
+            pixels, ids = np.concatenate([pixels, beside]), np.append(ids, part.body.ids)
+            seen = np.append(seen, self.cell.workpiece_visible(q, pose, self.camera))
         # The same numbers are drawn whatever is seen: one marker's fate does not change another's noise.
         noise = rng.standard_normal(pixels.shape) * self._fake.noise_px
         seen &= rng.random(len(seen)) >= self._fake.marker_drop_rate
@@ -190,7 +197,7 @@ class FakeCameraDriver(SimulatedCamera):
             seq=seq,
             t_shutter_ns=t_shutter_ns,
             t_received_ns=t_received_ns,
-            ids=self.cell.body.ids[seen],
+            ids=ids[seen],
             pixels=(pixels + noise)[seen],
             covariances=np.broadcast_to(np.eye(2) * sigma**2, (k, 2, 2)).copy(),
         )

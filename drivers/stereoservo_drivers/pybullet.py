@@ -101,5 +101,5 @@ class PybulletCameraDriver(SimulatedCamera):
             seq=seq,
             t_shutter_ns=t_shutter_ns,
             t_received_ns=t_received_ns,
-            image=self._renderer.render(q, rng),
+            image=self._renderer.render(q, rng, self.workpiece_pose()),
         )

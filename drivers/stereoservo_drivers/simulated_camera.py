@@ -5,7 +5,6 @@ the shutter.
 from __future__ import annotations
 
 import zlib
-from dataclasses import replace
 from typing import Annotated, Literal
 
 import msgspec
@@ -16,7 +15,8 @@ from msgspec import Meta
 from stereoservo.runtime.ports import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
 from stereoservo_drivers.lifecycle import DriverLifecycle, State
 from stereoservo_sim.history import FILE_NAME, HistoryError, JointHistory
-from stereoservo_sim.world import simulated_cell
+from stereoservo_sim.workpiece import Moved, WorkpieceFile, WorkpieceFileError
+from stereoservo_sim.world import SimulatedCell, simulated_cell, workpiece_cell
 
 FloatArray = npt.NDArray[np.float64]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -27,7 +27,9 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Options of every simulated camera.
 
     ``view``: which camera of the simulated rig it is (default: the one with the driver's own name). ``k1``: how its
-    lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole.
+    lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole. ``moved``: how far the
+    camera was moved from its place in the rig, in its own frame. ``workpiece``: one stands beside the body; where, the
+    file ``simulated-workpiece.json`` in the runtime directory tells for every frame (`stereoservo_sim.workpiece`).
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later. ``drop_rate``: chance
     that a frame is lost; ``dropouts``: spans [s, s] after activation without frames; ``freeze_after_s``:
     from then on the picture stands still though frames keep coming. ``seed``: of noise and losses
@@ -36,6 +38,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     view: str = ""
     k1: float = 0.0
+    moved: Moved = Moved()
+    workpiece: bool = False
     rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 30.0
     latency_s: NonNegative = 0.012
     phase_s: NonNegative = 0.0
@@ -59,16 +63,18 @@ class SimulatedCamera:
 
     def __init__(self, options: CameraOptions, context: DriverContext) -> None:
         self.name = context.camera
-        self.cell = simulated_cell(context.mount)
+        self.cell = _cell_of(options, context, self.driver)
         self._options = options
         self._context = context
         view = options.view or context.camera
         try:
-            self.camera = replace(self.cell.rig.camera(view), k1=options.k1)
+            self.camera = self.cell.camera(view, options.k1, options.moved)
         except KeyError as error:
             raise DriverError(
                 "option", f"driver {self.driver!r}: view: {error.args[0]}", view=view
             ) from error
+        except ValueError as error:
+            raise DriverError("option", f"driver {self.driver!r}: moved: {error}") from error
         if not self.camera.sees_whole_image:
             raise DriverError(
                 "option",
@@ -83,13 +89,19 @@ class SimulatedCamera:
         self._next = 0
         self._activated_ns = 0
         self._frozen: FloatArray | None = None
+        self._workpiece = WorkpieceFile(context.runtime_dir)
+        self._workpiece_pose: FloatArray | None = None
         self.blackout = False
 
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
     ) -> Frame | CameraObservation:
-        """What this camera gives for the arm at ``q`` (n,)."""
+        """What this camera gives for the arm at ``q`` (n,) and the workpiece where it stands."""
         raise NotImplementedError
+
+    def workpiece_pose(self) -> FloatArray | None:
+        """Where the workpiece stands in the world, (4, 4); None where the cell has none."""
+        return self._workpiece_pose
 
     def describe_as(
         self, delivers: Literal["frames", "observations"], marker_ids: tuple[int, ...] = ()
@@ -130,6 +142,7 @@ class SimulatedCamera:
         q = self._arm_at(t_shutter_ns, now_ns)
         if q is None:
             return []
+        self._workpiece_pose = self._workpiece_at(t_shutter_ns)
         self._next = k + 1
         rng = np.random.default_rng((self._seed & 0xFFFFFFFF, zlib.crc32(self.name.encode()), k))
         if self._lost(t_shutter_ns, rng):
@@ -163,8 +176,7 @@ class SimulatedCamera:
 
     def _arm_at(self, t_ns: int, now_ns: int) -> FloatArray | None:
         """Joint positions at the shutter, or None while the arm's process has not got there yet."""
-        after = self._options.freeze_after_s
-        if after is not None and self._frozen is not None and (t_ns - self._activated_ns) * 1e-9 >= after:
+        if self._stands_still(t_ns) and self._frozen is not None:
             return self._frozen
         history = self._open_history(now_ns)
         if history is None:
@@ -179,6 +191,20 @@ class SimulatedCamera:
                     q = newest[1]
         self._frozen = q
         return q
+
+    def _stands_still(self, t_ns: int) -> bool:
+        after = self._options.freeze_after_s
+        return after is not None and (t_ns - self._activated_ns) * 1e-9 >= after
+
+    def _workpiece_at(self, t_ns: int) -> FloatArray | None:
+        """Pose of the workpiece for a frame taken now. Raises DriverError."""
+        part = self.cell.workpiece
+        if part is None or (self._stands_still(t_ns) and self._workpiece_pose is not None):
+            return self._workpiece_pose
+        try:
+            return part.pose(self._workpiece.now())
+        except WorkpieceFileError as error:
+            raise DriverError("workpiece", str(error), path=str(self._workpiece.path)) from error
 
     def _open_history(self, now_ns: int) -> JointHistory | None:
         shared = self._context.services.get("world")
@@ -207,3 +233,15 @@ class SimulatedCamera:
                 f"the simulated arm has {history.joints} joints; this camera's cell has {joints}",
             )
         return history
+
+
+def _cell_of(options: CameraOptions, context: DriverContext, driver: str) -> SimulatedCell:
+    if not options.workpiece:
+        return simulated_cell(context.mount)
+    if context.mount != "eye_to_hand":
+        raise DriverError(
+            "option",
+            f"driver {driver!r}: workpiece: one is simulated before standing cameras only (mount 'eye_to_hand')",
+            mount=context.mount,
+        )
+    return workpiece_cell()

@@ -8,7 +8,9 @@ its rim, so that it is also off its centre's image as a real one is; what stands
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ import numpy.typing as npt
 from stereoservo.geometry.distortion import distort
 from stereoservo_sim.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
 from stereoservo_sim.bending import BentImage, bend_outline, unit_circle
+from stereoservo_sim.body import MarkerBody
 from stereoservo_sim.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.rig import PinholeCamera, project
 from stereoservo_sim.robots import shape_segments
@@ -29,6 +32,10 @@ DOT_LEVEL = 225.0
 PLATE_LEVEL = 24.0
 BACK_LEVEL = 70.0
 _NOISE_MARGIN = 64
+Region = tuple[int, int, int, int]
+"""Left, top, right, bottom [px]; right and bottom are the first beyond."""
+Link = tuple[FloatArray, float, float]
+"""A link's outline (k, 2) [px], its grey level, and how near it comes [m]."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +67,14 @@ class Renderer:
         field = np.random.default_rng(20010101).standard_normal(shape) * settings.noise_grey
         self._noise = field.astype(np.float32)
 
-    def render(self, q: FloatArray, rng: np.random.Generator) -> ImageArray:
-        """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise."""
+    def render(
+        self, q: FloatArray, rng: np.random.Generator, workpiece: FloatArray | None = None
+    ) -> ImageArray:
+        """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise.
+
+        ``workpiece`` (4, 4): where it stands in the world; default: where it stood at first. Links that are nearer
+        than the workpiece are drawn over it where they are nearer than the body, too.
+        """
         background, front = self._backdrop.image(q), []
         if self.settings.background == "arm":
             background = background.copy()
@@ -69,15 +82,38 @@ class Renderer:
         elif self.settings.background == "pybullet":
             front = self._draw_arm(background.copy(), q)  # only what stands before the body is drawn again
         image = self._bending.image(background).astype(np.float32)
-        region = draw_body(image, self.cell, self.camera, q)
-        for polygon, level in front:
-            blend_polygon(image, self._bending.outline(polygon), level)
-        if region is not None and self.settings.blur_px > 0:
-            _blur(image, region, self.settings.blur_px)
+        for region in self._draw_markers(image, q, front, workpiece):
+            if self.settings.blur_px > 0:
+                _blur(image, region, self.settings.blur_px)
         return self._expose(image, rng)
 
-    def _draw_arm(self, image: ImageArray, q: FloatArray) -> list[tuple[FloatArray, float]]:
-        """Links behind the body are drawn, those in front of it returned as (outline (k, 2), grey level).
+    def _draw_markers(
+        self,
+        image: npt.NDArray[np.float32],
+        q: FloatArray,
+        front: list[Link],
+        workpiece: FloatArray | None,
+    ) -> list[Region]:
+        """Body, workpiece and the links in ``front`` of the body, far ones first; the regions touched, none twice."""
+        layers: list[Callable[[], Region | None]] = [
+            lambda: draw_body(image, self.cell, self.camera, q),
+            *(partial(self._draw_link, image, outline, level) for outline, level, _ in front),
+        ]
+        part = self.cell.workpiece
+        if part is not None:
+            camera, pose = self.cell.in_world(self.camera, q), part.stand if workpiece is None else workpiece
+            depth = float(project(camera.P, part.marker_positions(pose))[1].min())
+            body_depth = float(project(camera.P, self.cell.marker_positions(q))[1].min())
+            depths = [body_depth, *(nearest + 0.03 for _, _, nearest in front)]
+            place = next((k for k, other in enumerate(depths) if other < depth), len(depths))
+            layers.insert(place, lambda: draw_faces(image, part.body, pose, camera))
+        return _apart([region for draw in layers if (region := draw()) is not None])
+
+    def _draw_link(self, image: npt.NDArray[np.float32], outline: FloatArray, level: float) -> None:
+        blend_polygon(image, self._bending.outline(outline), level)
+
+    def _draw_arm(self, image: ImageArray, q: FloatArray) -> list[Link]:
+        """Links behind the body are drawn, those in front of it returned as (outline (k, 2), grey level, depth).
 
         ``image`` and outlines are those of the pinhole, before the lens bends them.
         """
@@ -91,12 +127,12 @@ class Renderer:
                 continue
             sizes = camera.K[0, 0] * radius / depths
             links.append((float(depths.mean()), float(depths.min()), i, centres, sizes))
-        front = []
+        front: list[Link] = []
         for _, nearest, i, centres, sizes in sorted(links, key=lambda link: -link[0]):
             for scale, level in ((1.0, 96 + 6 * (i % 3)), (0.6, 122 + 6 * (i % 3))):
                 outline = _capsule_outline(centres, sizes * scale)
                 if nearest + 0.03 < body_depth:
-                    front.append((outline, float(level)))
+                    front.append((outline, float(level), nearest))
                 else:
                     fixed = np.round(np.clip(outline, -4000, 4000) * 16).astype(np.int32)
                     cv2.fillConvexPoly(image, fixed, int(level), cv2.LINE_AA, 4)
@@ -123,8 +159,15 @@ def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> B
 
 def draw_body(
     image: npt.NDArray[np.float32], cell: SimulatedCell, camera: PinholeCamera, q: FloatArray
-) -> tuple[int, int, int, int] | None:
-    """Draw the marker body into ``image`` (height, width), [grey levels], without blur and noise.
+) -> Region | None:
+    """Draw the marker body of ``cell`` with the arm at ``q`` (n,), as :func:`draw_faces` does."""
+    return draw_faces(image, cell.body, cell.body_pose(q), cell.in_world(camera, q))
+
+
+def draw_faces(
+    image: npt.NDArray[np.float32], body: MarkerBody, body_pose: FloatArray, camera: PinholeCamera
+) -> Region | None:
+    """Draw a body at ``body_pose`` (4, 4) into ``image`` (height, width), [grey levels], without blur and noise.
 
     Faces turned away show their dull backs and are drawn first: the body is convex, so no face that looks
     at the camera is hidden by another.
@@ -132,11 +175,9 @@ def draw_body(
     Returns:
         The region touched (left, top, right, bottom) [px], or None where nothing was drawn.
     """
-    camera = cell.in_world(camera, q)
-    body = cell.body_pose(q)
     faces = []
-    for face, flange_to_face in zip(cell.body.faces, cell.body.flange_to_face, strict=True):
-        pose = body @ flange_to_face
+    for face, flange_to_face in zip(body.faces, body.flange_to_face, strict=True):
+        pose = body_pose @ flange_to_face
         sight = camera.centre - pose[:3, 3]
         cosine = float(-pose[:3, 2] @ sight / np.linalg.norm(sight))
         faces.append((cosine, face, camera.P @ pose[:, [0, 1, 3]]))
@@ -185,9 +226,7 @@ def circle_image(H: FloatArray, centre: FloatArray, radius: float) -> FloatArray
     return np.asarray(conic / np.abs(conic[0, 0]), dtype=np.float64)
 
 
-def _region(
-    boxes: list[tuple[FloatArray, FloatArray]], camera: PinholeCamera
-) -> tuple[int, int, int, int] | None:
+def _region(boxes: list[tuple[FloatArray, FloatArray]], camera: PinholeCamera) -> Region | None:
     if not boxes:
         return None
     low = np.floor(np.min([box[0] for box in boxes], axis=0)) - 3
@@ -197,7 +236,16 @@ def _region(
     return (left, top, right, bottom) if right > left and bottom > top else None
 
 
-def _blur(image: npt.NDArray[np.float32], region: tuple[int, int, int, int], sigma: float) -> None:
+def _apart(regions: list[Region]) -> list[Region]:
+    """The same regions; where two overlap, the one around both, so that nothing is blurred twice."""
+    if len(regions) == 2:
+        (l0, t0, r0, b0), (l1, t1, r1, b1) = regions
+        if l0 < r1 and l1 < r0 and t0 < b1 and t1 < b0:
+            return [(min(l0, l1), min(t0, t1), max(r0, r1), max(b0, b1))]
+    return regions
+
+
+def _blur(image: npt.NDArray[np.float32], region: Region, sigma: float) -> None:
     left, top, right, bottom = region
     part = image[top:bottom, left:right]
     part[...] = cv2.GaussianBlur(part, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)

@@ -57,6 +57,10 @@ class PinholeCamera:
         """This camera, mounted in a frame of ``pose`` (4, 4) in the world, as it stands in the world."""
         return replace(self, world_to_camera=self.world_to_camera @ inverse_pose(pose))
 
+    def moved_by(self, displacement: FloatArray) -> PinholeCamera:
+        """This camera after ``displacement`` (4, 4), in its own frame."""
+        return replace(self, world_to_camera=inverse_pose(displacement) @ self.world_to_camera)
+
     @property
     def P(self) -> FloatArray:
         """Projection matrix from the world to ideal pixels, (3, 4)."""

@@ -16,6 +16,7 @@ from stereoservo_sim.body import MarkerBody, roof_body
 from stereoservo_sim.rig import PinholeCamera, StereoRig, inverse_pose, look_at, stereo_rig
 from stereoservo_sim.robots import RX90, Robot, flange_pose, shape_segments
 from stereoservo_sim.synthetic import rotation, translation
+from stereoservo_sim.workpiece import Moved, Workpiece, plate_body
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -29,7 +30,8 @@ class SimulatedCell:
     """Arm, body, cameras; ``base`` (n,) [rad] is the configuration around which the cell is laid out.
 
     Eye-to-hand the body is on the flange and the rig stands in the world. Where ``stand`` (4, 4) is given, the body
-    stands there in the world, and the rig, given in the flange's frame, is carried (eye-in-hand).
+    stands there in the world, and the rig, given in the flange's frame, is carried (eye-in-hand). ``workpiece``: what
+    stands beside the body, where there is one.
     """
 
     robot: Robot
@@ -37,10 +39,16 @@ class SimulatedCell:
     rig: StereoRig
     base: FloatArray
     stand: FloatArray | None = None
+    workpiece: Workpiece | None = None
 
     def with_lenses(self, k1: Mapping[str, float]) -> SimulatedCell:
         """The same cell with lenses of ``k1`` by the cameras' names."""
         return replace(self, rig=self.rig.with_lenses(k1))
+
+    def camera(self, view: str, k1: float = 0.0, moved: Moved | None = None) -> PinholeCamera:
+        """The camera ``view`` of the rig with a lens of ``k1``, moved in its own frame. Raises KeyError, ValueError."""
+        camera = replace(self.rig.camera(view), k1=k1)
+        return camera if moved is None else camera.moved_by(moved.matrix)
 
     def flange(self, q: FloatArray) -> FloatArray:
         """Pose of the flange in the world at ``q`` (n,), (4, 4)."""
@@ -90,21 +98,20 @@ class SimulatedCell:
 
         ``pose`` (4, 4) of body and camera in one frame; it may be one that the arm does not take.
         """
-        points = self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
-        normals = self.body.marker_normals @ pose[:3, :3].T
-        radii = np.concatenate([np.full(len(face.ids), face.radius) for face in self.body.faces])
-        pixels, depths = camera.image_of(points)
-        sight = camera.centre - points
-        distances = np.linalg.norm(sight, axis=1)
-        turned = np.sum(sight * normals, axis=1) > np.cos(max_incidence) * distances
-        stretch = 1.0 + 3.0 * max(camera.k1, 0.0) * (distances / np.maximum(depths, 1e-6)) ** 2
-        border = stretch * camera.K[0, 0] * radii / np.maximum(depths, 1e-6) + 2.0
-        inside = (
-            (depths > 0.05)
-            & np.all(pixels >= border[:, None], axis=1)
-            & np.all(pixels <= np.array([camera.width - 1, camera.height - 1]) - border[:, None], axis=1)
-        )
-        return np.asarray(turned & inside, dtype=np.bool_)
+        return turned_to(self.body, pose, camera, max_incidence=max_incidence)
+
+    def workpiece_visible(
+        self, q: FloatArray, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
+    ) -> BoolArray:
+        """Which markers of the workpiece at ``pose`` (4, 4) in the world ``camera`` of the rig sees, (m,): as
+        :meth:`visible`. That the body hides it is not looked for. Raises ValueError where there is no workpiece.
+        """
+        if self.workpiece is None:
+            raise ValueError("this cell has no workpiece")
+        camera = self.in_world(camera, q)
+        points = self.workpiece.marker_positions(pose)
+        seen = turned_to(self.workpiece.body, pose, camera, max_incidence=max_incidence)
+        return seen & ~self._behind_arm(q, points, camera.centre)
 
     def _behind_arm(self, q: FloatArray, points: FloatArray, eye: FloatArray) -> BoolArray:
         ends, radii = shape_segments(self.robot, q)
@@ -113,6 +120,29 @@ class SimulatedCell:
             # Start a little in front of the dot: the mount behind the plate is no obstacle.
             hidden |= _segment_distance(points + 0.02 * (eye - points), eye, start, end) < radius
         return hidden
+
+
+def turned_to(
+    body: MarkerBody, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
+) -> BoolArray:
+    """Which markers of ``body`` at ``pose`` (4, 4) have their whole dot in the image and their face turned to
+    ``camera``, (m,).
+    """
+    points = body.marker_points @ pose[:3, :3].T + pose[:3, 3]
+    normals = body.marker_normals @ pose[:3, :3].T
+    radii = np.concatenate([np.full(len(face.ids), face.radius) for face in body.faces])
+    pixels, depths = camera.image_of(points)
+    sight = camera.centre - points
+    distances = np.linalg.norm(sight, axis=1)
+    turned = np.sum(sight * normals, axis=1) > np.cos(max_incidence) * distances
+    stretch = 1.0 + 3.0 * max(camera.k1, 0.0) * (distances / np.maximum(depths, 1e-6)) ** 2
+    border = stretch * camera.K[0, 0] * radii / np.maximum(depths, 1e-6) + 2.0
+    inside = (
+        (depths > 0.05)
+        & np.all(pixels >= border[:, None], axis=1)
+        & np.all(pixels <= np.array([camera.width - 1, camera.height - 1]) - border[:, None], axis=1)
+    )
+    return np.asarray(turned & inside, dtype=np.bool_)
 
 
 def _segment_distance(starts: FloatArray, eye: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -138,6 +168,18 @@ def demo_cell() -> SimulatedCell:
     eye = target + 1.4 * pose[:3, 2]
     rig = stereo_rig(look_at(eye, target, np.array([0.0, 0.0, 1.0])))
     return SimulatedCell(robot=RX90, body=body, rig=rig, base=base)
+
+
+@lru_cache(maxsize=1)
+def workpiece_cell() -> SimulatedCell:
+    """The same cell with a workpiece that stands nearer to the cameras, at the upper left of both images: on no way
+    between the base and DEMO_GOALS, and at no calibration stop, does it hide the body.
+    """
+    cell = demo_cell()
+    rig_to_workpiece = translation(-0.223, -0.155, 1.0) @ rotation("y", 12.0) @ rotation("z", 7.0)
+    return replace(
+        cell, workpiece=Workpiece(plate_body(), inverse_pose(cell.rig.world_to_rig) @ rig_to_workpiece)
+    )
 
 
 @lru_cache(maxsize=1)

@@ -4,7 +4,7 @@ priors.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Annotated, Any, Literal
@@ -37,12 +37,14 @@ from stereoservo_drivers.detectors.centroids import (
     scratch,
 )
 from stereoservo_drivers.detectors.patterns import basis_inverse, find_face
-from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY
+from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY, FACES, DotFace
 from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, settle_face
 
 QUANTISATION = 1.0 / 12.0
 """Least noise variance [grey levels squared]: rounding to whole levels."""
 SMALLEST_IMAGE = 32
+SAME_SPOT_PX = 2.0
+"""A spot this near to a dot that was tracked is that dot."""
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -64,6 +66,10 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Dots lighter or darker than their plate."""
     faces: tuple[FaceOptions, ...] | None = None
     """Default: the two faces of the default marker body."""
+    beside: tuple[str | FaceOptions, ...] = ()
+    """Faces that stand beside the body, a workpiece's: names of printed ones or faces of one's own. No prior tells
+    where they are, so that every image is searched for them.
+    """
     image_size: tuple[int, int] | None = None
     """(width, height) [px] that frames must have; default: that of the first frame."""
     max_prior_age_s: Positive = 0.25
@@ -108,7 +114,8 @@ class DotDetector:
     """Dots of self-identifying faces with ids, centres and calibrated covariances. One thread at a time.
 
     With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are
-    found, the whole image is searched and every face identified on its own. A face with fewer than four
+    found, the whole image is searched and every face identified on its own. Faces ``beside`` the body, which the prior
+    does not know, are searched for in the whole image. A face with fewer than four
     accepted dots is not reported: fewer cannot be checked. Ids are reported in ascending order. The same
     frame and prior give the same observation.
 
@@ -150,8 +157,8 @@ class DotDetector:
         if prior is not None and self._fresh(frame, prior):
             found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9)
             if found[1].sum() >= self.options.min_dots:
-                return self._observation(frame, found)
-        return self._observation(frame, self._acquire(image))
+                return self._observation(frame, self._with_others(image, found, prior))
+        return self._observation(frame, self._acquire(image, range(len(self._patterns))))
 
     def _fresh(self, frame: Frame, prior: Prior) -> bool:
         age_s = abs(frame.t_shutter_ns - prior.t_ns) * 1e-9
@@ -211,7 +218,18 @@ class DotDetector:
         )  # fmt: skip
         return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
 
-    def _acquire(self, image: ImageArray) -> _Found:
+    def _with_others(self, image: ImageArray, tracked: _Found, prior: Prior) -> _Found:
+        """What was tracked, and the faces beside the body that the prior does not know, wherever they are."""
+        unknown = ~np.isin(self._every_id, prior.ids).any(axis=1)
+        unknown[: len(self._patterns) - len(self.options.beside)] = False
+        if not unknown.any():
+            return tracked
+        dots, used = tracked
+        found, seen = self._acquire(image, np.flatnonzero(unknown).tolist(), dots[used, :2])
+        return np.where(unknown[:, None, None], found, dots), np.where(unknown[:, None], seen, used)
+
+    def _acquire(self, image: ImageArray, faces: Iterable[int], taken: FloatArray | None = None) -> _Found:
+        """The ``faces`` by index, among all spots but those ``taken`` (k, 2) [px]."""
         options = self.options
         spots = find_spots(
             image,
@@ -222,10 +240,13 @@ class DotDetector:
             self._labels,
             self._stack,
         )
+        if taken is not None and len(taken) and len(spots):
+            away = np.hypot(*(spots[:, None, :2] - taken[None]).transpose(2, 0, 1)).min(axis=1)
+            spots = spots[away > SAME_SPOT_PX]
         centres, areas = np.ascontiguousarray(spots[:, :2]), np.ascontiguousarray(spots[:, AREA])
         owners = np.full(self._every_id.shape, -1, np.int64)
-        for pattern, owner in zip(self._patterns, owners, strict=True):
-            count = 0
+        for f in faces:
+            pattern, owner, count = self._patterns[f], owners[f], 0
             for bases in (slice(0, 1), slice(1, None)):
                 # the first basis is the corners, the others stand in where one is hidden
                 if count == 0 and len(spots) >= options.acquire_dots:
@@ -303,19 +324,26 @@ def _without_conflicts(owners: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _patterns(options: DotOptions) -> tuple[_Pattern, ...]:
-    if options.faces is None:
-        return tuple(_pattern(face.name, face.ids, face.positions, face.radius) for face in DEFAULT_BODY)
-    if not options.faces:
+    if options.faces is not None and not options.faces:
         raise DriverError("option", "faces: is empty; give at least one face, or leave it out", faces=[])
+    known = [_printed(face) if isinstance(face, str) else face for face in options.beside]
     patterns = tuple(
         _pattern(face.name, face.ids, np.array(face.positions, dtype=float), face.radius)
-        for face in options.faces
+        for face in (*(DEFAULT_BODY if options.faces is None else options.faces), *known)
     )
     ids = [int(i) for pattern in patterns for i in pattern.ids]
     twice = sorted({i for i in ids if ids.count(i) > 1})
     if twice:
         raise DriverError("option", f"faces: marker ids {twice} are used twice; ids must differ", ids=twice)
     return patterns
+
+
+def _printed(name: str) -> DotFace:
+    if name not in FACES:
+        raise DriverError(
+            "option", f"beside: no face {name!r} is printed; there are {', '.join(FACES)}", face=name
+        )
+    return FACES[name]
 
 
 def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float) -> _Pattern:

@@ -76,6 +76,15 @@ DEFAULT_BODY: tuple[DotFace, ...] = (
 )
 """The faces of the default marker body, ids 0..6 and 7..13."""
 
+WORKPIECE: tuple[DotFace, ...] = (
+    seven_dots("c", 14, 0.44, ((0.46, 0.85), (0.83, 0.49)), side=0.048, radius=0.005, margin=0.012),
+    seven_dots("d", 21, 0.56, ((0.49, 0.34), (0.85, 0.30)), side=0.048, radius=0.005, margin=0.012),
+)
+"""Two smaller faces for what stands beside the body, ids 14..20 and 21..27."""
+
+FACES: dict[str, DotFace] = {face.name: face for face in (*DEFAULT_BODY, *WORKPIECE)}
+"""Every face there is, by name."""
+
 
 def face_of(marker_id: int, faces: tuple[DotFace, ...] = DEFAULT_BODY) -> DotFace:
     """The face that carries ``marker_id``. Raises KeyError."""

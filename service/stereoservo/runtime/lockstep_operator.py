@@ -49,6 +49,7 @@ class LockstepOperator:
         self.taught: dict[str, FeatureTarget] = {}
         self.trials: TrialData | None = None
         self._epoch = 0
+        self._body: tuple[int, ...] | None = None
         self._ids = (uuid.UUID(int=(seed << 32) + k) for k in range(1, 1 << 32))
 
     def _submit(self, command: Command) -> Event:
@@ -91,6 +92,7 @@ class LockstepOperator:
     def _hand_over(self, model: CellModel, end: Event) -> None:
         self.cell.update_model(ModelUpdate(model))
         self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
+        self._body = model.marker_ids
 
     def _visit(self, *, check: bool) -> tuple[TrialData, Event]:
         """Trial motions, or the check's: what was seen, and the event that ended them."""
@@ -117,7 +119,7 @@ class LockstepOperator:
         )
         if event.kind != "taught":
             raise LockstepRefusalError(event)
-        self.taught[name] = feature_target(event, self._epoch)
+        self.taught[name] = feature_target(event, self._epoch, self._body)
         return event
 
     def goal(self, target: Target | str, *, timeout_s: float = 120.0, **options: object) -> Event:

@@ -6,12 +6,14 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from stereoservo.runtime.cellfile import CellFile
 from stereoservo_sim.history import FILE_NAME, JointHistory
-from stereoservo_sim.world import SimulatedCell, simulated_cell
+from stereoservo_sim.workpiece import Moved
+from stereoservo_sim.world import SimulatedCell, simulated_cell, workpiece_cell
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -19,19 +21,21 @@ POLL_S = 1.0
 
 
 def true_cell(cell: CellFile) -> SimulatedCell:
-    """The simulated cell that a cell file's cameras show: their mount and lenses, under the cell's own names.
+    """The simulated cell that a cell file's cameras show: their mount, lenses, workpiece, under its own names.
 
     Raises ValueError where a camera is none of the simulated rig.
     """
-    simulated = simulated_cell(cell.camera[0].mount)
+    shown = any(section.options.get("workpiece", False) for section in cell.camera)
+    simulated = workpiece_cell() if shown else simulated_cell(cell.camera[0].mount)
     cameras = []
     for section in cell.camera:
         view = section.options.get("view") or section.name
         try:
-            camera = simulated.rig.camera(view)
+            moved = msgspec.convert(section.options.get("moved", {}), Moved)
+            camera = simulated.camera(view, float(section.options.get("k1", 0.0)), moved)
         except KeyError as error:
             raise ValueError(f"camera {section.name!r} is not simulated: {error.args[0]}") from error
-        cameras.append(replace(camera, name=section.name, k1=float(section.options.get("k1", 0.0))))
+        cameras.append(replace(camera, name=section.name))
     return replace(simulated, rig=replace(simulated.rig, cameras=tuple(cameras)))
 
 
