@@ -6,7 +6,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from stereoservo.control.cartesian3 import cartesian3_law, cartesian3_reasons
-from stereoservo.control.kernels import cartesian3_step, stereo_step
+from stereoservo.control.cartesian_kernel import cartesian3_step
+from stereoservo.control.stereo_kernel import stereo_step
 from stereoservo.kinematics.kernels import image_jacobian
 from stereoservo.trajectory.three_points import ComponentStatus
 

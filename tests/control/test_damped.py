@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereoservo.control.damped import damped_least_squares_reference, null_direction_reference
-from stereoservo.control.kernels import damped_least_squares, null_direction, right_singular
+from stereoservo.kinematics.linear_kernels import damped_least_squares, null_direction, right_singular
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from stereoservo.control.face_choice_kernel import CLEARLY_BETTER, LASTING, triangle_sight
 from stereoservo.control.faces import NOT_CHOSEN, FaceChoice, choose_face, kept_faces, law_scene, sights_along
-from stereoservo.control.faces_kernel import plane_minors
 from stereoservo.control.law import Options
 from stereoservo.control.laws import LAWS
+from stereoservo.control.primitives_kernel import minors
 
 from .bodies import SIGMA, Body, scene_of, six_faces, task_of, upright
 
@@ -39,7 +39,7 @@ def test_the_choice_is_seen_and_large_and_stays(virtual):
                 other *= LASTING if lasts[triple[0]] else 1.0
                 assert others < cameras or (others == cameras and other <= CLEARLY_BETTER * area)
         # outward: the cameras that see it are before its front
-        plane = plane_minors(*scene.points[choice.triple])
+        plane = minors(*scene.points[choice.triple])
         assert (scene.camera_centres @ plane > 0).all()
         if choice.changed:
             handovers.append(turn)
@@ -76,7 +76,7 @@ def test_three_markers_of_any_faces_where_no_face_is_seen(virtual):
     choice = choose_face(faces, scene._replace(weights=weights), task)
     assert choice.face == -1
     assert set(choice.triple.tolist()) <= {2, 3, 4, 5}
-    assert (scene.camera_centres @ plane_minors(*scene.points[choice.triple]) > 0).all()
+    assert (scene.camera_centres @ minors(*scene.points[choice.triple]) > 0).all()
     back = choose_face(faces, scene, task, choice)
     assert back.face >= 0
     assert back.changed

@@ -12,10 +12,10 @@ from stereoservo.control.faces_kernel import (
     marker_distances,
     marker_information,
     off_plane,
-    plane_minors,
     triangle_altitudes,
     turned_average,
 )
+from stereoservo.control.primitives_kernel import minors
 from stereoservo.geometry.homogeneous import plane_of_points
 
 from .bodies import SIGMA, Body, corner, outward_is_right, six_faces, upright
@@ -176,9 +176,7 @@ def test_kernels_are_the_references(virtual):
             side, way = half @ (points[k] - points[j]), half @ (points[j] - points[i])
             altitudes.append(np.linalg.norm(way - side * (side @ way) / (side @ side)))
         expected_altitude[t] = min(altitudes)
-        np.testing.assert_allclose(
-            plane_minors(*points[triple]), plane_of_points(*points[triple]), atol=1e-12
-        )
+        np.testing.assert_allclose(minors(*points[triple]), plane_of_points(*points[triple]), atol=1e-12)
     scale = np.abs(expected_off).max()
     np.testing.assert_allclose(
         [off_plane(points, covariances, *triple) for triple in triples],

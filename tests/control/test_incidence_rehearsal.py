@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control import incidence_kernel, mobility_kernel
+from stereoservo.control import incidence_images_kernel, incidence_kernel, mobility_kernel
 from stereoservo.control.incidence import image_task, incidence_step, incidence_task, joint_task
 from stereoservo.control.incidence_freedoms import incidence_freedoms
 from stereoservo.control.incidence_rehearsal import rehearse_incidences
@@ -15,7 +15,7 @@ from stereoservo.kinematics import kernels, linear_kernels
 def compiled():
     return {
         f"{module.__name__}.{name}": len(kernel.signatures)
-        for module in (incidence_kernel, mobility_kernel, kernels, linear_kernels)
+        for module in (incidence_images_kernel, incidence_kernel, mobility_kernel, kernels, linear_kernels)
         for name, kernel in vars(module).items()
         if hasattr(kernel, "signatures")
     }

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereoservo.control.law import Task
-from stereoservo.control.linear_kernels import damped_least_squares
 from stereoservo.control.pd import damped_rates, joint_feature_rates, pd_task, tracking_error
 from stereoservo.kinematics.kernels import image_jacobian
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 
 LAG = 0.06
 DT = 0.01

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stereoservo.control.kernels import stereo_step
 from stereoservo.control.stereo import StereoCycle, stereo_law
+from stereoservo.control.stereo_kernel import stereo_step
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.kernels import triangulate
 

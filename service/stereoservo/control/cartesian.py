@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from stereoservo.control.law import IntArray
 from stereoservo.control.reasons import Reason
 from stereoservo.control.sight import APPROACH, Way, way_in_sight
 from stereoservo.control.step_correction import corrected_step
@@ -22,20 +22,20 @@ from stereoservo.geometry.screws import exp_twist
 from stereoservo.kinematics.composition import Composition
 from stereoservo.trajectory.primitives import HINGE, PLANAR, REACH_RATIO, TRANSLATION, arm_freedoms
 from stereoservo.trajectory.three_points import (
-    ComponentStatus,
+    DONE,
+    MOVES,
+    NO_FACE,
+    NOT_REACHABLE,
+    WAITS,
     Decomposition,
     DegenerateFaceError,
     decompose,
 )
 
-IntArray = npt.NDArray[np.int64]
-
 ROTATION = "rotation of the body about its centre"
 STEP_OF_BOUND = 0.9
 """Of the way to a visibility bound, how much one step may make."""
 
-WAITS, NOT_REACHABLE = int(ComponentStatus.WAITS), int(ComponentStatus.NOT_REACHABLE)
-NO_FACE = int(ComponentStatus.NO_FACE)
 BLOCKED = 1e-3
 """Share of what is left below which a component that waits stands."""
 
@@ -89,7 +89,7 @@ def cartesian_law(
             raise DegenerateFaceError("the centre is not known")
         parts = decompose(operators, points, targets, centre, centre_target, np.zeros((0, 4)))
     except DegenerateFaceError:
-        status = np.full(k, int(ComponentStatus.NO_FACE), dtype=np.int64)
+        status = np.full(k, NO_FACE, dtype=np.int64)
         return CartesianStep(np.zeros(n), np.zeros(k), np.zeros(k), status)
     translation, hinge, planar = (_part(parts, name) for name in ("translation", "hinge", "planar"))
     face = plane_of_points(points[0], points[1], points[2])
@@ -97,7 +97,7 @@ def cartesian_law(
     eyes = camera_centres
     if len(eyes):
         eyes = eyes if float(target_face @ eyes.mean(axis=0)) >= 0.0 else -eyes
-    moves = translation.status == ComponentStatus.MOVES
+    moves = translation.status == MOVES
     displacement = centre_target - centre if moves else np.zeros(4)
 
     error = None
@@ -105,7 +105,7 @@ def cartesian_law(
         whole = one_rotation(operators, hinge, planar)
         rotations = [whole]
         way = _way(face, whole, displacement, eyes)
-        if not way.clear and hinge.status == ComponentStatus.MOVES:
+        if not way.clear and hinge.status == MOVES:
             # Neither sense of the one rotation keeps the face in sight: the hinge, which turns its normal straight
             # towards the goal's, goes first.
             other = _way(face, hinge, displacement, eyes)
@@ -116,7 +116,7 @@ def cartesian_law(
         way = _way(face, hinge, displacement, eyes)
     rotations[0] = _turned(rotations[0], way.angle)
     chosen = [translation, *rotations]
-    turns = rotations[0].status == ComponentStatus.MOVES
+    turns = rotations[0].status == MOVES
     amounts = np.array([part.amount for part in chosen])
     status = np.array([part.status for part in chosen], dtype=np.int64)
     allowed = np.where([bool(part.screw.any()) for part in chosen], amounts, 0.0)
@@ -129,15 +129,15 @@ def cartesian_law(
         allowed[1] = min(amounts[1], APPROACH * way.turn)
         if way.turn < amounts[1]:
             limits[1] = STEP_OF_BOUND * way.turn
-    waits = (allowed < amounts) & (status == ComponentStatus.MOVES)
-    status[waits] = int(ComponentStatus.WAITS)
+    waits = (allowed < amounts) & (status == MOVES)
+    status[waits] = WAITS
     rates = np.array([translation_rate] + (k - 1) * [rotation_rate])
     velocity = _velocity(
         operators, composition, np.vstack([points, centre[None]]), chosen, gains, allowed, limits, rates, dt_s
     )
     if error is not None:
         amounts[1] = error
-        status[1] = int(ComponentStatus.WAITS)
+        status[1] = WAITS
     return CartesianStep(velocity, amounts, allowed, status)
 
 
@@ -146,10 +146,10 @@ def one_rotation(operators: FloatArray, hinge: Part, planar: Part) -> Part:
 
     A turn that the arm cannot make is left out of it; the status then says NOT_REACHABLE.
     """
-    status = int(ComponentStatus.MOVES)
+    status = MOVES
     for part in (hinge, planar):
-        if part.status == ComponentStatus.NOT_REACHABLE:
-            status = int(ComponentStatus.NOT_REACHABLE)
+        if part.status == NOT_REACHABLE:
+            status = NOT_REACHABLE
     H_r, H_p = hinge.generator, planar.generator
     s_r, c_r = math.sin(hinge.amount / 2), math.cos(hinge.amount / 2)
     s_p, c_p = math.sin(planar.amount / 2), math.cos(planar.amount / 2)
@@ -161,22 +161,22 @@ def one_rotation(operators: FloatArray, hinge: Part, planar: Part) -> Part:
     if cosine < 0.0:
         V, cosine = -V, -cosine
     if not sine > 0.0:
-        done = int(ComponentStatus.DONE) if status == ComponentStatus.MOVES else status
+        done = DONE if status == MOVES else status
         return Part(np.zeros(len(operators)), np.zeros((4, 4)), 0.0, done)
     V = V / sine
     basis = arm_freedoms(operators).joints  # (8.56) in it
     screw = basis @ (basis.T @ operators.reshape(len(operators), 16) @ V.reshape(16))
     left = np.tensordot(screw, operators, axes=1) - V
     if float((left**2).sum()) > REACH_RATIO**2 * float((V**2).sum()):
-        status = int(ComponentStatus.NOT_REACHABLE)
+        status = NOT_REACHABLE
     return Part(screw, V, 2.0 * math.atan2(sine, cosine), status)
 
 
 def _part(parts: Decomposition, name: str) -> Part:
     component = getattr(parts, name)
     status = component.status
-    if status == ComponentStatus.WAITS:
-        status = ComponentStatus.MOVES
+    if status == WAITS:
+        status = MOVES
     return Part(component.screw, component.operator, component.amount, int(status))
 
 
@@ -223,7 +223,7 @@ def cartesian_reasons(
 ) -> tuple[Reason, ...]:
     """What a step has to tell: components that the arm cannot make, or that wait. Empty when all move."""
     reasons = []
-    codes = status.tolist()  # plain numbers: comparing numpy's with an enumeration costs more than the law
+    codes = status.tolist()
     stuck = all(code == WAITS for code in codes[:2]) and bool((allowed[:2] <= BLOCKED * task_error[:2]).all())
     for i, (component, unit) in enumerate(zip(components, units, strict=True)):
         left, may = float(task_error[i]), float(allowed[i])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.cartesian import COMPONENTS2, UNITS2, IntArray, cartesian_reasons
+from stereoservo.control.cartesian import COMPONENTS2, UNITS2, cartesian_reasons
 from stereoservo.control.cartesian_kernel import cartesian_step
-from stereoservo.control.law import LawStep, Options, Scene, Task
+from stereoservo.control.law import IntArray, LawStep, Options, Scene, Task
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.homogeneous import FloatArray
 

@@ -10,12 +10,11 @@ from stereoservo.control.cartesian import (
     COMPONENTS3,
     UNITS3,
     CartesianStep,
-    IntArray,
     cartesian_law,
     cartesian_reasons,
 )
 from stereoservo.control.cartesian_kernel import cartesian_step
-from stereoservo.control.law import LawStep, Options, Scene, Task
+from stereoservo.control.law import IntArray, LawStep, Options, Scene, Task
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.composition import Composition

@@ -27,11 +27,7 @@ from stereoservo.control.primitives_kernel import (
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
 from stereoservo.trajectory.primitives import DEGENERATE_RATIO
-from stereoservo.trajectory.three_points import COINCIDENT, FLAT_FACE, ComponentStatus
-
-MOVES = int(ComponentStatus.MOVES)
-DONE = int(ComponentStatus.DONE)
-NOT_REACHABLE = int(ComponentStatus.NOT_REACHABLE)
+from stereoservo.trajectory.three_points import COINCIDENT, DONE, FLAT_FACE, MOVES, NOT_REACHABLE
 
 
 @kernel

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereoservo.control.cartesian import STEP_OF_BOUND
-from stereoservo.control.cartesian3_kernel import DONE, MOVES, NOT_REACHABLE, decompose_into, is_flat
+from stereoservo.control.cartesian3_kernel import decompose_into, is_flat
 from stereoservo.control.law import IntArray
 from stereoservo.control.primitives_kernel import dot, freedoms_of, minors, scale_primitive
 from stereoservo.control.sight import APPROACH
@@ -16,10 +16,7 @@ from stereoservo.control.step_correction_kernel import corrected_step, exponenti
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel, multiply4_into
 from stereoservo.trajectory.primitives import REACH_RATIO
-from stereoservo.trajectory.three_points import ComponentStatus
-
-WAITS = int(ComponentStatus.WAITS)
-NO_FACE = int(ComponentStatus.NO_FACE)
+from stereoservo.trajectory.three_points import DONE, MOVES, NO_FACE, NOT_REACHABLE, WAITS
 
 
 @kernel

@@ -1,11 +1,11 @@
-"""Damped least squares and null directions: the readable reference of `control.linear_kernels`."""
+"""Damped least squares and null directions: the readable reference of `kinematics.linear_kernels`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.linear_kernels import PIVOT_TOLERANCE
 from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.kinematics.linear_kernels import PIVOT_TOLERANCE
 
 
 def damped_least_squares_reference(

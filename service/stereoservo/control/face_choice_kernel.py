@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from stereoservo.control.faces_kernel import dot4, plane_minors
 from stereoservo.control.law import IntArray
+from stereoservo.control.primitives_kernel import dot, minors
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
 
@@ -41,10 +41,10 @@ def faces_fronting(
                 continue
             for corner in range(3):
                 for i in range(4):
-                    moved[corner, i] = dot4(displacements[s, i], points[triples[f, corner]])
-            plane = plane_minors(moved[0], moved[1], moved[2])
+                    moved[corner, i] = dot(displacements[s, i], points[triples[f, corner]])
+            plane = minors(moved[0], moved[1], moved[2])
             for c in range(cameras):
-                if not dot4(plane, camera_centres[c]) > 0.0:
+                if not dot(plane, camera_centres[c]) > 0.0:
                     out[s, f, c] = 0.0
     return out
 
@@ -142,9 +142,9 @@ def choose_face_step(
             usable[p] = 1.0
     lasting = np.zeros(faces)
     for f in range(faces):
-        plane = plane_minors(targets[triples[f, 0]], targets[triples[f, 1]], targets[triples[f, 2]])
+        plane = minors(targets[triples[f, 0]], targets[triples[f, 1]], targets[triples[f, 2]])
         for c in range(cameras):
-            if sided[f] > 0.0 and dot4(plane, camera_centres[c]) > 0.0:
+            if sided[f] > 0.0 and dot(plane, camera_centres[c]) > 0.0:
                 lasting[f] = 1.0
     face, triple, count = choose_triangle(members, lasting, usable, pixels, weights, face_now, triple_now)
     kept = np.zeros(cameras)
@@ -153,18 +153,18 @@ def choose_face_step(
     i, j, k = triple
     side = 0.0
     if face >= 0 and sided[face] > 0.0:
-        outward = plane_minors(body[triples[face, 0]], body[triples[face, 1]], body[triples[face, 2]])
-        side = dot4(outward, plane_minors(body[i], body[j], body[k]))
+        outward = minors(body[triples[face, 0]], body[triples[face, 1]], body[triples[face, 2]])
+        side = dot(outward, minors(body[i], body[j], body[k]))
     else:  # the side that most cameras see
-        plane = plane_minors(points[i], points[j], points[k])
+        plane = minors(points[i], points[j], points[k])
         for c in range(cameras):
             if weights[c, i] > 0.0 and weights[c, j] > 0.0 and weights[c, k] > 0.0:
-                side += 1.0 if dot4(plane, camera_centres[c]) > 0.0 else -1.0
+                side += 1.0 if dot(plane, camera_centres[c]) > 0.0 else -1.0
     if side < 0.0:
         triple[1], triple[2] = k, j
-    now = plane_minors(points[triple[0]], points[triple[1]], points[triple[2]])
-    then = plane_minors(targets[triple[0]], targets[triple[1]], targets[triple[2]])
+    now = minors(points[triple[0]], points[triple[1]], points[triple[2]])
+    then = minors(targets[triple[0]], targets[triple[1]], targets[triple[2]])
     for c in range(cameras):
-        if dot4(now, camera_centres[c]) > 0.0 and dot4(then, camera_centres[c]) > 0.0:
+        if dot(now, camera_centres[c]) > 0.0 and dot(then, camera_centres[c]) > 0.0:
             kept[c] = 1.0
     return face, triple, count, kept

@@ -25,12 +25,12 @@ from stereoservo.control.faces_kernel import (
     marker_covariances,
     marker_distances,
     marker_information,
-    plane_minors,
     trial_views,
     triangle_altitudes,
     turned_average,
 )
 from stereoservo.control.law import IntArray, Scene, Task
+from stereoservo.control.primitives_kernel import minors
 from stereoservo.geometry.homogeneous import FloatArray
 
 FLAT_PX = 0.05
@@ -152,7 +152,7 @@ def _side(
     members: IntArray, facts: IntArray, points: FloatArray, centres: FloatArray, seen: FloatArray
 ) -> int:
     """1 where a group's triple is in outward order, -1 where it is not, 0 where nothing tells."""
-    plane = plane_minors(points[facts[0]], points[facts[1]], points[facts[2]])
+    plane = minors(points[facts[0]], points[facts[1]], points[facts[2]])
     votes = 0
     for eye, row in zip(centres, seen, strict=True):
         if ((row > 0.0) & (members > 0)).sum() >= 3:

@@ -7,8 +7,10 @@ import math
 import numpy as np
 
 from stereoservo.control.law import IntArray
+from stereoservo.control.primitives_kernel import dot, minors
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import exp_twist, invert4, kernel, multiply4_into
+from stereoservo.kinematics.kernels import exp_twist, invert4, kernel
+from stereoservo.trajectory.motion_frame import average_over_turns
 
 AVERAGING_ROUNDS = 3
 """How often an arm's turns are averaged over, one joint after another."""
@@ -21,10 +23,13 @@ NEAREST, FARTHEST = 0.5, 2.0
 
 
 @kernel
-def dot4(a: FloatArray, b: FloatArray) -> float:
-    """``aᵀb`` of (4,)."""
-    total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    return total
+def _turns(operator: FloatArray) -> bool:
+    """Whether a joint's operator (4, 4), of eigenvalues ±i or none, is a revolute one's."""
+    trace = 0.0
+    for i in range(4):
+        for k in range(4):
+            trace += operator[i, k] * operator[k, i]
+    return trace < -1.0
 
 
 @kernel
@@ -35,17 +40,10 @@ def trial_views(points: FloatArray, matrices: FloatArray, operators: FloatArray)
     count = 0
     moved = np.empty((3, 4))
     for step in range(2 * n + 1):
-        H = np.zeros((4, 4))
-        if step == 0:
-            for i in range(4):
-                H[i, i] = 1.0
-        else:
+        H = np.eye(4)
+        if step > 0:
             j = (step - 1) // 2
-            trace = 0.0
-            for i in range(4):
-                for k in range(4):
-                    trace += operators[j, i, k] * operators[j, k, i]
-            size = TRIAL_TURN if trace < -1.0 else TRIAL_TURN / 3.0
+            size = TRIAL_TURN if _turns(operators[j]) else TRIAL_TURN / 3.0
             H = exp_twist((size if step % 2 == 1 else -size) * operators[j])
         for c in range(cameras):
             for r in range(3):
@@ -55,7 +53,7 @@ def trial_views(points: FloatArray, matrices: FloatArray, operators: FloatArray)
                         moved[r, k] += matrices[c, r, i] * H[i, k]
             good = True
             for p in range(points.shape[0]):
-                ratio = dot4(moved[2], points[p]) / dot4(matrices[c, 2], points[p])
+                ratio = dot(moved[2], points[p]) / dot(matrices[c, 2], points[p])
                 good = good and NEAREST < ratio < FARTHEST
             if good:
                 for r in range(3):
@@ -124,44 +122,11 @@ def turned_average(information: FloatArray, operators: FloatArray) -> FloatArray
         for i in range(4):
             for k in range(4):
                 mean[i, k] += information[p, i, k] / information.shape[0]
-    square, turn, product = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     for _ in range(AVERAGING_ROUNDS):
         for j in range(operators.shape[0]):
-            multiply4_into(operators[j], operators[j], square)
-            if not -(square[0, 0] + square[1, 1] + square[2, 2] + square[3, 3]) > 1.0:
-                continue  # prismatic: no turn
-            total = np.zeros((4, 4))
-            # a form is of second degree in sine and cosine: five samples average it exactly
-            for sample in range(5):
-                angle = 2.0 * math.pi * sample / 5.0
-                for i in range(4):
-                    for k in range(4):
-                        turn[i, k] = (
-                            math.sin(angle) * operators[j, i, k] + (1.0 - math.cos(angle)) * square[i, k]
-                        )
-                    turn[i, i] += 1.0
-                multiply4_into(mean, turn, product)
-                for i in range(4):
-                    for k in range(4):
-                        for x in range(4):
-                            total[i, k] += 0.2 * turn[x, i] * product[x, k]
-            for i in range(4):
-                for k in range(4):
-                    mean[i, k] = total[i, k]
+            if _turns(operators[j]):
+                average_over_turns(mean, operators[j])
     return mean
-
-
-@kernel
-def plane_minors(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-    """``aᵀX = det[p q r X]`` (4,): the signed minors of `geometry.homogeneous.plane_of_points`."""
-    xy, xz, xw = p[0] * q[1] - p[1] * q[0], p[0] * q[2] - p[2] * q[0], p[0] * q[3] - p[3] * q[0]
-    yz, yw, zw = p[1] * q[2] - p[2] * q[1], p[1] * q[3] - p[3] * q[1], p[2] * q[3] - p[3] * q[2]
-    a = np.empty(4)
-    a[0] = -(r[1] * zw - r[2] * yw + r[3] * yz)
-    a[1] = r[0] * zw - r[2] * xw + r[3] * xz
-    a[2] = -(r[0] * yw - r[1] * xw + r[3] * xy)
-    a[3] = r[0] * yz - r[1] * xz + r[2] * xy
-    return a
 
 
 @kernel
@@ -193,12 +158,12 @@ def off_plane(points: FloatArray, covariances: FloatArray, i: int, j: int, k: in
                 four[1 if left_out > 1 else 2],
                 four[2 if left_out > 2 else 3],
             )
-            plane = plane_minors(points[x], points[y], points[z])
+            plane = minors(points[x], points[y], points[z])
             covariance = covariances[four[left_out]]
             for r in range(4):
                 for c in range(4):
                     variance += plane[r] * covariance[r, c] * plane[c]
-            determinant = dot4(plane, points[four[left_out]])
+            determinant = dot(plane, points[four[left_out]])
         out[other] = determinant / math.sqrt(variance)
     return out
 

@@ -10,9 +10,9 @@ import math
 import numpy as np
 
 from stereoservo.control.law import JacobianChoice
-from stereoservo.control.linear_kernels import cholesky_solve
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
+from stereoservo.kinematics.linear_kernels import add_pixel_equations, damped_solve
 
 DESIRED = int(JacobianChoice.DESIRED)
 MEAN = int(JacobianChoice.MEAN)
@@ -26,6 +26,22 @@ def velocities_into(operators: FloatArray, M: FloatArray, out: FloatArray) -> No
         G = operators[j]
         for i in range(4):
             out[j, i] = G[i, 0] * M[0] + G[i, 1] * M[1] + G[i, 2] * M[2] + G[i, 3] * M[3]
+
+
+@kernel
+def pixel_gradients(matrices: FloatArray, X: FloatArray) -> FloatArray:
+    """``J_G P`` (2c, 4) [px]: gradient of the pixels of ``X`` (4,) in cameras (c, 3, 4) (8.8); NaN in a focal plane."""
+    cameras = matrices.shape[0]
+    A = np.empty((2 * cameras, 4))
+    for c in range(cameras):
+        P = matrices[c]
+        d = P[2, 0] * X[0] + P[2, 1] * X[1] + P[2, 2] * X[2] + P[2, 3] * X[3]
+        scale = 1.0 / d if d != 0.0 else math.nan
+        for r in range(2):
+            pixel = (P[r, 0] * X[0] + P[r, 1] * X[1] + P[r, 2] * X[2] + P[r, 3] * X[3]) * scale
+            for i in range(4):
+                A[2 * c + r, i] = (P[r, i] - pixel * P[2, i]) * scale
+    return A
 
 
 @kernel
@@ -106,21 +122,10 @@ def image_step_into(
                 add_rows(P, moved, now, 1.0, rows)
             else:
                 add_rows(P, points[p], now, 1.0, rows)
-            w2 = w * w
-            eu = gain * (set_points[c, p, 0] - pixels[c, p, 0]) + rates[c, p, 0]
-            ev = gain * (set_points[c, p, 1] - pixels[c, p, 1]) + rates[c, p, 1]
-            for i in range(n):
-                wu = w2 * rows[0, i]
-                wv = w2 * rows[1, i]
-                b[i] += wu * eu + wv * ev
-                for k in range(i + 1):
-                    N[i, k] += wu * rows[0, k] + wv * rows[1, k]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, N[i, i])
-    for i in range(n):
-        N[i, i] += damping * largest
-    return cholesky_solve(N, b, x)
+            u = gain * (set_points[c, p, 0] - pixels[c, p, 0]) + rates[c, p, 0]
+            v = gain * (set_points[c, p, 1] - pixels[c, p, 1]) + rates[c, p, 1]
+            add_pixel_equations(rows, u, v, w * w, N, b)
+    return damped_solve(N, b, damping, x)
 
 
 @kernel

@@ -12,17 +12,15 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.control import incidence_kernel as kernels
-from stereoservo.control.law import LawStep, Options, Scene
-from stereoservo.control.mobility_kernel import limit_pull
+from stereoservo.control.incidence_images_kernel import fixed_dimension, joint_metric, moving_count
+from stereoservo.control.incidence_kernel import incidence_kernel
+from stereoservo.control.law import IntArray, LawStep, Options, Scene
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import image_jacobian
-
-IntArray = npt.NDArray[np.int64]
+from stereoservo.trajectory.rooms import limit_pull
 
 KINDS = (
     "point-on-point",
@@ -118,14 +116,14 @@ def incidence_task(
         if kind not in KINDS:
             raise GeometryError("shape", f"incidence {kind!r} is not known; there are {', '.join(KINDS)}")
         codes[i] = KINDS.index(kind)
-        needed = kernels.moving_count(int(codes[i]))
+        needed = moving_count(int(codes[i]))
         if len(own) != needed or len(set(own)) != needed or min(own, default=-1) < 0:
             raise GeometryError(
                 "shape",
                 f"{kind}: the moving feature has markers {list(own)}; {needed} different ones are needed",
             )
         at[i, :needed] = own
-        dimension = kernels.fixed_dimension(int(codes[i]))
+        dimension = fixed_dimension(int(codes[i]))
         forms[i] = feature_form(points, dimension, plane_at_infinity, kind)
     return IncidenceTask(codes, at, forms, float(tolerance_px))
 
@@ -224,15 +222,15 @@ def incidence_step(
     """``q̇ = -gain J⁺ e`` by damped least squares, with the least motion, and the second task in its null space.
 
     Of the scene: ``operators``, ``composition``, ``matrices`` (two or more), ``points``. ``metric`` (n,) > 0: what a
-    unit of each joint's motion costs; None: the pixels by which it moves the points (`incidence_kernel.joint_metric`).
+    unit of each joint's motion costs; None: the pixels by which it moves the points (`joint_metric`).
     Damping rises where the residual, seen a step ``gain * dt_s`` ahead (at least a tenth), would not fall as the linear
     model says.
     """
     n = scene.operators.shape[0]
     if metric is None:
-        metric = kernels.joint_metric(scene.operators, scene.matrices, scene.points)
+        metric = joint_metric(scene.operators, scene.matrices, scene.points)
     rest = no_second_task(n) if second is None else second
-    velocity, error, status, rank, conditioning, share = kernels.incidence_kernel(
+    velocity, error, status, rank, conditioning, share = incidence_kernel(
         scene.operators,
         int(scene.composition),
         scene.matrices,

@@ -8,7 +8,7 @@ import numpy as np
 
 from stereoservo.control.body_frame import body_frame
 from stereoservo.control.incidence import IncidenceTask, incidence_step
-from stereoservo.control.incidence_kernel import METRIC_FLOOR
+from stereoservo.control.incidence_images_kernel import METRIC_FLOOR
 from stereoservo.control.law import Options, Scene
 from stereoservo.control.mobility import REACH, Freedom, attainable_motions, missing_freedom, rigid_motions
 from stereoservo.control.mobility_kernel import point_jacobian

@@ -9,6 +9,7 @@ import numpy as np
 from stereoservo.control import incidence_kernel as kernels
 from stereoservo.control.damped import damped_least_squares_reference
 from stereoservo.control.incidence import IncidenceStatus, IncidenceStep, IncidenceTask, SecondTask
+from stereoservo.control.incidence_images_kernel import METRIC_FLOOR, fixed_dimension, moving_count
 from stereoservo.control.law import Options, Scene
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.composition import Composition, displacement
@@ -22,7 +23,7 @@ def joint_metric_reference(operators: FloatArray, matrices: FloatArray, points: 
     """
     J = image_jacobian(operators, matrices, points)
     metric = np.sqrt((J**2).sum(axis=(0, 1, 2)) / (J.shape[0] * J.shape[1]))
-    floored = np.maximum(metric, kernels.METRIC_FLOOR * metric.max())
+    floored = np.maximum(metric, METRIC_FLOOR * metric.max())
     return np.where(floored > 0.0, floored, 1.0)
 
 
@@ -56,7 +57,7 @@ class _Residual:
         return cls(marker, owner, base, directions, A, np.eye(len(A)) - T @ np.linalg.pinv(T))
 
     def distance(self, matrices: FloatArray, X: FloatArray) -> float:
-        """Largest pixel distance to the nearest point of the feature, as `incidence_kernel.image_distance` says."""
+        """Largest pixel distance to the nearest point of the feature, as `image_distance` says."""
         first = self.gradient @ (X - self.base)
         along = np.linalg.pinv(self.gradient @ self.directions.T) @ first
         Y = self.base + along @ self.directions
@@ -72,11 +73,9 @@ def incidence_reference(
 ) -> IncidenceStep:
     """`incidence_step` in numpy, but for a task at rest far from its goal: no way out, nobody to blame."""
     residuals = [
-        _Residual.of(
-            scene.matrices, scene.points[i], form[0], form[1 : 1 + kernels.fixed_dimension(kind)], i, k
-        )
+        _Residual.of(scene.matrices, scene.points[i], form[0], form[1 : 1 + fixed_dimension(kind)], i, k)
         for k, (kind, own, form) in enumerate(zip(task.kinds.tolist(), task.markers, task.fixed, strict=True))
-        for i in own[: kernels.moving_count(kind)].tolist()
+        for i in own[: moving_count(kind)].tolist()
     ]
     e = np.concatenate([r.normal @ (r.gradient @ (scene.points[r.marker] - r.base)) for r in residuals])
     J = np.concatenate(

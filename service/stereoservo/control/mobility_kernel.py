@@ -15,6 +15,7 @@ import numpy.typing as npt
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
 from stereoservo.kinematics.linear_kernels import right_singular
+from stereoservo.trajectory.rooms import limit_pull
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -221,24 +222,6 @@ def missing_share(rows: FloatArray, motion: FloatArray) -> float:
     for r in range(count):
         left += rest[r] * rest[r]
     return math.sqrt(min(1.0, left / total))
-
-
-@kernel
-def limit_pull(positions: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pull (n,) in [-1, 1] to the middle of each joint's range, the cube of the way from it, and half ranges (n,).
-
-    No pull and a half range of 1 where ``lower`` and ``upper`` (n,) are infinite, or leave no range.
-    """
-    n = positions.shape[0]
-    half = np.ones(n)
-    pull = np.zeros(n)
-    for j in range(n):
-        width = upper[j] - lower[j]
-        if width > 0.0 and math.isfinite(width):
-            half[j] = 0.5 * width
-            x = max(-1.0, min(1.0, (positions[j] - lower[j]) / half[j] - 1.0))
-            pull[j] = -x * x * x
-    return pull, half
 
 
 @kernel

@@ -6,30 +6,18 @@ import math
 
 import numpy as np
 
-from stereoservo.control.law import JacobianChoice
-from stereoservo.control.linear_kernels import cholesky_solve
+from stereoservo.control.image_kernel import DESIRED, MEAN, pixel_gradients, velocities_into
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
-
-DESIRED = int(JacobianChoice.DESIRED)
-MEAN = int(JacobianChoice.MEAN)
+from stereoservo.kinematics.linear_kernels import add_equation, damped_solve
 
 
 @kernel
 def pixel_metrics(matrices: FloatArray, points: FloatArray) -> FloatArray:
     """``J_G P`` of all cameras (m, 2c, 4): what a displacement of a point (m, 4) is worth in pixels; NaN at depth 0."""
-    cameras, markers = matrices.shape[0], points.shape[0]
-    out = np.empty((markers, 2 * cameras, 4))
-    for p in range(markers):
-        M = points[p]
-        for c in range(cameras):
-            P = matrices[c]
-            d = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
-            scale = 1.0 / d if d != 0.0 else math.nan
-            for r in range(2):
-                pixel = (P[r, 0] * M[0] + P[r, 1] * M[1] + P[r, 2] * M[2] + P[r, 3] * M[3]) * scale
-                for i in range(4):
-                    out[p, 2 * c + r, i] = (P[r, i] - pixel * P[2, i]) * scale
+    out = np.empty((points.shape[0], 2 * matrices.shape[0], 4))
+    for p in range(points.shape[0]):
+        out[p] = pixel_gradients(matrices, points[p])
     return out
 
 
@@ -63,14 +51,7 @@ def points_step(
                 around[i] = target_points[p, i]
             else:
                 around[i] = points[p, i]
-        for j in range(n):
-            for i in range(4):
-                velocity[j, i] = (
-                    operators[j, i, 0] * around[0]
-                    + operators[j, i, 1] * around[1]
-                    + operators[j, i, 2] * around[2]
-                    + operators[j, i, 3] * around[3]
-                )
+        velocities_into(operators, around, velocity)
         for r in range(rows):
             g = metrics[p, r]
             error = 0.0
@@ -83,17 +64,8 @@ def points_step(
                     + g[2] * velocity[j, 2]
                     + g[3] * velocity[j, 3]
                 )
-            for j in range(n):
-                wj = w * w * row[j]
-                b[j] += wj * error
-                for k in range(j + 1):
-                    N[j, k] += wj * row[k]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, N[i, i])
-    for i in range(n):
-        N[i, i] += damping * largest
-    conditioning = cholesky_solve(N, b, x)
+            add_equation(row, error, w * w, N, b)
+    conditioning = damped_solve(N, b, damping, x)
     if choice == MEAN:
         # The mean finds a turn by θ as 2 tan(θ/2): back to the angle.
         square = 0.0

@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
-from stereoservo.control.linear_kernels import null_direction, right_singular
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
+from stereoservo.kinematics.linear_kernels import null_direction, right_singular
 from stereoservo.trajectory.primitives import (
     DEGENERATE_RATIO,
     NOISE_RATIO,

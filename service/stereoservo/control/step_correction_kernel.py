@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from stereoservo.control.linear_kernels import cholesky_solve
 from stereoservo.control.step_correction import BRACKETS, CONVERGED, DAMPING, ITERATIONS, SLACK
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import exp_twist, kernel, multiply4_into
+from stereoservo.kinematics.kernels import exp_twist, kernel, multiply4_into, transform_points_into
+from stereoservo.kinematics.linear_kernels import add_equation, damped_solve
 
 STRUCTURE = 1e-18
 """Squared relative residue of ``Ĥ³ = −cĤ`` below which the closed form of the exponential holds."""
@@ -122,19 +122,16 @@ def corrected_step(
     N = np.empty((n, n))
     b = np.empty(n)
     change = np.empty(n)
-    column = np.empty((n, 4))
+    rows = np.empty((4, n))
     moved = np.empty((count, 4))
     before = math.inf
     for _ in range(ITERATIONS):
         step_into(operators, composition, found, H, turned, work)
+        transform_points_into(H, points, moved)
         error = 0.0
         for p in range(count):
             for i in range(4):
-                s = 0.0
-                for k in range(4):
-                    s += H[i, k] * points[p, k]
-                moved[p, i] = s
-                error += (wanted[p, i] - s) ** 2
+                error += (wanted[p, i] - moved[p, i]) ** 2
         if not error <= SLACK * before:
             break
         before = error
@@ -149,19 +146,10 @@ def corrected_step(
                     s = 0.0
                     for k in range(4):
                         s += turned[j, i, k] * moved[p, k]
-                    column[j, i] = s
-            for j in range(n):
-                for i in range(4):
-                    b[j] += column[j, i] * (wanted[p, i] - moved[p, i])
-                for k in range(j + 1):
-                    for i in range(4):
-                        N[j, k] += column[j, i] * column[k, i]
-        largest = 0.0
-        for j in range(n):
-            largest = max(largest, N[j, j])
-        for j in range(n):
-            N[j, j] += DAMPING * largest
-        cholesky_solve(N, b, change)
+                    rows[i, j] = s
+            for i in range(4):
+                add_equation(rows[i], wanted[p, i] - moved[p, i], 1.0, N, b)
+        damped_solve(N, b, DAMPING, change)
         most = 0.0
         for j in range(n):
             found[j] += change[j]

@@ -1,6 +1,6 @@
 """Image-based stereo servoing: stacked (thesis 8.36) and block by block (8.37).
 
-``stereo_law`` is the readable reference of the bare step, `control.kernels.stereo_step`; the law runs
+``stereo_law`` is the readable reference of the bare step, `control.stereo_kernel.stereo_step`; the law runs
 `control.image_kernel.image_step`. `StereoCycle` makes a whole step from joints and pixels in one kernel call.
 """
 

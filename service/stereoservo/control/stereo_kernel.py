@@ -1,7 +1,7 @@
-"""One stereo control step in one call: kinematics, points, Jacobian, damped solve; what `stereo_cycle` runs.
+"""The stereo law's step in numba: bare, from a Jacobian, and a whole one in one call, from joints to velocities.
 
-The arithmetic is that of `chain_forward`, `triangulate` and `image_step`, but no operator is ever formed: a joint's
-velocity of a point is ``H̄_{j−1} Ĥ_j (exp_j … exp_n M₀)``, vectors instead of matrices.
+In `stereo_cycle` the arithmetic is that of `chain_forward`, `triangulate` and `image_step`, but no operator is ever
+formed: a joint's velocity of a point is ``H̄_{j−1} Ĥ_j (exp_j … exp_n M₀)``, vectors instead of matrices.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from stereoservo.control.linear_kernels import cholesky_solve
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import KindArray, invert4, kernel, triangulate_into
+from stereoservo.kinematics.kernels import KindArray, invert4, kernel, transform_points_into, triangulate_into
+from stereoservo.kinematics.linear_kernels import add_pixel_equations, damped_solve
 
 
 @kernel
@@ -107,13 +107,6 @@ def _add_point(
 
 
 @kernel
-def _apply_into(H: FloatArray, M: FloatArray, out: FloatArray) -> None:
-    for p in range(M.shape[0]):
-        for i in range(4):
-            out[p, i] = H[i, 0] * M[p, 0] + H[i, 1] * M[p, 1] + H[i, 2] * M[p, 2] + H[i, 3] * M[p, 3]
-
-
-@kernel
 def stereo_cycle(
     chain: FloatArray,
     kinds: KindArray,
@@ -137,7 +130,7 @@ def stereo_cycle(
     E, B = np.empty((n, 4, 4)), np.empty((n + 1, 4, 4))
     _factors_into(chain, kinds, zero, q, tip_first, E, B)
     M, M0 = np.empty((markers, 4)), marker_points
-    _apply_into(B[n], marker_points, M)
+    transform_points_into(B[n], marker_points, M)
     back = B[n]
     if triangulations >= 0 or mean:
         back = invert4(B[n])
@@ -149,11 +142,11 @@ def stereo_cycle(
             if ok[p]:
                 for i in range(4):
                     M[p, i] = found[p, i]
-        _apply_into(back, M, M0)
+        transform_points_into(back, M, M0)
     T0 = M0
     if mean:
         T0 = np.empty((markers, 4))
-        _apply_into(back, target_points, T0)
+        transform_points_into(back, target_points, T0)
     N, b = np.zeros((n, n)), np.zeros(n)
     rows, g = np.empty((cameras, 2, n)), np.empty((cameras, 2, 4))
     for p in range(markers):
@@ -172,21 +165,40 @@ def stereo_cycle(
             w = weights[c, p]
             if not w > 0.0:
                 continue
-            w2 = w * w
-            eu = w2 * (set_points[c, p, 0] - pixels[c, p, 0])
-            ev = w2 * (set_points[c, p, 1] - pixels[c, p, 1])
-            for i in range(n):
-                wu = w2 * rows[c, 0, i]
-                wv = w2 * rows[c, 1, i]
-                b[i] += rows[c, 0, i] * eu + rows[c, 1, i] * ev
-                for k in range(i + 1):
-                    N[i, k] += wu * rows[c, 0, k] + wv * rows[c, 1, k]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, N[i, i])
-    for i in range(n):
-        N[i, i] += damping * largest
-    conditioning = cholesky_solve(N, b, velocity)
+            u = set_points[c, p, 0] - pixels[c, p, 0]
+            v = set_points[c, p, 1] - pixels[c, p, 1]
+            add_pixel_equations(rows[c], u, v, w * w, N, b)
+    conditioning = damped_solve(N, b, damping, velocity)
     for i in range(n):
         velocity[i] *= gain
     return conditioning
+
+
+@kernel
+def stereo_step(
+    jacobian: FloatArray,
+    pixels: FloatArray,
+    set_points: FloatArray,
+    weights: FloatArray,
+    gain: float,
+    damping: float,
+) -> tuple[FloatArray, float, float]:
+    """`stereo.stereo_law` as a kernel: joint velocity (n,), largest pixel error [px], conditioning."""
+    cameras, points, _, n = jacobian.shape
+    N = np.zeros((n, n))
+    b = np.zeros(n)
+    x = np.zeros(n)
+    worst = 0.0
+    for c in range(cameras):
+        for p in range(points):
+            w = weights[c, p]
+            if w == 0.0:
+                continue
+            du = pixels[c, p, 0] - set_points[c, p, 0]
+            dv = pixels[c, p, 1] - set_points[c, p, 1]
+            worst = max(worst, math.sqrt(du * du + dv * dv))
+            add_pixel_equations(jacobian[c, p], du, dv, w * w, N, b)
+    conditioning = damped_solve(N, b, damping, x)
+    for i in range(n):
+        x[i] *= -gain
+    return x, worst, conditioning

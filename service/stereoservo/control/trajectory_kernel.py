@@ -7,22 +7,11 @@ import math
 import numpy as np
 
 from stereoservo.control.image_kernel import add_rows, image_step_into, velocities_into
-from stereoservo.control.linear_kernels import cholesky_solve
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK
 from stereoservo.control.step_correction_kernel import step_into
 from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import kernel
-
-
-@kernel
-def _project_into(matrices: FloatArray, M: FloatArray, pixels: FloatArray) -> None:
-    for c in range(matrices.shape[0]):
-        P = matrices[c]
-        for p in range(M.shape[0]):
-            d = P[2, 0] * M[p, 0] + P[2, 1] * M[p, 1] + P[2, 2] * M[p, 2] + P[2, 3] * M[p, 3]
-            for r in range(2):
-                x = P[r, 0] * M[p, 0] + P[r, 1] * M[p, 1] + P[r, 2] * M[p, 2] + P[r, 3] * M[p, 3]
-                pixels[c, p, r] = x / d if d != 0.0 else math.nan
+from stereoservo.kinematics.kernels import kernel, project_points, transform_points_into
+from stereoservo.kinematics.linear_kernels import add_pixel_equations, damped_solve
 
 
 @kernel
@@ -52,8 +41,7 @@ def trajectory_step(
     )  # fmt: skip
     if not dt_s > 0.0 or conditioning == 0.0:
         return x, conditioning
-    goal, seen = np.empty((cameras, markers, 2)), np.empty((cameras, markers, 2))
-    _project_into(matrices, points, goal)
+    goal, _ = project_points(matrices, points)
     for c in range(cameras):
         for p in range(markers):
             if weights[c, p] * wanted[c, p] > 0.0:
@@ -69,15 +57,8 @@ def trajectory_step(
     before = math.inf
     for _ in range(ITERATIONS):
         step_into(operators, composition, found, H, turned, work)
-        for p in range(markers):
-            for i in range(4):
-                moved[p, i] = (
-                    H[i, 0] * points[p, 0]
-                    + H[i, 1] * points[p, 1]
-                    + H[i, 2] * points[p, 2]
-                    + H[i, 3] * points[p, 3]
-                )
-        _project_into(matrices, moved, seen)
+        transform_points_into(H, points, moved)
+        seen, _ = project_points(matrices, moved)
         error = 0.0
         for c in range(cameras):
             for p in range(markers):
@@ -103,18 +84,9 @@ def trajectory_step(
                     rows[0, j] = 0.0
                     rows[1, j] = 0.0
                 add_rows(matrices[c], moved[p], velocity, 1.0, rows)
-                w2 = w * w
-                for i in range(n):
-                    wu, wv = w2 * rows[0, i], w2 * rows[1, i]
-                    b[i] += wu * (goal[c, p, 0] - seen[c, p, 0]) + wv * (goal[c, p, 1] - seen[c, p, 1])
-                    for k in range(i + 1):
-                        N[i, k] += wu * rows[0, k] + wv * rows[1, k]
-        largest = 0.0
-        for j in range(n):
-            largest = max(largest, N[j, j])
-        for j in range(n):
-            N[j, j] += damping * largest
-        cholesky_solve(N, b, change)
+                u, v = goal[c, p, 0] - seen[c, p, 0], goal[c, p, 1] - seen[c, p, 1]
+                add_pixel_equations(rows, u, v, w * w, N, b)
+        damped_solve(N, b, damping, change)
         most = 0.0
         for j in range(n):
             found[j] += change[j]

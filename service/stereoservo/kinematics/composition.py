@@ -54,6 +54,15 @@ def _order(composition: Composition, n: int) -> range:
 
 
 @kernel
+def _follow_joint(H: FloatArray, operator: FloatArray, step: float, product: FloatArray) -> None:
+    """``H exp(step Ĥ)`` in place of ``H`` (4, 4); ``product`` (4, 4): scratch."""
+    multiply4_into(H, exp_twist(step * operator), product)
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = product[i, k]
+
+
+@kernel
 def displace(operators: FloatArray, composition: int, step: FloatArray) -> FloatArray:
     """`displacement` as a kernel."""
     n = step.shape[0]
@@ -64,16 +73,10 @@ def displace(operators: FloatArray, composition: int, step: FloatArray) -> Float
                 for k in range(4):
                     total[i, k] += step[j] * operators[j, i, k]
         return exp_twist(total)
-    H = np.zeros((4, 4))
-    for i in range(4):
-        H[i, i] = 1.0
-    product = np.empty((4, 4))
+    H, product = np.eye(4), np.empty((4, 4))
     for nth in range(n):
         j = n - 1 - nth if composition == 1 else nth
-        multiply4_into(H, exp_twist(step[j] * operators[j]), product)
-        for i in range(4):
-            for k in range(4):
-                H[i, k] = product[i, k]
+        _follow_joint(H, operators[j], step[j], product)
     return H
 
 
@@ -84,16 +87,10 @@ def move_operators(operators: FloatArray, composition: int, step: FloatArray) ->
     moved = operators.copy()
     if composition == 2:
         return moved
-    H = np.zeros((4, 4))
-    for i in range(4):
-        H[i, i] = 1.0
-    product = np.empty((4, 4))
+    H, product = np.eye(4), np.empty((4, 4))
     for nth in range(n):
         j = n - 1 - nth if composition == 1 else nth
         multiply4_into(H, operators[j], product)
         multiply4_into(product, invert4(H), moved[j])
-        multiply4_into(H, exp_twist(step[j] * operators[j]), product)
-        for i in range(4):
-            for k in range(4):
-                H[i, k] = product[i, k]
+        _follow_joint(H, operators[j], step[j], product)
     return moved

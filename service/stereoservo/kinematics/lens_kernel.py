@@ -22,7 +22,7 @@ CONVERGED = 1e-14
 
 @kernel
 def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. A lens of ``k = 0`` leaves it as it is, to the bit."""
+    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. ``k = 0`` leaves it as it is, to the bit."""
     k, r0 = lens[0], lens[3]
     if k == 0.0:
         return u, v

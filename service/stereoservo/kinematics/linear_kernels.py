@@ -1,4 +1,4 @@
-"""Small linear algebra in numba: the same as `control.damped`, without BLAS, LAPACK or fastmath.
+"""Small linear algebra in numba: without BLAS, LAPACK or fastmath. Its readable reference is `control.damped`.
 
 Explicit loops in a fixed order: the same input gives the same bits on one machine. Arrays are float64.
 """
@@ -72,6 +72,42 @@ def cholesky_solve(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
 
 
 @kernel
+def add_equation(row: FloatArray, error: float, weight: float, N: FloatArray, b: FloatArray) -> None:
+    """One equation ``row·x = error`` of squared weight ``weight`` into the normal equations ``N x = b``.
+
+    ``row`` (n,); of ``N`` (n, n) the lower triangle is added to.
+    """
+    for i in range(b.shape[0]):
+        weighted = weight * row[i]
+        b[i] += weighted * error
+        for k in range(i + 1):
+            N[i, k] += weighted * row[k]
+
+
+@kernel
+def add_pixel_equations(
+    rows: FloatArray, u: float, v: float, weight: float, N: FloatArray, b: FloatArray
+) -> None:
+    """`add_equation` for the two ``rows`` (2, n) of a pixel and its errors ``u``, ``v``."""
+    for i in range(b.shape[0]):
+        weighted_u, weighted_v = weight * rows[0, i], weight * rows[1, i]
+        b[i] += weighted_u * u + weighted_v * v
+        for k in range(i + 1):
+            N[i, k] += weighted_u * rows[0, k] + weighted_v * rows[1, k]
+
+
+@kernel
+def damped_solve(N: FloatArray, b: FloatArray, damping: float, x: FloatArray) -> float:
+    """`cholesky_solve` with ``damping`` times the largest diagonal of ``N`` (n, n) added to its diagonal."""
+    largest = 0.0
+    for i in range(b.shape[0]):
+        largest = max(largest, N[i, i])
+    for i in range(b.shape[0]):
+        N[i, i] += damping * largest
+    return cholesky_solve(N, b, x)
+
+
+@kernel
 def damped_least_squares(
     J: FloatArray, e: FloatArray, weights: FloatArray, damping: float
 ) -> tuple[FloatArray, float]:
@@ -89,18 +125,8 @@ def damped_least_squares(
         w = weights[r]
         if w == 0.0:
             continue
-        w2 = w * w
-        for i in range(n):
-            wj = w2 * J[r, i]
-            b[i] += wj * e[r]
-            for k in range(i + 1):
-                N[i, k] += wj * J[r, k]
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, N[i, i])
-    for i in range(n):
-        N[i, i] += damping * largest
-    conditioning = cholesky_solve(N, b, x)
+        add_equation(J[r], e[r], w * w, N, b)
+    conditioning = damped_solve(N, b, damping, x)
     return x, conditioning
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from stereoservo.control.kernels import damped_least_squares
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import (
     chain_forward,
@@ -27,6 +26,7 @@ from stereoservo.kinematics.kernels import (
     triangulate,
 )
 from stereoservo.kinematics.lens_kernel import distort_expected, undistort_sights
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
 from stereoservo.runtime.settings import CoreSettings

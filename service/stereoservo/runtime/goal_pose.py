@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoservo.control.kernels import cartesian3_step, damped_least_squares
+from stereoservo.control.cartesian_kernel import cartesian3_step
 from stereoservo.kinematics.kernels import (
     BoolArray,
     exp_twist,
@@ -21,6 +21,7 @@ from stereoservo.kinematics.kernels import (
     project_points,
     transform_points,
 )
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo.runtime.estimate import ModelArrays
 from stereoservo.runtime.ports import FloatArray, IntArray
 

@@ -10,9 +10,9 @@ from math import log
 import numpy as np
 
 from stereoservo.control.gains import GainCurve, gain_at
-from stereoservo.control.kernels import damped_least_squares
 from stereoservo.control.laws import ILL_CONDITIONED
 from stereoservo.control.reasons import Reason
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo.runtime.motion import BRAKE_SHARE, Present
 from stereoservo.runtime.state import JointMove, LawRun, PlanJob, Servoing, Source
 

@@ -17,8 +17,8 @@ from stereoservo.control.filters import (
     observe,
     predict,
 )
-from stereoservo.control.kernels import damped_least_squares
 from stereoservo.kinematics.kernels import project_points, transform_points
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo.runtime.commands import FeatureTarget, PointTarget, UpdateGoal
 from stereoservo.runtime.estimate import ModelArrays
 from stereoservo.runtime.goal_pose import refined_pose

@@ -13,8 +13,8 @@ import numpy as np
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.composition import displace, move_operators
 from stereoservo.kinematics.kernels import kernel, multiply4_into
-from stereoservo.kinematics.linear_kernels import cholesky_solve, right_singular
-from stereoservo.trajectory.rooms import Surroundings, check_joints, check_view, moved
+from stereoservo.kinematics.linear_kernels import add_equation, damped_solve, right_singular
+from stereoservo.trajectory.rooms import Surroundings, check_joints, check_view, limit_pull, moved
 from stereoservo.trajectory.ways import pose_on_way
 
 ARRIVED = 1e-7
@@ -62,7 +62,6 @@ def _normal_equations(
     """Of least ``Σ|Ĥ_j x Δq_j − (x* − x)|²``; the largest ``|x* − x|``."""
     n, m = operators.shape[0], points.shape[0]
     J = np.empty((3, n))
-    e = np.empty(3)
     worst = 0.0
     for i in range(n):
         b[i] = 0.0
@@ -71,34 +70,18 @@ def _normal_equations(
     for p in range(m):
         length = 0.0
         for i in range(3):
-            e[i] = wanted[p, i] - points[p, i]
-            length += e[i] * e[i]
+            length += (wanted[p, i] - points[p, i]) ** 2
         worst = max(worst, length)
         for j in range(n):
             G = operators[j]
             for i in range(3):
                 J[i, j] = G[i, 0] * points[p, 0] + G[i, 1] * points[p, 1] + G[i, 2] * points[p, 2] + G[i, 3]
-        for i in range(n):
-            for r in range(3):
-                b[i] += J[r, i] * e[r]
-            for k in range(i + 1):
-                N[i, k] += J[0, i] * J[0, k] + J[1, i] * J[1, k] + J[2, i] * J[2, k]
+        for i in range(3):
+            add_equation(J[i], wanted[p, i] - points[p, i], 1.0, N, b)
     for i in range(n):
         for k in range(i):
             N[k, i] = N[i, k]
     return math.sqrt(worst)
-
-
-@kernel
-def _away_from_limits(joints: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """A joint step (n,) towards the middle of the ranges, the stronger the nearer the limit."""
-    z = np.zeros(joints.shape[0])
-    for j in range(joints.shape[0]):
-        if math.isfinite(lower[j]) and math.isfinite(upper[j]) and upper[j] > lower[j]:
-            middle, half = 0.5 * (lower[j] + upper[j]), 0.5 * (upper[j] - lower[j])
-            aside = min(1.0, max(-1.0, (joints[j] - middle) / half))
-            z[j] = -SELF_MOTION * half * aside * aside * aside
-    return z
 
 
 @kernel
@@ -141,7 +124,6 @@ def reach(
     N = np.empty((n, n))
     b = np.empty(n)
     x = np.empty(n)
-    undamped = np.empty((n, n))
     rest = np.zeros(n)
     worst = 0.0
     for iteration in range(iterations):
@@ -151,17 +133,13 @@ def reach(
             break
         z = np.zeros(n)
         if redundant and iteration == 0:
-            z = _away_from_limits(joints, lower, upper)
+            pull, half = limit_pull(joints, lower, upper)
+            for i in range(n):
+                z[i] = SELF_MOTION * half[i] * pull[i]
             for i in range(n):
                 for k in range(n):
-                    undamped[i, k] = N[i, k]
                     b[i] -= N[i, k] * z[k]
-        largest = 0.0
-        for i in range(n):
-            largest = max(largest, N[i, i])
-        for i in range(n):
-            N[i, i] += DAMPING * largest
-        cholesky_solve(N, b, x)
+        damped_solve(N, b, DAMPING, x)
         size = 0.0
         for i in range(n):
             x[i] += z[i]
@@ -260,6 +238,29 @@ def _astray_between(
 
 
 @kernel
+def _keep_sample(
+    k: int,
+    share: float,
+    surroundings: Surroundings,
+    joints: FloatArray,
+    displacement: FloatArray,
+    all_joints: FloatArray,
+    all_displacements: FloatArray,
+    table: FloatArray,
+) -> int:
+    """Sample ``k`` of the arm, kept and looked at: kind of limit broken or −1."""
+    for j in range(joints.shape[0]):
+        all_joints[k, j] = joints[j]
+    for i in range(4):
+        for r in range(4):
+            all_displacements[k, i, r] = displacement[i, r]
+    broken = check_joints(joints, share, surroundings, table)
+    if broken < 0:
+        broken = check_view(moved(displacement, surroundings.body), share, surroundings, table, True)
+    return broken
+
+
+@kernel
 def check_way(
     way: FloatArray,
     first: int,
@@ -334,14 +335,7 @@ def follow_way(
                 table[5, 2], table[5, 3] = apart, limit
                 table[5, 4], table[5, 5], table[5, 6] = -1.0, marker, share
                 return 5, k
-        for j in range(joints.shape[0]):
-            all_joints[k, j] = joints[j]
-        for i in range(4):
-            for r in range(4):
-                all_displacements[k, i, r] = displacement[i, r]
-        broken = check_joints(joints, share, s, table)
-        if broken < 0:
-            broken = check_view(moved(displacement, s.body), share, s, table, True)
+        broken = _keep_sample(k, share, s, joints, displacement, all_joints, all_displacements, table)
         if broken >= 0:
             return broken, k
     return -1, last
@@ -367,14 +361,9 @@ def follow_joints(
         share = k / (samples - 1.0)
         if k > 0:
             move_arm(operators, composition, step, joints, displacement)
-        for j in range(joints.shape[0]):
-            all_joints[k, j] = joints[j]
-        for i in range(4):
-            for r in range(4):
-                all_displacements[k, i, r] = displacement[i, r]
-        broken = check_joints(joints, share, surroundings, table)
-        if broken < 0:
-            broken = check_view(moved(displacement, surroundings.body), share, surroundings, table, True)
+        broken = _keep_sample(
+            k, share, surroundings, joints, displacement, all_joints, all_displacements, table
+        )
         if broken >= 0:
             return broken, k
     return -1, last

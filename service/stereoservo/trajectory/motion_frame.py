@@ -20,8 +20,8 @@ OPERATOR_WEIGHT = 1e-3
 """Of the operators beside the heights in the plane at infinity: heights are exact by convention, operators measured."""
 PRISMATIC = 1e-12
 """Square of the turn relative to that of the operator's block, below which a joint does not turn."""
-AVERAGED = 8
-"""Angles over which a form is averaged; five make the average of a quadratic form exact."""
+AVERAGED = 5
+"""Angles over which a form is averaged: it is of second degree in sine and cosine, so that five are exact."""
 INVERSE_ITERATIONS = 3
 SHIFT = 1e-10
 """Relative, of the inverse iteration."""
@@ -66,28 +66,46 @@ def conjugated(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
 
 
 @kernel
+def average_over_turns(form: FloatArray, generator: FloatArray) -> None:
+    """A quadratic ``form`` (k, k), in place, averaged over all turns by a ``generator`` (k, k) of eigenvalues 0, ±i."""
+    size = form.shape[0]
+    square, turned = np.zeros((size, size)), np.empty((size, size))
+    product, total = np.empty((size, size)), np.zeros((size, size))
+    _multiply_into(generator, generator, square)
+    share = 1.0 / AVERAGED
+    for sample in range(AVERAGED):
+        angle = 2.0 * math.pi * sample / AVERAGED
+        sine, versine = math.sin(angle), 1.0 - math.cos(angle)
+        for i in range(size):
+            for k in range(size):
+                turned[i, k] = sine * generator[i, k] + versine * square[i, k]
+            turned[i, i] += 1.0
+        _multiply_into(form, turned, product)
+        for i in range(size):
+            for k in range(size):
+                for r in range(size):
+                    total[i, k] += share * turned[r, i] * product[r, k]
+    for i in range(size):
+        for k in range(size):
+            form[i, k] = total[i, k]
+
+
+@kernel
+def _multiply_into(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    for i in range(A.shape[0]):
+        for k in range(B.shape[1]):
+            total = 0.0
+            for r in range(A.shape[1]):
+                total += A[i, r] * B[r, k]
+            out[i, k] = total
+
+
+@kernel
 def _averaged_form(blocks: FloatArray) -> FloatArray:
     """A positive form (3, 3), averaged over the turns of each block (k, 3, 3) of eigenvalues 0, ±i in sequence."""
-    Q = np.zeros((3, 3))
-    for i in range(3):
-        Q[i, i] = 1.0
-    E = np.empty((3, 3))
+    Q = np.eye(3)
     for j in range(blocks.shape[0]):
-        S = blocks[j]
-        mean = np.zeros((3, 3))
-        for nth in range(AVERAGED):
-            angle = 2.0 * math.pi * nth / AVERAGED
-            sine, versine = math.sin(angle), 1.0 - math.cos(angle)
-            for i in range(3):
-                for k in range(3):
-                    square = S[i, 0] * S[0, k] + S[i, 1] * S[1, k] + S[i, 2] * S[2, k]
-                    E[i, k] = (1.0 if i == k else 0.0) + sine * S[i, k] + versine * square
-            for i in range(3):
-                for k in range(3):
-                    for r in range(3):
-                        for s in range(3):
-                            mean[i, k] += E[r, i] * Q[r, s] * E[s, k] / AVERAGED
-        Q = mean
+        average_over_turns(Q, blocks[j])
     return Q
 
 

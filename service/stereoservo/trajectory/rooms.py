@@ -25,7 +25,6 @@ KINDS: tuple[Limit, ...] = (
     "NOT_REACHABLE",
 )
 JOINT_LIMIT, KEEP_OUT, FIELD_OF_VIEW, FACE_HIDDEN, BEHIND_CAMERA, NOT_REACHABLE = range(6)
-FEASIBLE = -1
 
 NEAREST_DEPTH = 0.05
 """Least depth of a marker, as a share of the depth that the centre has now."""
@@ -212,3 +211,21 @@ def check_joints(joints: FloatArray, share: float, surroundings: Surroundings, t
         ):
             broken = 1
     return broken
+
+
+@kernel
+def limit_pull(positions: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pull (n,) in [-1, 1] to the middle of each joint's range, the cube of the way from it, and half ranges (n,).
+
+    No pull and a half range of 1 where ``lower`` and ``upper`` (n,) are infinite, or leave no range.
+    """
+    n = positions.shape[0]
+    half = np.ones(n)
+    pull = np.zeros(n)
+    for j in range(n):
+        width = upper[j] - lower[j]
+        if width > 0.0 and math.isfinite(width):
+            half[j] = 0.5 * width
+            x = max(-1.0, min(1.0, (positions[j] - lower[j]) / half[j] - 1.0))
+            pull[j] = -x * x * x
+    return pull, half

@@ -47,6 +47,10 @@ class ComponentStatus(IntEnum):
     NO_FACE = 4
 
 
+MOVES, DONE, NOT_REACHABLE, WAITS, NO_FACE = (int(status) for status in ComponentStatus)
+"""As plain numbers, for kernels and the loop: comparing numpy's with an enumeration costs more than the law."""
+
+
 class DegenerateFaceError(ValueError):
     """The three points are collinear and span no face."""
 

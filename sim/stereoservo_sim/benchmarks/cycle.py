@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.control.kernels import stereo_step
 from stereoservo.control.law import Law, LawStep, Options, Scene, Task
 from stereoservo.control.laws import LAWS
 from stereoservo.control.stereo import StereoCycle, stereo_law
+from stereoservo.control.stereo_kernel import stereo_step
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.composition import Composition

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.control.incidence import SecondTask, image_task, incidence_step, incidence_task
-from stereoservo.control.kernels import damped_least_squares
 from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.laws import LAWS
 from stereoservo.geometry.alignment import AlignmentFrame, align
 from stereoservo.kinematics.composition import displace
 from stereoservo.kinematics.kernels import image_jacobian, project_points, transform_points, triangulate
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo.runtime.estimate import with_unit_height
 from stereoservo.runtime.streaming import FEED_FORWARD_DAMPING
 from stereoservo_sim.synthetic import rotation, translation

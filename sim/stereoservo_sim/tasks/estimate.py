@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.control.kernels import damped_least_squares
 from stereoservo.kinematics.composition import displace
 from stereoservo.kinematics.kernels import (
     exp_twist,
@@ -22,6 +21,7 @@ from stereoservo.kinematics.kernels import (
     transform_points,
     triangulate,
 )
+from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo_sim.tasks.calibrations import Knowledge
 
 FloatArray = npt.NDArray[np.float64]
