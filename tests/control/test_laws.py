@@ -116,8 +116,9 @@ def test_image_and_points_kernels_are_their_references(virtual, choice, dt_s):
                 assert step.conditioning == pytest.approx(expected[1], rel=1e-6)
 
 
+@pytest.mark.parametrize("joint_weight", [None, 0.0, 1.0])
 @pytest.mark.parametrize("dt_s", [0.0, PERIOD])
-def test_the_trajectory_kernel_is_its_reference(virtual, dt_s):
+def test_the_trajectory_kernel_is_its_reference(virtual, dt_s, joint_weight):
     for seed in range(4):
         rng = np.random.default_rng(seed)
         T0, _, both = arms(virtual, seed)
@@ -127,6 +128,10 @@ def test_the_trajectory_kernel_is_its_reference(virtual, dt_s):
             task = task_of(virtual, world, scene, T0)._replace(
                 set_points=near, rates=40.0 * rng.normal(size=near.shape)
             )
+            if joint_weight is not None:
+                task = task._replace(
+                    joint_rates=0.3 * rng.normal(size=6), joint_error=0.1 * rng.normal(size=6), joint_weight=joint_weight
+                )  # fmt: skip
             options = Options(2.0, dt_s)
             expected, conditioning = trajectory_velocity(scene, task, options)
             step = LAWS["trajectory"].step(scene, task, options)

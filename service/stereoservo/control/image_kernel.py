@@ -61,7 +61,7 @@ def add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, r
 
 
 @kernel
-def image_step_into(
+def image_equations_into(
     operators: FloatArray,
     matrices: FloatArray,
     camera_centres: FloatArray,
@@ -75,13 +75,15 @@ def image_step_into(
     wanted: FloatArray,
     gain: float,
     choice: int,
-    damping: float,
-    x: FloatArray,
-) -> float:
-    """`image.image_velocity` into ``x`` (n,); returns the conditioning."""
+    N: FloatArray,
+    b: FloatArray,
+) -> None:
+    """The normal equations ``N x = b`` of `image.image_velocity`, undamped; of ``N`` (n, n) the lower triangle."""
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
-    N = np.zeros((n, n))
-    b = np.zeros(n)
+    for i in range(n):
+        b[i] = 0.0
+        for k in range(n):
+            N[i, k] = 0.0
     rows = np.empty((2, n))
     now = np.empty((n, 4))
     then = np.empty((n, 4))
@@ -125,7 +127,6 @@ def image_step_into(
             u = gain * (set_points[c, p, 0] - pixels[c, p, 0]) + rates[c, p, 0]
             v = gain * (set_points[c, p, 1] - pixels[c, p, 1]) + rates[c, p, 1]
             add_pixel_equations(rows, u, v, w * w, N, b)
-    return damped_solve(N, b, damping, x)
 
 
 @kernel
@@ -146,11 +147,13 @@ def image_step(
     damping: float,
 ) -> tuple[FloatArray, float]:
     """`image.image_velocity` as a kernel: joint velocity (n,) and conditioning."""
-    x = np.zeros(operators.shape[0])
-    conditioning = image_step_into(
+    n = operators.shape[0]
+    N, b, x = np.empty((n, n)), np.empty(n), np.zeros(n)
+    image_equations_into(
         operators, matrices, camera_centres, points, target_points, target_known, pixels, set_points, rates,
-        weights, wanted, gain, choice, damping, x,
+        weights, wanted, gain, choice, N, b,
     )  # fmt: skip
+    conditioning = damped_solve(N, b, damping, x)
     return x, conditioning
 
 

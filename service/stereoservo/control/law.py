@@ -50,6 +50,9 @@ class Scene(NamedTuple):
     weights: FloatArray
 
 
+NO_JOINTS = np.zeros(0)
+
+
 class Task(NamedTuple):
     """Where to go.
 
@@ -57,6 +60,9 @@ class Task(NamedTuple):
     [px/s], zero for a goal that stands. ``target_points`` (m, 4) of height 1 where ``target_known`` (m,) is 1.
     ``centre`` now and ``centre_target``, (4,) of height 1: one point of the body. ``face`` (3,): markers that span
     the face whose sight is kept.
+
+    Of a planned way, for law ``trajectory``; empty where there is none: ``joint_rates`` (n,) [rad/s or m/s],
+    ``joint_error`` (n,) planned joints less the arm's, ``joint_weight`` [0, 1] what share of their weight they have.
     """
 
     set_points: FloatArray
@@ -67,6 +73,9 @@ class Task(NamedTuple):
     centre: FloatArray
     centre_target: FloatArray
     face: IntArray
+    joint_rates: FloatArray = NO_JOINTS
+    joint_error: FloatArray = NO_JOINTS
+    joint_weight: float = 0.0
 
 
 class Options(NamedTuple):

@@ -6,12 +6,21 @@ import math
 
 import numpy as np
 
-from stereoservo.control.image_kernel import add_rows, image_step_into, velocities_into
+from stereoservo.control.image_kernel import image_equations_into
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK
 from stereoservo.control.step_correction_kernel import step_into
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel, project_points, transform_points_into
-from stereoservo.kinematics.linear_kernels import add_pixel_equations, damped_solve
+from stereoservo.kinematics.linear_kernels import cholesky_solve, damped_solve
+
+JOINT_SHARE = 1e-4
+"""Squared weight of a planned joint, relative to the images' in the same joint.
+
+Above it: arm and plan disagree on lengths by some share of the arm's reach R. Where an elbow of depth ``c δ²``,
+``c`` about R/4, is stretched, images and joints have one solution, the plan's side, if ``share·R² > 2 c ε``: 1e-4 is
+right for ``ε`` up to 2e-4 of the reach, more than a calibration leaves. Below it: what the joints would
+bias a well determined direction by is 1e-4 of their disagreement, below image noise.
+"""
 
 
 @kernel
@@ -29,16 +38,35 @@ def trajectory_step(
     gain: float,
     dt_s: float,
     damping: float,
+    joint_rates: FloatArray,
+    joint_error: FloatArray,
+    joint_weight: float,
 ) -> tuple[FloatArray, float]:
     """`trajectory.trajectory_velocity` as a kernel: joint velocity (n,) and conditioning."""
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
-    x = np.zeros(n)
+    x, pull, meant = np.zeros(n), np.zeros(n), np.zeros(n)
     known = np.zeros(markers)
     held = -math.expm1(-gain * dt_s) / dt_s if dt_s > 0.0 else gain
-    conditioning = image_step_into(
+    N, b = np.empty((n, n)), np.empty(n)
+    image_equations_into(
         operators, matrices, camera_centres, points, points, known, pixels, set_points, rates, weights, wanted,
-        held, 0, damping, x,
+        held, 0, N, b,
     )  # fmt: skip
+    planned = joint_rates.shape[0] == n
+    if planned:
+        largest = 0.0
+        for j in range(n):
+            largest = max(largest, N[j, j])
+        for j in range(n):
+            pull[j] = damping * largest + joint_weight * JOINT_SHARE * N[j, j]
+            meant[j] = joint_rates[j] + joint_weight * held * joint_error[j]
+            if not math.isfinite(pull[j] * meant[j]):
+                return x, 0.0
+            N[j, j] += pull[j]
+            b[j] += pull[j] * meant[j]
+        conditioning = cholesky_solve(N, b, x)
+    else:
+        conditioning = damped_solve(N, b, damping, x)
     if not dt_s > 0.0 or conditioning == 0.0:
         return x, conditioning
     goal, _ = project_points(matrices, points)
@@ -52,8 +80,8 @@ def trajectory_step(
         found[j] = x[j] * dt_s
         best[j] = found[j]
     H, turned, work = np.empty((4, 4)), np.empty((n, 4, 4)), np.empty((5, 4, 4))
-    N, b, change = np.empty((n, n)), np.empty(n), np.empty(n)
-    rows, velocity, moved = np.empty((2, n)), np.empty((n, 4)), np.empty((markers, 4))
+    change, moved = np.empty(n), np.empty((markers, 4))
+    no_rates = np.zeros((cameras, markers, 2))
     before = math.inf
     for _ in range(ITERATIONS):
         step_into(operators, composition, found, H, turned, work)
@@ -66,27 +94,24 @@ def trajectory_step(
                 if w > 0.0:
                     for r in range(2):
                         error += (w * (goal[c, p, r] - seen[c, p, r])) ** 2
+        for j in range(n):
+            error += pull[j] * (dt_s * meant[j] - found[j]) ** 2
         if not error <= SLACK * before:
             break
         before = error
         for j in range(n):
             best[j] = found[j]
-            b[j] = 0.0
-            for k in range(n):
-                N[j, k] = 0.0
-        for p in range(markers):
-            velocities_into(turned, moved[p], velocity)
-            for c in range(cameras):
-                w = weights[c, p] * wanted[c, p]
-                if not w > 0.0:
-                    continue
-                for j in range(n):
-                    rows[0, j] = 0.0
-                    rows[1, j] = 0.0
-                add_rows(matrices[c], moved[p], velocity, 1.0, rows)
-                u, v = goal[c, p, 0] - seen[c, p, 0], goal[c, p, 1] - seen[c, p, 1]
-                add_pixel_equations(rows, u, v, w * w, N, b)
-        damped_solve(N, b, damping, change)
+        image_equations_into(
+            turned, matrices, camera_centres, moved, moved, known, seen, goal, no_rates, weights, wanted, 1.0, 0,
+            N, b,
+        )  # fmt: skip
+        if planned:
+            for j in range(n):
+                N[j, j] += pull[j]
+                b[j] += pull[j] * (dt_s * meant[j] - found[j])
+            cholesky_solve(N, b, change)
+        else:
+            damped_solve(N, b, damping, change)
         most = 0.0
         for j in range(n):
             found[j] += change[j]

@@ -197,7 +197,7 @@ def servo_step(source: Servoing, present: Present) -> Motion:
     velocity = step.velocity
     if streamed:
         velocity = velocity + feed_forward(source, present, active)
-    if len(velocity) > RIGID_FREEDOMS:
+    if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has kept off the limits itself
         velocity = velocity + away_from_limits(present)
     return Motion(
         velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,

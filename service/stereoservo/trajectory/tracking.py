@@ -15,6 +15,10 @@ FOLLOWS = 0.5
 """Lag, relative to the largest that is tolerated, up to which the plan goes on at full pace."""
 
 
+FADE_S = 0.5
+"""Before its end [s]: the time over which a plan's joints lose their say, so that images alone decide at rest."""
+
+
 class PlanSample(NamedTuple):
     """``displacement`` (4, 4) of the body from its pose when the plan began, its rate (4, 4) [1/s]; ``joints`` (n,) and
     their rates (n,) [rad/s or m/s].
@@ -24,6 +28,16 @@ class PlanSample(NamedTuple):
     displacement_rate: FloatArray
     joints: FloatArray
     joint_rates: FloatArray
+
+
+class PlannedJoints(NamedTuple):
+    """What a plan has the joints do in a step: mean ``rates`` (n,) [rad/s or m/s] over it, ``error`` (n,) planned less
+    present joints at its begin, and ``weight`` [0, 1].
+    """
+
+    rates: FloatArray
+    error: FloatArray
+    weight: float
 
 
 @kernel
@@ -88,6 +102,20 @@ def sample_plan(plan: Plan, t_s: float) -> PlanSample:
     interpolate_into(plan.times, plan.displacements.reshape(-1, 16), t_s, H, H_rate)
     interpolate_into(plan.times, plan.joints, t_s, joints, joint_rates)
     return PlanSample(H.reshape(4, 4), H_rate.reshape(4, 4), joints, joint_rates)
+
+
+def planned_joints(
+    plan: Plan, begin_s: float, end_s: float, dt_s: float, joints: FloatArray
+) -> PlannedJoints:
+    """For an arm at ``joints`` (n,) and a step of ``dt_s`` in which the plan's time goes from ``begin_s`` to ``end_s``.
+
+    Empty, with weight 0, when the plan is at its end.
+    """
+    left_s = float(plan.times[-1]) - begin_s
+    if not left_s > 0.0:
+        return PlannedJoints(np.zeros(0), np.zeros(0), 0.0)
+    here, there = sample_plan(plan, begin_s).joints, sample_plan(plan, end_s).joints
+    return PlannedJoints((there - here) / dt_s, here - joints, min(1.0, left_s / FADE_S))
 
 
 def pace(lag: float) -> float:

@@ -179,7 +179,7 @@ class Controller:
         if self._plans:
             if self._way is None:
                 self._way = planned_way(scene, task, joints, self._limits)
-            task = self._way.task_now(scene, task, self._dt_s)
+            task = self._way.task_now(scene, task, joints, self._dt_s)
         step = self._law(scene, task, self._options)
         self.task_error = step.error
         if self._joint_speed is None:

@@ -10,7 +10,7 @@ from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.kinematics.model import pinhole
 from stereoservo.trajectory.plan import Approach, Plan, PlanLimits, PlanRequest
 from stereoservo.trajectory.planning import plan
-from stereoservo.trajectory.tracking import advance, sample_plan
+from stereoservo.trajectory.tracking import advance, planned_joints, sample_plan
 from stereoservo_sim.tasks.setting import FACE, HEIGHT, WIDTH
 
 FloatArray = npt.NDArray[np.float64]
@@ -45,16 +45,21 @@ class PlannedWay:
         self._task = task
         self._time_s = 0.0
 
-    def task_now(self, scene: Scene, task: Task, dt_s: float) -> Task:
+    def task_now(self, scene: Scene, task: Task, joints: FloatArray, dt_s: float) -> Task:
         """Set-points where the plan has them now, and how fast they go from there to where it has them ``dt_s`` later.
 
+        The same of its joints, for an arm at ``joints`` (n,).
         The plan's time goes on by ``dt_s``, or less where the body lags.
         """
         set_points = self._set_points(scene)
         apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
         lag = float(np.where(scene.weights > 0.0, apart, 0.0).max()) / LARGEST_LAG_PX
-        self._time_s = advance(self.plan, self._time_s, dt_s, lag)
-        return task._replace(set_points=set_points, rates=(self._set_points(scene) - set_points) / dt_s)
+        begin_s, self._time_s = self._time_s, advance(self.plan, self._time_s, dt_s, lag)
+        planned = planned_joints(self.plan, begin_s, self._time_s, dt_s, joints)
+        return task._replace(
+            set_points=set_points, rates=(self._set_points(scene) - set_points) / dt_s, joint_rates=planned.rates,
+            joint_error=planned.error, joint_weight=planned.weight,
+        )  # fmt: skip
 
     def _set_points(self, scene: Scene) -> FloatArray:
         points = transform_points(sample_plan(self.plan, self._time_s).displacement, self._start)
