@@ -306,6 +306,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         "figs 8.6 to 8.12: three alignments by image-based stereo control, projective and coarse calibration",
         12,
     ),
+    "benchmark-180": simulated(
+        "benchmark_180",
+        "figs 8.13 to 8.22: half a turn of a tilted face by the classical and the Cartesian laws",
+        None,
+    ),
+    "projective-vs-euclidean": simulated(
+        "projective_vs_euclidean",
+        "thesis 9.3: the same tasks with a projective model and with metric ones of growing errors",
+        50,
+    ),
     "laws": Experiment(
         "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
         frozenset(),
