@@ -196,7 +196,8 @@ class Controller:
         every = np.ones(self._set_points.shape[:2])
         found, ok = triangulate(knowledge.matrices, self._set_points, every, 5)
         targets = found / (found @ knowledge.plane_at_infinity)[:, None]
-        if knowledge.points is not None:
+        # What triangulation errs by in the same way, here and there, then cancels.
+        if knowledge.points is not None and not self.estimate.triangulates:
             pose = goal_pose(
                 _arrays(knowledge), knowledge.basis, points, targets, ok, FACE, self._set_points, every
             )

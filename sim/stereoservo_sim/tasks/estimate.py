@@ -41,7 +41,7 @@ class Estimate:
 
     def __init__(self, knowledge: Knowledge, source: PointsName, dt_s: float) -> None:
         self._knowledge = knowledge
-        self._triangulates = source == "triangulated" or knowledge.points is None
+        self.triangulates = source == "triangulated" or knowledge.points is None
         self._dt_s = dt_s
         self._frames = 0
         self._rests = True
@@ -60,7 +60,7 @@ class Estimate:
 
     def seen(self, pixels: FloatArray, weights: FloatArray) -> None:
         """A frame of every camera: pixels (c, m, 2), weights (c, m), 0 where a marker is not seen."""
-        if self._triangulates:
+        if self.triangulates:
             self._triangulate(pixels, weights)
             return
         basis, matrices = self._knowledge.basis, self._knowledge.matrices
