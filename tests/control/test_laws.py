@@ -130,7 +130,8 @@ def test_the_trajectory_kernel_is_its_reference(virtual, dt_s, joint_weight):
             )
             if joint_weight is not None:
                 task = task._replace(
-                    joint_rates=0.3 * rng.normal(size=6), joint_error=0.1 * rng.normal(size=6), joint_weight=joint_weight
+                    joint_rates=0.3 * rng.normal(size=6), joint_error=0.1 * rng.normal(size=6),
+                    joint_weight=joint_weight,
                 )  # fmt: skip
             options = Options(2.0, dt_s)
             expected, conditioning = trajectory_velocity(scene, task, options)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stereoservo.trajectory.planning import plan
-from stereoservo.trajectory.tracking import advance, pace, sample_plan
+from stereoservo.trajectory.tracking import FADE_S, advance, pace, planned_joints, sample_plan
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +89,22 @@ def test_feed_forward_never_runs_away_from_a_slow_body(planned):
     assert t == found.times[-1]
     assert worst < 1.05 * tolerated
     np.testing.assert_allclose(q, found.joints[-1], atol=1e-6)
+
+
+def test_planned_joints_lead_to_where_the_plan_has_them_and_fade_out_at_its_end(planned):
+    _, found = planned
+    end, dt = found.times[-1], 0.04
+    at = sample_plan(found, 0.3 * end).joints + 0.01
+    joints = planned_joints(found, 0.3 * end, 0.3 * end + dt, dt, at)
+    np.testing.assert_allclose(joints.error, -0.01, atol=1e-12)
+    np.testing.assert_allclose(
+        at + joints.error + dt * joints.rates, sample_plan(found, 0.3 * end + dt).joints, atol=1e-12
+    )
+    assert joints.weight == 1.0
+    assert planned_joints(found, end - 0.5 * FADE_S, end, dt, at).weight == pytest.approx(0.5)
+    waiting = planned_joints(found, 0.3 * end, 0.3 * end, dt, at)
+    assert not waiting.rates.any()
+    for over in (end, end + 1.0, np.nan):
+        none = planned_joints(found, over, over, dt, at)
+        assert len(none.rates) == len(none.error) == 0
+        assert none.weight == 0.0
