@@ -53,6 +53,22 @@ def test_limits_hold_between_the_samples(seed, size):
     np.testing.assert_array_equal(rates[-1], 0)
 
 
+def test_limits_hold_between_samples_where_joints_flip():
+    """A wrist that passes near its singularity: joints hardly move, then turn by much between two samples."""
+    s = np.linspace(0, 1, K)
+    flip = 0.5 * np.pi * np.tanh(60.0 * (s - 0.62))
+    joints = np.stack([0.4 * s, -0.9 * s, flip, 1.5 * s - 0.9 * flip], axis=1)
+    v, a = np.full(4, 0.6), np.full(4, 1.2)
+    times = sample_times(joints, v, a, False)
+    plan = as_plan(times, joints)
+    t = np.linspace(0, times[-1], 4001)
+    rates = np.array([sample_plan(plan, x).joint_rates for x in t])
+    assert (np.abs(rates) <= 1.01 * v).all()
+    at_samples = np.array([sample_plan(plan, x).joint_rates for x in times])
+    mean = np.diff(at_samples, axis=0) / np.diff(times)[:, None]
+    assert (np.abs(mean) <= 1.25 * a * (1.0 + 1e-9)).all()
+
+
 @pytest.mark.parametrize(
     ("way", "v", "a", "best"),
     [

@@ -13,10 +13,17 @@ import numpy as np
 
 from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.kernels import kernel
+from stereoservo.trajectory.tracking import interpolate_into
 
 FASTEST = 1e8
 """Largest pace [(samples/s)²]: where no joint moves, the way is over in a ten-thousandth of a second a sample."""
 HALVINGS = 50
+ROUNDS = 12
+"""Times at most that the pace is lowered where the way between samples is faster than at them."""
+LOOKS = 4
+"""Places in an interval at which its rates are looked at."""
+VELOCITY_EXCESS, ACCELERATION_EXCESS = 1.01, 1.25
+"""Of the limits, what the cubics between samples may have; accelerations as means over an interval."""
 
 
 @kernel
@@ -45,6 +52,82 @@ def _next_paces(
             elif abs(now) > limits[j]:
                 largest = -1.0
     return least, largest
+
+
+@kernel
+def _times_below(
+    slopes: FloatArray, bows: FloatArray, highest: FloatArray, acceleration_max: FloatArray, even: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The least times (K,) with paces at the samples not above ``highest`` (K,); and these paces (K,)."""
+    K = highest.shape[0]
+    times, paces = np.zeros(K), np.zeros(K)
+    ceilings = highest.copy()
+    if even:
+        lowest = FASTEST
+        for k in range(K):
+            lowest = min(lowest, ceilings[k])
+        for k in range(K):
+            ceilings[k] = lowest
+    ceilings[0] = 0.0
+    ceilings[K - 1] = 0.0
+    for back in range(K - 1):
+        k = K - 2 - back
+        least, largest = _next_paces(slopes[k], bows[k], acceleration_max, ceilings[k], ceilings[k + 1])
+        if least <= largest:
+            continue
+        low, high = 0.0, ceilings[k]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            least, largest = _next_paces(slopes[k], bows[k], acceleration_max, middle, ceilings[k + 1])
+            if least <= largest:
+                low = middle
+            else:
+                high = middle
+        ceilings[k] = low
+    pace = 0.0
+    for k in range(K - 1):
+        least, largest = _next_paces(slopes[k], bows[k], acceleration_max, pace, ceilings[k + 1])
+        after = max(0.0, largest)
+        if k == K - 2:
+            after = 0.0
+        both = math.sqrt(pace) + math.sqrt(after)
+        if both <= 0.0:
+            # from rest to rest in one interval: half the way each
+            duration = 0.0
+            for j in range(slopes.shape[1]):
+                if math.isfinite(acceleration_max[j]):
+                    duration = max(duration, 2.0 * math.sqrt(abs(slopes[k, j]) / acceleration_max[j]))
+            times[k + 1] = times[k] + max(duration, 1.0 / math.sqrt(FASTEST))
+        else:
+            times[k + 1] = times[k] + 2.0 / both
+        pace = after
+        paces[k + 1] = pace
+    return times, paces
+
+
+@kernel
+def _excess(
+    times: FloatArray, joints: FloatArray, velocity_max: FloatArray, acceleration_max: FloatArray, k: int
+) -> float:
+    """By how much the pace in interval ``k`` has to come down; at most 1 where it need not."""
+    n = joints.shape[1]
+    q, rates, first = np.empty(n), np.empty(n), np.empty(n)
+    duration = times[k + 1] - times[k]
+    found = 1.0
+    for look in range(LOOKS + 1):
+        # the last look is at the end, where the next interval's first one sees the same rates
+        interpolate_into(times, joints, times[k] + duration * look / LOOKS, q, rates)
+        for j in range(n):
+            speed = abs(rates[j])
+            if speed > VELOCITY_EXCESS * velocity_max[j] and velocity_max[j] > 0.0:
+                found = max(found, (speed / velocity_max[j]) ** 2)
+            if look == 0:
+                first[j] = rates[j]
+            elif look == LOOKS:
+                change = abs(rates[j] - first[j]) / duration
+                if change > ACCELERATION_EXCESS * acceleration_max[j] and acceleration_max[j] > 0.0:
+                    found = max(found, change / acceleration_max[j])
+    return found
 
 
 @kernel
@@ -79,43 +162,20 @@ def sample_times(
                 steepest = max(steepest, abs(slopes[k, j]), abs(slopes[k, j] - 0.5 * bows[k, j]))
             if steepest > 0.0 and math.isfinite(velocity_max[j]):
                 ceilings[k] = min(ceilings[k], (velocity_max[j] / steepest) ** 2)
-    if even:
-        lowest = FASTEST
+    times, paces = _times_below(slopes, bows, ceilings, acceleration_max, even)
+    for _ in range(ROUNDS):
+        lowered = False
+        factors = np.ones(K)
+        for k in range(K - 1):
+            excess = _excess(times, joints, velocity_max, acceleration_max, k)
+            if excess > 1.0:
+                lowered = True
+                factors[k] = max(factors[k], excess)
+                factors[k + 1] = max(factors[k + 1], excess)
+        if not lowered:
+            break
         for k in range(K):
-            lowest = min(lowest, ceilings[k])
-        for k in range(K):
-            ceilings[k] = lowest
-    ceilings[0] = 0.0
-    ceilings[K - 1] = 0.0
-    for back in range(K - 1):
-        k = K - 2 - back
-        least, largest = _next_paces(slopes[k], bows[k], acceleration_max, ceilings[k], ceilings[k + 1])
-        if least <= largest:
-            continue
-        low, high = 0.0, ceilings[k]
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            least, largest = _next_paces(slopes[k], bows[k], acceleration_max, middle, ceilings[k + 1])
-            if least <= largest:
-                low = middle
-            else:
-                high = middle
-        ceilings[k] = low
-    pace = 0.0
-    for k in range(K - 1):
-        least, largest = _next_paces(slopes[k], bows[k], acceleration_max, pace, ceilings[k + 1])
-        after = max(0.0, largest)
-        if k == K - 2:
-            after = 0.0
-        both = math.sqrt(pace) + math.sqrt(after)
-        if both <= 0.0:
-            # from rest to rest in one interval: half the way each
-            duration = 0.0
-            for j in range(n):
-                if math.isfinite(acceleration_max[j]):
-                    duration = max(duration, 2.0 * math.sqrt(abs(slopes[k, j]) / acceleration_max[j]))
-            times[k + 1] = times[k] + max(duration, 1.0 / math.sqrt(FASTEST))
-        else:
-            times[k + 1] = times[k] + 2.0 / both
-        pace = after
+            if factors[k] > 1.0:
+                ceilings[k] = min(ceilings[k], paces[k]) / factors[k]
+        times, paces = _times_below(slopes, bows, ceilings, acceleration_max, even)
     return times
