@@ -67,7 +67,8 @@ def _control_errors(curves: list[Curve], folder: Path) -> Path:
                     t, values, "--" if limited else "-", color=COLOURS[i], label=None if limited else name
                 )
         labelled(axis, title, "[s]", "still to be made")
-        axis.legend(fontsize=7)
+        if axis.lines:
+            axis.legend(fontsize=7)
     return saved(figure, folder, "benchmark-180-control-errors")
 
 
@@ -82,7 +83,8 @@ def _centres(curves: list[Curve], folder: Path) -> Path:
                 centre = np.array(curve["centre_mm"])
                 axis.plot(centre[:, 0], centre[:, 1], color=colour, linewidth=0.9, label=name)
             labelled(axis, f"{law}, {step}", "along the line [mm]", "beside it [mm]")
-            axis.legend(fontsize=6)
+            if axis.lines:
+                axis.legend(fontsize=6)
     return saved(figure, folder, "benchmark-180-centre")
 
 

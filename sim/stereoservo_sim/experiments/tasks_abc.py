@@ -238,7 +238,7 @@ def draw_tasks_abc(answer: dict[str, Any], folder: Path) -> list[Path]:
     joint_axes = joints.subplots(1, 3)
     for k, (line, name) in enumerate(zip(motion.subplots(3, 2), DRAWN, strict=True)):
         for colour, dash, calibration in zip(COLOURS, ("-", "--"), CALIBRATIONS, strict=False):
-            curve = _curves(answer, name, calibration, SHOWN_GAIN)[0]
+            curve = [*_curves(answer, name, calibration, SHOWN_GAIN), *_curves(answer, name, calibration)][0]
             for c, axis in enumerate(line):
                 draw_images(axis, np.array(curve["pixels"])[:, c], colour, calibration)
             for j, q in enumerate(np.array(curve["joints_deg"]).T):
