@@ -132,7 +132,7 @@ def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> 
     ("change", "text"),
     [
         ({"law": "pbvs"}, "law: Invalid enum value 'pbvs'; valid: stereo, image, points, cartesian3"),
-        ({"gain": -1}, "gain: Expected `float` > 0.0, got -1"),
+        ({"gain": -1}, "gain: Expected `float` > 0.0001, got -1"),
         ({"zz": 1}, "unknown field `zz`; known: id, target, law"),
         (
             {"target": {"kind": "wish"}},

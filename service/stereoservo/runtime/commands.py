@@ -14,10 +14,12 @@ from msgspec import Meta
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 GoalId = Annotated[str, Meta(pattern=r"^[0-9a-fA-F]{8}[0-9a-fA-F-]{0,28}$")]
 Positive = Annotated[float, Meta(gt=0)]
-Gain = Annotated[float, Meta(gt=0, le=50)]
-Pixels = Annotated[float, Meta(gt=0, le=1000)]
+Duration = Annotated[float, Meta(gt=0, le=86_400)]
+"""[s], a day at most."""
+Gain = Annotated[float, Meta(gt=1e-4, le=50)]
+Pixels = Annotated[float, Meta(gt=1e-4, le=1000)]
 Lease = Annotated[float, Meta(ge=0.3, le=3600)]
-Fraction = Annotated[float, Meta(gt=0, le=1)]
+Fraction = Annotated[float, Meta(gt=1e-4, le=1)]
 
 LAWS = ("stereo", "image", "points", "cartesian3", "cartesian2", "trajectory")
 LawName = Literal["stereo", "image", "points", "cartesian3", "cartesian2", "trajectory"]
@@ -158,7 +160,7 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ``blend_px``: hand over to the next queued goal as soon as the error is below it, without stopping; without one it
     is reached as usual. ``acknowledge_s``: reached, the arm holds there and the queue waits until a client
-    acknowledges (a gripper has closed), at most so long; then the queue is cancelled.
+    acknowledges (a gripper has closed), at most so long; then, and where it is not reached, the queue is cancelled.
     """
 
     id: GoalId
@@ -174,10 +176,10 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hold_frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None
     speed_scale: Fraction = 1.0
     lease_s: Lease | None = None
-    time_limit_s: Positive | None = None
+    time_limit_s: Duration | None = None
     mode: Literal["preempt", "queue"] = "preempt"
     blend_px: Pixels | None = None
-    acknowledge_s: Positive | None = None
+    acknowledge_s: Duration | None = None
     check: bool = False
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import ending, following, going_on, intake, progress
+from stereoservo.runtime import ending, following, goals, going_on, intake, progress
 from stereoservo.runtime.check import check_step
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
@@ -243,6 +243,7 @@ class ServoCore:
         reason = Reason("STOPPED", "hold", hint="resume, then send the goal again")
         ending.end_source(present, "goal_aborted", (reason,), "stopped")
         ending.end_queue(present, (reason,), "stopped")
+        goals.refuse_waiting((reason,), present)
         present.state.stopped = True
         present.emit("stopped", message="stop: the arm brakes and holds", reasons=(reason,))
 

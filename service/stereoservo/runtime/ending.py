@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 from stereoservo.control.reasons import Reason
+from stereoservo.runtime.commands import Goal
 from stereoservo.runtime.cycle import Lifecycle
 from stereoservo.runtime.motion import Present
 from stereoservo.runtime.refusal import RefusalError
-from stereoservo.runtime.state import Holding, JointMove, LawRun, Source, Visiting
+from stereoservo.runtime.state import Awaiting, Holding, JointMove, LawRun, Source, Visiting
 
 
 def goal_of(source: Source) -> str:
@@ -27,20 +28,53 @@ def end_source(
     """End the active source with its one terminal event; the arm then holds."""
     source = present.state.source
     present.state.source = Holding()
-    present.state.ahead = None
+    forget_ahead(present)
     if isinstance(source, Visiting):
         present.emit("calibration_aborted", id=source.id, message=message, reasons=reasons)
     elif goal_of(source):
         present.emit(kind, id=goal_of(source), message=message, reasons=reasons)
+    if awaits_client(source):
+        end_followers(present, source, reasons)
+
+
+def awaits_client(source: Source) -> bool:
+    """Whether what is queued behind ``source`` may begin only once a client has acknowledged it."""
+    if isinstance(source, LawRun):
+        return source.goal.acknowledge_s is not None
+    return isinstance(source, Awaiting) or (
+        isinstance(source, JointMove) and source.acknowledge_s is not None
+    )
+
+
+def end_followers(present: Present, ended: Source | Goal, reasons: tuple[Reason, ...]) -> None:
+    """The queue behind a goal that a client was to acknowledge ends with it: what was to happen there has not."""
+    id_ = ended.id if isinstance(ended, Goal | Awaiting) else goal_of(ended)
+    cancel_queue(present, reasons, f"goal {id_} ended before it was acknowledged")
+
+
+def forget_ahead(present: Present) -> None:
+    """What is planned for the active source, or from where it ends, goes with it."""
+    state = present.state
+    state.ahead = None
+    if state.planning is not None and state.planning.purpose in ("ahead", "again"):
+        state.planning = None
 
 
 def end_queue(present: Present, reasons: tuple[Reason, ...], message: str) -> None:
     """Every queued goal ends with a terminal event too, and what is being planned is not begun."""
-    state = present.state
-    job = state.planning
+    job = present.state.planning
     if job is not None and not job.source.goal.check:
         drop_plan(present, reasons, message)
+    cancel_queue(present, reasons, message)
+
+
+def cancel_queue(present: Present, reasons: tuple[Reason, ...], message: str) -> None:
+    """Every queued goal ends, also the one whose way is being planned; who waits for an answer is not concerned."""
+    state = present.state
+    if state.planning is not None and state.planning.purpose == "queue":
+        drop_plan(present, reasons, message)
     queued, state.queue = state.queue, []
+    state.queued_until_ns = {}
     for goal in queued:
         present.emit("goal_cancelled", id=goal.id, message=message, reasons=reasons)
 

@@ -5,18 +5,22 @@ from __future__ import annotations
 from stereoservo.control.reasons import Reason
 from stereoservo.runtime.commands import (
     AcknowledgeGoal,
+    Calibrate,
     CancelGoal,
+    Command,
     Goal,
+    Home,
     IncidenceTarget,
     JointTarget,
     PlanReport,
     RenewGoal,
     Request,
+    RunGoal,
     TaughtTarget,
     UpdateGoal,
 )
 from stereoservo.runtime.cycle import ModelReadiness
-from stereoservo.runtime.ending import drop_plan, end_queue, end_source, goal_of, may_move
+from stereoservo.runtime.ending import drop_plan, end_source, forget_ahead, goal_of, may_move
 from stereoservo.runtime.incidences import start_incidence
 from stereoservo.runtime.joint_goals import joint_goal, joint_report
 from stereoservo.runtime.motion import Present
@@ -62,16 +66,26 @@ def run_goal(goal: Goal, request: Request, present: Present) -> Accepted | None:
     return accept(goal, source, report, present)
 
 
-def somebody_waits(present: Present) -> bool:
-    """Whether a client waits for the answer to a goal that is being planned."""
+def planning_comes_first(present: Present) -> bool:
+    """Whether a goal is being planned that a client waits for, or that has been accepted already."""
     job = present.state.planning
-    return job is not None and job.purpose == "reply"
+    return job is not None and job.purpose != "ahead"
 
 
 def _known(goal_id: str, present: Present) -> bool:
     state = present.state
-    planned = state.planning is not None and state.planning.source.goal.id == goal_id
-    return goal_of(state.source) == goal_id or planned or any(goal.id == goal_id for goal in state.queue)
+    job, source = state.planning, state.source
+    planned = job is not None and not job.source.goal.check and job.source.goal.id == goal_id
+    active = goal_of(source) == goal_id or (isinstance(source, Awaiting) and source.id == goal_id)
+    return active or planned or any(goal.id == goal_id for goal in state.queue)
+
+
+def new_id(goal_id: str, present: Present) -> None:
+    """Raises RefusalError for an id that another goal has: each ends in one event of its own."""
+    if _known(goal_id, present):
+        raise RefusalError(
+            "ID_IN_USE", f"a goal {goal_id} is active or queued; give an id of its own", subject=goal_id
+        )
 
 
 def _enqueue(goal: Goal, present: Present) -> str:
@@ -85,7 +99,13 @@ def _enqueue(goal: Goal, present: Present) -> str:
         )
     prepare(goal, present)  # what cannot be at all is refused now; its way is planned when its turn comes
     state.queue.append(goal)
+    _renew_queued(goal, present)
     return f"queued as number {len(state.queue)}; it is planned when its turn comes"
+
+
+def _renew_queued(goal: Goal, present: Present) -> None:
+    if goal.lease_s is not None:
+        present.state.queued_until_ns[goal.id] = present.now_ns + int(goal.lease_s * 1e9)
 
 
 def accept(goal: Goal, source: Source, report: PlanReport | None, present: Present) -> Accepted:
@@ -149,7 +169,10 @@ def renew(command: RenewGoal, present: Present) -> str:
     if isinstance(source, LawRun | JointMove | Visiting) and goal_of(source) == command.id:
         source.renew_lease(present.now_ns)
         return "renewed"
-    if _known(command.id, present):
+    for goal in present.state.queue:
+        if goal.id == command.id:
+            _renew_queued(goal, present)
+    if _known(command.id, present) or any(id_of(r.command) == command.id for r in present.state.waiting):
         return "renewed"
     raise RefusalError(
         "NO_SUCH_GOAL",
@@ -183,13 +206,14 @@ def cancel(command: CancelGoal, present: Present) -> str:
         end_source(present, "goal_cancelled", (), "cancelled by its client")
         return "cancelled"
     if isinstance(state.source, Awaiting) and state.source.id == command.id:
-        state.source = Holding()
-        end_queue(present, (), f"goal {command.id} was cancelled before it was acknowledged")
+        end_source(present, "goal_cancelled", (), "cancelled by its client")
         return "cancelled: it is not waited for any more, and the queue is empty"
     job = state.planning
     if job is not None and job.source.goal.id == command.id and job.purpose != "ahead":
         drop_plan(present, (), "cancelled by its client")
         return "cancelled while it was planned"
+    if _cancel_waiting(command.id, present):
+        return "cancelled while it waited to be looked at"
     kept = [goal for goal in state.queue if goal.id != command.id]
     if len(kept) == len(state.queue):
         raise RefusalError(
@@ -198,11 +222,51 @@ def cancel(command: CancelGoal, present: Present) -> str:
             subject=command.id,
         )
     state.queue = kept
-    if job is not None and job.source.goal.id == command.id:
-        state.planning = None
-    state.ahead = None
+    state.queued_until_ns.pop(command.id, None)
+    if (job is not None and job.source.goal.id == command.id) or (
+        state.ahead is not None and state.ahead.goal.id == command.id
+    ):
+        forget_ahead(present)
     present.emit("goal_cancelled", id=command.id, message="cancelled while queued")
     return "cancelled"
+
+
+def _cancel_waiting(goal_id: str, present: Present) -> bool:
+    """Refuse what waits behind a goal that is being planned; whether there was such a request."""
+    state = present.state
+    found = [r for r in state.waiting if id_of(r.command) == goal_id]
+    state.waiting = [r for r in state.waiting if id_of(r.command) != goal_id]
+    hint = "cancelled before it was looked at"
+    refuse(found, (Reason("CANCELLED", "info", goal_id, hint=hint),), present)
+    return bool(found)
+
+
+def refuse(requests: list[Request], reasons: tuple[Reason, ...], present: Present) -> None:
+    """Answer requests that are not carried out any more."""
+    for request in requests:
+        present.emit(
+            "reply", request=request.request, accepted=False, id=id_of(request.command), message=reasons[0].hint,
+            reasons=reasons,
+        )  # fmt: skip
+
+
+def refuse_waiting(reasons: tuple[Reason, ...], present: Present) -> None:
+    """What waits to move the arm was asked for before it was told not to."""
+    state = present.state
+    moves = [
+        r for r in state.waiting
+        if isinstance(r.command, Home | Calibrate) or (isinstance(r.command, RunGoal) and not r.command.goal.check)
+    ]  # fmt: skip
+    state.waiting = [r for r in state.waiting if r not in moves]
+    refuse(moves, reasons, present)
+
+
+def id_of(command: Command) -> str:
+    """Id of the goal that a command is about, or ''."""
+    if isinstance(command, RunGoal):
+        return command.goal.id
+    with_id = RenewGoal | CancelGoal | UpdateGoal | AcknowledgeGoal | Home | Calibrate
+    return command.id if isinstance(command, with_id) else ""
 
 
 def acknowledge(command: AcknowledgeGoal, present: Present) -> str:
@@ -227,8 +291,8 @@ def begin(source: Source, present: Present) -> None:
         source.last_frames = sum(e.frames for e in present.state.cameras)
     if isinstance(source, LawRun | JointMove):
         source.renew_lease(present.now_ns)
+    forget_ahead(present)
     present.state.source = source
-    present.state.ahead = None
     law = (
         source.law
         if isinstance(source, Servoing)

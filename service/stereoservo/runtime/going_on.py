@@ -6,7 +6,14 @@ import numpy as np
 
 from stereoservo.control.reasons import Reason
 from stereoservo.runtime.commands import Goal
-from stereoservo.runtime.ending import end_queue, end_source, goal_of, may_move
+from stereoservo.runtime.ending import (
+    cancel_queue,
+    end_followers,
+    end_source,
+    forget_ahead,
+    goal_of,
+    may_move,
+)
 from stereoservo.runtime.goals import accept, begin, prepare, trusted_model
 from stereoservo.runtime.joint_goals import joint_report
 from stereoservo.runtime.motion import Motion, Present
@@ -30,11 +37,15 @@ def finish(motion: Motion, present: Present) -> None:
         wait_s = source.goal.acknowledge_s
     elif isinstance(source, JointMove):
         wait_s = source.acknowledge_s
+    forget_ahead(present)
     if motion.reached and wait_s is not None:
         until_ns = present.now_ns + int(wait_s * 1e9)
         present.state.source = Awaiting(goal_of(source), wait_s, until_ns)
-    else:
-        present.state.source = Holding()
+        return
+    present.state.source = Holding()
+    if wait_s is not None:
+        hint = f"goal {goal_of(source)} was not reached, nothing is there to acknowledge: send it and the queue again"
+        end_followers(present, source, (Reason("NOT_REACHED", "hold", goal_of(source), hint=hint),))
 
 
 def go_on(present: Present) -> None:
@@ -42,6 +53,7 @@ def go_on(present: Present) -> None:
     state = present.state
     if isinstance(state.source, Awaiting) and present.now_ns > state.source.until_ns:
         _not_acknowledged(state.source, present)
+    _watch_leases(present)
     if state.planning is not None:
         _plan_on(state.planning, present)
     if state.planning is None:
@@ -56,7 +68,24 @@ def _not_acknowledged(source: Awaiting, present: Present) -> None:
     )
     present.state.source = Holding()
     present.emit("warning", id=source.id, message=hint, reasons=(reason,))
-    end_queue(present, (reason,), hint)
+    cancel_queue(present, (reason,), hint)
+
+
+def _watch_leases(present: Present) -> None:
+    """A goal whose client dies while it is queued does not begin."""
+    state = present.state
+    expired = [i for i, until_ns in state.queued_until_ns.items() if present.now_ns > until_ns]
+    for goal in [goal for goal in state.queue if goal.id in expired]:
+        state.queue.remove(goal)
+        del state.queued_until_ns[goal.id]
+        hint = "the client did not renew its lease while the goal was queued: is it alive?"
+        reason = Reason("LEASE_EXPIRED", "hold", goal.id, goal.lease_s, goal.lease_s, "s", hint)
+        if state.ahead is not None and state.ahead.goal.id == goal.id:
+            state.ahead = None
+        present.emit("goal_aborted", id=goal.id, message=hint, reasons=(reason,))
+        if goal.acknowledge_s is not None:
+            end_followers(present, goal, (reason,))
+            return
 
 
 def _plan_on(job: PlanJob, present: Present) -> None:
@@ -96,7 +125,7 @@ def _refused(job: PlanJob, refusal: RefusalError, present: Present) -> None:
             plan=refusal.plan if isinstance(refusal, NotPlanned) else None,
         )  # fmt: skip
     elif job.purpose == "queue":
-        present.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
+        _not_begun(goal, refusal, present)
     elif job.purpose == "again" and state.source is job.source:
         end_source(present, "goal_aborted", refusal.reasons, str(refusal))
     elif job.purpose == "ahead":
@@ -115,8 +144,9 @@ def _next_plan(present: Present) -> None:
         return
     if state.held:
         return
-    while state.queue and isinstance(source, Holding):
+    if state.queue and isinstance(source, Holding):
         goal = state.queue.pop(0)
+        state.queued_until_ns.pop(goal.id, None)
         try:
             may_move(present)
             prepared, place = prepare(goal, present)
@@ -126,11 +156,18 @@ def _next_plan(present: Present) -> None:
                 if isinstance(prepared, JointMove):
                     joint_report(prepared, present)
                 begin(prepared, present)
-            return
         except RefusalError as refusal:
-            present.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
+            _not_begun(goal, refusal, present)
+        return
     if state.queue and _blends(source) and state.ahead is None and state.not_ahead != state.queue[0].id:
         _plan_ahead(state.queue[0], source, present)
+
+
+def _not_begun(goal: Goal, refusal: RefusalError, present: Present) -> None:
+    """A queued goal cannot be driven from where the arm is now."""
+    present.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
+    if goal.acknowledge_s is not None:
+        end_followers(present, goal, refusal.reasons)
 
 
 def _blends(source: Source) -> bool:
@@ -175,6 +212,7 @@ def _hand_over(present: Present) -> None:
     if state.held or source.error_px is None or source.error_px > source.goal.blend_px:
         return
     state.queue.pop(0)
+    state.queued_until_ns.pop(following.goal.id, None)
     message = f"handed over to goal {following.goal.id} at {source.error_px:.2f} px"
     present.emit("goal_reached", id=source.goal.id, message=message, error_px=source.error_px)
     begin(following, present)

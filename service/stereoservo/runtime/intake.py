@@ -32,35 +32,44 @@ from stereoservo.runtime.incidences import joint_index
 from stereoservo.runtime.joint_goals import joint_move_to
 from stereoservo.runtime.motion import Present
 from stereoservo.runtime.refusal import RefusalError
-from stereoservo.runtime.state import Checking, Holding, Jogging, Trials
+from stereoservo.runtime.state import Checking, Holding, Jogging, JointMove, Trials, Visiting
 from stereoservo.runtime.teaching import start_teaching
 from stereoservo.runtime.trials import start_trials
 
 HOME_SPEED = 0.5
 
 
-IN_ORDER = (RunGoal, Jog, Home, Calibrate, Teach)
+IN_ORDER = (RunGoal, Home, Calibrate, Teach)
 """Requests that wait while a goal is planned, so that they are answered in the order in which they came."""
 
 
 def answer(request: Request, present: Present) -> None:
     """Carry out one request and emit its reply: at once, or once what it asks for is planned."""
-    state = present.state
-    if isinstance(request.command, IN_ORDER) and (state.waiting or goals.somebody_waits(present)):
-        if len(state.waiting) < goals.QUEUE_LENGTH:
-            state.waiting.append(request)
-            return
-        hint = f"{goals.QUEUE_LENGTH} requests wait while a goal is planned"
-        _refuse(request, RefusalError("BUSY", hint, value=float(len(state.waiting))), present)
+    if not isinstance(request.command, IN_ORDER):
+        _answer(request, present)
         return
-    _answer(request, present)
+    waiting = present.state.waiting
+    if not waiting and _free(present):
+        _answer(request, present)
+    elif len(waiting) < goals.QUEUE_LENGTH:
+        waiting.append(request)
+    else:
+        hint = f"{goals.QUEUE_LENGTH} requests wait while a goal is planned: send it again after a reply"
+        limit = float(goals.QUEUE_LENGTH)
+        refusal = RefusalError("BUSY", hint, value=float(len(waiting)), threshold=limit, unit="requests")
+        _refuse(request, refusal, present)
 
 
 def answer_waiting(present: Present) -> None:
     """Answer what has waited for a plan."""
     waiting = present.state.waiting
-    while waiting and not goals.somebody_waits(present):
+    while waiting and _free(present):
         _answer(waiting.pop(0), present)
+
+
+def _free(present: Present) -> bool:
+    """Whether the next request may be looked at: no goal is planned before it, and no other was read in this step."""
+    return not goals.planning_comes_first(present) and not present.goals_read
 
 
 def _answer(request: Request, present: Present) -> None:
@@ -76,7 +85,7 @@ def _answer(request: Request, present: Present) -> None:
             request=request.request,
             accepted=True,
             message=message,
-            id=_id(request.command),
+            id=goals.id_of(request.command),
             plan=plan,
         )
 
@@ -84,19 +93,13 @@ def _answer(request: Request, present: Present) -> None:
 def _refuse(request: Request, refusal: RefusalError, present: Present) -> None:
     present.emit(
         "reply", request=request.request, accepted=False, message=str(refusal), reasons=refusal.reasons,
-        id=_id(request.command),
+        id=goals.id_of(request.command),
     )  # fmt: skip
-
-
-def _id(command: Command) -> str:
-    if isinstance(command, RunGoal):
-        return command.goal.id
-    with_id = RenewGoal | CancelGoal | UpdateGoal | AcknowledgeGoal | Home | Calibrate
-    return command.id if isinstance(command, with_id) else ""
 
 
 def _carry_out(request: Request, command: Command, present: Present) -> goals.Accepted | None:
     if isinstance(command, RunGoal):
+        present.goals_read.append(command.goal.id)
         return goals.run_goal(command.goal, request, present)
     return _do(request, command, present), None
 
@@ -110,6 +113,7 @@ def _do(request: Request, command: Command, present: Present) -> str:
         reason = Reason("DISABLED", "hold", hint="enable, then send the goal again")
         ending.end_source(present, "goal_aborted", (reason,), "disabled")
         ending.end_queue(present, (reason,), "disabled")
+        goals.refuse_waiting((reason,), present)
         state.driver_request = "deactivate"
         return "the arm is stopped and its drives go off"
     if isinstance(command, Reset):
@@ -149,6 +153,9 @@ def _home(command: Home, present: Present) -> str:
     home = present.settings.home
     if home is None:
         raise RefusalError("NO_HOME", "the cell file states neither [joints] home nor [calibration] base")
+    if isinstance(present.state.source, JointMove) and present.state.source.id == command.id:
+        return "already accepted"  # a client's retry
+    goals.new_id(command.id, present)
     goals.preempt(present, "home")
     speed = HOME_SPEED * command.speed_scale
     present.state.source = joint_move_to(command.id, home, speed, present, lease_s=command.lease_s)
@@ -163,6 +170,9 @@ def _calibrate(command: Calibrate, present: Present) -> str:
         raise RefusalError(
             "RESET_WITHOUT_CHECK", "joint zeros are reset by a check: give check as well as reset_zeros"
         )
+    if isinstance(state.source, Visiting) and state.source.id == command.id:
+        return "already accepted"  # a client's retry
+    goals.new_id(command.id, present)
     visiting: Checking | Trials
     if not command.check:
         visiting, what = (
@@ -206,6 +216,11 @@ def _jog(command: Jog, present: Present) -> str:
         active = ending.goal_of(state.source)
         waits = f"a goal is active ({active})" if active else "a reached goal waits to be acknowledged"
         raise RefusalError("BUSY", f"{waits}: cancel it before jogging", subject=active)
+    if state.planning is not None and not state.planning.source.goal.check:
+        planned = state.planning.source.goal.id
+        raise RefusalError(
+            "BUSY", f"goal {planned} is being planned: cancel it before jogging", subject=planned
+        )
     velocity = np.zeros_like(present.q)
     for name, speed in command.velocities.items():
         if not math.isfinite(speed):

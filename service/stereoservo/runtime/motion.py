@@ -38,6 +38,8 @@ class Present:
     weights: FloatArray | None = None
     pixels: FloatArray | None = None
     """Ideal pixels."""
+    goals_read: list[str] = field(default_factory=list)
+    """Ids of the goals that were looked at in this step: one at most, for it is work."""
 
 
 @dataclass(frozen=True)

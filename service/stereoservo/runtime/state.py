@@ -18,7 +18,7 @@ from stereoservo.runtime.settings import CoreSettings
 from stereoservo.trajectory.plan import Plan
 from stereoservo.trajectory.planning import Planning
 
-STATE_VERSION = 3
+STATE_VERSION = 4
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
 
 
@@ -329,6 +329,8 @@ class CoreState(msgspec.Struct, eq=False):
     cameras: list[CameraEstimate]
     source: Source
     queue: list[Goal]
+    queued_until_ns: dict[str, int]
+    """When the leases of queued goals run out, by id."""
     planning: PlanJob | None
     waiting: list[Request]
     """Answered once the goal that is being planned has its answer."""
@@ -370,6 +372,7 @@ def initial_state(settings: CoreSettings) -> CoreState:
         cameras=[camera_estimate(0) for _ in settings.cameras],
         source=Holding(),
         queue=[],
+        queued_until_ns={},
         planning=None,
         waiting=[],
         ahead=None,
