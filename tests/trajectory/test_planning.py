@@ -343,6 +343,9 @@ def same_bits(one, other):
         ({"points": np.linspace([0.1, 0, 1, 1], [0.2, 0, 1, 1], 4)}, "one line"),
         ({"speed_scale": 0.0}, "speed_scale is 0"),
         ({"matrices": np.zeros((0, 3, 4)), "camera_centres": np.zeros((0, 4))}, "a camera"),
+        ({"camera_centres": np.full((2, 4), np.nan)}, "camera_centres of a plan's request must be finite"),
+        ({"faces": np.array([[0, 1, 9]])}, "markers from 0 to 3"),
+        ({"faces": np.array([[0, 0, 1]])}, r"\[0, 0, 1\] of a face are on one line"),
     ],
 )
 def test_requests_without_an_answer_are_refused(virtual, cells, change, match):
@@ -350,6 +353,24 @@ def test_requests_without_an_answer_are_refused(virtual, cells, change, match):
     flat = virtual.World(world.generators, world.plate, np.eye(4), world.q)
     with pytest.raises(PlanRequestError, match=match):
         start_planning(cells.request(flat, cells.START, **change))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"acceleration_max": np.array([1.0, 1, 1, 1, 1, 0])}, "acceleration_max .* above 0"),
+        ({"velocity_max": np.full(6, np.nan)}, "velocity_max .* above 0"),
+        ({"position_min": np.full(6, np.nan)}, "position_min .* must be numbers"),
+        ({"keep_outs": np.full((1, 6, 2), np.nan)}, "keep_outs .* must be numbers"),
+        ({"view_margin_px": np.nan}, "view_margin_px"),
+    ],
+)
+def test_limits_that_are_none_are_refused(virtual, cells, change, match):
+    world = virtual.free_arm(np.random.default_rng(0), cells.START)
+    request = cells.request(world, cells.START)
+    limits = msgspec.structs.replace(request.limits, **change)
+    with pytest.raises(PlanRequestError, match=match):
+        start_planning(msgspec.structs.replace(request, limits=limits))
 
 
 def test_a_slower_scale_takes_longer_on_the_same_way(virtual, cells):

@@ -14,7 +14,7 @@ from stereoservo.kinematics.kernels import invert4, transform_points
 from stereoservo.trajectory.bending import bend_directions, turnings
 from stereoservo.trajectory.following import freedoms
 from stereoservo.trajectory.motion_frame import conjugated, motion_frame, plane_at_infinity, turn_between
-from stereoservo.trajectory.plan import PlanRequest
+from stereoservo.trajectory.plan import PlanLimits, PlanRequest
 from stereoservo.trajectory.rooms import empty_table, moved
 from stereoservo.trajectory.search import (
     MISSING_FREEDOMS,
@@ -49,7 +49,7 @@ COLLINEAR = 1e-6
 
 
 class PlanRequestError(ValueError):
-    """A request that no plan can answer: numbers that are not finite, markers on one line, no heights."""
+    """A request that no plan can answer: numbers that are not finite, no limits, markers or a face on one line."""
 
 
 def plan(request: PlanRequest) -> Planning:
@@ -79,6 +79,9 @@ def start_planning(request: PlanRequest) -> Planning:
         raise PlanRequestError(
             f"{len(body)} markers on one line fix no pose: three that span a plane are needed"
         )
+    for face in np.asarray(r.faces).reshape(-1, 3):
+        if not _spans_a_plane(body[face]):
+            raise PlanRequestError(f"the markers {face.tolist()} of a face are on one line")
     centre_way = _in_frame(inverse, r.centre_target[None])[0]
     rotation = turn_between(body, goal)
     whole = np.zeros(NUMBERS)
@@ -122,7 +125,9 @@ def start_planning(request: PlanRequest) -> Planning:
 
 
 def _check(request: PlanRequest) -> None:
-    for name in ("operators", "joints", "matrices", "points", "targets", "centre", "centre_target"):
+    for name in (
+        "operators", "joints", "matrices", "camera_centres", "points", "targets", "kept", "centre", "centre_target"
+    ):  # fmt: skip
         values = getattr(request, name)
         if not np.isfinite(values).all():
             raise PlanRequestError(f"{name} of a plan's request must be finite, got {values.tolist()}")
@@ -130,6 +135,26 @@ def _check(request: PlanRequest) -> None:
         raise PlanRequestError(f"speed_scale is {request.speed_scale}; above 0, at most 1 is valid")
     if len(request.joints) == 0 or len(request.matrices) == 0:
         raise PlanRequestError("a plan needs a joint and a camera at least")
+    faces = np.asarray(request.faces)
+    if faces.size and not (int(faces.min()) >= 0 and int(faces.max()) < len(request.points)):
+        raise PlanRequestError(
+            f"faces name markers from 0 to {len(request.points) - 1}, got {faces.tolist()}"
+        )
+    _check_limits(request.limits)
+
+
+def _check_limits(limits: PlanLimits) -> None:
+    """Limits that are no numbers, or not above zero where a joint has to move, would be none."""
+    for name in ("velocity_max", "acceleration_max", "sizes"):
+        values = getattr(limits, name)
+        if not (np.asarray(values) > 0.0).all():
+            raise PlanRequestError(f"{name} of a plan's limits must be above 0, got {values.tolist()}")
+    for name in ("position_min", "position_max", "keep_outs"):
+        values = getattr(limits, name)
+        if np.isnan(values).any():
+            raise PlanRequestError(f"{name} of a plan's limits must be numbers, got {values.tolist()}")
+    if not (np.isfinite(limits.lenses).all() and np.isfinite(limits.view_margin_px)):
+        raise PlanRequestError("lenses and view_margin_px of a plan's limits must be finite")
 
 
 def _in_frame(inverse: FloatArray, points: FloatArray) -> FloatArray:
