@@ -21,6 +21,7 @@ from stereoservo.runtime.commands import (
     Request,
     Resume,
     RunGoal,
+    UpdateGoal,
 )
 from stereoservo.runtime.state import Holding
 
@@ -194,3 +195,28 @@ def test_extreme_numbers_are_refused_when_they_are_read(bench: Any) -> None:
         request = Request(1, "tester", of("0000aaaa", target, **{name: value}))
         with pytest.raises(msgspec.ValidationError, match=name):
             msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=Request)
+
+
+def test_set_points_at_any_rate_are_worked_on_once_a_step(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.ready()
+    base = bench.q.copy()
+    assert bench.reply(of("0000aaaa", to(bench, base), gain=4.0)).accepted
+    worked = []
+    move = goals.move_goal
+
+    def counted(command: UpdateGoal, present: Any) -> str:
+        worked.append((bench.seq, command.stamp_s))
+        return move(command, present)
+
+    monkeypatch.setattr(goals, "move_goal", counted)
+    for k in range(100):
+        q = base + 0.2 * DISPLACED * min(1.0, k / 80.0)
+        told = [UpdateGoal("0000aaaa", to(bench, q), 1.0 + 0.01 * k + 0.001 * i) for i in range(10)]
+        outputs = bench.step(*told)
+        assert [e.accepted for e in outputs.events if e.kind == "reply"] == [True] * 10
+        assert worked[-1] == (bench.seq, told[-1].stamp_s)
+    assert len(worked) == 100
+    assert bench.ended(5.0).kind == "goal_reached"
+    assert bench.error_px(base + 0.2 * DISPLACED) < 0.3

@@ -105,8 +105,7 @@ class ServoCore:
         present = self._present(inputs, q, emit)
         if inputs.stop:
             self._stop(present)
-        for request in inputs.requests:
-            intake.answer(request, present)
+        intake.answer_all(inputs.requests, present)
         self._watch_following(present)
         teach_step(present)
         self._watch_model(present)

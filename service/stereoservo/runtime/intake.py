@@ -43,6 +43,18 @@ IN_ORDER = (RunGoal, Home, Calibrate, Teach)
 """Requests that wait while a goal is planned, so that they are answered in the order in which they came."""
 
 
+def answer_all(requests: tuple[Request, ...], present: Present) -> None:
+    """Answer a step's requests in order. Of several set-points for one goal the newest counts: each is work."""
+    newest = {r.command.id: r.request for r in requests if isinstance(r.command, UpdateGoal)}
+    for request in requests:
+        command = request.command
+        if isinstance(command, UpdateGoal) and newest[command.id] != request.request:
+            message = "overtaken by newer set-points in the same cycle"
+            present.emit("reply", request=request.request, accepted=True, id=command.id, message=message)
+        else:
+            answer(request, present)
+
+
 def answer(request: Request, present: Present) -> None:
     """Carry out one request and emit its reply: at once, or once what it asks for is planned."""
     if not isinstance(request.command, IN_ORDER):
