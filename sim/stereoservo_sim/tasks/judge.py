@@ -110,8 +110,9 @@ def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> F
 def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, cameras: int) -> float:
     """Mean of the largest error over markers that image noise leaves to a loop at rest [px].
 
-    The pose of least squares of each frame alone has the covariance ``σ²(JᵀJ)⁻¹``; a proportional loop of ``gain``
-    lets ``λ/(2 - λ)``, ``λ = gain·dt``, of it through. The mean over its directions is taken from 4096 fixed draws.
+    The pose of least squares of each frame alone has the covariance ``σ²(JᵀJ)⁻¹``; a loop in which an error decays by
+    ``exp(-gain·dt)`` a step lets ``λ/(2 - λ)``, ``λ = 1 - exp(-gain·dt)``, of it through. The mean over its directions
+    is taken from 4096 fixed draws.
     """
     if noise_px == 0.0:
         return 0.0
@@ -125,5 +126,5 @@ def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, 
     Q = np.linalg.qr(flat)[0]
     draws = np.random.default_rng(0).normal(size=(4096, 6)) @ Q.T
     worst = np.sqrt((draws.reshape(4096, -1, 2) ** 2).sum(axis=-1)).max(axis=1)
-    share = gain * dt_s
+    share = -math.expm1(-gain * dt_s)
     return float(noise_px * np.sqrt(share / (2.0 - share)) * worst.mean())

@@ -107,10 +107,21 @@ def test_noise_floor_is_what_a_linear_loop_leaves():
         J[:, k] = (independent(moved)[0].ravel() - exact) / 1e-6
     rng = np.random.default_rng(2)
     gain, dt, sigma = 2.0, 0.04, 0.1
+    share = 1.0 - np.exp(-gain * dt)
     x, pinv, errors = np.zeros(6), np.linalg.pinv(J), []
     for _ in range(40_000):
-        x = x - gain * dt * (x + pinv @ rng.normal(0, sigma, 16))
+        x = x - share * (x + pinv @ rng.normal(0, sigma, 16))
         errors.append(np.sqrt(((J @ x).reshape(8, 2) ** 2).sum(axis=1)).max())
     floor = noise_floor_px(goal, sigma, gain, dt, 2)
     assert floor == pytest.approx(np.mean(errors[500:]), rel=0.03)
     assert noise_floor_px(goal, 0.0, gain, dt, 2) == 0.0
+
+
+def test_the_floor_of_any_gain_is_that_of_one_frame_at_most():
+    goal = np.eye(4)
+    goal[2, 3] = 1.0
+    floors = [noise_floor_px(goal, 0.1, gain, 1.0, 2) for gain in (0.01, 1.0, 2.0, 50.0)]
+    assert np.isfinite(floors).all()
+    assert (np.diff(floors) > 0).all()
+    # all of a frame's noise, of which six of sixteen freedoms are a pose
+    assert floors[-1] < 0.1 * np.sqrt(16)
