@@ -113,7 +113,7 @@ class DaemonProcess:
             if stream is not None:
                 stream.close()
 
-    def wait_ready(self, timeout_s: float = 90.0) -> DaemonInfo:
+    def wait_ready(self, timeout_s: float = 600.0) -> DaemonInfo:
         """Wait until it takes requests. Raises DaemonError with what it said."""
         until = time.monotonic() + timeout_s
         while time.monotonic() < until:

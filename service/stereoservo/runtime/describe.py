@@ -18,6 +18,7 @@ from stereoservo.runtime import plugins
 from stereoservo.runtime.cameras import describe_camera, make_camera
 from stereoservo.runtime.cellfile import CellFile, CellFileError, load_cell_file
 from stereoservo.runtime.clock import MonotonicClock
+from stereoservo.runtime.compiling import compile_ahead
 from stereoservo.runtime.interprocess import RunPlan, save_plan
 from stereoservo.runtime.lifeline import die_with_parent
 from stereoservo.runtime.ports import (
@@ -105,6 +106,7 @@ def main() -> int:
         print(error, file=sys.stderr)
         return EXIT_INVALID
     save_plan(plan)
+    compile_ahead()
     warm_up()
     return 0
 

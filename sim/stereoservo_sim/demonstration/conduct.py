@@ -109,7 +109,7 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
         stage.tell("starting the daemon (the first start compiles the kernels)")
         options = ("--seed", str(seed), "--record", str(recording))
         with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
-            daemon.wait_ready(180.0)
+            daemon.wait_ready()
             log = TruthLog.of_directory(cell_directories(cell.cell.name).runtime)
             log.follow()
             with Client(cell.cell.name) as client:
