@@ -135,6 +135,10 @@ def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> 
         ({"gain": -1}, "gain: Expected `float` > 0.0001, got -1"),
         ({"zz": 1}, "unknown field `zz`; known: id, target, law"),
         (
+            {"target": {"kind": "taught", "name": "a", "relative_to": "table"}},
+            "target.relative_to: Invalid enum value 'table'; valid: workpiece, cameras",
+        ),
+        (
             {"target": {"kind": "wish"}},
             "target.kind: Invalid value 'wish'; valid: features, points, displacement, taught, joints, incidence",
         ),

@@ -388,6 +388,8 @@ _WORDS: dict[str, tuple[str, ...]] = {
         for field in msgspec.structs.fields(Goal)
     },
     "target.kind": tuple(str(target.__struct_config__.tag) for target in get_args(Target)),
+    "target.relative_to": ("workpiece", "cameras"),
+    "command": ("renew", "update", "acknowledge", "cancel"),
 }
 """What a field of a goal may say, where its words are few."""
 

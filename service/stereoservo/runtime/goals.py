@@ -93,9 +93,10 @@ def _enqueue(goal: Goal, present: Present) -> str:
     if len(state.queue) >= QUEUE_LENGTH:
         raise RefusalError(
             "QUEUE_FULL",
-            f"{QUEUE_LENGTH} goals are queued",
+            f"{QUEUE_LENGTH} goals are queued: wait until one has ended, or cancel one",
             value=float(len(state.queue)),
             threshold=float(QUEUE_LENGTH),
+            unit="goals",
         )
     prepare(goal, present)  # what cannot be at all is refused now; its way is planned when its turn comes
     state.queue.append(goal)
