@@ -220,3 +220,12 @@ def test_set_points_at_any_rate_are_worked_on_once_a_step(
     assert len(worked) == 100
     assert bench.ended(5.0).kind == "goal_reached"
     assert bench.error_px(base + 0.2 * DISPLACED) < 0.3
+
+
+def test_tolerance_that_noise_never_allows_ends_at_the_time_limit_with_the_cause(benches: Any) -> None:
+    bench = benches(1, noise_px=0.3).ready()
+    command = of("0000aaaa", to(bench, bench.q), tolerance_px=0.001, time_limit_s=8.0)
+    assert bench.reply(command).accepted
+    event = bench.ended(10.0)
+    assert (event.kind, [r.code for r in event.reasons][:2]) == ("goal_aborted", ["TIME_LIMIT", "STUCK"])
+    assert "tolerance of 0.001 px is below what the images allow" in event.reasons[1].hint

@@ -322,8 +322,9 @@ def _out_of_time(source: LawRun, present: Present, error_px: float | None) -> Mo
         else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
     )  # fmt: skip
     present.emit(
-        "goal_aborted", id=source.goal.id, message="not reached in time", reasons=(reason,), error_px=error_px
-    )
+        "goal_aborted", id=source.goal.id, message="not reached in time", error_px=error_px,
+        reasons=(reason, *source.watch.reasons),
+    )  # fmt: skip
     return Motion(np.zeros_like(present.q), finished=True, error_px=error_px)
 
 
