@@ -48,7 +48,7 @@ def test_a_goal_survives_the_wire() -> None:
     ("change", "text"),
     [
         ({"law": "magic"}, "law: Invalid enum value 'magic'"),
-        ({"gain": -1.0}, "gain: Expected `float` > 0"),
+        ({"gain": -1.0}, "gain: Expected `float` >= 0.0001"),
         ({"speed_scale": 1.5}, "speed_scale: Expected `float` <= 1"),
         ({"hurry": True}, "unknown field `hurry`"),
         ({"id": "x"}, "id: Expected `str` matching regex"),
@@ -132,7 +132,7 @@ def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> 
     ("change", "text"),
     [
         ({"law": "pbvs"}, "law: Invalid enum value 'pbvs'; valid: stereo, image, points, cartesian3"),
-        ({"gain": -1}, "gain: Expected `float` > 0.0001, got -1"),
+        ({"gain": -1}, "gain: Expected `float` >= 0.0001, got -1"),
         ({"zz": 1}, "unknown field `zz`; known: id, target, law"),
         (
             {"target": {"kind": "taught", "name": "a", "relative_to": "table"}},

@@ -16,10 +16,10 @@ GoalId = Annotated[str, Meta(pattern=r"^[0-9a-fA-F]{8}[0-9a-fA-F-]{0,28}$")]
 Positive = Annotated[float, Meta(gt=0)]
 Duration = Annotated[float, Meta(gt=0, le=86_400)]
 """[s], a day at most."""
-Gain = Annotated[float, Meta(gt=1e-4, le=50)]
-Pixels = Annotated[float, Meta(gt=1e-4, le=1000)]
+Gain = Annotated[float, Meta(ge=1e-4, le=50)]
+Pixels = Annotated[float, Meta(ge=1e-4, le=1000)]
 Lease = Annotated[float, Meta(ge=0.3, le=3600)]
-Fraction = Annotated[float, Meta(gt=1e-4, le=1)]
+Fraction = Annotated[float, Meta(ge=1e-4, le=1)]
 
 LAWS = ("stereo", "image", "points", "cartesian3", "cartesian2", "trajectory")
 LawName = Literal["stereo", "image", "points", "cartesian3", "cartesian2", "trajectory"]
