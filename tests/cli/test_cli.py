@@ -146,7 +146,7 @@ def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: R
         (("goal", "nowhere", "--joint", "j1=nan"), "NAME=NUMBER with a finite number"),
         (("goal", "nowhere", "--joint", "j1"), "NAME=NUMBER"),
         (("goal", "nowhere", "pick", "--law", "magic"), "Invalid enum value 'magic'"),
-        (("goal", "nowhere", "pick", "--gain", "-1"), "gain: Expected `float` > 0"),
+        (("goal", "nowhere", "pick", "--gain", "-1"), "gain: Expected `float` >= 0.0001"),
         (("goal", "nowhere", "pick", "--gain", "nan"), "gain is nan; finite numbers are valid"),
         (("goal", "nowhere", "pick", "--time-limit", "inf"), "time_limit_s is inf; finite numbers are valid"),
         (("goal", "nowhere", "--set-points", "/none.json"), "/none.json: No such file"),

@@ -81,7 +81,7 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
         (("pick", "--follow", "-"), "--follow is a target of its own"),
         (("--follow", "/none.jsonl"), "/none.jsonl: No such file"),
         (("--displacement", "/none.json"), "/none.json: No such file"),
-        (("pick", "--blend", "-1"), "blend_px: Expected `float` > 0"),
+        (("pick", "--blend", "-1"), "blend_px: Expected `float` >= 0.0001"),
         (("pick", "--acknowledge", "inf"), "acknowledge_s is inf"),
     ],
 )

@@ -148,12 +148,13 @@ def test_dots_are_where_they_should_be(blur):
             measured = measured_dots(image, camera, q)
             errors.append(measured - CELL.truth_pixels(q)[camera.name])
             from_ellipse.append(measured - ellipse_centres(camera, q))
-    for name, values in (("projected centres", errors), ("ellipse centres", from_ellipse)):
+    # Perspective shifts the image of a disc off that of its centre, all dots of a tilted plate to one side.
+    for name, values, bias in (("projected centres", errors, 0.006), ("ellipse centres", from_ellipse, 0.004)):
         error = np.concatenate(values)
         rms = np.sqrt(np.mean(error**2))
         print(f"blur {blur} px: {name}: rms {rms:.4f}, max {np.abs(error).max():.4f} px")
         assert rms <= 0.012
-        assert np.abs(error.mean(axis=0)).max() <= 0.004
+        assert np.abs(error.mean(axis=0)).max() <= bias
 
 
 def test_noise_has_its_sigma_and_differs_from_frame_to_frame():
