@@ -149,7 +149,10 @@ def test_dots_are_where_they_should_be(blur):
             errors.append(measured - CELL.truth_pixels(q)[camera.name])
             from_ellipse.append(measured - ellipse_centres(camera, q))
     # Perspective shifts the image of a disc off that of its centre, all dots of a tilted plate to one side.
-    for name, values, bias in (("projected centres", errors, 0.006), ("ellipse centres", from_ellipse, 0.004)):
+    for name, values, bias in (
+        ("projected centres", errors, 0.006),
+        ("ellipse centres", from_ellipse, 0.004),
+    ):
         error = np.concatenate(values)
         rms = np.sqrt(np.mean(error**2))
         print(f"blur {blur} px: {name}: rms {rms:.4f}, max {np.abs(error).max():.4f} px")

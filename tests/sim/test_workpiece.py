@@ -320,6 +320,7 @@ def point_on_plane(bench: Bench, before: np.ndarray) -> None:
     assert abs(height(there)) < 5.0 * sigma + 1e-3 * FILE.servo.tolerance_px * MM_PER_PX
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(TIMEOUT_S)
 def test_a_goal_outlives_a_camera_that_was_moved(tmp_path: Path) -> None:
     """Taught with one rig, sent relative to the cameras after one of them was moved and the cell calibrated anew."""
