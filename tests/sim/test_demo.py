@@ -1,4 +1,4 @@
-"""The demonstration as the command line gives it: ten seeds in lockstep, and once as real processes."""
+"""The demonstration as the command line gives it: four seeds in lockstep, and once as real processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from scipy.stats import chi2
 
-SEEDS = range(10)
+SEEDS = range(4)
 TIMEOUT_S = 900
 
 
@@ -35,7 +35,7 @@ def run_demo(out: Path, *options: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[dict[str, Any]]]]:
-    """All lockstep demos, two at a time: seeds 0 to 9, and seed 0 again."""
+    """All lockstep demos, two at a time: every seed, and seed 0 again."""
     with ThreadPoolExecutor(2) as pool:
         runs = {
             name: pool.submit(run_demo, tmp_path_factory.mktemp(f"demo-{name}"), "--lockstep", "--seed", seed)
