@@ -22,7 +22,7 @@ from stereoservo.runtime.ports import (
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
 from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
-from stereoservo_sim.drives import DriveBank, IdealPlant, Plant
+from stereoservo_sim.drives.bank import DriveBank, IdealPlant, Plant
 from stereoservo_sim.world import demo_cell
 
 FloatArray = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ from stereoservo.runtime.ports import CameraDescription, DriverContext, DriverEr
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
 from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
-from stereoservo_sim.drives import Plant
+from stereoservo_sim.drives.bank import Plant
 from stereoservo_sim.world import demo_cell
 
 if TYPE_CHECKING:

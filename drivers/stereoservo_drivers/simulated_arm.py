@@ -19,7 +19,7 @@ from stereoservo.runtime.ports import (
     JointState,
 )
 from stereoservo_drivers.lifecycle import DriverLifecycle, State
-from stereoservo_sim.drives import DriveBank, Plant
+from stereoservo_sim.drives.bank import DriveBank, Plant
 from stereoservo_sim.history import CAPACITY, FILE_NAME, HistoryError, JointHistory
 
 FloatArray = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereoservo.runtime.ports import JointSpec
-from stereoservo_sim.drives import DriveBank, IdealPlant, ramp
+from stereoservo_sim.drives.bank import DriveBank, IdealPlant, ramp
 
 MS = 1_000_000
 JOINT = JointSpec("a", "revolute", -1.0, 1.0, velocity_max=1.0, acceleration_max=4.0)

@@ -168,6 +168,8 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     calibration: CalibrationSection | None = None
     servo: ServoSection = ServoSection()
     zenoh: ZenohSection = ZenohSection()
+    emulate: dict[str, Any] = {}
+    """``[emulate.drives]``: what `stereoservo emulate` puts in the place of the hardware; not read by the daemon."""
 
 
 def load_cell_file(path: Path) -> CellFile:

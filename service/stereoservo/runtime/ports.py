@@ -11,7 +11,7 @@ connected. Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -98,13 +98,17 @@ class DetectorDescription(msgspec.Struct, frozen=True):
 
 
 class JointState(msgspec.Struct, frozen=True, eq=False):
-    """One joint sample: ``positions`` (n,), ``velocities`` (n,); ``efforts`` (n,) where the drive has them."""
+    """One joint sample: ``positions`` (n,), ``velocities`` (n,), and, where the drives have them, (n,) each:
+    ``efforts`` [N m or N; shares of the rated torque where the driver does not know that] and ``following_errors``,
+    set less actual position [rad or m].
+    """
 
     seq: int
     t_ns: int
     positions: FloatArray
     velocities: FloatArray
     efforts: FloatArray | None = None
+    following_errors: FloatArray | None = None
 
 
 class CommandReport(msgspec.Struct, frozen=True, eq=False):
@@ -217,6 +221,27 @@ class JointDriver(Protocol):
 
     def close(self) -> None:
         """Release everything. Idempotent; never raises."""
+        ...
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """What an examination found. ``ok`` None: worth knowing, no verdict. ``cure``: the setting or act that mends it."""
+
+    name: str
+    ok: bool | None
+    message: str
+    cure: str = ""
+
+
+@runtime_checkable
+class ExaminableJointDriver(Protocol):
+    """A joint driver that can examine its machine for `stereoservo doctor`; the driver is not configured then."""
+
+    def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+        """Connect, look, tell, release. ``may_move`` is asked, with a sentence, before any joint is moved.
+
+        Never raises on what the machine does: a failure is a finding.
+        """
         ...
 
 

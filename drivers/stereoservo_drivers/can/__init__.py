@@ -1,0 +1,1 @@
+"""CAN transports: frames, their bits on the wire, fast serial-line CAN."""

@@ -1,0 +1,79 @@
+"""Options of the CAN joint driver: ``[joints.options]`` of a cell file, checked before anything is connected."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+NodeId = Annotated[int, Meta(ge=1, le=126)]
+Feedback = Literal["velocity", "effort", "following_error"]
+
+
+class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One ``[[joints.options.joint]]``: a drive and what hangs on it [rad, s; m for prismatic joints].
+
+    ``counts_per_rev``, ``velocity_units_per_rev_s``: of the motor (60: the drive speaks rpm; default: counts/s).
+    ``gear_ratio``: motor turns per joint turn; of a prismatic joint, motor turns per metre. ``offset_rad``:
+    ``q = counts / k - offset``. ``max_*`` go to the drive and clamp commands; ``position_min``, ``position_max``: the
+    machine's limits. ``rated_torque`` [N m or N at the joint] of 1000 permille; without it, efforts are shares of it.
+    ``vendor_id``, ``product_code``, ``revision``, ``serial_number``: checked against the drive's identity where given.
+    ``sdo``: further writes ``"index:subindex" = value``, verified by reading back.
+    """
+
+    name: str
+    node_id: NodeId
+    kind: Literal["revolute", "prismatic"] = "revolute"
+    counts_per_rev: Positive
+    gear_ratio: Positive = 1.0
+    direction: Literal[1, -1] = 1
+    offset_rad: float = 0.0
+    velocity_units_per_rev_s: Positive | None = None
+    max_velocity: Positive
+    max_acceleration: Positive
+    quick_stop_deceleration: Positive
+    position_min: float
+    position_max: float
+    multi_turn: bool = False
+    rated_torque: Positive | None = None
+    vendor_id: int | None = None
+    product_code: int | None = None
+    revision: int | None = None
+    serial_number: int | None = None
+    sdo: dict[str, int] = {}
+
+
+class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[joints.options]`` of driver ``canopen``.
+
+    ``interface``, ``channel``, ``bitrate``, ``interface_options``: as python-can takes them; ``stereoservo_slcan`` is
+    the fast serial-line CAN of this package. ``feedback``: what the drives send beside status word and position.
+    ``rpdo_deadline_ms``: 0 where the drives have none. ``emcy_ignore``: emergency codes that do not trip.
+    ``command_timeout_s``: without a command for so long the joints are brought to rest (they stay enabled);
+    ``loop_timeout_ms``: without any call for so long, while enabled, the driver latches a fault.
+    """
+
+    protocol: Literal["cia402", "odrive"] = "cia402"
+    interface: str
+    channel: str | int
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
+    interface_options: dict[str, str | int | float | bool] = {}
+    rate_hz: Annotated[float, Meta(ge=10, le=1000)] = 250.0
+    max_bus_load: Annotated[float, Meta(gt=0, le=0.95)] = 0.70
+    master_id: Annotated[int, Meta(ge=1, le=127)] = 127
+    heartbeat_ms: Annotated[int, Meta(ge=2, le=1000)] = 20
+    heartbeat_timeout_ms: Annotated[int, Meta(ge=10, le=5000)] = 100
+    rpdo_deadline_ms: Annotated[int, Meta(ge=0, le=5000)] = 20
+    max_missed_cycles: Annotated[int, Meta(ge=1, le=50)] = 3
+    mode: Literal["csv", "pv"] = "csv"
+    quick_stop_option: Literal[1, 2, 3, 4, 5, 6, 7, 8] = 2
+    abort_option: Literal[1, 2, 3] = 3
+    emcy_ignore: tuple[int, ...] = ()
+    eds: str = ""
+    feedback: tuple[Feedback, ...] = ("velocity", "effort")
+    command_timeout_s: Positive = 0.1
+    loop_timeout_ms: Annotated[int, Meta(ge=20, le=5000)] = 100
+    joint: tuple[CanJoint, ...]

@@ -1,0 +1,1 @@
+"""Emulated drives: what a rack of servo drives on a CAN bus does, frame by frame."""
