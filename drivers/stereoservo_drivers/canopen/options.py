@@ -20,6 +20,7 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     ``gear_ratio``: motor turns per joint turn; of a prismatic joint, motor turns per metre. ``offset_rad``:
     ``q = counts / k - offset``. ``max_*`` go to the drive and clamp commands; ``position_min``, ``position_max``: the
     machine's limits. ``rated_torque`` [N m or N at the joint] of 1000 permille; without it, efforts are shares of it.
+    ``current_limit`` [A]: protocol ``odrive`` only; where given, it and ``max_velocity`` become the drive's limits.
     ``vendor_id``, ``product_code``, ``revision``, ``serial_number``: checked against the drive's identity where given.
     ``sdo``: further writes ``"index:subindex" = value``, verified by reading back.
     """
@@ -39,6 +40,7 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     position_max: float
     multi_turn: bool = False
     rated_torque: Positive | None = None
+    current_limit: Positive | None = None
     vendor_id: int | None = None
     product_code: int | None = None
     revision: int | None = None
