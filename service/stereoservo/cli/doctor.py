@@ -11,6 +11,7 @@ from typing import Annotated
 import msgspec
 import typer
 
+from stereoservo.cli.examination import examine_joints, permission
 from stereoservo.cli.output import CommandError, JsonOption, emit
 from stereoservo.gateway.session import SessionError, gateway_config
 from stereoservo.gateway.stores import ModelStore
@@ -25,18 +26,27 @@ LOW_DISK_BYTES = 500_000_000
 
 
 class Check(msgspec.Struct, frozen=True):
-    """One check. ``ok`` None: a warning."""
+    """One check. ``ok`` None: worth knowing. ``cure``: the setting or act that mends it."""
 
     name: str
     ok: bool | None
     message: str
+    cure: str = ""
 
 
 def doctor(
     cell: Annotated[Path, typer.Argument(metavar="CELL", help="Path of a cell file.")],
+    jog: Annotated[
+        bool,
+        typer.Option("--jog", help="Also turn each joint by one degree, once allowed: checks its units."),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Allow what --jog asks for.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Check cell file, drivers, cameras, directories, wire, model and scheduling, without moving anything."""
+    """Check cell file, drivers, drives, cameras, directories, wire, model and scheduling. Nothing moves without
+    ``--jog``; the drives are asked only while no daemon has them.
+    """
+    may_move = permission(jog, yes)
     loaded = load_cell_file(cell)
     checks = [Check("cell file", True, f"{cell} is valid")]
     directories = cell_directories(loaded.cell.name)
@@ -44,14 +54,24 @@ def doctor(
     plan = make_plan(cell.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
     checks.append(Check("drivers", True, _drivers(plan)))
     checks += [check(plan, directories) for check in CHECKS]
+    for found in examine_joints(plan, may_move):
+        checks.append(Check(found.name, found.ok, found.message, found.cure))
     failed = [check for check in checks if check.ok is False]
-    marks = {True: "ok", False: "FAILED", None: "note"}
+    text = "\n".join(_line(check) for check in checks)
     if failed:
+        if not json:
+            emit(None, text, False)
         tree = msgspec.to_builtins(checks)
         raise CommandError(
             "checks_failed", "; ".join(f"{check.name}: {check.message}" for check in failed), checks=tree
         )
-    emit({"checks": checks}, "\n".join(f"{marks[c.ok]:6} {c.name:12} {c.message}" for c in checks), json)
+    emit({"checks": checks}, text, json)
+
+
+def _line(check: Check) -> str:
+    mark = {True: "ok", False: "FAILED", None: "note"}[check.ok]
+    cure = f"\n{'':20}cure: {check.cure}" if check.cure else ""
+    return f"{mark:6} {check.name:12} {check.message}{cure}"
 
 
 def _drivers(plan: RunPlan) -> str:

@@ -1,0 +1,131 @@
+"""`stereoservo doctor` and a joint driver that can examine its machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stereoservo.cli import main as cli
+from stereoservo.runtime.directories import cell_directories, create_directories
+from stereoservo.runtime.locks import FileLock
+from stereoservo.runtime.ports import DriverError, Finding
+from stereoservo_drivers.fake import FakeJointDriver
+
+Doctor = Callable[..., tuple[int, list[dict[str, Any]]]]
+QUESTION = "j1 will turn by one degree"
+
+
+class Examination:
+    """What the fake arm finds, and what it was told."""
+
+    def __init__(self) -> None:
+        self.allowed: list[bool] = []
+        self.ended = False
+        self.error: DriverError | None = None
+
+    def __call__(self, _driver: object, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+        try:
+            yield Finding("node 1", True, "answers")
+            if self.error is not None:
+                raise self.error
+            self.allowed.append(may_move(QUESTION))
+            yield Finding("node 2", False, "is silent", "[[joints.options.joint]] node_id")
+        finally:
+            self.ended = True
+
+
+@pytest.fixture
+def examination(monkeypatch: pytest.MonkeyPatch) -> Examination:
+    found = Examination()
+
+    def examine(driver: FakeJointDriver, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+        return found(driver, may_move)
+
+    monkeypatch.setattr(FakeJointDriver, "examine", examine, raising=False)
+    return found
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    path = tmp_path / "cell.toml"
+    assert cli.invoke(["init", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def doctor(cell: Path, capfd: pytest.CaptureFixture[str]) -> Doctor:
+    def run(*options: str) -> tuple[int, list[dict[str, Any]]]:
+        capfd.readouterr()
+        code = cli.invoke(["doctor", str(cell), "--json", *options])
+        result = json.loads(capfd.readouterr().out)
+        checks = result["error"]["checks"] if code else result["checks"]
+        return code, [check for check in checks if check["name"] in ("node 1", "node 2", "drives")]
+
+    return run
+
+
+def test_findings_are_checks_with_their_cure(doctor: Doctor, examination: Examination) -> None:
+    code, checks = doctor()
+    assert code == 1
+    assert [(check["name"], check["ok"]) for check in checks] == [("node 1", True), ("node 2", False)]
+    assert checks[1]["cure"] == "[[joints.options.joint]] node_id"
+    assert examination.allowed == [False]
+    assert examination.ended
+
+
+def test_the_cure_is_printed_and_what_was_found_well(
+    cell: Path, examination: Examination, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.invoke(["doctor", str(cell)]) == 1
+    out, err = capfd.readouterr()
+    assert "ok     node 1       answers" in out
+    assert "FAILED node 2       is silent" in out
+    assert "cure: [[joints.options.joint]] node_id" in out
+    assert err.strip() == "error: node 2: is silent"
+
+
+def test_a_jog_is_allowed_by_yes_or_a_person_and_by_nobody_else(
+    doctor: Doctor, examination: Examination, cell: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    doctor("--jog", "--yes")
+    assert examination.allowed == [True]
+    assert cli.invoke(["doctor", str(cell), "--jog"]) == 1  # no terminal here
+    assert cli.invoke(["doctor", str(cell), "--yes"]) == 1
+    assert examination.allowed == [True]
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    asked = []
+
+    def confirm(question: str, **_: Any) -> bool:
+        asked.append(question)
+        return False
+
+    monkeypatch.setattr("typer.confirm", confirm)
+    doctor("--jog")
+    assert asked == [QUESTION]
+    assert examination.allowed == [True, False]
+
+
+def test_a_machine_that_somebody_has_is_left_alone(doctor: Doctor, examination: Examination) -> None:
+    directories = cell_directories("cell")
+    create_directories(directories)
+    with FileLock(directories.servo_lock, "the cell"):
+        code, (check,) = doctor()
+    assert (code, check["name"], check["ok"]) == (0, "drives", None)
+    assert "already in use" in check["message"]
+    with FileLock(directories.daemon_lock, "the daemon"):
+        code, (check,) = doctor()
+    assert (code, check["ok"]) == (0, None)
+    assert "daemon" in check["message"]
+    assert not examination.ended
+
+
+def test_a_driver_error_is_a_failed_check(doctor: Doctor, examination: Examination) -> None:
+    examination.error = DriverError("connection_lost", "no adapter at /dev/ttyACM0")
+    code, checks = doctor()
+    assert code == 1
+    assert checks[-1]["message"] == "no adapter at /dev/ttyACM0"
+    assert checks[-1]["ok"] is False
