@@ -57,7 +57,7 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> int:
 
 class PybulletPlant:
     """The arm as rigid bodies under gravity. Drives follow their set-points by position and velocity, so
-    nothing sags.
+    nothing sags. ``efforts`` (n,) [N m]: what the motors gave in the last step; at rest, what gravity asks for.
     """
 
     def __init__(self, robot: Robot, positions: FloatArray, step_s: float) -> None:
@@ -91,6 +91,12 @@ class PybulletPlant:
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         self.positions = positions.copy()
         self.velocities = np.zeros(self._count)
+        still = [0.0] * self._count
+        self.efforts = np.array(
+            self._bullet.calculateInverseDynamics(
+                self._arm, positions.tolist(), still, still, physicsClientId=self._client
+            )
+        )
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Move on by ``h`` [s], one step of the engine, towards set-points (n,), (n,)."""
@@ -109,6 +115,7 @@ class PybulletPlant:
         states = self._bullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
         self.positions = np.array([state[0] for state in states])
         self.velocities = np.array([state[1] for state in states])
+        self.efforts = np.array([state[3] for state in states])
 
     def flange(self) -> FloatArray:
         """Pose (4, 4) of the flange as the engine sees it, for checks against the closed form."""

@@ -98,6 +98,7 @@ class SteppingPlant:
     def __init__(self) -> None:
         self.positions = np.zeros(1)
         self.velocities = np.zeros(1)
+        self.efforts = np.zeros(1)
         self.steps = 0
 
     def follow(self, set_positions, set_velocities, h):

@@ -51,6 +51,17 @@ def test_urdf_means_the_same_arm_to_pybullet(engine):
         assert np.abs(engine.flange() - flange_pose(RX90, q)).max() < 1e-6
 
 
+def test_efforts_at_rest_are_what_gravity_asks_for(engine):
+    """Where the arm stands still, the motors of the stepped engine and inverse dynamics say the same torques."""
+    for q in random_configurations(3, seed=5):
+        engine.place(q)
+        asked = engine.efforts.copy()
+        for _ in range(300):
+            engine.follow(q, np.zeros(6), 1e-3)
+        assert np.abs(engine.efforts - asked).max() < 1e-3 * max(1.0, np.abs(asked).max())
+        assert abs(engine.efforts[0]) < 1e-3  # a vertical axis carries no weight
+
+
 def test_urdf_names_the_joints_and_their_limits():
     text = urdf(RX90)
     for joint in RX90.joints:

@@ -17,10 +17,11 @@ REST_VELOCITY = 1e-9
 
 
 class Plant(Protocol):
-    """What the drives move. ``positions`` and ``velocities`` (n,) are the truth."""
+    """What the drives move. ``positions``, ``velocities`` and the motors' ``efforts`` [N m or N], (n,), are the truth."""
 
     positions: FloatArray
     velocities: FloatArray
+    efforts: FloatArray
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Move on by ``h`` [s] towards the drives' set-points at its end, (n,), (n,)."""
@@ -32,11 +33,12 @@ class Plant(Protocol):
 
 
 class IdealPlant:
-    """Joints that are where their drives want them."""
+    """Joints that are where their drives want them, without mass: no effort."""
 
     def __init__(self, positions: FloatArray) -> None:
         self.positions = positions.copy()
         self.velocities = np.zeros_like(positions)
+        self.efforts = np.zeros_like(positions)
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Take the set-points."""
