@@ -8,7 +8,7 @@ import msgspec
 class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """A classical CAN data or remote frame. ``id``: 11 bits, or 29 where ``extended``; ``data`` at most 8 bytes.
 
-    ``length``: the data length code that a remote frame asks for; of a data frame it is ``len(data)``.
+    ``length``: the data length code that a remote frame asks for. Data frames leave it 0: theirs is ``len(data)``.
     """
 
     id: int

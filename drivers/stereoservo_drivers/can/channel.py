@@ -1,0 +1,279 @@
+"""Any python-can interface as frames, its failures as typed errors that say what to check."""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import socket
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import can
+import msgspec
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can import socketcan
+from stereoservo_drivers.can.bus_errors import BUS_OFF, BusError, bus_error
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.slcan import SlcanBus, SlcanGarbledError, SlcanLostError, SlcanRefusedError
+from stereoservo_drivers.can.slcan_lines import flags_in_words
+
+SEND_TIMEOUT_S = 0.05
+BATCH = 512
+"""Most frames that one ``receive`` gives: a babbling node must not hold the caller for ever."""
+_KEPT_ERRORS = 256
+_GONE = (errno.ENODEV, errno.EIO, errno.ENXIO, errno.EBADF, errno.EPIPE, errno.ECONNRESET, errno.ENETDOWN)
+_FULL = (errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT)
+
+
+class ChannelOptions(Protocol):
+    """What a channel is opened by; ``CanOptions`` has these too."""
+
+    @property
+    def interface(self) -> str: ...
+
+    @property
+    def channel(self) -> str | int: ...
+
+    @property
+    def bitrate(self) -> int: ...
+
+    @property
+    def interface_options(self) -> Mapping[str, Any]: ...
+
+
+class ChannelSettings(msgspec.Struct, frozen=True):
+    """The options alone."""
+
+    interface: str
+    channel: str | int
+    bitrate: int = 1_000_000
+    interface_options: dict[str, str | int | float | bool] = {}
+
+
+class Channel:
+    """An open CAN bus; opened by the constructor. One thread receives; others may send meanwhile where the interface
+    is ``stereoservo_slcan`` or ``socketcan``.
+
+    ``frames_sent``, ``frames_received``: counts. Raises everywhere DriverError with code ``can_open``,
+    ``connection_lost`` (unplugged, peer gone, interface down), ``bus_off``, ``send_timeout`` (nothing is taken any
+    more) or ``send_refused`` (the adapter says no); bus-off is never restarted here.
+    """
+
+    def __init__(self, options: ChannelOptions, *, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
+        self.name = f"CAN interface {options.interface!r}, channel {options.channel!r}"
+        self.frames_sent = 0
+        self.frames_received = 0
+        self._options = options
+        self._send_timeout_s = send_timeout_s
+        self._errors: deque[tuple[int, BusError]] = deque(maxlen=_KEPT_ERRORS)
+        self._malformed = 0
+        self._bus = self._open()
+        self._fast = self._bus if isinstance(self._bus, SlcanBus) else None
+
+    def send(self, frames: list[CanFrame]) -> None:
+        """Send ``frames`` in order, in one write where the interface can."""
+        try:
+            if self._fast is not None:
+                self._fast.send_many(frames, self._send_timeout_s)
+            else:
+                for frame in frames:
+                    self._bus.send(to_message(frame), timeout=self._send_timeout_s)
+        except (can.CanError, OSError) as error:
+            raise self._failure(error, "sending") from error
+        self.frames_sent += len(frames)
+
+    def receive(self, timeout_s: float) -> list[tuple[int, CanFrame]]:
+        """All frames that are there (at most ``BATCH``), stamped [ns, monotonic] as read; waits for the first one.
+
+        What controller and line report beside frames is kept for ``take_errors``; bus-off raises.
+        """
+        try:
+            received = self._receive_fast(timeout_s) if self._fast is not None else self._receive(timeout_s)
+        except (can.CanError, OSError) as error:
+            raise self._failure(error, "receiving") from error
+        self.frames_received += len(received)
+        return received
+
+    def take_errors(self) -> list[tuple[int, BusError]]:
+        """What the bus reported since the last call, stamped [ns]; the newest 256."""
+        errors = list(self._errors)
+        self._errors.clear()
+        return errors
+
+    def close(self) -> None:
+        """Release the interface. Idempotent; what fails now has no consequence any more."""
+        try:
+            self._bus.shutdown()
+        except (can.CanError, OSError) as error:
+            self._errors.append((time.monotonic_ns(), BusError("close", f"{self.name}: closing: {error}")))
+
+    def _receive_fast(self, timeout_s: float) -> list[tuple[int, CanFrame]]:
+        assert self._fast is not None
+        frames = self._fast.receive_many(timeout_s)
+        now = time.monotonic_ns()
+        if self._fast.malformed != self._malformed:
+            self._malformed = self._fast.malformed
+            self._errors.append((now, BusError("malformed_line", str(self._fast.last_malformed))))
+        return [(now, frame) for frame in frames]
+
+    def _receive(self, timeout_s: float) -> list[tuple[int, CanFrame]]:
+        received: list[tuple[int, CanFrame]] = []
+        message = self._bus.recv(timeout_s)
+        while message is not None:
+            now = time.monotonic_ns()
+            if message.is_error_frame:
+                self._take_error(bus_error(message), now)
+            elif message.is_fd:
+                self._errors.append((now, BusError("fd_frame", f"CAN FD frame 0x{message.arbitration_id:X}")))
+            elif message.is_rx:
+                received.append((now, from_message(message)))
+            if len(received) >= BATCH:
+                break
+            message = self._bus.recv(0)
+        return received
+
+    def _take_error(self, error: BusError, now_ns: int) -> None:
+        self._errors.append((now_ns, error))
+        if error.code == BUS_OFF:
+            raise self._error(
+                "bus_off",
+                f"{error.message}. It stays off until somebody restarts it: check cable, terminators and the bit "
+                f"rate ({self._options.bitrate} bit/s) of every node, then set the interface down and up",
+            )
+
+    def _open(self) -> can.BusABC:
+        options = self._options
+        if options.interface not in can.VALID_INTERFACES:
+            known = sorted(can.VALID_INTERFACES)
+            near = difflib.get_close_matches(options.interface, known, 1)
+            meant = f" Did you mean {near[0]!r}?" if near else ""
+            raise self._error(
+                "can_open", f"no such interface.{meant} There are: {', '.join(known)}", known=known
+            )
+        if options.interface == "socketcan":
+            self._check_socketcan(str(options.channel))
+        try:
+            bus = can.Bus(
+                interface=options.interface,
+                channel=options.channel,
+                bitrate=options.bitrate,
+                ignore_config=True,
+                **dict(options.interface_options),
+            )
+        except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
+            raise self._not_opened(error) from error
+        if options.interface == "socketcan":
+            socketcan.enlarge_receive_buffer(bus)
+        return bus
+
+    def _check_socketcan(self, channel: str) -> None:
+        if not hasattr(socket, "AF_CAN"):
+            raise self._error("can_open", "this system has no socketcan; use another interface")
+        state = socketcan.read_state(channel)
+        if state is None:
+            return
+        reason = socketcan.objection(state, channel, self._options.bitrate)
+        if reason is not None:
+            raise self._error("can_open", reason, retry=True)
+        if state.restart_ms:
+            text = f"{channel} restarts itself {state.restart_ms} ms after bus-off; set restart-ms 0 (deploy/can)"
+            self._errors.append((time.monotonic_ns(), BusError("restart_ms", text)))
+
+    def _not_opened(self, error: BaseException) -> DriverError:
+        number, cause = _errno(error), str(error) or type(error).__name__
+        socketcan_name = self._options.interface == "socketcan"
+        if number in (errno.EACCES, errno.EPERM):
+            cure = "No permission: is this user in group dialout (`id`)? The udev rules in deploy/can set it"
+        elif number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+            cure = f"Somebody else has it: `fuser -v {self._options.channel}`; another daemon on this cell?"
+        elif number == errno.ECONNREFUSED:
+            cure = (
+                "Nobody listens there: is `stereoservo emulate drives CELL` or the adapter's server running?"
+            )
+        elif socketcan_name and number == errno.EAFNOSUPPORT:
+            cure = "This kernel has no CAN: `modprobe can_raw`; in a container, on the host"
+        elif socketcan_name:
+            cure = f"Check `ip link show {self._options.channel}`; deploy/can sets interfaces up"
+        elif number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+            cure = "Is the adapter plugged in (`ls -l /dev/serial/by-id`, `dmesg | tail`)?"
+        elif isinstance(error, (TypeError, ValueError)):
+            cure = "Check `channel`, `bitrate` and `interface_options` of the cell file"
+        else:
+            cure = "Is the adapter plugged in and powered, its driver installed, and nobody else using it?"
+        return self._error("can_open", f"cannot be opened: {cause}. {cure}", retry=not _wrong(error))
+
+    def _failure(self, error: Exception, doing: str) -> DriverError:
+        if isinstance(error, SlcanRefusedError):
+            return self._error("send_refused", f"{error}{self._told()}")
+        if isinstance(error, SlcanGarbledError):
+            return self._error(
+                "connection_lost",
+                f"{error}. Check the serial speed (`@…` in the channel) and the adapter's firmware",
+            )
+        number = _errno(error)
+        if isinstance(error, can.CanTimeoutError) or number in _FULL or "buffer full" in str(error).lower():
+            return self._error(
+                "send_timeout",
+                f"{doing}: nothing was taken for {self._send_timeout_s} s ({error}). Does any drive have power and "
+                f"acknowledge? Check cable, terminators and bit rate ({self._options.bitrate} bit/s)",
+                retry=True,
+            )
+        if isinstance(error, SlcanLostError) or number in _GONE:
+            return self._error(
+                "connection_lost",
+                f"{doing}: {error}. {self._where_it_went()}",
+                retry=True,
+            )
+        return self._error("connection_lost", f"{doing}: {error}. {self._where_it_went()}", retry=True)
+
+    def _told(self) -> str:
+        """What the adapter answers when asked why it refused."""
+        assert self._fast is not None
+        try:
+            flags = self._fast.status_flags()
+        except can.CanError as error:
+            return f"; asked for its status: {error}"
+        if flags is None:
+            return "; it tells no status. Its buffer is full, or its channel is closed or only listens"
+        return (
+            f"; its status: {flags_in_words(flags)}. Check cable, terminators and the bit rate of every node"
+        )
+
+    def _where_it_went(self) -> str:
+        if self._options.interface == "socketcan":
+            return f"Check `ip -details link show {self._options.channel}` and the adapter's plug"
+        if "://" in str(self._options.channel):
+            return "The other side has closed: is it still running?"
+        return "Is the adapter still plugged in (`dmesg | tail`)?"
+
+    def _error(self, code: str, text: str, *, retry: bool = False, **data: Any) -> DriverError:
+        return DriverError(
+            code,
+            f"{self.name}: {text}",
+            retry=retry,
+            interface=self._options.interface,
+            channel=self._options.channel,
+            bitrate=self._options.bitrate,
+            **data,
+        )
+
+
+def _errno(error: BaseException | None) -> int | None:
+    """The system's number of an error, looked for in its causes too."""
+    while error is not None:
+        number = getattr(error, "errno", None)
+        if number is None:
+            number = getattr(error, "error_code", None)
+        if isinstance(number, int):
+            return number
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _wrong(error: BaseException) -> bool:
+    """Whether the configuration and not the world is at fault."""
+    return isinstance(error, (TypeError, ValueError, ImportError, can.CanInterfaceNotImplementedError))

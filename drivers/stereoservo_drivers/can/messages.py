@@ -1,0 +1,32 @@
+"""Frames as python-can's messages and back."""
+
+from __future__ import annotations
+
+import can
+
+from stereoservo_drivers.can.frames import CanFrame
+
+
+def to_message(frame: CanFrame) -> can.Message:
+    """``frame`` as python-can sends it."""
+    return can.Message(
+        arbitration_id=frame.id,
+        data=frame.data,
+        dlc=frame.length if frame.remote else len(frame.data),
+        is_remote_frame=frame.remote,
+        is_extended_id=frame.extended,
+    )
+
+
+def from_message(message: can.Message) -> CanFrame:
+    """A received ``message``.
+
+    Raises:
+        ValueError: an error frame or a CAN FD frame, which are no ``CanFrame``.
+    """
+    if message.is_error_frame or message.is_fd:
+        kind = "an error frame" if message.is_error_frame else "a CAN FD frame"
+        raise ValueError(f"{kind}, id 0x{message.arbitration_id:X}, is no classical data or remote frame")
+    if message.is_remote_frame:
+        return CanFrame(message.arbitration_id, b"", True, message.is_extended_id, message.dlc)
+    return CanFrame(message.arbitration_id, bytes(message.data), False, message.is_extended_id)

@@ -1,0 +1,270 @@
+"""Serial-line CAN as a python-can interface, ``stereoservo_slcan``: for adapters on serial lines, pty, and over TCP.
+
+python-can's own ``slcan`` reads byte by byte (python-can #2027), leaves Nagle's algorithm on over TCP and sleeps two
+seconds when it opens; cycles of hundreds of hertz need whole reads and one write a cycle.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import can
+
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.slcan_lines import (
+    BEL,
+    LineError,
+    LineSplitter,
+    bitrate_command,
+    decode_frame,
+    encode_frame,
+)
+from stereoservo_drivers.can.slcan_ports import PortLostError, open_port
+
+GARBLED_LINES = 32
+"""So many malformed lines one after the other are no line noise: the other side speaks something else."""
+_FRAMES = frozenset(b"tTrR")
+_SENT = frozenset((b"", b"z", b"Z"))
+
+
+class SlcanLostError(can.CanOperationError):
+    """The adapter is unplugged, or the peer has closed."""
+
+
+class SlcanRefusedError(can.CanOperationError):
+    """The adapter answered BEL: it did not take a frame or command."""
+
+
+class SlcanGarbledError(can.CanOperationError):
+    """Only malformed lines arrive."""
+
+
+class SlcanBus(can.BusABC):
+    """A CAN bus behind a Lawicel-style adapter.
+
+    ``channel``: a serial device (``/dev/ttyACM0``, ``/dev/ttyUSB0@1000000``), a pty, or ``socket://HOST:PORT``.
+    ``bitrate``: set on the adapter (None: left as it is). ``send_timeout_s``: how long a full line may hold a send up.
+    ``reply_timeout_s``: how long an answer to a command is awaited; adapters that give none cost it thrice at opening.
+    One thread may receive while others send. A malformed line is skipped and counted (``malformed``, the last one
+    in ``last_malformed``).
+
+    Raises:
+        ValueError: channel or bitrate; says what is valid.
+        can.CanInitializationError: device, peer or adapter refuse.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        bitrate: int | None = None,
+        *,
+        tty_baudrate: int = 115_200,
+        rtscts: bool = False,
+        listen_only: bool = False,
+        connect_timeout_s: float = 2.0,
+        send_timeout_s: float = 0.1,
+        reply_timeout_s: float = 0.1,
+        can_filters: Any = None,
+    ) -> None:
+        set_up = [bitrate_command(bitrate)] if bitrate is not None else []
+        self._send_timeout_s = send_timeout_s
+        self._reply_timeout_s = reply_timeout_s
+        self._splitter = LineSplitter()
+        self._frames: deque[CanFrame] = deque()
+        self._answers: deque[bytes] = deque(maxlen=64)
+        self._write_lock = threading.Lock()
+        self._refusal_lock = threading.Lock()
+        self._unsent = b""
+        self._refusals = 0
+        self._garbled = 0
+        self.malformed = 0
+        self.last_malformed: LineError | None = None
+        try:
+            self._port = open_port(
+                str(channel), tty_baudrate, rtscts=rtscts, connect_timeout_s=connect_timeout_s
+            )
+        except OSError as error:
+            raise can.CanInitializationError(f"cannot open {channel}: {error}") from error
+        self.channel_info = f"serial-line CAN on {channel}"
+        try:
+            self._begin([*set_up, "L" if listen_only else "O"])
+        except can.CanOperationError as error:
+            self._port.close()
+            raise can.CanInitializationError(f"no serial-line CAN on {channel}: {error}") from error
+        super().__init__(channel, can_filters)
+
+    def _begin(self, commands: list[str]) -> None:
+        """Close whatever was open, empty the line, then ``commands``, none of which may be refused."""
+        self._write(b"\r\r\rC\r")
+        deadline = time.monotonic() + self._reply_timeout_s
+        self._await_answer(deadline)
+        while self._fill(0.01) and time.monotonic() < deadline:
+            pass
+        self._frames.clear()
+        self._answers.clear()
+        self._forget_refusals()
+        self._garbled = self.malformed = 0
+        for command in commands:
+            self._write(command.encode() + b"\r")
+            if self._await_answer(time.monotonic() + self._reply_timeout_s) == BEL:
+                raise SlcanRefusedError(f"the adapter refused command {command!r}")
+
+    def _await_answer(self, deadline: float) -> bytes | None:
+        """The next answer that is no frame; None where there is none by ``deadline`` of the monotonic clock [s]."""
+        while not self._answers:
+            left = deadline - time.monotonic()
+            if left <= 0 or not self._fill(left):
+                return None
+        return self._answers.popleft()
+
+    def _forget_refusals(self) -> int:
+        with self._refusal_lock:
+            refusals, self._refusals = self._refusals, 0
+        return refusals
+
+    def _write(self, lines: bytes, timeout_s: float | None = None) -> None:
+        limit = self._send_timeout_s if timeout_s is None else timeout_s
+        with self._write_lock:
+            try:
+                # What a time-out cut off goes first, so that no line is torn.
+                self._unsent = self._port.write(self._unsent + lines, limit)
+            except PortLostError as error:
+                raise SlcanLostError(f"{self._port.name}: {error.strerror}", error.errno) from error
+            except (OSError, ValueError) as error:
+                raise can.CanOperationError(f"{self._port.name}: {error}") from error
+            if self._unsent:
+                message = (
+                    f"{self._port.name} took no more for {limit} s; {len(self._unsent)} bytes wait and go first "
+                    "with the next send"
+                )
+                raise can.CanTimeoutError(message)
+
+    def _fill(self, timeout_s: float | None) -> bool:
+        """Read once and sort what came; False on time-out."""
+        try:
+            chunk = self._port.read(timeout_s)
+        except PortLostError as error:
+            raise SlcanLostError(f"{self._port.name}: {error.strerror}", error.errno) from error
+        except (OSError, ValueError) as error:
+            raise can.CanOperationError(f"{self._port.name}: {error}") from error
+        for line in self._splitter.feed(chunk):
+            if line in _SENT:
+                self._answers.append(line)
+            elif line[0] in _FRAMES:
+                self._take_frame(line)
+            elif line == BEL:
+                with self._refusal_lock:
+                    self._refusals += 1
+                self._answers.append(line)
+            elif line[0] in b"VNF":
+                self._answers.append(line)
+            else:
+                self._skip(LineError(line, "neither a frame nor an answer"))
+        return bool(chunk)
+
+    def _take_frame(self, line: bytes) -> None:
+        try:
+            self._frames.append(decode_frame(line))
+        except LineError as error:
+            self._skip(error)
+        else:
+            self._garbled = 0
+
+    def _skip(self, error: LineError) -> None:
+        self.malformed += 1
+        self._garbled += 1
+        self.last_malformed = error
+
+    def _check(self) -> None:
+        """Raises what the adapter has said since the last call."""
+        if self._refusals:
+            refusals = self._forget_refusals()
+            raise SlcanRefusedError(
+                f"{self._port.name}: the adapter refused {refusals} frames or commands (BEL)"
+            )
+        if self._garbled >= GARBLED_LINES:
+            garbled, self._garbled = self._garbled, 0
+            raise SlcanGarbledError(
+                f"{self._port.name}: {garbled} lines one after the other were no frames; the last: "
+                f"{self.last_malformed}"
+            )
+
+    def send_many(self, frames: Sequence[CanFrame], timeout: float | None = None) -> None:
+        """``frames`` in one write. ``timeout`` [s] instead of ``send_timeout_s``.
+
+        Raises:
+            can.CanTimeoutError: the line takes no more.
+            can.CanOperationError: the connection is lost (``SlcanLostError``), or an earlier frame was refused
+                (``SlcanRefusedError``); in the latter case these are sent all the same.
+        """
+        self._write(b"".join([encode_frame(frame) for frame in frames]), timeout)
+        self._check()
+
+    def receive_many(self, timeout: float | None) -> list[CanFrame]:
+        """All frames that are there, unfiltered; waits up to ``timeout`` [s] for the first. Raises as ``recv``."""
+        self._await_frame(timeout)
+        frames = list(self._frames)
+        self._frames.clear()
+        return frames
+
+    def _await_frame(self, timeout: float | None) -> None:
+        """Read until there is a frame, at most for ``timeout`` [s]."""
+        self._check()
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not self._frames:
+            left = None if deadline is None else deadline - time.monotonic()
+            if not self._fill(left if left is None or left > 0.0 else 0.0):
+                return
+            self._check()
+            if left is not None and left <= 0.0:
+                return
+
+    def status_flags(self) -> int | None:
+        """The adapter's status by command ``F``, see ``flags_in_words``; None where it does not tell."""
+        self._answers.clear()
+        self._write(b"F\r")
+        deadline = time.monotonic() + self._reply_timeout_s
+        while (answer := self._await_answer(deadline)) is not None:
+            if answer[:1] == b"F" and len(answer) == 3:
+                return int(answer[1:], 16)
+            if answer == BEL:
+                self._forget_refusals()
+                return None
+        return None
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """One message; see ``send_many``.
+
+        Raises:
+            ValueError: an error frame or a CAN FD frame.
+        """
+        self.send_many([from_message(msg)], timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._frames:
+            self._await_frame(timeout)
+        if not self._frames:
+            return None, False
+        message = to_message(self._frames.popleft())
+        message.timestamp = time.time()
+        return message, False
+
+    def fileno(self) -> int:
+        """Of the port. Frames already read do not make it readable: receive until there is none."""
+        return self._port.fileno()
+
+    def shutdown(self) -> None:
+        """Close the adapter's channel and the port; quiet where they are gone already."""
+        if self._is_shutdown:
+            return
+        super().shutdown()
+        # Unplugged, or the line is full: closing the port is all that is left.
+        with contextlib.suppress(can.CanError):
+            self._write(b"C\r", 0.05)
+        self._port.close()

@@ -1,0 +1,154 @@
+"""Lawicel's serial-line CAN: frames as lines, lines out of a byte stream. Pure; for the host's and the adapter's side.
+
+A line ends with CR; BEL alone says that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
+(29 bits), ``rIIIL``, ``RIIIIIIIIL`` (remote); an adapter may append a time stamp of four digits.
+Source: LAWICEL AB, CANUSB manual, "CANUSB ASCII commands".
+"""
+
+from __future__ import annotations
+
+from binascii import Error as HexError
+from binascii import hexlify, unhexlify
+
+from stereoservo_drivers.can.frames import CanFrame
+
+CR = b"\r"
+BEL = b"\a"
+LONGEST_LINE = 64
+"""Bytes; the longest valid line has 30. What is longer without an end is not a line."""
+
+BITRATES = {
+    10_000: "S0",
+    20_000: "S1",
+    50_000: "S2",
+    100_000: "S3",
+    125_000: "S4",
+    250_000: "S5",
+    500_000: "S6",
+    800_000: "S7",
+    1_000_000: "S8",
+}
+"""[bit/s] to command. S7 is 800 kbit/s in the manual; python-can's ``slcan`` calls it 750 kbit/s."""
+
+FLAG_WORDS = (
+    "receive buffer full",
+    "transmit buffer full",
+    "error warning",
+    "data overrun",
+    "",
+    "error passive",
+    "arbitration lost",
+    "bus error",
+)
+"""Of the answer to ``F``, from bit 0."""
+
+_ID_DIGITS = {ord("t"): 3, ord("r"): 3, ord("T"): 8, ord("R"): 8}
+_REMOTE = {ord("r"), ord("R")}
+
+
+class LineError(ValueError):
+    """A line that is none of Lawicel's. ``line``: as received, without its end; ``reason``: what is wrong with it."""
+
+    def __init__(self, line: bytes, reason: str) -> None:
+        super().__init__(f"malformed serial-line CAN {line[:LONGEST_LINE]!r}: {reason}")
+        self.line = line
+        self.reason = reason
+
+
+def encode_frame(frame: CanFrame) -> bytes:
+    """``frame`` as a line with its end.
+
+    Raises:
+        ValueError: id, data or length that no classical frame has.
+    """
+    highest = 0x1FFFFFFF if frame.extended else 0x7FF
+    if not 0 <= frame.id <= highest:
+        raise ValueError(f"id 0x{frame.id:X} of a frame; valid here: 0 to 0x{highest:X}")
+    length = frame.length if frame.remote else len(frame.data)
+    if not 0 <= length <= 8:
+        raise ValueError(f"{length} data bytes in a frame; at most 8")
+    if frame.remote:
+        if frame.data:
+            raise ValueError(f"a remote frame with {len(frame.data)} data bytes; it has none")
+        return (b"R%08X%d\r" if frame.extended else b"r%03X%d\r") % (frame.id, length)
+    line = b"T%08X%d%b\r" if frame.extended else b"t%03X%d%b\r"
+    return line % (frame.id, length, hexlify(frame.data).upper())
+
+
+def decode_frame(line: bytes) -> CanFrame:
+    """A frame from its ``line`` without the end, with or without a time stamp.
+
+    Raises:
+        LineError: it is not one.
+    """
+    digits = _ID_DIGITS.get(line[0]) if line else None
+    if digits is None:
+        raise LineError(line, "a frame begins with t, T, r or R")
+    extended, remote = digits == 8, line[0] in _REMOTE
+    if len(line) < digits + 2:
+        raise LineError(line, f"{len(line)} characters; a frame of this kind has at least {digits + 2}")
+    length = line[digits + 1] - 48
+    if not 0 <= length <= 8:
+        raise LineError(line, f"data length {line[digits + 1 : digits + 2]!r}; valid: 0 to 8")
+    end = digits + 2 + (0 if remote else 2 * length)
+    if len(line) not in (end, end + 4):
+        raise LineError(
+            line, f"{len(line)} characters; with length {length}: {end}, or {end + 4} with a stamp"
+        )
+    try:
+        identifier = int.from_bytes(unhexlify(line[1:9] if extended else b"0" + line[1:4]), "big")
+        data = unhexlify(line[digits + 2 :])
+    except HexError:
+        raise LineError(line, "a character that is no hexadecimal digit") from None
+    if identifier > (0x1FFFFFFF if extended else 0x7FF):
+        raise LineError(line, f"id 0x{identifier:X} is beyond {'29' if extended else '11'} bits")
+    if remote:
+        return CanFrame(identifier, b"", True, extended, length)
+    return CanFrame(identifier, data[:length], False, extended)
+
+
+def bitrate_command(bitrate: int) -> str:
+    """``S0`` … ``S8``.
+
+    Raises:
+        ValueError: a bitrate that adapters of this kind cannot be asked for; lists the others.
+    """
+    if bitrate not in BITRATES:
+        valid = ", ".join(f"{known}" for known in BITRATES)
+        raise ValueError(f"bitrate {bitrate} bit/s has no serial-line CAN command; valid: {valid}")
+    return BITRATES[bitrate]
+
+
+def flags_in_words(flags: int) -> str:
+    """The status that an adapter answers to ``F``."""
+    words = [word for bit, word in enumerate(FLAG_WORDS) if word and flags >> bit & 1]
+    return ", ".join(words) or "no error"
+
+
+class LineSplitter:
+    """Lines out of a byte stream that comes in pieces of any size.
+
+    What is longer than any line is given as a line as far as it came, so that noise without ends does not pile up.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, chunk: bytes) -> list[bytes]:
+        """Lines that ``chunk`` completes, without CR. A BEL ends what stands before it and is a line of its own."""
+        if BEL in chunk:
+            chunk = chunk.replace(BEL, b"\r\a\r")
+            lines = (self._rest + chunk).split(CR)
+            # The CRs put in around BEL are no answers of the adapter.
+            lines = [line for k, line in enumerate(lines) if line or not _beside_bell(lines, k)]
+        else:
+            lines = (self._rest + chunk).split(CR)
+        self._rest = lines.pop()
+        if len(self._rest) > LONGEST_LINE:
+            lines.append(self._rest)
+            self._rest = b""
+        return lines
+
+
+def _beside_bell(lines: list[bytes], k: int) -> bool:
+    return k + 1 < len(lines) and lines[k + 1] == BEL

@@ -1,0 +1,127 @@
+"""What serial-line CAN runs over: a serial device, a pseudo terminal, a TCP connection. A file descriptor each."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import select
+import socket
+import time
+from typing import Protocol
+
+import serial
+
+CHUNK = 8192
+DISCONNECTED = (errno.EIO, errno.ENODEV, errno.ENXIO, errno.EBADF, errno.EPIPE, errno.ECONNRESET)
+_URL = re.compile(r"socket://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
+
+
+class PortLostError(OSError):
+    """The other side is gone: adapter unplugged, peer closed."""
+
+
+class _Descriptor(Protocol):
+    def fileno(self) -> int: ...
+
+    def close(self) -> None: ...
+
+
+class SlcanPort:
+    """Reads and writes of one open descriptor, non-blocking, with time limits."""
+
+    def __init__(self, descriptor: _Descriptor, name: str) -> None:
+        self.name = name
+        self._descriptor = descriptor
+        self._fd = [descriptor.fileno()]
+
+    def fileno(self) -> int:
+        """For ``select``."""
+        return self._fd[0]
+
+    def read(self, timeout_s: float | None) -> bytes:
+        """What is there, at most ``CHUNK`` bytes; waits for it so long (None: for ever). Empty on time-out.
+
+        Raises:
+            PortLostError: the other side is gone.
+            OSError: anything else that the system says.
+        """
+        if not select.select(self._fd, (), (), timeout_s)[0]:
+            return b""
+        try:
+            chunk = os.read(self._fd[0], CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise _sorted(error) from error
+        if not chunk:
+            raise PortLostError(errno.ENODEV, "end of the stream: the other side has closed or is unplugged")
+        return chunk
+
+    def write(self, content: bytes, timeout_s: float) -> bytes:
+        """Write ``content``; what could not be written within ``timeout_s`` is returned.
+
+        Raises:
+            PortLostError: the other side is gone.
+            OSError: anything else that the system says.
+        """
+        deadline = None
+        while content:
+            try:
+                content = content[os.write(self._fd[0], content) :]
+                continue
+            except BlockingIOError:
+                pass
+            except OSError as error:
+                raise _sorted(error) from error
+            now = time.monotonic()
+            deadline = now + timeout_s if deadline is None else deadline
+            if now >= deadline or not select.select((), self._fd, (), deadline - now)[1]:
+                return content
+        return b""
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        self._descriptor.close()
+
+
+def open_port(channel: str, baud: int, *, rtscts: bool = False, connect_timeout_s: float = 2.0) -> SlcanPort:
+    """``channel``: ``socket://HOST:PORT`` or a serial device, its speed behind an ``@`` or else ``baud``.
+
+    A serial device is locked: nobody else opens it meanwhile.
+
+    Raises:
+        ValueError: the channel's text; says what would be valid.
+        OSError: the system refuses (``serial.SerialException`` is one).
+    """
+    if "://" in channel:
+        return _connect(channel, connect_timeout_s)
+    device, at, speed = channel.rpartition("@")
+    if at and speed.isdecimal():
+        channel, baud = device, int(speed)
+    if not channel:
+        raise ValueError(
+            "an empty channel; valid: /dev/ttyACM0, /dev/ttyUSB0@1000000, socket://127.0.0.1:5400"
+        )
+    line = serial.Serial(channel, baudrate=baud, timeout=0, rtscts=rtscts, exclusive=True)
+    os.set_blocking(line.fileno(), False)
+    return SlcanPort(line, channel)
+
+
+def _connect(channel: str, timeout_s: float) -> SlcanPort:
+    match = _URL.fullmatch(channel)
+    if match is None or not 0 < int(match["port"]) < 65536:
+        raise ValueError(
+            f"channel {channel!r} is no address; valid: socket://HOST:PORT, for instance socket://127.0.0.1:5400"
+        )
+    connection = socket.create_connection((match["host"].strip("[]"), int(match["port"])), timeout_s)
+    connection.setblocking(False)
+    # Without it, Nagle's algorithm and delayed acknowledgement hold small writes back for 40 ms.
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return SlcanPort(connection, channel)
+
+
+def _sorted(error: OSError) -> OSError:
+    if error.errno in DISCONNECTED:
+        return PortLostError(error.errno, error.strerror)
+    return error
