@@ -1,0 +1,395 @@
+"""CiA 402 for the cyclic master: SYNC, process data, heartbeats and emergencies of velocity-controlled drives.
+
+RPDO1: control word (0x6040) and target velocity (0x60FF), type 255, so that a stop needs no SYNC. TPDO1: status word
+(0x6041) and position (0x6064); TPDO2, TPDO3: the further feedback; all with every SYNC. COB-IDs of the predefined
+connection set (CiA 301).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+from stereoservo.runtime.ports import FloatArray
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.cia402_words import (
+    ENABLE_STEPS,
+    FAULTY,
+    INTERNAL_LIMIT_BIT,
+    POWER_OFF,
+    WARNING_BIT,
+    ControlWord,
+    DriveState,
+    NmtState,
+    drive_state,
+    error_hint,
+    error_words,
+    nmt_words,
+)
+from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.units import JointScale, Unwrapper
+
+SYNC_ID = 0x080
+EMCY_ID = 0x080
+HEARTBEAT_ID = 0x700
+RPDO_IDS = (0x200, 0x300, 0x400, 0x500)
+TPDO_IDS = (0x180, 0x280, 0x380, 0x480)
+
+FEEDBACK_OBJECTS: dict[str, tuple[int, str]] = {
+    "velocity": (0x606C0020, "i"),
+    "effort": (0x60770010, "h"),
+    "following_error": (0x60F40020, "i"),
+}
+"""Feedback -> (mapping entry: index, sub-index, bits; struct format)."""
+
+STATUS_AND_POSITION = (0x60410010, 0x60640020)
+COMMAND = (0x60400010, 0x60FF0020)
+_COMMAND = struct.Struct("<Hi")
+_STATUS_AND_POSITION = struct.Struct("<Hi")
+_PDO_BYTES = 8
+_CODES_KEPT = 4
+_PERMILLE = 1e-3
+
+
+def tpdo_feedback(feedback: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
+    """What TPDO2, TPDO3, … carry: ``feedback`` in its order, as many as fit into 8 bytes each."""
+    pdos: list[tuple[str, ...]] = []
+    free = 0
+    for what in feedback:
+        size = struct.calcsize("<" + FEEDBACK_OBJECTS[what][1])
+        if size > free:
+            pdos.append(())
+            free = _PDO_BYTES
+        pdos[-1] = (*pdos[-1], what)
+        free -= size
+    return tuple(pdos)
+
+
+def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
+    """Mapping entries of TPDO1, TPDO2, …"""
+    further = (tuple(FEEDBACK_OBJECTS[what][0] for what in pdo) for pdo in tpdo_feedback(feedback))
+    return (STATUS_AND_POSITION, *further)
+
+
+class Axis:
+    """What is known of one drive. ``codes``: its emergencies since the last error reset, newest last.
+
+    ``limit_side``: 1 or -1 where the drive's internal limit is known to lie on that side of the joint, else 0.
+    """
+
+    def __init__(self, index: int, joint: CanJoint) -> None:
+        self.index = index
+        self.joint = joint
+        self.node_id = joint.node_id
+        self.scale = JointScale.of(joint)
+        self.counts = Unwrapper()
+        self.effort_unit = joint.direction * _PERMILLE * (joint.rated_torque or 1.0)
+        self.status_word: int | None = None
+        self.state = DriveState.UNKNOWN
+        self.codes: list[int] = []
+        self.heartbeat_age = 0
+        self.limit_side = 0
+        self.commanded = 0.0
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether the drive limits the motion by itself (bit 11 of the status word)."""
+        return bool((self.status_word or 0) & INTERNAL_LIMIT_BIT)
+
+    def take_status(self, status_word: int) -> None:
+        """The newest status word."""
+        self.status_word = status_word
+        self.state = drive_state(status_word)
+        if not self.at_limit:
+            self.limit_side = 0
+
+    def take_code(self, code: int) -> None:
+        """An emergency's error code; 0 is the drive's error reset."""
+        if code == 0:
+            self.codes = []
+        elif code not in self.codes:
+            self.codes = [*self.codes, code][-_CODES_KEPT:]
+
+    def words(self) -> str:
+        """For people."""
+        if self.status_word is None:
+            return "no status word yet"
+        said = self.state.value if self.state is not DriveState.UNKNOWN else self._unknown()
+        if self.codes:
+            said += f" {', '.join(error_words(code) for code in self.codes)}"
+        if self.status_word & WARNING_BIT:
+            said += "; warning"
+        if self.at_limit:
+            said += "; internal limit active"
+        return said
+
+    def _unknown(self) -> str:
+        return f"status word 0x{self.status_word:04X}: {self.state.value}"
+
+
+class Cia402Codec:
+    """Codec of CiA 402 drives.
+
+    Boot-ups, NMT states, heartbeats and emergencies count as faults from ``watch`` to ``ignore``: bring-up itself makes
+    drives boot and complain. States that the newest status words show always count.
+    """
+
+    def __init__(self, options: CanOptions) -> None:
+        self.axes = tuple(Axis(index, joint) for index, joint in enumerate(options.joint))
+        count = len(self.axes)
+        self.feedback = Feedback(
+            positions=np.full(count, np.nan),
+            velocities=np.full(count, np.nan),
+            efforts=np.full(count, np.nan) if "effort" in options.feedback else None,
+            following_errors=np.full(count, np.nan) if "following_error" in options.feedback else None,
+        )
+        self._ignored = frozenset(options.emcy_ignore)
+        self._heartbeat_polls = math.ceil(options.heartbeat_timeout_ms * 1e-3 * options.rate_hz)
+        self._heartbeat_timeout_ms = options.heartbeat_timeout_ms
+        self._watching = False
+        self._commanding = False
+        self._events: list[AxisFault] = []
+        self._sync = [CanFrame(SYNC_ID)]
+        self._heartbeat = [CanFrame(HEARTBEAT_ID + options.master_id, bytes([NmtState.OPERATIONAL]))]
+        self._idle = [self._rpdo(axis, ControlWord.DISABLE_VOLTAGE) for axis in self.axes]
+        self._quick_stop = [self._rpdo(axis, ControlWord.QUICK_STOP) for axis in self.axes]
+        self._at_rest = {
+            word: [self._rpdo(axis, word) for axis in self.axes]
+            for word in {*ENABLE_STEPS.values(), ControlWord.DISABLE_VOLTAGE}
+        }
+        self._takers: dict[int, Callable[[bytes], int]] = {}
+        bits: list[tuple[int, str]] = []
+        for axis in self.axes:
+            self._register(axis, tpdo_feedback(options.feedback), bits)
+        self.expected = (1 << len(bits)) - 1
+        self.bit_axis = tuple(index for index, _ in bits)
+        self.bit_name = tuple(name for _, name in bits)
+
+    @staticmethod
+    def _rpdo(axis: Axis, word: ControlWord) -> CanFrame:
+        return CanFrame(RPDO_IDS[0] + axis.node_id, _COMMAND.pack(word, 0))
+
+    # -- receiving ------------------------------------------------------------------------------------------
+
+    def _register(
+        self, axis: Axis, further: tuple[tuple[str, ...], ...], bits: list[tuple[int, str]]
+    ) -> None:
+        node = axis.node_id
+        decoders = [self._status_and_position(axis, len(bits))]
+        decoders += [self._further(axis, pdo, k + 2, len(bits) + 1 + k) for k, pdo in enumerate(further)]
+        for number, decoder in enumerate(decoders):
+            self._takers[TPDO_IDS[number] + node] = decoder
+            bits.append((axis.index, f"TPDO{number + 1} of node {node}"))
+        self._takers[EMCY_ID + node] = lambda data: self._take_emergency(axis, data)
+        self._takers[HEARTBEAT_ID + node] = lambda data: self._take_heartbeat(axis, data)
+
+    def _status_and_position(self, axis: Axis, bit: int) -> Callable[[bytes], int]:
+        positions, k = self.feedback.positions, axis.index
+
+        def take(data: bytes) -> int:
+            if len(data) != _STATUS_AND_POSITION.size:
+                return self._wrong_length(axis, "TPDO1", len(data), _STATUS_AND_POSITION.size)
+            word, counts = _STATUS_AND_POSITION.unpack(data)
+            self._take_status(axis, word)
+            positions[k] = axis.scale.position(axis.counts.update(counts))
+            return bit
+
+        return take
+
+    def _further(self, axis: Axis, pdo: tuple[str, ...], number: int, bit: int) -> Callable[[bytes], int]:
+        layout = struct.Struct("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
+        scale, feedback, k = axis.scale, self.feedback, axis.index
+        kinds: dict[str, tuple[FloatArray | None, Callable[[int], float]]] = {
+            "velocity": (feedback.velocities, scale.velocity),
+            "effort": (feedback.efforts, lambda permille: permille * axis.effort_unit),
+            "following_error": (feedback.following_errors, scale.difference),
+        }
+        targets = [(array, convert) for array, convert in (kinds[what] for what in pdo) if array is not None]
+
+        def take(data: bytes) -> int:
+            if len(data) != layout.size:
+                return self._wrong_length(axis, f"TPDO{number}", len(data), layout.size)
+            for raw, (array, convert) in zip(layout.unpack(data), targets, strict=True):
+                array[k] = convert(raw)
+            return bit
+
+        return take
+
+    def receive(self, frame: CanFrame) -> int:
+        """Take a frame: a TPDO gives its bit, everything else NOT_CYCLIC."""
+        take = self._takers.get(frame.id)
+        if take is None or frame.remote or frame.extended:
+            return NOT_CYCLIC
+        return take(frame.data)
+
+    def _event(self, axis: Axis, code: str, message: str, value: int, hint: str) -> None:
+        self._events.append(AxisFault(axis.index, code, f"node {axis.node_id}: {message}", value, hint))
+
+    def _wrong_length(self, axis: Axis, pdo: str, got: int, mapped: int) -> int:
+        self._event(
+            axis,
+            "mapping",
+            f"{pdo} has {got} bytes, {mapped} are mapped",
+            got,
+            "the drive's PDO mapping was changed, or another node has its id: reset configures it anew",
+        )
+        return NOT_CYCLIC
+
+    def _take_status(self, axis: Axis, word: int) -> None:
+        limited_before = axis.at_limit
+        axis.take_status(word)
+        if axis.at_limit and not limited_before and axis.state is DriveState.OPERATION_ENABLED:
+            axis.limit_side = int(np.sign(axis.commanded))
+            self._event(
+                axis,
+                "limit_switch",
+                "internal limit active: a limit switch, or the drive's own position, velocity or current limit",
+                word,
+                "see the limit switches (0x60FD); reset, enable and move the joint inward",
+            )
+
+    def _take_emergency(self, axis: Axis, data: bytes) -> int:
+        code = int.from_bytes(data[:2], "little")
+        axis.take_code(code)
+        if code and code not in self._ignored and self._watching:
+            self._event(axis, "emergency", f"emergency {error_words(code)}", code, error_hint(code))
+        return NOT_CYCLIC
+
+    def _take_heartbeat(self, axis: Axis, data: bytes) -> int:
+        if len(data) != 1:
+            return NOT_CYCLIC
+        axis.heartbeat_age = 0
+        state = data[0] & 0x7F
+        if not self._watching or state == NmtState.OPERATIONAL:
+            return NOT_CYCLIC
+        if state == NmtState.BOOT_UP:
+            message = "booted while in use"
+            hint = "its supply broke down, it was reset, or another node has its id; reset configures it anew"
+            self._event(axis, "rebooted", message, state, hint)
+        else:
+            self._event(
+                axis,
+                "left_operational",
+                f"left operational, is now {nmt_words(state)}",
+                state,
+                "another master is on the bus, or the drive reacts to an error (0x1029); reset configures it anew",
+            )
+        return NOT_CYCLIC
+
+    # -- verdicts -------------------------------------------------------------------------------------------
+
+    def watch(self) -> None:
+        """Drives are configured and operational: from now on what they do unasked is a fault."""
+        self._events = []
+        for axis in self.axes:
+            axis.heartbeat_age = 0
+        self._watching = True
+
+    def ignore(self) -> None:
+        """Bring-up begins, or the drives are released."""
+        self._watching = False
+        self._commanding = False
+
+    def faults(self) -> tuple[AxisFault, ...]:
+        """Events since the last call; drives in fault, off unasked, silent, or commanded against a limit."""
+        events, self._events = self._events, []
+        levels = (fault for axis in self.axes for fault in self._levels(axis))
+        return (*events, *levels)
+
+    def _levels(self, axis: Axis) -> list[AxisFault]:
+        who, found = f"node {axis.node_id}", []
+        if axis.state in FAULTY:
+            hint = error_hint(axis.codes[-1]) if axis.codes else "remove the cause, then reset"
+            found.append(
+                AxisFault(axis.index, "drive_fault", f"{who}: {axis.words()}", axis.status_word, hint)
+            )
+        elif self._commanding and axis.state is not DriveState.OPERATION_ENABLED:
+            message = f"{who} left operation enabled unasked: {axis.words()}"
+            hint = "look at the drive's enable input, its supply and the emergency stop's circuit"
+            found.append(AxisFault(axis.index, "disabled", message, axis.status_word, hint))
+        if self._commanding and axis.at_limit and axis.commanded * axis.limit_side > 0.0:
+            side = "upper" if axis.limit_side > 0 else "lower"
+            message = f"{who}: commanded further into its internal limit at the {side} side"
+            found.append(
+                AxisFault(axis.index, "limit_switch", message, axis.status_word, "move the joint inward")
+            )
+        if self._watching and axis.heartbeat_age > self._heartbeat_polls:
+            message = f"{who}: no heartbeat for {self._heartbeat_timeout_ms} ms"
+            found.append(
+                AxisFault(axis.index, "heartbeat_lost", message, None, "check its supply and the bus cable")
+            )
+        return found
+
+    def enabled(self) -> bool:
+        """Every axis in operation enabled."""
+        return all(axis.state is DriveState.OPERATION_ENABLED for axis in self.axes)
+
+    def at_rest_unpowered(self) -> bool:
+        """Every axis in a state without torque."""
+        return all(axis.state in POWER_OFF for axis in self.axes)
+
+    def status_words(self) -> tuple[str, ...]:
+        """States with emergencies, e.g. ``fault 0x3210 DC link over-voltage``."""
+        return tuple(axis.words() for axis in self.axes)
+
+    # -- sending --------------------------------------------------------------------------------------------
+
+    def poll(self) -> list[CanFrame]:
+        """SYNC."""
+        for axis in self.axes:
+            axis.heartbeat_age += 1
+        return self._sync
+
+    def heartbeat(self) -> list[CanFrame]:
+        """The master's heartbeat, operational."""
+        return self._heartbeat
+
+    def _stand(self) -> None:
+        self._commanding = False
+        for axis in self.axes:
+            axis.commanded = 0.0
+
+    def idle(self) -> list[CanFrame]:
+        """Disable voltage, target zero.
+
+        0x00 and not 0x06 (shutdown): it leads from every state to switch on disabled, from which only the whole
+        enable sequence leads to power. No fault is reset by it. A moving axis would coast: stop it first.
+        """
+        self._stand()
+        return self._idle
+
+    def enable(self) -> list[CanFrame]:
+        """For every axis the next step from the state that its newest status word shows."""
+        self._stand()
+        return [
+            self._at_rest[ENABLE_STEPS.get(axis.state, ControlWord.DISABLE_VOLTAGE)][axis.index]
+            for axis in self.axes
+        ]
+
+    def command(self, velocities: FloatArray) -> list[CanFrame]:
+        """Enable operation (halt bit clear) with target velocities (n,) [rad/s or m/s]."""
+        self._commanding = True
+        frames = []
+        for axis, velocity in zip(self.axes, velocities.tolist(), strict=True):
+            axis.commanded = velocity
+            units = axis.scale.velocity_units(velocity)
+            frames.append(
+                CanFrame(RPDO_IDS[0] + axis.node_id, _COMMAND.pack(ControlWord.ENABLE_OPERATION, units))
+            )
+        return frames
+
+    def quick_stop(self) -> list[CanFrame]:
+        """Quick stop, target zero: it takes the place of the stored cyclic control word."""
+        self._stand()
+        return self._quick_stop
+
+    def sendable(self, velocities: FloatArray) -> FloatArray:
+        """Rounded to the drives' velocity units, within 32 bits."""
+        pairs = zip(self.axes, velocities.tolist(), strict=True)
+        return np.array(
+            [axis.scale.velocity(axis.scale.velocity_units(velocity)) for axis, velocity in pairs]
+        )
