@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.demonstration.conduct import (
     DemoFailedError,
@@ -23,6 +23,7 @@ from stereoservo_sim.demonstration.conduct import (
     conduct_live,
     conduct_lockstep,
 )
+from stereoservo_sim.demonstration.emulated import has_emulated_drives
 from stereoservo_sim.demonstration.results import summary
 from stereoservo_sim.demonstration.truth import true_cell
 
@@ -48,7 +49,7 @@ def demo(
     """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
     try:
         path = Path(cell) if cell.endswith(".toml") else shipped_cell_path(cell)
-        true_cell(load_cell_file(path))
+        _check(load_cell_file(path), lockstep)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--cell") from error
     out.mkdir(parents=True, exist_ok=True)
@@ -66,6 +67,21 @@ def demo(
         if json:
             raise SystemExit(1)
         raise DemoFailedError(f"{'; '.join(result['problems'])}; report: {result['report']}")
+
+
+def _check(cell: CellFile, lockstep: bool) -> None:
+    """Raises ValueError where a cell cannot be demonstrated: nothing is simulated that could be judged."""
+    true_cell(cell)
+    emulated = has_emulated_drives(cell)
+    if emulated and lockstep:
+        raise ValueError(
+            f"cell {cell.cell.name!r} drives a CAN bus, which runs in real time; lockstep has a virtual clock: leave "
+            f"--lockstep out, or take a cell without [emulate.drives], e.g. {CELLS[0]}"
+        )
+    if cell.joints.driver == "canopen" and not emulated:
+        raise ValueError(
+            f"cell {cell.cell.name!r} drives real hardware; the demonstration needs emulated drives: [emulate.drives]"
+        )
 
 
 @contextmanager

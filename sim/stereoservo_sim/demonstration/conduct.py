@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo.runtime.daemon import DaemonProcess
 from stereoservo.runtime.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.runtime.lockstep import LockstepCell
+from stereoservo_sim.demonstration.emulated import HOST, free_port, has_emulated_drives, move_to_channel
 from stereoservo_sim.demonstration.live import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import Calibrated, perform
@@ -103,9 +105,12 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
     cell = load_cell_file(cell_path)
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
-    with tempfile.TemporaryDirectory(prefix="stereoservo-") as scratch:
-        os.environ[RUNTIME_VARIABLE] = str(Path(scratch) / "run")
-        os.environ[STATE_VARIABLE] = str(Path(scratch) / "state")
+    with ExitStack() as ends:
+        scratch = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="stereoservo-")))
+        os.environ[RUNTIME_VARIABLE] = str(scratch / "run")
+        os.environ[STATE_VARIABLE] = str(scratch / "state")
+        if has_emulated_drives(cell):
+            cell_path = _emulate_drives(ends, cell_path, scratch, out, stage)
         stage.tell("starting the daemon (the first start compiles the kernels)")
         options = ("--seed", str(seed), "--record", str(recording))
         with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
@@ -126,3 +131,15 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
     return Demonstration(
         cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False
     )
+
+
+def _emulate_drives(ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: Stage) -> Path:
+    """Start the cell's emulated drives on a free port, to end with ``ends``; the cell file that speaks to them."""
+    from stereoservo_sim.drives.emulator import EmulatorProcess
+
+    channel = f"socket://{HOST}:{free_port()}"
+    stage.tell(f"starting emulated drives on {channel}")
+    moved = move_to_channel(cell_path, scratch, channel)
+    emulator = ends.enter_context(EmulatorProcess(moved, log=out / "drives.log"))
+    emulator.wait_ready()
+    return moved

@@ -1,0 +1,63 @@
+"""A cell whose drives are emulated by a process of its own, on a channel of its own."""
+
+from __future__ import annotations
+
+import re
+import socket
+import tomllib
+from pathlib import Path
+
+from stereoservo.runtime.cellfile import CellFile
+
+SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
+HEADING = re.compile(r"^\[", re.MULTILINE)
+HOST = "127.0.0.1"
+
+
+def has_emulated_drives(cell: CellFile) -> bool:
+    """Whether the cell file says what to put in the place of its drives."""
+    return "drives" in cell.emulate
+
+
+def free_port() -> int:
+    """A TCP port of this host that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
+    """A copy of the cell file in ``folder`` whose joint driver speaks over ``channel``; ``eds`` stays the same file.
+
+    Raises ValueError where the file has no ``[joints.options]`` with a ``channel``.
+    """
+    text = cell_path.read_text(encoding="utf-8")
+    options = tomllib.loads(text).get("joints", {}).get("options", {})
+    text = _replaced(text, "channel", channel, cell_path)
+    eds = options.get("eds", "")
+    if eds:
+        text = _replaced(text, "eds", str(cell_path.parent.absolute() / eds), cell_path)
+    copy = folder / cell_path.name
+    if copy.absolute() == cell_path.absolute():
+        raise ValueError(f"{folder} is the cell file's own directory; another is needed for its copy")
+    copy.write_text(text, encoding="utf-8")
+    return copy
+
+
+def _replaced(text: str, key: str, value: str, path: Path) -> str:
+    """``text`` with ``key`` of ``[joints.options]`` set to the string ``value``."""
+    section = SECTION.search(text)
+    if section is not None:
+        end = HEADING.search(text, section.end())
+        body = text[section.end() : end.start() if end else len(text)]
+        changed, count = re.subn(
+            rf"^{key}\s*=\s*(\"[^\"\n]*\"|'[^'\n]*'|\d+)",
+            lambda _: f'{key} = "{value}"',
+            body,
+            flags=re.MULTILINE,
+        )
+        if count == 1:
+            return text[: section.end()] + changed + (text[end.start() :] if end else "")
+    raise ValueError(
+        f"{path}: needs a line `{key} = …` under [joints.options], to be run with emulated drives"
+    )
