@@ -1,0 +1,443 @@
+"""The cycle of the CAN master, without I/O: time and frames in, frames out.
+
+A tick closes the books on the cycle that ends, judges it, and gives the frames of the next: poll, axes, heartbeat.
+The first fault latches; from then on every tick sends target zero and quick stop to all axes, until ``clear``. Nothing
+here clears a fault or enables by itself.
+
+Threads: ``tick`` and ``receive`` belong to one; the rest may be called from another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import msgspec
+import numpy as np
+
+from stereoservo.runtime.ports import FloatArray, JointState
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.codec import AxisFault, Codec
+from stereoservo_drivers.canopen.limits import limit_command
+from stereoservo_drivers.canopen.monitors import (
+    FloodMonitor,
+    FrameCounter,
+    JumpMonitor,
+    LatenessMonitor,
+    ReversalMonitor,
+    Trip,
+)
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.units import JointScale
+
+ENABLE_LIMIT_S = 1.5
+STOP_MARGIN_S = 0.1
+REST_SHARE = 0.01
+"""Of the largest velocity: slower than this a joint that is told to stand counts as at rest."""
+REST_CYCLES = 3
+RESOLUTION_SAID = 1e-3
+"""[rad/s or m/s] A command that the wire's resolution changes by more is reported."""
+
+
+class Mode(StrEnum):
+    """What the master does with the axes."""
+
+    OFF = "off"
+    ENABLING = "enabling"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    LATCHED = "latched"
+
+
+class MasterFault(msgspec.Struct, frozen=True):
+    """What ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: where there are some."""
+
+    code: str
+    message: str
+    axis: str = ""
+    value: float | None = None
+    limit: float | None = None
+    hint: str = ""
+    t_ns: int = 0
+
+    def text(self) -> str:
+        """All of it as one sentence for people."""
+        return self.message + (f": {self.hint}" if self.hint else "")
+
+
+class MasterSettings(msgspec.Struct, frozen=True):
+    """What the master needs of the cell file's options."""
+
+    joints: tuple[CanJoint, ...]
+    rate_hz: float
+    bitrate: int
+    heartbeat_ms: int
+    max_missed_cycles: int
+    command_timeout_s: float
+    loop_timeout_ms: int
+
+    @classmethod
+    def of(cls, options: CanOptions) -> MasterSettings:
+        """The settings in ``options``."""
+        return cls(
+            joints=options.joint,
+            rate_hz=options.rate_hz,
+            bitrate=options.bitrate,
+            heartbeat_ms=options.heartbeat_ms,
+            max_missed_cycles=options.max_missed_cycles,
+            command_timeout_s=options.command_timeout_s,
+            loop_timeout_ms=options.loop_timeout_ms,
+        )
+
+
+@dataclass
+class MasterStatistics:
+    """Since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two ticks.
+
+    ``answered_ns``: from the newest complete cycle's poll to its last frame; ``answered_max_ns``: the largest.
+    """
+
+    cycles: int = 0
+    complete: int = 0
+    incomplete: int = 0
+    lost: int = 0
+    doubled: int = 0
+    foreign: int = 0
+    heartbeats: int = 0
+    longest_cycle_ns: int = 0
+    answered_ns: int = 0
+    answered_max_ns: int = 0
+
+
+@dataclass
+class _Monitors:
+    frames: FrameCounter
+    lateness: LatenessMonitor
+    flood: FloodMonitor
+    jump: JumpMonitor
+    reversal: ReversalMonitor
+
+
+@dataclass
+class _Cycle:
+    """The cycle that is under way."""
+
+    poll_ns: int = 0
+    received: int = 0
+    open: bool = False
+    states: list[JointState] = field(default_factory=list)
+
+
+class Master:
+    """The cycle over a ``codec``. ``fault`` is the first one, None while there is none; ``also`` those after it."""
+
+    def __init__(self, codec: Codec, settings: MasterSettings) -> None:
+        self.codec = codec
+        self.settings = settings
+        self.fault: MasterFault | None = None
+        self.also: list[MasterFault] = []
+        self.statistics = MasterStatistics()
+        joints = settings.joints
+        self._n = len(joints)
+        self._period_s = 1.0 / settings.rate_hz
+        self._period_ns = round(1e9 / settings.rate_hz)
+        self._max_velocity = np.array([joint.max_velocity for joint in joints])
+        self._acceleration = np.array([joint.max_acceleration for joint in joints])
+        self._low = np.array([joint.position_min for joint in joints])
+        self._high = np.array([joint.position_max for joint in joints])
+        self._resolution = np.array([JointScale.of(joint).resolution for joint in joints])
+        self._zero = np.zeros(self._n)
+        self._stop_limit_s = float(np.max(self._max_velocity / self._acceleration)) + STOP_MARGIN_S
+        self._seq = 0
+        self._restart()
+
+    def _restart(self) -> None:
+        codec, settings = self.codec, self.settings
+        self._mode = Mode.OFF
+        self._since_ns = 0
+        self._request = ""
+        self._command: tuple[FloatArray, int] = (self._zero, 0)
+        self._called_ns = 0
+        self._cycle = _Cycle()
+        self._heartbeat_ns = 0
+        self._rests = 0
+        self._sample: JointState | None = None
+        self._sent = self._zero
+        self._monitors = _Monitors(
+            frames=FrameCounter(codec.bit_name, settings.max_missed_cycles),
+            lateness=LatenessMonitor(codec.bit_name, codec.bit_axis, self._period_ns),
+            flood=FloodMonitor(settings.bitrate, self._period_s),
+            jump=JumpMonitor(self._max_velocity, self._resolution),
+            reversal=ReversalMonitor(self._acceleration, self._resolution, self._period_s),
+        )
+
+    # -- what others ask for --------------------------------------------------------------------------------
+
+    @property
+    def mode(self) -> Mode:
+        """LATCHED as long as there is a fault."""
+        return self._mode if self.fault is None else Mode.LATCHED
+
+    def set_command(self, velocities: FloatArray, now_ns: int) -> None:
+        """The newest command (n,), sent from the next tick on while running. Counts as a call of the port."""
+        self._command = (velocities.copy(), now_ns)
+        self._called_ns = now_ns
+
+    def port_called(self, now_ns: int) -> None:
+        """Whoever uses the port lives."""
+        self._called_ns = now_ns
+
+    def request_enable(self, now_ns: int) -> None:
+        """From the next tick on enable all axes at velocity zero, unless a fault is latched."""
+        self._command = (self._zero, 0)
+        self._called_ns = now_ns
+        self._request = "enable"
+
+    def request_disable(self) -> None:
+        """From the next tick on bring to rest, then switch off."""
+        self._request = "disable"
+
+    def request_quick_stop(self) -> None:
+        """Quick stop all axes; as any latched fault it lasts until ``clear``."""
+        self.latch(MasterFault("quick_stop", "a quick stop was asked for", hint="reset, then enable"))
+
+    def latch(self, fault: MasterFault) -> None:
+        """Take ``fault``: the first one latches, later ones are kept in ``also`` (each code and axis once)."""
+        if self.fault is None:
+            self.fault = fault
+            return
+        known = {(f.code, f.axis) for f in (self.fault, *self.also)}
+        if (fault.code, fault.axis) not in known:
+            self.also.append(fault)
+
+    def clear(self) -> None:
+        """Forget the latched fault and all that was observed. The axes are off, and stay off until enabled.
+
+        Call it while nobody ticks. A drive that is still in fault latches again with the next answers.
+        """
+        self.codec.faults()  # events of the reset itself: a node that was told to boot has booted
+        self._restart()
+        self.also = []
+        self.fault = None
+
+    def sample(self) -> JointState | None:
+        """The newest complete set, stamped with its poll; None before the first."""
+        return self._sample
+
+    def limited(self, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+        """What the master would send now of a command (n,), and why it differs. Before the first sample: nothing."""
+        sample = self._sample
+        if sample is None:
+            return self._zero.copy(), ("no_position",)
+        sent, reasons = limit_command(velocities, self._max_velocity, sample.positions, self._low, self._high)
+        wire = self.codec.sendable(sent)
+        if np.max(np.abs(wire - sent)) > RESOLUTION_SAID:
+            reasons = (*reasons, "drive_resolution")
+        return wire, reasons
+
+    # -- the bus --------------------------------------------------------------------------------------------
+
+    def receive(self, frame: CanFrame, now_ns: int) -> bool:
+        """Take a frame that arrived at ``now_ns``; gives whether it belongs to the cycle."""
+        bit = self.codec.receive(frame)
+        if bit < 0:
+            self._monitors.flood.note(frame.id)
+            self.statistics.foreign += 1
+            return False
+        cycle = self._cycle
+        if not cycle.open:
+            return True
+        self._monitors.frames.note(bit)
+        self._monitors.lateness.note(bit, now_ns - cycle.poll_ns)
+        before = cycle.received
+        cycle.received |= 1 << bit
+        if cycle.received == self.codec.expected and before != cycle.received:
+            self._complete(now_ns)
+        return True
+
+    def _complete(self, now_ns: int) -> None:
+        feedback = self.codec.feedback
+        poll_ns = self._cycle.poll_ns
+        positions = feedback.positions.copy()
+        velocities = feedback.velocities.copy()
+        unknown = np.isnan(velocities)
+        if unknown.any():  # drives that do not send it
+            last = self._sample
+            if last is None:
+                velocities[unknown] = 0.0
+            else:
+                change = (positions - last.positions) / (max(poll_ns - last.t_ns, 1) * 1e-9)
+                velocities = np.where(unknown, change, velocities)
+        self._seq += 1
+        sample = JointState(
+            seq=self._seq,
+            t_ns=poll_ns,
+            positions=positions,
+            velocities=velocities,
+            efforts=None if feedback.efforts is None else feedback.efforts.copy(),
+            following_errors=None if feedback.following_errors is None else feedback.following_errors.copy(),
+        )
+        self._sample = sample
+        self._cycle.states.append(sample)
+        self.statistics.answered_ns = now_ns - poll_ns
+        self.statistics.answered_max_ns = max(self.statistics.answered_max_ns, now_ns - poll_ns)
+
+    def tick(self, now_ns: int) -> list[CanFrame]:
+        """End the cycle under way, begin the next: the frames to send now, in order."""
+        complete = self._cycle.received == self.codec.expected
+        if self._cycle.open:
+            self._close(now_ns, complete)
+        axes = self._axes(now_ns, complete)
+        frames = [*self.codec.poll(), *axes]
+        if self._heartbeat_due(now_ns):
+            frames += self.codec.heartbeat()
+        self._cycle = _Cycle(poll_ns=now_ns, open=True)
+        return frames
+
+    def _heartbeat_due(self, now_ns: int) -> bool:
+        if not self._monitors.frames.within_allowed_misses:
+            return False
+        due = now_ns - self._heartbeat_ns >= self.settings.heartbeat_ms * 1_000_000 - self._period_ns // 2
+        if due:
+            self._heartbeat_ns = now_ns
+            self.statistics.heartbeats += 1
+        return due
+
+    # -- verdict on a cycle ---------------------------------------------------------------------------------
+
+    def _close(self, now_ns: int, complete: bool) -> None:
+        statistics, monitors = self.statistics, self._monitors
+        cycle_ns = now_ns - self._cycle.poll_ns
+        statistics.cycles += 1
+        statistics.complete += complete
+        statistics.incomplete += not complete
+        statistics.longest_cycle_ns = max(statistics.longest_cycle_ns, cycle_ns)
+        monitors.frames.end_cycle()
+        statistics.lost = monitors.frames.lost
+        statistics.doubled = monitors.frames.doubled
+        for fault in self.codec.faults():
+            self.latch(self._from_axis(fault, now_ns))
+        for trip in (
+            monitors.frames.verdict(self._period_s),
+            monitors.lateness.end_cycle(),
+            monitors.flood.end_cycle(),
+            *self._watch_encoders(cycle_ns),
+        ):
+            if trip is not None:
+                self.latch(self._from_trip(trip, now_ns))
+        self._watch_port(now_ns)
+
+    def _watch_encoders(self, cycle_ns: int) -> list[Trip | None]:
+        trips = []
+        for sample in self._cycle.states:
+            trips.append(self._monitors.jump.check(sample.t_ns, sample.positions))
+            if self.mode is Mode.RUNNING:
+                trips.append(self._monitors.reversal.check(cycle_ns * 1e-9, self._sent, sample.positions))
+        return trips
+
+    def _watch_port(self, now_ns: int) -> None:
+        silent_ms = (now_ns - self._called_ns) * 1e-6
+        limit_ms = self.settings.loop_timeout_ms
+        if self.mode in (Mode.RUNNING, Mode.ENABLING) and silent_ms > limit_ms:
+            self.latch(
+                MasterFault(
+                    "loop_hung",
+                    f"the servo loop has not called the driver for {silent_ms:.0f} ms, limit {limit_ms}",
+                    value=silent_ms,
+                    limit=limit_ms,
+                    hint="the servo process hangs or is starved of the processor",
+                    t_ns=now_ns,
+                )
+            )
+
+    def _from_axis(self, fault: AxisFault, now_ns: int) -> MasterFault:
+        name = self.settings.joints[fault.axis].name if fault.axis >= 0 else ""
+        return MasterFault(
+            fault.code, fault.message, axis=name, value=fault.value, hint=fault.hint, t_ns=now_ns
+        )
+
+    def _from_trip(self, trip: Trip, now_ns: int) -> MasterFault:
+        axis = self.codec.bit_axis[trip.bit] if trip.bit >= 0 else trip.axis
+        name = self.settings.joints[axis].name if axis >= 0 else ""
+        return MasterFault(
+            trip.code,
+            f"joint {name!r}: {trip.message}" if name else trip.message,
+            axis=name,
+            value=trip.value,
+            limit=trip.limit,
+            hint=trip.hint,
+            t_ns=now_ns,
+        )
+
+    # -- modes ----------------------------------------------------------------------------------------------
+
+    def _enter(self, mode: Mode, now_ns: int) -> None:
+        self._mode = mode
+        self._since_ns = now_ns
+        self._rests = 0
+        self._sent = self._zero
+        self._monitors.reversal.restart()
+
+    def _axes(self, now_ns: int, complete: bool) -> list[CanFrame]:
+        request, self._request = self._request, ""
+        if self.fault is None:
+            self._follow(request, now_ns)
+            self._advance(now_ns, complete)
+        mode = self.mode
+        if mode is Mode.LATCHED:
+            self._mode = Mode.OFF
+            return self.codec.quick_stop()
+        if mode is Mode.ENABLING:
+            return self.codec.enable()
+        if mode is Mode.RUNNING:
+            self._sent = self._wanted(now_ns)
+            return self.codec.command(self._sent)
+        if mode is Mode.STOPPING:
+            return self.codec.command(self._zero)
+        return self.codec.idle()
+
+    def _follow(self, request: str, now_ns: int) -> None:
+        if request == "enable" and self._mode is Mode.OFF:
+            self._enter(Mode.ENABLING, now_ns)
+        elif request == "disable" and self._mode is Mode.ENABLING:
+            self._enter(Mode.OFF, now_ns)
+        elif request == "disable" and self._mode is Mode.RUNNING:
+            self._enter(Mode.STOPPING, now_ns)
+
+    def _advance(self, now_ns: int, complete: bool) -> None:
+        in_mode_s = (now_ns - self._since_ns) * 1e-9
+        if self._mode is Mode.ENABLING:
+            if complete and self.codec.enabled():
+                self._enter(Mode.RUNNING, now_ns)
+            elif in_mode_s > ENABLE_LIMIT_S:
+                self.latch(self._states_fault("enable_timeout", in_mode_s, ENABLE_LIMIT_S, now_ns))
+        elif self._mode is Mode.RUNNING:
+            if complete and not self.codec.enabled():
+                self.latch(self._states_fault("disabled", None, None, now_ns))
+        elif self._mode is Mode.STOPPING:
+            slow = self._sample is not None and bool(
+                np.all(np.abs(self._sample.velocities) <= REST_SHARE * self._max_velocity)
+            )
+            self._rests = self._rests + 1 if slow and complete else 0
+            if self._rests >= REST_CYCLES or in_mode_s > self._stop_limit_s:
+                self._enter(Mode.OFF, now_ns)
+
+    def _states_fault(self, code: str, value: float | None, limit: float | None, now_ns: int) -> MasterFault:
+        states = zip(self.settings.joints, self.codec.status_words(), strict=True)
+        words = ", ".join(f"{joint.name}: {state}" for joint, state in states)
+        if value is None:
+            message, hint = (
+                f"a drive left its enabled state by itself: {words}",
+                "look at the drive's own inputs",
+            )
+        else:
+            message = f"not all drives are enabled after {value:.2f} s, limit {limit:g}: {words}"
+            hint = "is the power stage supplied, is the emergency stop released?"
+        return MasterFault(code, message, value=value, limit=limit, hint=hint, t_ns=now_ns)
+
+    def _wanted(self, now_ns: int) -> FloatArray:
+        velocities, t_ns = self._command
+        if now_ns - t_ns > self.settings.command_timeout_s * 1e9:
+            return self._zero
+        assert self._sample is not None  # running: there has been a complete cycle
+        return limit_command(velocities, self._max_velocity, self._sample.positions, self._low, self._high)[0]

@@ -1,0 +1,301 @@
+"""What the master watches on the bus and on the axes: missed, doubled, late and foreign frames; encoders.
+
+Every monitor takes what a cycle brought and gives a :class:`Trip` or None. No clock, no I/O.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from stereoservo.runtime.ports import FloatArray
+
+DOUBLES_IN_A_ROW = 3
+"""One double may be a frame that waited on a busy bus; several in a row are two drives with one node id."""
+LATE_WINDOW = 25
+LATE_BASELINE_WINDOWS = 4
+LATE_EVERY = 5
+LATE_SHARE = 0.25
+"""Of the period: later than its own baseline by so much, compared with the other drives, a drive is late."""
+LATE_SHARE_ALL = 0.40
+"""The same where all drives are later than they were."""
+FLOOD_WINDOW = 5
+FLOOD_SHARE = 0.30
+FLOOD_FRAME_BITS = 111
+"""A data frame of 8 bytes without stuffing (CiA 301, ISO 11898-1)."""
+JUMP_FACTOR = 3.0
+JUMP_COUNTS = 16.0
+REVERSED_WINDOW_S = 0.05
+REVERSED_FOR_S = 0.1
+REVERSED_SHARE = 0.3
+REVERSED_COUNTS = 8.0
+
+
+class Trip(msgspec.Struct, frozen=True):
+    """Why a monitor ends motion. ``bit`` or ``axis`` say whose fault it is, -1: nobody's in particular."""
+
+    code: str
+    message: str
+    value: float
+    limit: float
+    hint: str
+    bit: int = -1
+    axis: int = -1
+
+
+class FrameCounter:
+    """Frames of every cycle, by bit: consecutive misses, doubles in a row."""
+
+    def __init__(self, names: tuple[str, ...], max_missed: int) -> None:
+        self._names = names
+        self._max_missed = max_missed
+        self._counts = [0] * len(names)
+        self._misses = [0] * len(names)
+        self._doubles = [0] * len(names)
+        self.lost = 0
+        self.doubled = 0
+
+    def note(self, bit: int) -> None:
+        """A frame came."""
+        self._counts[bit] += 1
+
+    @property
+    def within_allowed_misses(self) -> bool:
+        """Whether no bit misses more than is tolerated."""
+        return max(self._misses) <= self._max_missed
+
+    def end_cycle(self) -> None:
+        """Close the books on a poll's cycle."""
+        for bit, count in enumerate(self._counts):
+            if count == 1:
+                self._misses[bit] = self._doubles[bit] = 0
+            elif count == 0:
+                self._misses[bit] += 1
+                self._doubles[bit] = 0
+                self.lost += 1
+            else:
+                self._misses[bit] = 0
+                self._doubles[bit] += 1
+                self.doubled += count - 1
+            self._counts[bit] = 0
+
+    def verdict(self, period_s: float) -> Trip | None:
+        """After ``end_cycle``."""
+        return self._missing(period_s) or self._duplicate()
+
+    def _missing(self, period_s: float) -> Trip | None:
+        worst = max(self._misses)
+        if worst <= self._max_missed:
+            return None
+        waited = f"{worst} cycles ({worst * period_s * 1e3:.0f} ms), limit {self._max_missed}"
+        # A bus that went quiet in the middle of a cycle: the answers before that moment count one miss less.
+        if len(self._misses) > 1 and min(self._misses) >= self._max_missed:
+            return Trip(
+                "bus_silent",
+                f"no drive answered for {waited}",
+                worst,
+                self._max_missed,
+                "check the bus cable, its termination, the bitrate and the drives' logic supply",
+            )
+        bit = self._misses.index(worst)
+        return Trip(
+            "silent",
+            f"no {self._names[bit]} for {waited}",
+            worst,
+            self._max_missed,
+            "is the drive powered, is its cable in?",
+            bit=bit,
+        )
+
+    def _duplicate(self) -> Trip | None:
+        worst = max(self._doubles)
+        if worst < DOUBLES_IN_A_ROW:
+            return None
+        bit = self._doubles.index(worst)
+        return Trip(
+            "duplicate",
+            f"more than one {self._names[bit]} in each of {worst} consecutive cycles",
+            worst,
+            DOUBLES_IN_A_ROW,
+            "two drives have the same node id: give one of them another",
+            bit=bit,
+        )
+
+
+class LatenessMonitor:
+    """When frames come after their poll, against when they used to come.
+
+    A drive that is late by more than a cycle answers as often as one in time: only its phase tells. Medians over
+    ``LATE_WINDOW`` cycles; the baseline is the smallest of the first medians. What all axes have in common is the
+    host's or the bus's doing and is given more room.
+    """
+
+    def __init__(self, names: tuple[str, ...], bit_axis: tuple[int, ...], period_ns: int) -> None:
+        self._names = names
+        self._axes = np.array(bit_axis)
+        self._period_ns = period_ns
+        self._arrivals = np.zeros((LATE_WINDOW, len(names)))
+        self._now = [0.0] * len(names)
+        self._cycles = 0
+        self._baseline = np.full(len(names), math.inf)
+
+    def note(self, bit: int, after_ns: int) -> None:
+        """The frame of ``bit`` came ``after_ns`` after its poll."""
+        self._now[bit] = float(after_ns)
+
+    def end_cycle(self) -> Trip | None:
+        """Of a frame that did not come, the last arrival stands."""
+        self._arrivals[self._cycles % LATE_WINDOW] = self._now
+        self._cycles += 1
+        if self._cycles < LATE_WINDOW or self._cycles % LATE_EVERY:
+            return None
+        medians = np.median(self._arrivals, axis=0)
+        if self._cycles <= LATE_BASELINE_WINDOWS * LATE_WINDOW:
+            np.minimum(self._baseline, medians, out=self._baseline)
+        return self._judge(medians - self._baseline)
+
+    def _judge(self, excess: FloatArray) -> Trip | None:
+        worst = int(np.argmax(excess))
+        others = excess[self._axes != self._axes[worst]]
+        common = float(max(np.min(others), 0.0)) if others.size else 0.0
+        alone = float(excess[worst]) - common
+        if alone > LATE_SHARE * self._period_ns:
+            return Trip(
+                "late",
+                f"{self._names[worst]} comes {excess[worst] * 1e-6:.2f} ms later after its poll than it used to "
+                f"(median of {LATE_WINDOW} cycles)",
+                excess[worst] * 1e-6,
+                LATE_SHARE * self._period_ns * 1e-6,
+                "the drive is overloaded, or its frames wait behind frames of higher priority",
+                bit=worst,
+            )
+        if common > LATE_SHARE_ALL * self._period_ns:
+            return Trip(
+                "late",
+                f"all drives' answers come {common * 1e-6:.2f} ms later than they used to "
+                f"(median of {LATE_WINDOW} cycles)",
+                common * 1e-6,
+                LATE_SHARE_ALL * self._period_ns * 1e-6,
+                "the adapter or the host buffers frames, or the bus is overloaded: lower rate_hz",
+            )
+        return None
+
+
+class FloodMonitor:
+    """Frames that belong to no part of the cycle, as a share of the bus."""
+
+    def __init__(self, bitrate: int, period_s: float) -> None:
+        bits = FLOOD_SHARE * bitrate * period_s * FLOOD_WINDOW
+        self._limit = max(math.ceil(bits / FLOOD_FRAME_BITS), 4 * FLOOD_WINDOW)
+        self._window_s = FLOOD_WINDOW * period_s
+        self._by_id: dict[int, int] = {}
+        self._cycles = 0
+        self.total = 0
+
+    def note(self, can_id: int) -> None:
+        """A frame that is nobody's."""
+        self.total += 1
+        if can_id in self._by_id or len(self._by_id) < 256:
+            self._by_id[can_id] = self._by_id.get(can_id, 0) + 1
+
+    def end_cycle(self) -> Trip | None:
+        """Judges every ``FLOOD_WINDOW`` cycles."""
+        self._cycles += 1
+        if self._cycles % FLOOD_WINDOW:
+            return None
+        heard, self._by_id = self._by_id, {}
+        count = sum(heard.values())
+        if count <= self._limit:
+            return None
+        loudest = max(heard, key=lambda can_id: heard[can_id])
+        return Trip(
+            "bus_flood",
+            f"{count} frames in {self._window_s * 1e3:.0f} ms that are not part of the cycle, limit {self._limit}; "
+            f"most of them ({heard[loudest]}) have the id 0x{loudest:X}",
+            count,
+            self._limit,
+            f"find and silence the node that sends 0x{loudest:X}",
+        )
+
+
+class JumpMonitor:
+    """Positions that change by more than the axis can move."""
+
+    def __init__(self, max_velocities: FloatArray, resolutions: FloatArray) -> None:
+        self._max_velocities = max_velocities
+        self._margins = JUMP_COUNTS * resolutions
+        self._positions: FloatArray | None = None
+        self._t_ns = 0
+
+    def check(self, t_ns: int, positions: FloatArray) -> Trip | None:
+        """A complete set (n,) with its stamp."""
+        last, last_ns = self._positions, self._t_ns
+        self._positions, self._t_ns = positions, t_ns
+        if last is None:
+            return None
+        moved = np.abs(positions - last)
+        limits = JUMP_FACTOR * self._max_velocities * ((t_ns - last_ns) * 1e-9) + self._margins
+        excess = moved / limits
+        axis = int(np.argmax(excess))
+        if not excess[axis] > 1.0:
+            return None
+        return Trip(
+            "encoder_jump",
+            f"position jumped by {moved[axis]:.6g} within {(t_ns - last_ns) * 1e-6:.1f} ms; at "
+            f"{JUMP_FACTOR:g} times max_velocity it is {limits[axis]:.3g}",
+            float(moved[axis]),
+            float(limits[axis]),
+            "check the encoder, its cable, and counts_per_rev and gear_ratio",
+            axis=axis,
+        )
+
+
+class ReversalMonitor:
+    """Axes that move against their command.
+
+    Compares over ``REVERSED_WINDOW_S`` the travel that the commands ask for, ramped at the joint's acceleration, with
+    the measured one. Opposite signs for ``REVERSED_FOR_S`` trip: longer than any drive lags behind its ramp.
+    """
+
+    def __init__(self, accelerations: FloatArray, resolutions: FloatArray, period_s: float) -> None:
+        self._accelerations = accelerations
+        self._least = REVERSED_COUNTS * resolutions
+        self._cycles = max(round(REVERSED_WINDOW_S / period_s), 2)
+        self._need = max(round(REVERSED_FOR_S / period_s), 3)
+        self.restart()
+
+    def restart(self) -> None:
+        """At rest."""
+        n = self._accelerations.size
+        self._velocities = np.zeros(n)
+        self._asked = np.zeros(n)
+        self._history: list[tuple[FloatArray, FloatArray]] = []
+        self._runs = np.zeros(n, dtype=np.int64)
+
+    def check(self, dt_s: float, command: FloatArray, positions: FloatArray) -> Trip | None:
+        """One cycle of ``dt_s``: what was sent (n,), where the axes are (n,)."""
+        step = self._accelerations * dt_s
+        self._velocities = self._velocities + np.clip(command - self._velocities, -step, step)
+        self._asked = self._asked + self._velocities * dt_s
+        self._history.append((self._asked, positions))
+        if len(self._history) <= self._cycles:
+            return None
+        asked_then, positions_then = self._history.pop(0)
+        asked, moved = self._asked - asked_then, positions - positions_then
+        against = (asked * moved < 0.0) & (np.abs(moved) > REVERSED_SHARE * np.abs(asked))
+        against &= (np.abs(asked) > self._least) & (np.abs(moved) > self._least)
+        self._runs = np.where(against, self._runs + 1, 0)
+        axis = int(np.argmax(self._runs))
+        if self._runs[axis] < self._need:
+            return None
+        return Trip(
+            "encoder_reversed",
+            f"moves against its command: asked to travel {asked[axis]:+.4g}, measured {moved[axis]:+.4g}",
+            float(moved[axis]),
+            float(asked[axis]),
+            "encoder and motor count in opposite senses, or the axis is being pushed; "
+            "check the encoder's polarity in the drive (direction in the cell file turns both alike)",
+            axis=axis,
+        )
