@@ -1,0 +1,109 @@
+"""The bus as discrete events: who sends next, and for how long (ISO 11898-1)."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_sim.drives.node import NEVER_NS
+
+MASTER = 0
+"""The sender that is not a node of the rack; nodes are 1, 2, ... in their order."""
+QUEUE_LIMIT = 2000
+"""Frames that a sender may have waiting; further ones are lost, as from a full transmit buffer."""
+SECOND_NS = 1_000_000_000
+
+
+def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
+    """The bits of the arbitration field in the order of sending, dominant as 0: the smallest wins.
+
+    A data frame so goes before the remote frame of its id, and a standard one before an extended one that begins alike.
+    """
+    if frame.extended:
+        return frame.id >> 18, 1, 1, frame.id & 0x3FFFF, int(frame.remote)
+    return frame.id, int(frame.remote), 0, 0, 0
+
+
+def frame_bits(frame: CanFrame) -> int:
+    """Bits of ``frame`` on the wire with its stuff bits and the intermission."""
+    length = frame.length if frame.remote else len(frame.data)
+    if frame.extended:
+        head = f"0{frame.id >> 18:011b}11{frame.id & 0x3FFFF:018b}{int(frame.remote)}00{length:04b}"
+    else:
+        head = f"0{frame.id:011b}{int(frame.remote)}00{length:04b}"
+    bits = head + ("" if frame.remote else "".join(f"{byte:08b}" for byte in frame.data))
+    crc = 0
+    for bit in bits:
+        crc = (crc << 1) ^ (0x4599 if (crc >> 14 & 1) ^ (bit == "1") else 0)
+        crc &= 0x7FFF
+    bits += f"{crc:015b}"
+    stuffed, run, last = 0, 0, ""
+    for bit in bits:
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            stuffed += 1
+            last, run = ("0" if bit == "1" else "1"), 1
+    return len(bits) + stuffed + 13
+
+
+class Wire:
+    """One frame at a time. Every sender's frames go out in their order; among senders, arbitration decides.
+
+    ``bitrate`` [bit/s]; None: frames take no time. A frame occupies its stuffed bits and the intermission and arrives
+    when those are over. Bit errors, and the collision of two frames with one id, are not modelled: both go out.
+    """
+
+    def __init__(self, bitrate: int | None) -> None:
+        self.bitrate = bitrate
+        self.frames = 0
+        self.lost = 0
+        self.busy_ns = 0
+        self.end_ns = NEVER_NS
+        """When the frame on the wire ends."""
+        self._queues: dict[int, deque[CanFrame]] = {}
+        self._waiting = 0
+        self._sending: tuple[int, CanFrame] | None = None
+
+    def send(self, sender: int, frame: CanFrame) -> None:
+        """Queue a frame of ``sender``."""
+        queue = self._queues.setdefault(sender, deque())
+        if len(queue) >= QUEUE_LIMIT:
+            self.lost += 1
+            return
+        queue.append(frame)
+        self._waiting += 1
+
+    def waiting(self, sender: int) -> int:
+        """Frames of ``sender`` that are not on the wire yet."""
+        return len(self._queues.get(sender, ()))
+
+    def start(self, t_ns: int) -> None:
+        """Where the bus is free at ``t_ns``, put the frame on it that wins the arbitration."""
+        if self._sending is not None or self._waiting == 0:
+            return
+        sender = min(
+            (sender for sender, queue in self._queues.items() if queue),
+            key=lambda one: (arbitration_key(self._queues[one][0]), one),
+        )
+        frame = self._queues[sender].popleft()
+        self._waiting -= 1
+        self._sending = sender, frame
+        duration = self.duration_ns(frame)
+        self.busy_ns += duration
+        self.end_ns = t_ns + duration
+
+    def finish(self) -> tuple[int, CanFrame]:
+        """The frame on the wire has ended: its sender and itself."""
+        assert self._sending is not None  # end_ns is NEVER_NS otherwise
+        ended = self._sending
+        self._sending = None
+        self.end_ns = NEVER_NS
+        self.frames += 1
+        return ended
+
+    def duration_ns(self, frame: CanFrame) -> int:
+        """How long ``frame`` occupies the bus, intermission included."""
+        if self.bitrate is None:
+            return 0
+        return frame_bits(frame) * SECOND_NS // self.bitrate
