@@ -1,0 +1,210 @@
+"""Whether units, limits and signs of a joint in the cell file fit what its drive does. Numbers in, findings out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stereoservo.runtime.ports import Finding, FloatArray
+from stereoservo_drivers.canopen.options import CanJoint
+from stereoservo_drivers.canopen.units import JointScale
+
+NOISE_COUNTS = 8.0
+NOISE = 1e-4
+"""[rad or m] An encoder at rest may waver by so much, or by ``NOISE_COUNTS``."""
+COARSE = 1e-4
+"""[rad/s or m/s] A velocity unit that is larger shows in how a law comes to rest."""
+JOG = {"revolute": math.radians(1.0), "prismatic": 2e-3}
+"""How far a joint is jogged [rad or m]."""
+SLOWEST_SHARE = 5e-3
+FASTEST = {"revolute": 0.04, "prismatic": 0.005}
+"""[rad/s or m/s]"""
+DOUBLING_S = 0.06
+"""The jog's velocity doubles in this time: units that are wrong by a thousand show while it still creeps."""
+RUNAWAY = 3.0
+TOLERANCE = 0.15
+LAG_S = 0.15
+SURE = 1.6
+"""A named unit within this factor of what would fit is meant: a joint stopped early has not come up to speed."""
+NAMED_UNITS = {1.0: "rev/s", 60.0: "rpm", 600.0: "rpm/10", 6000.0: "rpm/100", 60_000.0: "rpm/1000"}
+
+
+def position_finding(joint: CanJoint, position: float) -> Finding:
+    """A joint's position [rad or m] against the machine's limits."""
+    name, unit = f"{joint.name} position", _unit(joint)
+    limits = f"{joint.position_min:g} to {joint.position_max:g} {unit}"
+    if joint.position_min <= position <= joint.position_max:
+        return Finding(name, True, f"{position:+.4f} {unit}, within {limits}")
+    outside = max(joint.position_min - position, position - joint.position_max)
+    message = f"{position:+.4f} {unit} is {outside:.3g} {unit} outside {limits}"
+    zero = joint.offset_rad + position
+    cure = f"if the joint stands at its zero now, offset_rad = {zero:.4f}"
+    if joint.kind == "revolute" and abs(zero) > math.pi:
+        cure = (
+            "so far outside, counts_per_rev (of the motor, after quadrature) or gear_ratio is wrong, limits are in "
+            "degrees, or the encoder has lost its zero: home the drive"
+        )
+    return Finding(name, False, message, cure)
+
+
+def limits_finding(joint: CanJoint) -> Finding | None:
+    """Limits that look like degrees, None where they do not."""
+    widest = max(abs(joint.position_min), abs(joint.position_max))
+    if joint.kind != "revolute" or joint.multi_turn or widest <= 4.0 * math.pi:
+        return None
+    return Finding(
+        f"{joint.name} limits",
+        False,
+        f"{joint.position_min:g} to {joint.position_max:g} rad are {widest / (2 * math.pi):.1f} turns",
+        f"in radians {math.radians(joint.position_min):.4f} and {math.radians(joint.position_max):.4f}; "
+        "multi_turn = true where the joint really turns so far",
+    )
+
+
+def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
+    """Positions (k,) of a joint that should stand still."""
+    name, unit = f"{joint.name} at rest", _unit(joint)
+    counts = abs(JointScale.of(joint).counts_per_unit)
+    spread = float(np.ptp(positions))
+    drift = float(positions[-1] - positions[0])
+    message = f"wavers by {spread:.2g} {unit} ({spread * counts:.0f} counts)"
+    if spread <= max(NOISE, NOISE_COUNTS / counts):
+        return Finding(name, True, message)
+    if abs(drift) > 0.8 * spread:
+        return Finding(
+            name, False, f"moves by {drift:+.2g} {unit} while nobody drives it",
+            "it sinks: see to its brake; or it was pushed: leave it alone and repeat",
+        )  # fmt: skip
+    return Finding(name, False, message, "encoder cable, its screen, and the encoder's type set in the drive")
+
+
+def resolution_finding(joint: CanJoint) -> Finding:
+    """What one unit of velocity is at the joint."""
+    unit = _unit(joint)
+    step = 1.0 / abs(JointScale.of(joint).velocity_units_per_unit)
+    message = (
+        f"one unit of velocity is {step:.2g} {unit}/s, one count {JointScale.of(joint).resolution:.2g} {unit}"
+    )
+    if step <= COARSE:
+        return Finding(f"{joint.name} units", True, message)
+    return Finding(
+        f"{joint.name} units",
+        None,
+        f"{message}: coarse; goals end in a slow hunt about rest",
+        "set the drive's velocity unit finer (0x60A9, e.g. rpm/1000) and velocity_units_per_rev_s with it",
+    )
+
+
+def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
+    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: creeping, doubling, constant; None: it is over."""
+    fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
+    slowest = max(SLOWEST_SHARE * fastest, 1.0 / abs(JointScale.of(joint).velocity_units_per_unit))
+    slowest = min(slowest, fastest)
+    growth = math.log(2.0) / DOUBLING_S
+    rise_s = math.log(fastest / slowest) / growth
+    risen = (fastest - slowest) / growth
+    if t_s < rise_s:
+        return sign * slowest * math.exp(growth * t_s)
+    if t_s < rise_s + max(JOG[joint.kind] - risen, 0.0) / fastest:
+        return sign * fastest
+    return None
+
+
+@dataclass
+class JogTrace:
+    """A jog as it went. ``add`` every cycle; ``asked``: travel that the commands sent so far mean [rad or m]."""
+
+    joint: CanJoint
+    start: float
+    asked: float = 0.0
+    longest_lag: float = 0.0
+    reported: float = 0.0
+    positions: list[float] = field(default_factory=list)
+
+    @property
+    def travel(self) -> float:
+        """By the joint's encoder."""
+        return self.positions[-1] - self.start if self.positions else 0.0
+
+    def add(self, asked: float, position: float, velocity: float, dt_s: float) -> None:
+        """One cycle: the travel asked for in it, position and velocity as reported."""
+        self.asked += asked
+        self.positions.append(position)
+        self.reported += velocity * dt_s
+        self.longest_lag = max(self.longest_lag, abs(self.asked - self.travel))
+
+    def runs_away(self) -> bool:
+        """Whether the joint moves far more than it was asked to: stop it."""
+        margin = max(NOISE, NOISE_COUNTS / abs(JointScale.of(self.joint).counts_per_unit))
+        return abs(self.travel) > RUNAWAY * abs(self.asked) + 3.0 * margin
+
+
+def jog_finding(trace: JogTrace) -> Finding:
+    """A jog that is over: the way it went, how far, by which factor the units are wrong."""
+    joint = trace.joint
+    name = f"{joint.name} jog"
+    asked, travel = _told(joint, trace.asked), _told(joint, trace.travel)
+    ratio = trace.travel / trace.asked if trace.asked else math.inf
+    if trace.runs_away() or ratio > 1.0 + TOLERANCE:
+        return Finding(
+            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
+        )
+    if ratio < -0.05:
+        return Finding(
+            name, False, f"asked for {asked}, its encoder moved {travel}: the wrong way",
+            "motor and encoder count in opposite senses: polarity of the encoder in the drive (0x607E turns both)",
+        )  # fmt: skip
+    if ratio < 0.05:
+        return Finding(
+            name, False, f"asked for {asked}, moved {travel}: it stands",
+            f"brake, safe torque off, the drive's mode; or {_units_cure(joint, ratio)}"
+            if ratio > 1e-5 else "brake, safe torque off, the drive's mode, its velocity limit",
+        )  # fmt: skip
+    if ratio < 1.0 - TOLERANCE:
+        return Finding(
+            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
+        )
+    share = trace.reported / trace.travel
+    if not 1.0 - 2 * TOLERANCE < share < 1.0 + 2 * TOLERANCE:
+        return Finding(
+            name, False,
+            f"moved {travel}, but the velocity that the drive reports (0x606C) adds up to "
+            f"{_told(joint, trace.reported)}: {share:.3g} times",
+            "actual and target velocity differ in units: see the drive's manual; or leave velocity out of feedback",
+        )  # fmt: skip
+    fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
+    lag_s = trace.longest_lag / fastest
+    message = f"asked for {asked}, moved {travel} by its own encoder, at most {lag_s * 1e3:.0f} ms behind"
+    if lag_s > LAG_S:
+        return Finding(name, None, message, "velocity loop of the drive: gains, or its acceleration limit")
+    return Finding(
+        name, True, f"{message}; where your eye saw less or more, gear_ratio is wrong by that factor, where it saw the "
+        "other way, direction",
+    )  # fmt: skip
+
+
+def _units_cure(joint: CanJoint, ratio: float) -> str:
+    configured = joint.velocity_units_per_rev_s or joint.counts_per_rev
+    true = configured / abs(ratio) if ratio else math.inf
+    named = {**NAMED_UNITS, joint.counts_per_rev: "counts/s"}
+    near = min(named, key=lambda value: abs(math.log(value / true)) if 0.0 < true < math.inf else math.inf)
+    if 0.0 < true < math.inf and near != configured and abs(math.log(near / true)) < math.log(SURE):
+        return f"velocity_units_per_rev_s = {near:g} ({named[near]})? it is {configured:g}"
+    return (
+        f"velocity_units_per_rev_s is {configured:g}; about {_rounded(true)} would fit this travel, if counts_per_rev "
+        f"({joint.counts_per_rev:g}) is right"
+    )
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.0f}" if 100.0 <= value < 1e9 else f"{value:.3g}"
+
+
+def _unit(joint: CanJoint) -> str:
+    return "rad" if joint.kind == "revolute" else "m"
+
+
+def _told(joint: CanJoint, travel: float) -> str:
+    return f"{math.degrees(travel):+.3f}°" if joint.kind == "revolute" else f"{travel * 1e3:+.3f} mm"
