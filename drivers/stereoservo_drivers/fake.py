@@ -39,7 +39,8 @@ class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     ``freeze_encoder_after``: from that read on positions, velocities and stamp stand still (no feedback).
     ``stuck_encoder_after``: positions stand still, the stamp goes on. ``drop_writes_after``: later
     commands do not reach the drives, though reported as sent. ``delay_s``: states are that old. ``gain``:
-    the drives run at this multiple of the command.
+    the drives run at this multiple of the command. ``block_after``: from that write on something is in the way of
+    the joint ``block_joint`` (empty: of the one that is then fastest), where it stands, in the direction it moves in.
     """
 
     fail_write: Count | None = None
@@ -50,6 +51,8 @@ class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     drop_writes_after: Count | None = None
     delay_s: NonNegative = 0.0
     gain: float = 1.0
+    block_after: Count | None = None
+    block_joint: str = ""
 
 
 class FakeJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -93,10 +96,19 @@ class FakeJointDriver(SimulatedArm):
         self._writes = 0
         self._frozen: JointState | None = None
         self._past: list[JointState] = []
+        self._plant: IdealPlant | None = None
+        self._blocked = False
+        names = [joint.name for joint in joints]
+        if self.faults.block_joint and self.faults.block_joint not in names:
+            raise DriverError(
+                "option",
+                f"driver 'fake': faults.block_joint: no joint {self.faults.block_joint!r}; joints: {', '.join(names)}",
+            )
 
     def make_plant(self, positions: FloatArray) -> Plant:
         """Ideal joints."""
-        return IdealPlant(positions)
+        self._plant = IdealPlant(positions)
+        return self._plant
 
     def activate(self) -> None:
         """Brakes off, at rest. Raises DriverError."""
@@ -121,7 +133,14 @@ class FakeJointDriver(SimulatedArm):
         held = self._frozen if self._frozen is not None else state
         if frozen:
             return held
-        return JointState(state.seq, state.t_ns, held.positions, np.zeros_like(held.velocities))
+        return JointState(
+            state.seq,
+            state.t_ns,
+            held.positions,
+            np.zeros_like(held.velocities),
+            held.efforts,
+            held.following_errors,
+        )
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
         """Command (n,) velocities. Raises DriverError."""
@@ -134,12 +153,23 @@ class FakeJointDriver(SimulatedArm):
 
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         """Hand a command to the drives, unless a fault swallows it."""
+        if _due(self.faults.block_after, self._writes) and not self._blocked:
+            self._block(asked)
         if _due(self.faults.drop_writes_after, self._writes):
             return asked.copy(), ()
         if self.faults.gain != 1.0:
             bank.command(now_ns, asked * self.faults.gain)
             return asked.copy(), ()
         return super().send(bank, now_ns, asked)
+
+    def _block(self, asked: FloatArray) -> None:
+        """Put a wall before a joint, once it moves."""
+        assert self._plant is not None  # configured: the lifecycle was checked
+        named = [k for k, joint in enumerate(self._joints) if joint.name == self.faults.block_joint]
+        joint = named[0] if named else int(np.abs(asked).argmax())
+        if asked[joint] != 0.0:
+            self._plant.walls[1 if asked[joint] > 0.0 else 0, joint] = self._plant.positions[joint]
+            self._blocked = True
 
     def _delayed(self, state: JointState) -> JointState:
         self._past.append(state)

@@ -114,13 +114,14 @@ class SimulatedArm:
         self._life.state = State.ACTIVE
 
     def read_state(self) -> JointState:
-        """The encoders now. Raises DriverError."""
+        """Encoders, motors' efforts and following errors now. Raises DriverError."""
         self._life.require("read_state()", State.CONFIGURED, State.ACTIVE)
         bank = self._advance()
         self._seq += 1
+        positions = self.encode(bank.plant.positions)
         return JointState(
-            seq=self._seq, t_ns=self._stamp(bank), positions=self.encode(bank.plant.positions),
-            velocities=bank.plant.velocities.copy(),
+            seq=self._seq, t_ns=self._stamp(bank), positions=positions, velocities=bank.plant.velocities.copy(),
+            efforts=bank.plant.efforts.copy(), following_errors=bank.set_positions - positions,
         )  # fmt: skip
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:

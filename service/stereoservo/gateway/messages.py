@@ -196,6 +196,14 @@ class StateMessage(msgspec.Struct, frozen=True):
     progress: float | None = None
     """Of the active goal's way, 0 to 1, where it is known."""
     seconds_left: float | None = None
+    efforts: dict[str, float] = {}
+    """As the drives tell them [N m or N, or shares of the rated torque]; empty where they do not."""
+    following_errors: dict[str, float] = {}
+    """Set less actual position [rad or m]."""
+    effort_limits: dict[str, float] = {}
+    """How far efforts may go from their moving mean before the arm stops for a contact; absent where nobody knows."""
+    following_limits: dict[str, float] = {}
+    """How large following errors may become before the arm stops for a contact."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):

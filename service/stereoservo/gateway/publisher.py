@@ -164,6 +164,10 @@ def state_message(
         notes=notes,
         progress=_number(status.progress),
         seconds_left=_number(status.seconds_left),
+        efforts=_finite(names, status.efforts),
+        following_errors=_finite(names, status.following_errors),
+        effort_limits=_finite(names, status.effort_limits),
+        following_limits=_finite(names, status.following_limits),
     )
 
 
@@ -173,6 +177,8 @@ def _number(value: float | None) -> float | None:
 
 
 def _finite(names: tuple[str, ...], values: Any) -> dict[str, float]:
+    if values is None:
+        return {}
     return {name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)}
 
 

@@ -73,6 +73,21 @@ class FitStatistics(msgspec.Struct, frozen=True, eq=False):
     images: int
 
 
+class JointLoads(msgspec.Struct, frozen=True, eq=False):
+    """What the joints' drives said of their loads in the trial motions: where thresholds of contact come from.
+
+    ``efforts`` (n, n) [N m or N, or shares of the rated torque]: entry (j, k) is the farthest that joint j's effort
+    went from its moving mean, and stayed for a few samples, while joint k moved. ``largest_efforts`` (n,): largest
+    magnitude of all. ``following_errors`` (n,): likewise, from zero [rad or m]. ``velocities`` (n,): highest speed
+    commanded [rad/s or m/s]. None where the drives do not tell.
+    """
+
+    velocities: FloatArray
+    efforts: FloatArray | None = None
+    largest_efforts: FloatArray | None = None
+    following_errors: FloatArray | None = None
+
+
 class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
     """Covariance of all free parameters of a model and what each of them moves, in the model's projective frame.
 
@@ -133,6 +148,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     source: str = ""
     mount: Mount = "eye_to_hand"
     covariance: ModelCovariance | None = None
+    loads: JointLoads | None = None
 
     @property
     def tip_first(self) -> bool:
@@ -218,6 +234,29 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         _check_metric(model, model.projective_to_euclidean, path)
     if model.covariance is not None:
         _check_covariance(model, model.covariance, path)
+    if model.loads is not None:
+        check_loads(model.loads, n, path)
+
+
+def check_loads(loads: JointLoads, n: int, path: Path | str = "<loads>") -> None:
+    """Check the loads of ``n`` joints. Raises ModelFileError."""
+    given: list[tuple[str, FloatArray | None, tuple[int, ...]]] = [
+        ("velocities", loads.velocities, (n,)),
+        ("efforts", loads.efforts, (n, n)),
+        ("largest_efforts", loads.largest_efforts, (n,)),
+        ("following_errors", loads.following_errors, (n,)),
+    ]
+    for key, array, shape in given:
+        if array is None:
+            continue
+        if array.shape != shape:
+            raise ModelFileError(path, f"loads.{key}", f"has shape {array.shape}; {shape} is needed")
+        if not (np.isfinite(array) & (array >= 0.0)).all():
+            raise ModelFileError(
+                path, f"loads.{key}", "has entries that are negative or not finite; magnitudes are needed"
+            )
+    if (loads.efforts is None) != (loads.largest_efforts is None):
+        raise ModelFileError(path, "loads", "has one of efforts and largest_efforts; both or none are needed")
 
 
 def _check_cameras(model: CellModel, path: Path | str) -> None:

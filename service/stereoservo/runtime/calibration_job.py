@@ -8,6 +8,7 @@ import numpy as np
 
 from stereoservo.kinematics.calibration.standing import standing_markers
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialCamera, TrialData
+from stereoservo.kinematics.model import JointLoads
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.settings import CameraSettings, CoreSettings
 
@@ -20,6 +21,7 @@ class CalibrationJob:
         self.id = ""
         self._stops: list[Event] = []
         self.standing: tuple[int, ...] = ()
+        self._loads: JointLoads | None = None
 
     @property
     def stops(self) -> int:
@@ -27,12 +29,15 @@ class CalibrationJob:
         return len(self._stops)
 
     def add(self, event: Event) -> None:
-        """Take an event; only ``calibration_sample`` counts."""
+        """Take an event; ``calibration_sample`` counts, and what ``calibration_finished`` says of the loads."""
+        if event.kind == "calibration_finished" and event.id == self.id:
+            self._loads = event.loads
         if event.kind != "calibration_sample":
             return
         if event.id != self.id:
             self.id = event.id
             self._stops.clear()
+            self._loads = None
         self._stops.append(event)
 
     def trials(self) -> TrialData:
@@ -81,6 +86,7 @@ class CalibrationJob:
             pixels=pixels[:, :, ~still],
             sigmas=sigmas[:, :, ~still],
             images=images,
+            loads=self._loads,
         )
 
     def _noise_factor(self, camera: CameraSettings) -> float:

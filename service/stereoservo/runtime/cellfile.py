@@ -89,6 +89,21 @@ class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ranges: dict[str, tuple[float, float]]
 
 
+class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[safety.contact]``: stop where a joint's effort or following error says that the arm has met something.
+
+    ``effort`` [as the driver tells it] and ``following`` [rad or m]: thresholds by joint, in place of those that the
+    calibration's motions have taught. These are ``factor`` times what was seen there. A stop takes ``samples`` joint
+    samples beyond the threshold, one after the other.
+    """
+
+    effort: dict[str, float] = {}
+    following: dict[str, float] = {}
+    factor: Annotated[float, Meta(ge=1, le=100)] = 1.5
+    samples: Annotated[int, Meta(ge=1, le=100)] = 5
+    enabled: bool = True
+
+
 class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[safety]``"""
 
@@ -101,6 +116,7 @@ class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position_margin: NonNegative = 0.01
     """Distance kept from every position limit [rad or m]."""
     speed_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    contact: ContactSection = ContactSection()
 
 
 class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -256,6 +272,9 @@ def _check_limits(cell: CellFile, path: Path | str) -> None:
         if cell.calibration.spread is not None:
             joint = cell.calibration.spread.joint
             sections += [("calibration.spread.joint", {joint: joint})]
+    contact = cell.safety.contact
+    sections += [("safety.contact.effort", dict(contact.effort))]
+    sections += [("safety.contact.following", dict(contact.following))]
     for box in cell.safety.keep_out:
         if not box.ranges:
             raise CellFileError(path, f"safety.keep_out {box.name!r}", "bounds no joint; give ranges of some")
@@ -287,6 +306,12 @@ def _check_value(key: str, joint: str, value: Any, cell: CellFile, path: Path | 
             path,
             f"{key}.{joint}",
             f"is {value:g}; at most {limit.max - limit.min:g}, all that its limits leave (in rad?)",
+        )
+    if key.startswith("safety.contact") and not value > 0.0:
+        raise CellFileError(
+            path,
+            f"{key}.{joint}",
+            f"is {value:g}; a threshold is above 0 (leave the joint out where it is to be learnt)",
         )
     if isinstance(value, tuple) and not value[0] < value[1]:
         raise CellFileError(path, f"{key}.{joint}", f"is {list(value)}; the first must be below the second")
@@ -335,6 +360,7 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
     sections: dict[str, type[msgspec.Struct]] = {
         "": CellFile, "cell": CellSection, "joints": JointsSection, "camera": CameraSection, "servo": ServoSection,
         "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
+        "safety.contact": ContactSection,
         "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
         "zenoh.tls": TlsSection,
     }  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import ending, following, goals, going_on, intake, progress
+from stereoservo.runtime import contact, ending, following, goals, going_on, intake, progress
 from stereoservo.runtime.check import check_step
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
 from stereoservo.runtime.estimate import (
@@ -87,6 +87,7 @@ class ServoCore:
                 FRESH_S, FRESH_FRAMES / min((c.rate_hz for c in settings.cameras), default=30.0)
             ),
         )
+        self._contact_limits = self._contact_thresholds()
         self._prior_every = max(1, round(settings.rate_hz / PRIOR_RATE_HZ))
 
     def step(self, inputs: StepInputs) -> StepOutputs:
@@ -106,6 +107,7 @@ class ServoCore:
         if inputs.stop:
             self._stop(present)
         intake.answer_all(inputs.requests, present)
+        self._watch_contact(present, inputs)
         self._watch_following(present)
         teach_step(present)
         self._watch_model(present)
@@ -195,8 +197,15 @@ class ServoCore:
         state = self.state
         self._arrays = model_arrays(model, self.settings)
         state.model = model
+        self._contact_limits = self._contact_thresholds()
         state.readiness = self._fitted(model)
         state.cameras = [camera_estimate(len(model.marker_ids)) for _ in self.settings.cameras]
+
+    def _contact_thresholds(self) -> tuple[FloatArray, FloatArray] | None:
+        if not self.settings.watch_following:
+            return None
+        model = self.state.model
+        return contact.thresholds(self.settings, None if model is None else model.loads)
 
     @staticmethod
     def _fitted(model: CellModel) -> ModelReadiness:
@@ -240,11 +249,22 @@ class ServoCore:
 
     def _stop(self, present: Present) -> None:
         reason = Reason("STOPPED", "hold", hint="resume, then send the goal again")
-        ending.end_source(present, "goal_aborted", (reason,), "stopped")
-        ending.end_queue(present, (reason,), "stopped")
+        present.state.contact.reason = None
+        self._stop_because(reason, "stopped", "stop: the arm brakes and holds", present)
+
+    @staticmethod
+    def _stop_because(reason: Reason, ended: str, message: str, present: Present) -> None:
+        ending.end_source(present, "goal_aborted", (reason,), ended)
+        ending.end_queue(present, (reason,), ended)
         goals.refuse_waiting((reason,), present)
         present.state.stopped = True
-        present.emit("stopped", message="stop: the arm brakes and holds", reasons=(reason,))
+        present.emit("stopped", message=message, reasons=(reason,))
+
+    def _watch_contact(self, present: Present, inputs: StepInputs) -> None:
+        """The arm has met something: it stops with its drives on, as if a person had stopped it."""
+        reason = contact.watch(self.state, self.settings, self._contact_limits, inputs.joints)
+        if reason is not None:
+            self._stop_because(reason, reason.hint, f"contact: {reason.hint}", present)
 
     def _watch_following(self, present: Present) -> None:
         """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
@@ -365,6 +385,8 @@ class ServoCore:
         if state.planning is not None:
             found.append(progress.planning_reason(state.planning))
         if state.stopped:
+            if state.contact.reason is not None:
+                found.append(state.contact.reason)
             found.append(Reason("STOPPED", "hold", hint="resume to go on"))
         elif state.held:
             found.append(Reason("HELD", "hold", hint="resume to go on"))
@@ -402,6 +424,7 @@ class ServoCore:
             },
             progress=done,
             seconds_left=left_s,
+            **contact.told(state.contact, self._contact_limits),
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.control.reasons import Reason
-from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.model import CellModel, JointLoads
 from stereoservo.runtime.commands import PlanReport, Request
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
 
@@ -126,6 +126,8 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     progress: float | None = None
     plan: PlanReport | None = None
     """Of a reply to a goal that was planned."""
+    loads: JointLoads | None = None
+    """Of finished trial motions, where the drives tell."""
 
 
 class Status(msgspec.Struct, frozen=True, eq=False):
@@ -153,6 +155,13 @@ class Status(msgspec.Struct, frozen=True, eq=False):
     progress: float | None = None
     """Share [0, 1] of the goal's way that is done."""
     seconds_left: float | None = None
+    efforts: FloatArray | None = None
+    """As the driver tells them (n,)."""
+    following_errors: FloatArray | None = None
+    effort_limits: FloatArray | None = None
+    """How far an effort may go from its moving mean (n,), infinite where nobody knows; None: no watch at all."""
+    following_limits: FloatArray | None = None
+    """Likewise of the following errors, from zero."""
 
 
 class StepOutputs(msgspec.Struct, frozen=True, eq=False):

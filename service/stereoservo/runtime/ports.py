@@ -60,6 +60,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     """What a joint driver drives, readable before it is connected.
 
     ``home``: a configuration in which the arm may well stand (in joint order; empty: the driver knows none).
+    ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
     """
 
     driver: str
@@ -69,6 +70,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     command_timeout_s: float
     call_budget_us: float
     home: tuple[float, ...] = ()
+    effort_units: tuple[str, ...] = ()
 
 
 class CameraDescription(msgspec.Struct, frozen=True):

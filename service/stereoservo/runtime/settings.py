@@ -67,6 +67,21 @@ class TrialSettings(msgspec.Struct, frozen=True, eq=False):
     spread_offsets: FloatArray = msgspec.field(default_factory=lambda: np.zeros(1))
 
 
+class ContactSettings(msgspec.Struct, frozen=True, eq=False):
+    """The watch on contact, in joint order; see ``cellfile.ContactSection``.
+
+    ``efforts``, ``following_errors`` (n,): stated thresholds, NaN where they are to be learnt. ``effort_units``: for
+    people.
+    """
+
+    enabled: bool
+    efforts: FloatArray
+    following_errors: FloatArray
+    factor: float
+    samples: int
+    effort_units: tuple[str, ...]
+
+
 class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     """Everything constant that a step may depend on."""
 
@@ -88,6 +103,7 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     gate_sigma: float
     watch_following: bool = True
     """Off where commands are computed and never written (dry run)."""
+    contact: ContactSettings | None = None
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
@@ -170,6 +186,20 @@ def core_settings(
         filter_s=cell.servo.filter_s,
         gate_sigma=cell.servo.gate_sigma,
         watch_following=watch_following,
+        contact=_contact_settings(cell, joints),
+    )
+
+
+def _contact_settings(cell: CellFile, joints: JointDriverDescription) -> ContactSettings:
+    section = cell.safety.contact
+    units = joints.effort_units or tuple("N m" if j.kind == "revolute" else "N" for j in joints.joints)
+    return ContactSettings(
+        enabled=section.enabled,
+        efforts=np.array([section.effort.get(j.name, np.nan) for j in joints.joints]),
+        following_errors=np.array([section.following.get(j.name, np.nan) for j in joints.joints]),
+        factor=section.factor,
+        samples=section.samples,
+        effort_units=units,
     )
 
 

@@ -18,7 +18,7 @@ from stereoservo.runtime.settings import CoreSettings
 from stereoservo.trajectory.plan import Plan
 from stereoservo.trajectory.planning import Planning
 
-STATE_VERSION = 4
+STATE_VERSION = 5
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
 
 
@@ -50,6 +50,39 @@ class CameraEstimate(msgspec.Struct, eq=False):
     agreeing_frames: int = 0
     """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
     rms_px: float = 0.0
+
+
+class Loads(msgspec.Struct, eq=False):
+    """What the trial motions ``id`` have shown of the joints' loads so far; see `kinematics.model.JointLoads`."""
+
+    id: str
+    velocities: FloatArray
+    efforts: FloatArray
+    largest_efforts: FloatArray
+    following_errors: FloatArray
+    mover: int = -1
+    """The joint that was commanded fastest of late."""
+
+
+class Contact(msgspec.Struct, eq=False):
+    """What the drives say of their loads, (n,) each; see ``contact``.
+
+    ``mean_efforts``: moving mean. ``effort_excess``, ``following_excess`` (samples, n), newest last: how far the last
+    samples lay beyond what is expected. ``low``, ``high`` (2, n), of efforts and following errors: what a contact has
+    brought, and what it may take away again in the next ``leave_s`` of motion. ``reason``: of the last contact.
+    """
+
+    mean_efforts: FloatArray
+    effort_excess: FloatArray
+    following_excess: FloatArray
+    low: FloatArray
+    high: FloatArray
+    efforts: FloatArray | None = None
+    following_errors: FloatArray | None = None
+    seen_ns: int = 0
+    leave_s: float = 0.0
+    reason: Reason | None = None
+    loads: Loads | None = None
 
 
 class Holding(msgspec.Struct, tag="hold"):
@@ -351,6 +384,7 @@ class CoreState(msgspec.Struct, eq=False):
     last_positions: FloatArray | None
     correction: FloatArray
     """Joint-space correction that explains the innovations best (n,)."""
+    contact: Contact
 
 
 def initial_state(settings: CoreSettings) -> CoreState:
@@ -387,6 +421,14 @@ def initial_state(settings: CoreSettings) -> CoreState:
         last_followed_ns=0,
         last_positions=None,
         correction=np.zeros(n),
+        contact=no_contact(n, 1 if settings.contact is None else settings.contact.samples),
+    )
+
+
+def no_contact(n: int, samples: int) -> Contact:
+    """Nothing known of the loads of ``n`` joints."""
+    return Contact(
+        np.zeros(n), np.zeros((samples, n)), np.zeros((samples, n)), np.zeros((2, n)), np.zeros((2, n))
     )
 
 

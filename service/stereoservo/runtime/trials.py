@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.control.reasons import Reason
+from stereoservo.runtime.contact import learnt
 from stereoservo.runtime.cycle import Sample
 from stereoservo.runtime.motion import Motion, Present
 from stereoservo.runtime.ports import FloatArray
@@ -80,7 +81,10 @@ def _rest(present: Present, *, finished: bool = False) -> Motion:
 def _move(trials: Trials, present: Present, settings: TrialSettings) -> Motion:
     if there(trials, present):
         if trials.phase == "finish":
-            present.emit("calibration_finished", id=trials.id, message="trial motions done", progress=1.0)
+            present.emit(
+                "calibration_finished", id=trials.id, message="trial motions done", progress=1.0,
+                loads=learnt(trials.id, present.state.contact),
+            )  # fmt: skip
             return _rest(present, finished=True)
         if trials.phase == "return":
             return _next(trials, present, settings)

@@ -12,12 +12,14 @@ from stereoservo.runtime.ports import JointSpec
 FloatArray = npt.NDArray[np.float64]
 
 
+STIFFNESS = 500.0
+"""Of an ideal joint's drive at a wall [N m/rad or N/m]."""
 REST_VELOCITY = 1e-9
 """Below this [rad/s or m/s] a physics engine's joint stands still."""
 
 
 class Plant(Protocol):
-    """What the drives move. ``positions``, ``velocities`` and the motors' ``efforts`` [N m or N], (n,), are the truth."""
+    """What the drives move. ``positions``, ``velocities``, ``efforts`` of the motors [N m or N], (n,): the truth."""
 
     positions: FloatArray
     velocities: FloatArray
@@ -33,17 +35,23 @@ class Plant(Protocol):
 
 
 class IdealPlant:
-    """Joints that are where their drives want them, without mass: no effort."""
+    """Joints that are where their drives want them, without mass; effort comes of walls alone.
+
+    ``walls`` (2, n): no joint goes below the first or above the second; its drive then pushes with ``STIFFNESS``.
+    """
 
     def __init__(self, positions: FloatArray) -> None:
         self.positions = positions.copy()
         self.velocities = np.zeros_like(positions)
         self.efforts = np.zeros_like(positions)
+        self.walls = np.array([np.full_like(positions, -np.inf), np.full_like(positions, np.inf)])
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
-        """Take the set-points."""
-        self.positions = set_positions.copy()
-        self.velocities = set_velocities.copy()
+        """Take the set-points, as far as the walls let."""
+        self.positions = np.clip(set_positions, self.walls[0], self.walls[1])
+        beyond = set_positions - self.positions
+        self.velocities = np.where(beyond != 0.0, 0.0, set_velocities)
+        self.efforts = STIFFNESS * beyond
 
     def close(self) -> None:
         """Nothing to release."""
@@ -84,6 +92,11 @@ class DriveBank:
         self._target = np.zeros(len(joints))
         self._deadline_ns = now_ns
         self.timed_out = False
+
+    @property
+    def set_positions(self) -> FloatArray:
+        """Where the drives want the joints (n,)."""
+        return self._q
 
     def _plant_rests(self) -> bool:
         return bool(np.all(np.abs(self.plant.velocities) < REST_VELOCITY))

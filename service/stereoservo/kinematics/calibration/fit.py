@@ -94,7 +94,7 @@ def fit_model(
         untested=untested(chain),
     )
     model = result.model if mount == "eye_to_hand" else restored(result.model)
-    return CalibrationResult(model, report)
+    return CalibrationResult(msgspec.structs.replace(model, loads=trials.loads), report)
 
 
 def _fit(

@@ -13,12 +13,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.kinematics.model import Mount, write_atomically
+from stereoservo.kinematics.model import JointLoads, ModelFileError, Mount, check_loads, write_atomically
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 TRIALS_SCHEMA = 1
+LOADS = "loads_"
 MAX_POSITION = 1e6
 """Largest joint position [rad or m] that is taken for one."""
 MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
@@ -71,7 +72,8 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     Joints stand base first. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1
     for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
     seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
-    one. ``images``: how many images were averaged into the pixels (for the record).
+    one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: what the drives said
+    of their loads on the way, where they did; handed on to the model.
     """
 
     joint_names: tuple[str, ...]
@@ -83,6 +85,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     pixels: FloatArray
     sigmas: FloatArray
     images: int = 0
+    loads: JointLoads | None = None
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
@@ -143,6 +146,11 @@ def check_trials(trials: TrialData) -> None:
     for key, array, shape in expected:
         if array.shape != shape:
             raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
+    if trials.loads is not None:
+        try:
+            check_loads(trials.loads, n)
+        except ModelFileError as error:
+            raise CalibrationError("bad_data", str(error), key=error.key) from error
     if not s:
         raise CalibrationError("too_few_stops", "the trials hold no stops; each joint needs some", stops=0)
     if not np.issubdtype(trials.trials.dtype, np.integer):
@@ -247,8 +255,26 @@ def encode_trials(trials: TrialData) -> bytes:
         trials=np.asarray(trials.trials, dtype=np.int64),
         pixels=np.asarray(trials.pixels, dtype=np.float64),
         sigmas=np.asarray(trials.sigmas, dtype=np.float64),
+        **_load_arrays(trials.loads),  # type: ignore[arg-type]
     )
     return buffer.getvalue()
+
+
+def _load_arrays(loads: JointLoads | None) -> dict[str, FloatArray]:
+    """Loads as arrays of their own: a program that does not know them reads the rest."""
+    if loads is None:
+        return {}
+    given = {field: getattr(loads, field) for field in JointLoads.__struct_fields__}
+    return {LOADS + field: array for field, array in given.items() if array is not None}
+
+
+def _loads(arrays: dict[str, npt.NDArray[Any]]) -> JointLoads | None:
+    fields = {
+        key.removeprefix(LOADS): array.astype(np.float64, casting="same_kind")
+        for key, array in arrays.items()
+        if key.startswith(LOADS)
+    }
+    return msgspec.convert(fields, JointLoads) if fields else None
 
 
 def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
@@ -273,6 +299,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             pixels=arrays["pixels"].astype(np.float64, casting="same_kind"),
             sigmas=arrays["sigmas"].astype(np.float64, casting="same_kind"),
             images=header.images,
+            loads=_loads(arrays),
         )
     except KeyError as error:
         raise CalibrationError(
