@@ -147,7 +147,7 @@ class Master:
         self._high = np.array([joint.position_max for joint in joints])
         self._resolution = np.array([JointScale.of(joint).resolution for joint in joints])
         self._zero = np.zeros(self._n)
-        self._stop_limit_s = float(np.max(self._max_velocity / self._acceleration)) + STOP_MARGIN_S
+        self.stop_limit_s = float(np.max(self._max_velocity / self._acceleration)) + STOP_MARGIN_S
         self._seq = 0
         self._restart()
 
@@ -241,8 +241,9 @@ class Master:
         """Take a frame that arrived at ``now_ns``; gives whether it belongs to the cycle."""
         bit = self.codec.receive(frame)
         if bit < 0:
-            self._monitors.flood.note(frame.id)
             self.statistics.foreign += 1
+            if self._cycle.open:
+                self._monitors.flood.note(frame.id)
             return False
         cycle = self._cycle
         if not cycle.open:
@@ -352,9 +353,8 @@ class Master:
 
     def _from_axis(self, fault: AxisFault, now_ns: int) -> MasterFault:
         name = self.settings.joints[fault.axis].name if fault.axis >= 0 else ""
-        return MasterFault(
-            fault.code, fault.message, axis=name, value=fault.value, hint=fault.hint, t_ns=now_ns
-        )
+        message = fault.message if name in fault.message else f"joint {name!r}: {fault.message}"
+        return MasterFault(fault.code, message, axis=name, value=fault.value, hint=fault.hint, t_ns=now_ns)
 
     def _from_trip(self, trip: Trip, now_ns: int) -> MasterFault:
         axis = self.codec.bit_axis[trip.bit] if trip.bit >= 0 else trip.axis
@@ -419,7 +419,7 @@ class Master:
                 np.all(np.abs(self._sample.velocities) <= REST_SHARE * self._max_velocity)
             )
             self._rests = self._rests + 1 if slow and complete else 0
-            if self._rests >= REST_CYCLES or in_mode_s > self._stop_limit_s:
+            if self._rests >= REST_CYCLES or in_mode_s > self.stop_limit_s:
                 self._enter(Mode.OFF, now_ns)
 
     def _states_fault(self, code: str, value: float | None, limit: float | None, now_ns: int) -> MasterFault:

@@ -1,0 +1,218 @@
+"""The one thread that owns the bus: receives, ticks the master on an absolute grid, sends.
+
+Before the cycle begins, and while faults are reset, it pumps: it receives, hands frames to whoever has subscribed, and
+sends the master's heartbeat. In the cycle heartbeats come from the master's ticks alone: a hung thread is silent.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import defaultdict
+from dataclasses import dataclass
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can.channel import Channel
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.master import Master, MasterFault
+
+PUMP_WAIT_S = 0.002
+HAND_OVER_S = 1.0
+DRAIN_LATE_NS = 200_000
+FOLLOW_EVERY_NS = 500_000_000
+
+
+@dataclass
+class ThreadStatistics:
+    """``skipped``: slots of the grid for which the thread came too late. ``late_max_ns``: of a tick on the grid."""
+
+    skipped: int = 0
+    late_max_ns: int = 0
+
+
+class BusThread:
+    """A pumped bus (:class:`~stereoservo_drivers.canopen.bringup.Link`) that can also run the master's cycle.
+
+    It ends by itself when the connection is lost or something unforeseen is raised in it: that fault is latched in the
+    master, the heartbeat ends, and the drives stop by their own watch on it. ``error`` tells why.
+    """
+
+    def __init__(self, channel: Channel, master: Master) -> None:
+        self.error: DriverError | None = None
+        self.statistics = ThreadStatistics()
+        self._channel = channel
+        self._master = master
+        self._period_ns = round(1e9 / master.settings.rate_hz)
+        self._send_lock = threading.Lock()
+        self._subscribers: defaultdict[int, list[list[CanFrame]]] = defaultdict(list)
+        self._cycle_wanted = False
+        self._cycling = False
+        self._ending = False
+        self._next_ns = 0
+        self._heartbeat_ns = 0
+        self._follow_ns = 0
+        self._thread = threading.Thread(target=self._run, name="can-bus", daemon=True)
+        self._thread.start()
+
+    # -- link -----------------------------------------------------------------------------------------------
+
+    def send(self, frames: list[CanFrame]) -> None:
+        """Send in order. Raises DriverError."""
+        self._require()
+        with self._send_lock:
+            self._channel.send(frames)
+
+    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+        """Append frames of ``can_id`` to ``heard`` from now on."""
+        self._subscribers[can_id] = [*self._subscribers[can_id], heard]
+
+    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+        """End it."""
+        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not heard]
+
+    def wait(self, seconds: float) -> None:
+        """Let the bus go on. Raises DriverError once it is lost."""
+        self._require()
+        time.sleep(seconds)
+        self._require()
+
+    def now_ns(self) -> int:
+        """Monotonic time."""
+        return time.monotonic_ns()
+
+    # -- who owns it ----------------------------------------------------------------------------------------
+
+    @property
+    def alive(self) -> bool:
+        """Whether the bus is being served."""
+        return self._thread.is_alive() and self.error is None
+
+    def begin_cycle(self) -> None:
+        """From now on tick the master. Raises DriverError."""
+        self._hand_over(True)
+
+    def end_cycle(self) -> None:
+        """From now on only pump. Raises DriverError."""
+        self._hand_over(False)
+
+    def end(self) -> None:
+        """End the thread and release the channel. Never raises."""
+        self._ending = True
+        self._thread.join()
+        self._channel.close()
+
+    def _require(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def _hand_over(self, cycle: bool) -> None:
+        self._cycle_wanted = cycle
+        until = time.monotonic() + HAND_OVER_S
+        while self._cycling is not cycle:
+            self._require()
+            if time.monotonic() > until:
+                raise DriverError(
+                    "bus_thread", f"the thread of the CAN bus did not follow within {HAND_OVER_S:g} s"
+                )
+            time.sleep(0.0005)
+
+    # -- the thread -----------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while not self._ending:
+                self._step()
+        except DriverError as error:
+            self._fail(error)
+        except Exception as error:
+            self._fail(_unforeseen(error))
+            self._stop_blindly()
+
+    def _fail(self, error: DriverError) -> None:
+        self._master.latch(
+            MasterFault(error.code, str(error), hint="reset connects again", t_ns=time.monotonic_ns())
+        )
+        self.error = error
+
+    def _stop_blindly(self) -> None:
+        """Quick stop every cycle, without the heartbeat, which makes the drives stop by themselves."""
+        try:
+            while not self._ending:
+                with self._send_lock:
+                    self._channel.send(self._master.codec.quick_stop())
+                time.sleep(self._period_ns * 1e-9)
+        except DriverError as error:
+            self._fail(error)
+
+    def _step(self) -> None:
+        now = time.monotonic_ns()
+        if self._cycle_wanted is not self._cycling:
+            self._cycling = self._cycle_wanted
+            self._next_ns = now
+        if now >= self._follow_ns:
+            self._follow_ns = now + FOLLOW_EVERY_NS
+            follow_scheduling()
+        if not self._cycling:
+            self._pump(now)
+            self._receive(PUMP_WAIT_S)
+        elif now >= self._next_ns:
+            self._tick(now)
+        else:
+            self._receive((self._next_ns - now) * 1e-9)
+
+    def _pump(self, now: int) -> None:
+        if now - self._heartbeat_ns >= self._master.settings.heartbeat_ms * 1_000_000:
+            self._heartbeat_ns = now
+            frames = self._master.codec.heartbeat()
+            if frames:
+                with self._send_lock:
+                    self._channel.send(frames)
+
+    def _receive(self, timeout_s: float) -> None:
+        for t_ns, frame in self._channel.receive(timeout_s):
+            self._master.receive(frame, t_ns)
+            for heard in self._subscribers.get(frame.id, ()):
+                heard.append(frame)
+
+    def _tick(self, now: int) -> None:
+        late = now - self._next_ns
+        if late > DRAIN_LATE_NS:  # what came while this thread was held up belongs to the cycle that ends
+            self._receive(0.0)
+            now = time.monotonic_ns()
+        self.statistics.late_max_ns = max(self.statistics.late_max_ns, late)
+        with self._send_lock:
+            self._channel.send(self._master.tick(now))
+        self._next_ns += self._period_ns
+        # The drives need time to answer before the next poll: a slot that is nearly over is left out.
+        behind = now + self._period_ns // 2 - self._next_ns
+        if behind > 0:
+            slots = -(-behind // self._period_ns)
+            self.statistics.skipped += slots
+            self._next_ns += slots * self._period_ns
+
+
+def follow_scheduling() -> None:
+    """Run this thread just above the main thread where that runs in real time; else leave it as it is."""
+    process = os.getpid()
+    if os.sched_getscheduler(process) != os.SCHED_FIFO:
+        return
+    above = os.sched_getparam(process).sched_priority + 1
+    priority = min(above, os.sched_get_priority_max(os.SCHED_FIFO))
+    if os.sched_getscheduler(0) == os.SCHED_FIFO and os.sched_getparam(0).sched_priority == priority:
+        return
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        return  # RLIMIT_RTPRIO allows the main thread's priority and no more: this thread keeps what it has
+
+
+def _unforeseen(error: Exception) -> DriverError:
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = f"{trace.tb_frame.f_code.co_name}, line {trace.tb_lineno}" if trace is not None else "?"
+    return DriverError(
+        "internal",
+        f"the CAN master failed: {type(error).__name__}: {error} (in {where}); all axes are stopped",
+    )

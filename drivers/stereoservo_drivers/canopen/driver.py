@@ -1,0 +1,268 @@
+"""The joint driver ``canopen``: an arm of drives on a CAN bus.
+
+``write_velocity`` stores the newest command, ``read_state`` gives the newest complete set; a thread of its own runs the
+cycle (``bus_thread.py``, ``master.py``) whatever the caller does. A latched fault is raised by ``read_state`` once,
+and by ``write_velocity`` and ``activate`` until ``configure()`` clears it: reset and enable are two acts.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from stereoservo.runtime.clock import VirtualClock
+from stereoservo.runtime.ports import (
+    CommandReport,
+    DriverContext,
+    DriverError,
+    FloatArray,
+    JointDriverDescription,
+    JointSpec,
+    JointState,
+)
+from stereoservo_drivers.can.channel import Channel
+from stereoservo_drivers.canopen.bus_thread import BusThread
+from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFault, MasterSettings, Mode
+from stereoservo_drivers.canopen.option_checks import check_options
+from stereoservo_drivers.canopen.options import CanOptions
+from stereoservo_drivers.canopen.protocols import make_bringup, make_codec
+from stereoservo_drivers.lifecycle import DriverLifecycle, State
+from stereoservo_drivers.options import decode_options
+
+DRIVER = "canopen"
+CALL_BUDGET_US = 500.0
+FIRST_SAMPLE_S = 1.0
+OFF_MARGIN_S = 1.0
+SWITCH_INTERVAL_S = 0.0005
+"""How long Python lets another thread of the process compute before the bus thread may go on."""
+_POLL_S = 0.001
+
+
+class CanJointDriver:
+    """An arm of CiA 402 drives or ODrives. Options: :class:`~stereoservo_drivers.canopen.options.CanOptions`."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self.options = decode_options(CanOptions, options, DRIVER)
+        check_options(self.options)
+        self._context = context
+        self._life = DriverLifecycle(f"joint driver {DRIVER!r}")
+        self._codec = make_codec(self.options)
+        self._bringup = make_bringup(self.options, self._codec, context.cell_dir)
+        self.master = Master(self._codec, MasterSettings.of(self.options))
+        self.bus: BusThread | None = None
+        self._told: MasterFault | None = None
+        self._write_seq = 0
+
+    def describe(self) -> JointDriverDescription:
+        """Joints and limits of the cell file; the servo's clock paces."""
+        return JointDriverDescription(
+            driver=DRIVER,
+            joints=tuple(
+                JointSpec(
+                    name=joint.name,
+                    kind=joint.kind,
+                    position_min=joint.position_min,
+                    position_max=joint.position_max,
+                    velocity_max=joint.max_velocity,
+                    acceleration_max=joint.max_acceleration,
+                )
+                for joint in self.options.joint
+            ),
+            rate_hz=self.options.rate_hz,
+            pacing="clock",
+            command_timeout_s=self.options.command_timeout_s,
+            call_budget_us=CALL_BUDGET_US,
+        )
+
+    # -- lifecycle ------------------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Connect, check and configure all drives; of a configured driver, clear its latched fault. Never enables.
+
+        A drive that is found in fault does not fail the first call: the fault is latched, and the next call clears it.
+        Raises DriverError.
+        """
+        self._life.require("configure()", State.CREATED, State.CONFIGURED)
+        if isinstance(self._context.clock, VirtualClock):
+            raise DriverError(
+                "real_time",
+                "joint driver 'canopen' needs real time, and this cell runs in lockstep on a virtual clock; use "
+                "driver 'pybullet' in lockstep",
+            )
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        if self._life.state is State.CREATED:
+            self._connect()
+            self._life.state = State.CONFIGURED
+        elif self.bus is None or not self.bus.alive:
+            self._connect()
+            self._clear()
+        elif self.master.fault is not None:
+            self._clear()
+
+    def _connect(self) -> None:
+        """Open, bring up, begin the cycle, wait for a complete set. Raises DriverError; nothing stays open then."""
+        self._release()
+        self.bus = BusThread(Channel(self.options), self.master)
+        try:
+            self._bringup.connect(self.bus)
+            self._begin_cycle(self.bus)
+        except DriverError:
+            self._release()
+            raise
+
+    def _begin_cycle(self, bus: BusThread) -> None:
+        """Raises DriverError where no complete set comes."""
+        self.master.clear()
+        self._told = None
+        bus.begin_cycle()
+        cycles = self.master.statistics.cycles + 2
+
+        def answered() -> bool:
+            return self.master.sample() is not None and self.master.statistics.cycles >= cycles
+
+        if not self._wait(answered, FIRST_SAMPLE_S):
+            self._require_no_fault()
+            states = ", ".join(self._codec.status_words())
+            raise DriverError(
+                "no_sample",
+                f"the drives did not answer the first cycles within {FIRST_SAMPLE_S:g} s; they say: {states}",
+                retry=True,
+            )
+
+    def _clear(self) -> None:
+        """The reset. Raises DriverError where a fault stays; it stays latched then."""
+        assert self.bus is not None
+        fault = self.master.fault
+        if fault is None:
+            return
+        self.bus.end_cycle()
+        try:
+            self._bringup.reset(self.bus)
+        except DriverError as error:
+            if self.bus.alive:
+                self.bus.begin_cycle()
+            raise error
+        self._begin_cycle(self.bus)
+        self._require_no_fault()
+
+    def activate(self) -> None:
+        """Enable all axes at velocity zero. Raises DriverError, also while a fault is latched."""
+        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
+        self._require_no_fault()
+        if self._life.state is State.ACTIVE:
+            return
+        self.master.request_enable(time.monotonic_ns())
+
+        def settled() -> bool:
+            self.master.port_called(time.monotonic_ns())
+            return self.master.mode in (Mode.RUNNING, Mode.LATCHED)
+
+        if not self._wait(settled, ENABLE_LIMIT_S + OFF_MARGIN_S):
+            self.master.request_disable()
+            raise DriverError("enable_timeout", f"the CAN bus's thread is stuck in mode {self.master.mode}")
+        self._require_no_fault()
+        self._life.state = State.ACTIVE
+
+    def deactivate(self) -> None:
+        """Bring to rest, then switch off. Idempotent. Raises DriverError where a drive does not say that it is off."""
+        if self._life.state is not State.ACTIVE:
+            return
+        self._life.state = State.CONFIGURED
+        self.master.request_disable()
+        limit_s = self.master.stop_limit_s + OFF_MARGIN_S
+        if not self._wait(self._is_off, limit_s):
+            states = ", ".join(self._codec.status_words())
+            raise DriverError(
+                "not_off",
+                f"the drives are not off {limit_s:.1f} s after they were told to be; they say: {states}",
+            )
+
+    def _is_off(self) -> bool:
+        """Whether all is off, or a latched fault's quick stop is at work, which nothing here may weaken."""
+        mode = self.master.mode
+        return mode is Mode.LATCHED or (mode is Mode.OFF and self._codec.at_rest_unpowered())
+
+    def stop(self) -> None:
+        """Velocity zero from the next cycle on; the drives stay enabled. Any state, never raises."""
+        self.master.set_command(np.zeros(len(self.options.joint)), time.monotonic_ns())
+
+    def close(self) -> None:
+        """Stop, switch off, leave the drives quiet, release the bus. Idempotent; never raises."""
+        try:
+            self.deactivate()
+        except DriverError as error:
+            self.master.latch(MasterFault(error.code, str(error)))
+        bus = self.bus
+        if bus is not None and bus.alive:
+            try:
+                bus.end_cycle()
+                self._bringup.release(bus)
+            except DriverError as error:
+                self.master.latch(MasterFault(error.code, str(error)))
+        self._release()
+        self._life.state = State.CLOSED
+
+    def _release(self) -> None:
+        if self.bus is not None:
+            self.bus.end()
+            self.bus = None
+
+    # -- the cycle of the caller ----------------------------------------------------------------------------
+
+    def read_state(self) -> JointState:
+        """The newest complete set, stamped with its poll. Raises DriverError, a latched fault's once."""
+        self._life.require("read_state()", State.CONFIGURED, State.ACTIVE)
+        self.master.port_called(time.monotonic_ns())
+        if self.master.fault is not self._told:
+            self._require_no_fault()
+        sample = self.master.sample()
+        if sample is None:
+            raise DriverError("no_sample", "the drives have not answered since the last reset", retry=True)
+        return sample
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        """The newest command, (n,). Raises DriverError: not active, a latched fault, wrong shape, not finite."""
+        self._life.require("write_velocity()", State.ACTIVE)
+        asked = np.array(qd, dtype=np.float64)
+        if asked.shape != (len(self.options.joint),):
+            raise DriverError(
+                "shape",
+                f"write_velocity() got shape {asked.shape}; this arm takes ({len(self.options.joint)},)",
+            )
+        if not np.isfinite(asked).all():
+            raise DriverError(
+                "not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite"
+            )
+        self._require_no_fault()
+        now_ns = time.monotonic_ns()
+        sent, reasons = self.master.limited(asked)
+        self.master.set_command(asked, now_ns)
+        self._write_seq += 1
+        return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
+
+    def _require_no_fault(self) -> None:
+        fault = self.master.fault
+        if fault is not None:
+            self._told = fault
+            raise DriverError(
+                fault.code,
+                f"{fault.text()} [all axes are stopped until a reset]",
+                axis=fault.axis,
+                value=fault.value,
+                limit=fault.limit,
+            )
+
+    def _wait(self, until: Callable[[], bool], limit_s: float) -> bool:
+        """Wait for ``until``, at most ``limit_s``; gives whether it came."""
+        end = time.monotonic() + limit_s
+        while not until():
+            if time.monotonic() > end:
+                return until()
+            if self.bus is None or not self.bus.alive:
+                return until()
+            time.sleep(_POLL_S)
+        return True

@@ -1,0 +1,169 @@
+"""What the types of the options cannot say: whether they fit each other, the wire and the bus."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can.load import BusLoad, cycle_load, refusal
+from stereoservo_drivers.canopen.cia402 import FEEDBACK_OBJECTS, tpdo_feedback
+from stereoservo_drivers.canopen.odrive import SHARE
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.units import INT32_MAX, UINT32_MAX, JointScale
+
+LONGEST_TURN = 2.0 * math.pi
+"""[rad] A joint that goes further from zero turns more than once: ``multi_turn`` has to say so."""
+FASTEST_TURN = 4.0 * math.pi
+"""[rad/s] No joint of an arm is meant to be faster; the number is in degrees."""
+SDO_KEY = re.compile(r"0[xX][0-9A-Fa-f]{1,4}:([0-9]{1,3}|0[xX][0-9A-Fa-f]{1,2})")
+ODRIVE_HEARTBEATS_S = 10.0
+
+
+def parse_sdo_key(key: str) -> tuple[int, int]:
+    """``"0x60C2:1"`` as (index, sub-index). Raises ValueError."""
+    if SDO_KEY.fullmatch(key):
+        index, subindex = (int(part, 0) for part in key.split(":"))
+        if index and subindex <= 0xFF:
+            return index, subindex
+    raise ValueError(f'{key!r} is not an object; valid: index and sub-index such as "0x60C2:1"')
+
+
+def check_options(options: CanOptions) -> None:
+    """Raises DriverError (``option``): names the joint, the value, and what would be valid."""
+    if not options.joint:
+        raise _refusal("joint", "[]", "at least one [[joints.options.joint]] with its name and node_id")
+    _check_unique(options, "node_id", lambda joint: joint.node_id)
+    _check_unique(options, "name", lambda joint: joint.name)
+    for joint in options.joint:
+        if joint.node_id == options.master_id:
+            valid = f"an id that is not master_id ({options.master_id}), which is this computer's"
+            raise _refusal("node_id", joint.node_id, valid, joint)
+        _check_geometry(joint)
+        _check_limits(joint)
+        if options.protocol == "cia402":
+            _check_range(joint)
+        for key, value in joint.sdo.items():
+            _check_sdo(joint, key, value)
+    if options.heartbeat_timeout_ms < 2 * options.heartbeat_ms:
+        valid = (
+            f"at least {2 * options.heartbeat_ms}, twice heartbeat_ms: one that is late must not stop the arm"
+        )
+        raise _refusal("heartbeat_timeout_ms", options.heartbeat_timeout_ms, valid)
+    if 0 < options.rpdo_deadline_ms < 2000.0 / options.rate_hz:
+        valid = f"0 (no such timer) or at least {math.ceil(2000.0 / options.rate_hz)}, two cycles at rate_hz"
+        raise _refusal("rpdo_deadline_ms", options.rpdo_deadline_ms, valid)
+    why = refusal(bus_load(options), options.max_bus_load)
+    if why is not None:
+        raise DriverError(
+            "option", f"driver 'canopen': {why}", option="rate_hz", value=options.rate_hz,
+            load=bus_load(options).share,
+        )  # fmt: skip
+
+
+def bus_load(options: CanOptions) -> BusLoad:
+    """Worst case of the cycle and of the heartbeats beside it."""
+    n = len(options.joint)
+    if options.protocol == "odrive":
+        asked_in_turn = (2 if "effort" in options.feedback else 1) * min(SHARE, n)
+        # Estimates are asked for by a remote frame, answered, and followed by a velocity; errors and torques in turn.
+        lengths = [0, 8, 8] * n + [0, 8] * asked_in_turn
+        return cycle_load(lengths, options.rate_hz, options.bitrate, [(8, n * ODRIVE_HEARTBEATS_S)])
+    further = [
+        struct.calcsize("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
+        for pdo in tpdo_feedback(options.feedback)
+    ]
+    heartbeats = (1, (n + 1) * 1000.0 / options.heartbeat_ms)
+    return cycle_load([0, *[6, 6, *further] * n], options.rate_hz, options.bitrate, [heartbeats])
+
+
+def _check_unique(options: CanOptions, option: str, of: Callable[[CanJoint], Any]) -> None:
+    seen: dict[Any, CanJoint] = {}
+    for joint in options.joint:
+        other = seen.setdefault(of(joint), joint)
+        if other is not joint:
+            who = f"joint {other.name!r} (node {other.node_id})"
+            raise _refusal(option, of(joint), f"one that {who} does not have already", joint)
+
+
+def _check_geometry(joint: CanJoint) -> None:
+    if joint.kind == "revolute" and not abs(joint.offset_rad) <= math.pi:
+        degrees = f"; {_in_radians(joint.offset_rad)}" if abs(joint.offset_rad) <= 360.0 else ""
+        raise _refusal("offset_rad", joint.offset_rad, f"-pi to pi [rad]{degrees}", joint)
+    if not joint.position_min < joint.position_max:
+        valid = f"less than position_max = {joint.position_max:g}"
+        raise _refusal("position_min", joint.position_min, valid, joint)
+    for option in ("position_min", "position_max", "offset_rad", "max_velocity", "max_acceleration"):
+        if not math.isfinite(getattr(joint, option)):
+            raise _refusal(option, getattr(joint, option), "a finite number", joint)
+
+
+def _check_limits(joint: CanJoint) -> None:
+    if joint.kind != "revolute":
+        return
+    for option in ("position_min", "position_max"):
+        value = getattr(joint, option)
+        if abs(value) > LONGEST_TURN and not joint.multi_turn:
+            valid = (
+                f"radians, -2 pi to 2 pi; {_in_radians(value)}. A joint that turns further: multi_turn = true"
+            )
+            raise _refusal(option, value, valid, joint)
+    if joint.max_velocity > FASTEST_TURN:
+        valid = f"rad/s, up to 4 pi; {_in_radians(joint.max_velocity)}"
+        raise _refusal("max_velocity", joint.max_velocity, valid, joint)
+
+
+def _in_radians(degrees: float) -> str:
+    return f"are these degrees? {degrees:g} deg = {math.radians(degrees):.4g} rad"
+
+
+def _check_range(joint: CanJoint) -> None:
+    """Whether what goes to the drive fits its objects: 0x60FF is INTEGER32, 0x6083 to 0x6085 are UNSIGNED32."""
+    scale = JointScale.of(joint)
+    units = abs(scale.velocity_units_per_unit)
+    cure = "check counts_per_rev, gear_ratio and velocity_units_per_rev_s"
+    for option, largest in (
+        ("max_velocity", INT32_MAX),
+        ("max_acceleration", UINT32_MAX),
+        ("quick_stop_deceleration", UINT32_MAX),
+    ):
+        value = getattr(joint, option)
+        if not value * units <= largest:
+            what = f"{value * units:.4g} drive units; valid: up to {largest / units:.4g}, which is {largest}; {cure}"
+            raise _refusal(option, f"{value:g} is {what}", "", joint)
+        if value * units < 0.5:
+            what = f"{value * units:.3g} drive units, which is nothing; valid: at least {0.5 / units:.4g}; {cure}"
+            raise _refusal(option, f"{value:g} is {what}", "", joint)
+    if joint.multi_turn:
+        return  # the counter may wrap on its way
+    farthest = max(abs(joint.position_min + joint.offset_rad), abs(joint.position_max + joint.offset_rad))
+    if farthest * abs(scale.counts_per_unit) > INT32_MAX:
+        valid = (
+            f"within {INT32_MAX / abs(scale.counts_per_unit):.4g} of the encoder's zero, beyond which its 32-bit "
+            "counter wraps, or multi_turn = true (the position is then known only while the driver runs)"
+        )
+        raise _refusal("position_min, position_max", (joint.position_min, joint.position_max), valid, joint)
+
+
+def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
+    try:
+        parse_sdo_key(key)
+    except ValueError as error:
+        raise _refusal("sdo", key, str(error), joint) from error
+    if not -(2**31) <= value <= UINT32_MAX:
+        raise _refusal(f"sdo {key}", value, "an integer of at most 32 bits", joint)
+
+
+def _refusal(option: str, value: object, valid: str, joint: CanJoint | None = None) -> DriverError:
+    where = f"joint {joint.name!r}: " if joint is not None else ""
+    text = f"{value}" if isinstance(value, str) else f"{value!r}"
+    return DriverError(
+        "option",
+        f"driver 'canopen': {where}{option} = {text}" + (f"; valid: {valid}" if valid else ""),
+        option=option,
+        value=value,
+        joint=joint.name if joint is not None else "",
+    )
