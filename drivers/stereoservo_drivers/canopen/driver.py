@@ -136,9 +136,9 @@ class CanJointDriver:
     def _clear(self) -> None:
         """The reset. Raises DriverError where a fault stays; it stays latched then."""
         assert self.bus is not None
-        fault = self.master.fault
-        if fault is None:
+        if self.master.fault is None:
             return
+        self._await_rest()
         self.bus.end_cycle()
         try:
             self._bringup.reset(self.bus)
@@ -148,6 +148,21 @@ class CanJointDriver:
             raise error
         self._begin_cycle(self.bus)
         self._require_no_fault()
+
+    def _await_rest(self) -> None:
+        """Let the quick stop end before its cycle does. Raises DriverError where the arm goes on moving."""
+        limit_s = self.master.stop_limit_s
+        if self._wait(lambda: self.master.stands() is True, limit_s) or self.master.stands() is None:
+            return
+        sample = self.master.sample()
+        speeds = [] if sample is None else np.round(sample.velocities, 4).tolist()
+        raise DriverError(
+            "moving",
+            f"no reset while the arm moves: {speeds} rad/s or m/s {limit_s:.1f} s after its stop; is it pushed, or is "
+            "an encoder wrong?",
+            retry=True,
+            velocities=speeds,
+        )
 
     def activate(self) -> None:
         """Enable all axes at velocity zero. Raises DriverError, also while a fault is latched."""
@@ -198,6 +213,7 @@ class CanJointDriver:
             self.master.latch(MasterFault(error.code, str(error)))
         bus = self.bus
         if bus is not None and bus.alive:
+            self._wait(lambda: self.master.stands() is True, self.master.stop_limit_s)
             try:
                 bus.end_cycle()
                 self._bringup.release(bus)

@@ -35,6 +35,7 @@ STOP_MARGIN_S = 0.1
 REST_SHARE = 0.01
 """Of the largest velocity: slower than this a joint that is told to stand counts as at rest."""
 REST_CYCLES = 3
+FRESH_CYCLES = 2
 RESOLUTION_SAID = 1e-3
 """[rad/s or m/s] A command that the wire's resolution changes by more is reported."""
 
@@ -223,6 +224,13 @@ class Master:
     def sample(self) -> JointState | None:
         """The newest complete set, stamped with its poll; None before the first."""
         return self._sample
+
+    def stands(self) -> bool | None:
+        """Whether all axes stand by the newest complete set; None where that is too old to tell."""
+        sample, poll_ns = self._sample, self._cycle.poll_ns
+        if sample is None or poll_ns - sample.t_ns > FRESH_CYCLES * self._period_ns:
+            return None
+        return bool(np.all(np.abs(sample.velocities) <= REST_SHARE * self._max_velocity))
 
     def limited(self, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         """What the master would send now of a command (n,), and why it differs. Before the first sample: nothing."""
@@ -415,10 +423,7 @@ class Master:
             if complete and not self.codec.enabled():
                 self.latch(self._states_fault("disabled", None, None, now_ns))
         elif self._mode is Mode.STOPPING:
-            slow = self._sample is not None and bool(
-                np.all(np.abs(self._sample.velocities) <= REST_SHARE * self._max_velocity)
-            )
-            self._rests = self._rests + 1 if slow and complete else 0
+            self._rests = self._rests + 1 if complete and self.stands() else 0
             if self._rests >= REST_CYCLES or in_mode_s > self.stop_limit_s:
                 self._enter(Mode.OFF, now_ns)
 
