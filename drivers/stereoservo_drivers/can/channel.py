@@ -18,14 +18,13 @@ from stereoservo_drivers.can import socketcan
 from stereoservo_drivers.can.bus_errors import BUS_OFF, BusError, bus_error
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.messages import from_message, to_message
-from stereoservo_drivers.can.slcan import SlcanBus, SlcanGarbledError, SlcanLostError, SlcanRefusedError
+from stereoservo_drivers.can.slcan import SlcanBus, SlcanGarbledError, SlcanRefusedError
 from stereoservo_drivers.can.slcan_lines import flags_in_words
 
 SEND_TIMEOUT_S = 0.05
 BATCH = 512
 """Most frames that one ``receive`` gives: a babbling node must not hold the caller for ever."""
 _KEPT_ERRORS = 256
-_GONE = (errno.ENODEV, errno.EIO, errno.ENXIO, errno.EBADF, errno.EPIPE, errno.ECONNRESET, errno.ENETDOWN)
 _FULL = (errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT)
 
 
@@ -220,12 +219,6 @@ class Channel:
                 "send_timeout",
                 f"{doing}: nothing was taken for {self._send_timeout_s} s ({error}). Does any drive have power and "
                 f"acknowledge? Check cable, terminators and bit rate ({self._options.bitrate} bit/s)",
-                retry=True,
-            )
-        if isinstance(error, SlcanLostError) or number in _GONE:
-            return self._error(
-                "connection_lost",
-                f"{doing}: {error}. {self._where_it_went()}",
                 retry=True,
             )
         return self._error("connection_lost", f"{doing}: {error}. {self._where_it_went()}", retry=True)
