@@ -1,0 +1,304 @@
+"""Bring-up of CiA 402 drives: who is there, is it the right drive, its configuration, faults cleared on demand.
+
+All of it in NMT state pre-operational, where no process data moves anything and none is awaited. What is written is
+read back. Nothing here enables a drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Axis, Cia402Codec
+from stereoservo_drivers.canopen.cia402_configuration import (
+    HEARTBEAT_CONSUMER,
+    MODES,
+    PDO_OFF,
+    Write,
+    eds_path,
+    load_eds,
+    parameter_writes,
+    pdo_writes,
+    unused_pdos,
+)
+from stereoservo_drivers.canopen.cia402_presence import Identity, find, identify, listening, until
+from stereoservo_drivers.canopen.cia402_words import (
+    FAULTY,
+    ControlWord,
+    DriveState,
+    NmtState,
+    error_hint,
+    error_words,
+    is_communication_error,
+)
+from stereoservo_drivers.canopen.options import CanOptions
+
+if TYPE_CHECKING:
+    import canopen
+
+    from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+
+STATE_S = 0.5
+"""Time for a change of state that needs no ramp."""
+REST_S = 2.0
+"""Time for a quick stop of a drive that was found moving."""
+BOOT_S = 3.0
+SETTLE_S = 0.03
+"""A cause that is still there trips a drive again within this time."""
+STANDS_SHARE = 0.01
+"""Of the largest velocity: slower than this a drive stands."""
+
+
+class Cia402Bringup:
+    """Bring-up of the drives of one bus. ``identities``: by node id, once connected."""
+
+    def __init__(self, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> None:
+        self.codec = codec
+        self.identities: dict[int, Identity] = {}
+        self._options = options
+        self._eds = eds_path(options, cell_dir)
+        self._dictionary: canopen.ObjectDictionary | None = None
+
+    # -- what the driver asks for ---------------------------------------------------------------------------
+
+    def connect(self, link: Link) -> None:
+        """Check and configure every drive, power off, process data on.
+
+        A drive in fault stays in fault: the codec reports it. Raises DriverError: ``node_missing``,
+        ``duplicate_node``, ``not_a_drive``, ``identity``, ``wrong_eds``, ``eds``, ``mode``, ``option``, ``sdo_abort``,
+        ``sdo_timeout``, ``read_back``, ``not_off``, ``not_operational``.
+        """
+        self.codec.ignore()
+        with self._drives(link) as drives:
+            self._quiet(drives)
+            find(link, drives, self._options)
+            self._prepare(link, drives)
+            self._start(link, drives)
+
+    def reset(self, link: Link) -> None:
+        """Configure anew and clear the faults of all drives, by NMT reset communication where they were of the bus.
+
+        Ends in switch on disabled. Raises DriverError: as ``connect``; ``fault_stays`` where one cannot be cleared.
+        """
+        self.codec.ignore()
+        with self._drives(link) as drives:
+            self._quiet(drives)
+            find(link, drives, self._options)
+            self._reset_communication(link, [drive for drive in drives if _lost_the_bus(drive)])
+            self._prepare(link, drives)
+            for drive in drives:
+                self._clear_fault(link, drive)
+            self._settle(link, drives)
+            self._start(link, drives)
+
+    def release(self, link: Link) -> None:
+        """Process data off; the drives no longer wait for this master. Raises one DriverError for all."""
+        self.codec.ignore()
+        failed: list[DriverError] = []
+        with self._drives(link) as drives:
+            for drive in drives:
+                try:
+                    if self._options.abort_option == 1:  # leaving operational would make a fault of it
+                        drive.write(0x6007, 0, 0)
+                    drive.nmt("PRE-OPERATIONAL")
+                    drive.write(*HEARTBEAT_CONSUMER, 0)
+                except DriverError as error:
+                    failed.append(error)
+                    if error.code == "connection_lost":
+                        break
+        if failed:
+            raise DriverError(
+                "not_released",
+                f"{len(failed)} of {len(drives)} drives did not take leave of this master and will miss its heartbeat: "
+                f"{failed[0]}",
+                retry=True,
+            ) from failed[0]
+
+    # -- steps ---------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _drives(self, link: Link) -> Iterator[list[RemoteDrive]]:
+        # canopen takes long to import: only who talks to drives pays for it
+        from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+
+        if self._dictionary is None:
+            self._dictionary = load_eds(self._eds)
+        with ExitStack() as stack:
+            yield [stack.enter_context(RemoteDrive(link, axis, self._dictionary)) for axis in self.codec.axes]
+
+    def _quiet(self, drives: list[RemoteDrive]) -> None:
+        for drive in drives:
+            drive.nmt("PRE-OPERATIONAL")
+
+    def _prepare(self, link: Link, drives: list[RemoteDrive]) -> None:
+        for drive in drives:
+            self.identities[drive.node_id] = identify(drive, self._options, self._eds)
+            self._power_off(link, drive)
+            self._configure(link, drive)
+
+    def _power_off(self, link: Link, drive: RemoteDrive) -> None:
+        """A drive that was left enabled is brought to rest and switched off. A fault stays as it is."""
+        state = _state(drive)
+        if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
+            drive.write(0x6040, 0, ControlWord.QUICK_STOP)
+            until(link, lambda: _at_rest(drive), REST_S)
+        if state is not DriveState.FAULT:
+            drive.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE)
+        off = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
+        if not until(link, lambda: _state(drive) in off, REST_S if state in FAULTY else STATE_S):
+            raise DriverError(
+                "not_off",
+                f"{drive.name}: does not switch off, it says {drive.axis.words()!r}; switch its supply off and on",
+                node_id=drive.node_id,
+            )
+
+    def _configure(self, link: Link, drive: RemoteDrive) -> None:
+        """Write everything, then read everything back. Raises DriverError (``read_back``)."""
+        options, joint = self._options, drive.axis.joint
+        parameters = parameter_writes(options, joint, drive.dictionary)
+        pdos = pdo_writes(options, drive.node_id)
+        off = [write for index in unused_pdos(options, drive.dictionary) for write in self._off(drive, index)]
+        for write in (*off, *parameters, *pdos):
+            drive.write(write.index, write.subindex, write.value, write.option)
+        for write in {write[:2]: write for write in (*off, *parameters, *pdos)}.values():
+            self._compare(drive, write)
+        mode = MODES[options.mode]
+        if not until(link, lambda: drive.read(0x6061) == mode, STATE_S):
+            self._compare(drive, Write(0x6061, 0, mode))
+
+    @staticmethod
+    def _off(drive: RemoteDrive, index: int) -> list[Write]:
+        cob_id = drive.read_if_there(index, 1)
+        return [] if cob_id is None else [Write(index, 1, cob_id | PDO_OFF, PDO_OFF)]
+
+    @staticmethod
+    def _compare(drive: RemoteDrive, write: Write) -> None:
+        found = drive.read(write.index, write.subindex)
+        if not write.agrees(found):
+            name = drive.object_name(write.index, write.subindex)
+            raise DriverError(
+                "read_back",
+                f"{drive.name}: {name} reads {found} (0x{found & 0xFFFFFFFF:X}), "
+                f"written was {write.value} (0x{write.value & 0xFFFFFFFF:X}); the drive limits or ignores it: set "
+                f"{write.option or 'the drive up so'} that it fits",
+                node_id=drive.node_id,
+                object=f"0x{write.index:04X}:{write.subindex}",
+                written=write.value,
+                found=found,
+            )
+
+    def _start(self, link: Link, drives: list[RemoteDrive]) -> None:
+        """Arm the watch on this master's heartbeat, go operational, see that all say so."""
+        value = self._options.master_id << 16 | self._options.heartbeat_timeout_ms
+        for drive in drives:
+            drive.write(*HEARTBEAT_CONSUMER, value)
+            self._compare(drive, Write(*HEARTBEAT_CONSUMER, value))
+            _look(drive)
+        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+            for drive in drives:
+                drive.nmt("OPERATIONAL")
+            limit_s = max(STATE_S, 10e-3 * self._options.heartbeat_ms)
+            for drive in drives:
+                said = heard[HEARTBEAT_ID + drive.node_id]
+                if not until(link, _says(said, NmtState.OPERATIONAL), limit_s):
+                    raise DriverError(
+                        "not_operational",
+                        f"{drive.name}: no heartbeat says operational within {limit_s:g} s after NMT start; "
+                        f"{len(said)} heartbeats came",
+                        retry=True,
+                        node_id=drive.node_id,
+                    )
+        self.codec.watch()
+
+    # -- faults ---------------------------------------------------------------------------------------------
+
+    def _reset_communication(self, link: Link, drives: list[RemoteDrive]) -> None:
+        """Some drives refuse to forget a lost heartbeat or bus without it (EPOS4)."""
+        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+            for drive in drives:
+                drive.nmt("RESET COMMUNICATION")
+            for drive in drives:
+                said = heard[HEARTBEAT_ID + drive.node_id]
+                if not until(link, _says(said, NmtState.BOOT_UP), BOOT_S):
+                    raise DriverError(
+                        "no_boot_up",
+                        f"{drive.name}: no boot-up within {BOOT_S:g} s after NMT reset communication; switch its "
+                        "supply off and on",
+                        retry=True,
+                        node_id=drive.node_id,
+                    )
+
+    def _clear_fault(self, link: Link, drive: RemoteDrive) -> None:
+        """The fault reset's edge, and what came of it. Raises DriverError (``fault_stays``)."""
+        until(link, lambda: _state(drive) is not DriveState.FAULT_REACTION_ACTIVE, REST_S)
+        drive.axis.codes = []
+        if _state(drive) in FAULTY:
+            drive.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE)
+            drive.write(0x6040, 0, ControlWord.FAULT_RESET)
+            until(link, lambda: _state(drive) not in FAULTY, STATE_S)
+            drive.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE)
+        if not until(link, lambda: _state(drive) is DriveState.SWITCH_ON_DISABLED, STATE_S):
+            raise self._stays(drive)
+
+    def _settle(self, link: Link, drives: list[RemoteDrive]) -> None:
+        """A cause that is still there shows itself. Raises DriverError (``fault_stays``)."""
+        with listening(link, [EMCY_ID + drive.node_id for drive in drives]) as heard:
+            link.wait(SETTLE_S)
+        for drive in drives:
+            codes = [int.from_bytes(frame.data[:2], "little") for frame in heard[EMCY_ID + drive.node_id]]
+            tripping = [code for code in codes if code and code not in self._options.emcy_ignore]
+            if tripping or _state(drive) is not DriveState.SWITCH_ON_DISABLED:
+                drive.axis.codes = [*drive.axis.codes, *tripping]
+                raise self._stays(drive)
+            drive.axis.codes = []
+
+    @staticmethod
+    def _stays(drive: RemoteDrive) -> DriverError:
+        code = drive.read_if_there(0x603F) or (drive.axis.codes[-1] if drive.axis.codes else 0)
+        return DriverError(
+            "fault_stays",
+            f"{drive.name}: {error_words(code)} is still there after the reset (state {drive.axis.state.value!r}); "
+            f"remove the cause first: {error_hint(code)}",
+            retry=True,
+            node_id=drive.node_id,
+            error_code=code,
+            state=drive.axis.state.value,
+        )
+
+
+def _state(drive: RemoteDrive) -> DriveState:
+    """By SDO; the codec takes it as the newest."""
+    drive.axis.take_status(drive.read(0x6041))
+    return drive.axis.state
+
+
+def _at_rest(drive: RemoteDrive) -> bool:
+    if _state(drive) not in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
+        return True
+    slow = STANDS_SHARE * drive.axis.scale.rate_units(drive.axis.joint.max_velocity)
+    return drive.axis.state is DriveState.QUICK_STOP_ACTIVE and abs(drive.read(0x606C)) <= slow
+
+
+def _look(drive: RemoteDrive) -> None:
+    """State, error code and limit switches before the first cycle."""
+    axis = drive.axis
+    if _state(drive) in FAULTY:
+        axis.take_code(drive.read_if_there(0x603F) or 0)
+    if axis.at_limit:
+        switches = drive.read_if_there(0x60FD) or 0
+        axis.limit_side = axis.joint.direction * ((switches >> 1 & 1) - (switches & 1))
+
+
+def _lost_the_bus(drive: RemoteDrive) -> bool:
+    axis: Axis = drive.axis
+    code = drive.read_if_there(0x603F) or 0
+    return any(is_communication_error(known) for known in (*axis.codes, code))
+
+
+def _says(said: list[CanFrame], state: NmtState) -> Callable[[], bool]:
+    return lambda: any(len(frame.data) == 1 and frame.data[0] & 0x7F == state for frame in said)

@@ -1,0 +1,171 @@
+"""Who is on the bus, and is it the right drive: one answer a node id, device type, identity, EDS, mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.cia402_configuration import MODES, SHIPPED_EDS
+from stereoservo_drivers.canopen.options import CanOptions
+
+if TYPE_CHECKING:
+    from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+
+STEP_S = 0.001
+PROBE_S = 0.05
+"""Two nodes of one id both answer within this time."""
+CIA_402 = 402
+ALL_NODES = range(1, 128)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Identity object 0x1018."""
+
+    vendor_id: int
+    product_code: int
+    revision: int
+    serial_number: int
+
+
+def until(link: Link, done: Callable[[], bool], limit_s: float) -> bool:
+    """Wait for ``done``; gives whether it came within ``limit_s``."""
+    deadline_ns = link.now_ns() + round(limit_s * 1e9)
+    while not done():
+        if link.now_ns() >= deadline_ns:
+            return False
+        link.wait(STEP_S)
+    return True
+
+
+@contextmanager
+def listening(link: Link, ids: list[int]) -> Iterator[dict[int, list[CanFrame]]]:
+    heard: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
+    for can_id, frames in heard.items():
+        link.subscribe(can_id, frames)
+    try:
+        yield heard
+    finally:
+        for can_id, frames in heard.items():
+            link.unsubscribe(can_id, frames)
+
+
+def ask(link: Link, nodes: list[int], index: int, subindex: int) -> dict[int, list[CanFrame]]:
+    """All answers of ``nodes`` to one SDO read each, within ``PROBE_S``."""
+    request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
+    with listening(link, [0x580 + node for node in nodes]) as heard:
+        for node in nodes:
+            link.send([CanFrame(0x600 + node, request)])
+        link.wait(PROBE_S)
+    return {node: heard[0x580 + node] for node in nodes}
+
+
+def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
+    """One answer of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
+    answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4)
+    missing = [drive for drive in drives if not answers[drive.node_id]]
+    if missing:
+        raise _missing(link, missing, drives, options)
+    for drive in drives:
+        count = len(answers[drive.node_id])
+        if count > 1:
+            serials = ", ".join(
+                f"{int.from_bytes(frame.data[4:8], 'little')}" for frame in answers[drive.node_id]
+            )
+            raise DriverError(
+                "duplicate_node",
+                f"{drive.name}: {count} nodes answer to this id (serial numbers {serials}); disconnect all but one "
+                "and give each an id of its own",
+                node_id=drive.node_id,
+                answers=count,
+            )
+
+
+def _missing(
+    link: Link, missing: list[RemoteDrive], drives: list[RemoteDrive], options: CanOptions
+) -> DriverError:
+    configured = [drive.node_id for drive in drives]
+    others = ask(link, [node for node in ALL_NODES if node not in configured], 0x1000, 0)
+    absent = [drive.node_id for drive in missing]
+    present = sorted({*configured} - {*absent} | {node for node, answers in others.items() if answers})
+    names = ", ".join(drive.name for drive in missing)
+    if present:
+        found = f"nodes that do answer: {', '.join(map(str, present))}; is it powered, is its node id right?"
+    else:
+        found = (
+            f"no node answers on this bus; check bitrate ({options.bitrate}), interface and channel, power, "
+            "cable and termination (120 ohm at both ends)"
+        )
+    return DriverError(
+        "node_missing",
+        f"no answer of {names} within {PROBE_S * 1e3:.0f} ms; {found}",
+        retry=True,
+        missing=absent,
+        present=present,
+    )
+
+
+def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
+    """Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``, ``mode``)."""
+    device_type = drive.read(0x1000)
+    if device_type & 0xFFFF != CIA_402:
+        raise DriverError(
+            "not_a_drive",
+            f"{drive.name}: device type is 0x{device_type:08X} (profile {device_type & 0xFFFF}), not a drive "
+            f"(profile {CIA_402}); is node_id right?",
+            node_id=drive.node_id,
+            device_type=device_type,
+        )
+    identity = Identity(*(drive.read(0x1018, subindex) for subindex in (1, 2, 3, 4)))
+    for key in ("vendor_id", "product_code", "revision", "serial_number"):
+        wanted, found = getattr(drive.axis.joint, key), getattr(identity, key)
+        if wanted is not None and wanted != found:
+            raise DriverError(
+                "identity",
+                f"{drive.name}: {key} is {found} (0x{found:X}), the cell file says {wanted} (0x{wanted:X}); was "
+                "the drive exchanged, or are node ids swapped?",
+                node_id=drive.node_id,
+                key=key,
+                found=found,
+                wanted=wanted,
+            )
+    _check_eds(drive, identity, eds)
+    mode = MODES[options.mode]
+    modes = drive.read(0x6502)
+    if not modes >> (mode - 1) & 1:
+        able = ", ".join(name for name, number in MODES.items() if modes >> (number - 1) & 1)
+        raise DriverError(
+            "mode",
+            f"{drive.name}: the drive has no mode {mode} ({options.mode}), 0x6502 is 0x{modes:08X}; set "
+            f"mode to {able or 'none of csv and pv: this drive cannot be used'}",
+            node_id=drive.node_id,
+            modes=modes,
+        )
+    return identity
+
+
+def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
+    """An EDS of the drive's own maker must be of this drive; the shipped one is of none."""
+    if eds == SHIPPED_EDS:
+        return
+    of = drive.dictionary.device_information
+    for key, in_eds, found in (
+        ("vendor", of.vendor_number, identity.vendor_id),
+        ("product", of.product_number, identity.product_code),
+    ):
+        if in_eds and in_eds != found:
+            raise DriverError(
+                "wrong_eds",
+                f"{drive.name}: {eds.name} is for {key} 0x{in_eds:X} ({of.vendor_name} {of.product_name}), "
+                f"the drive is {key} 0x{found:X}; take the drive's own EDS, or leave eds out",
+                node_id=drive.node_id,
+                eds=str(eds),
+                in_eds=in_eds,
+                found=found,
+            )

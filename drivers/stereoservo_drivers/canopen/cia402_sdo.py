@@ -1,0 +1,210 @@
+"""A drive's object dictionary over the bus: SDO reads and writes with errors in words, and NMT commands.
+
+The protocol is the ``canopen`` package's; frames go and come by the ``Link``, so that no thread of its own receives
+and nothing is swallowed in its callbacks.
+"""
+
+from __future__ import annotations
+
+import logging
+from types import TracebackType
+from typing import Any
+
+import canopen
+from canopen.nmt import NMT_COMMANDS, NmtMaster
+from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary.datatypes import SIGNED_TYPES
+from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
+from canopen.sdo.client import ReadableStream, WritableStream
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.cia402 import Axis
+from stereoservo_drivers.canopen.cia402_words import (
+    ABORT_NO_OBJECT,
+    ABORT_NO_SUBINDEX,
+    abort_hint,
+    abort_words,
+)
+
+logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+SDO_REQUEST_ID = 0x600
+SDO_RESPONSE_ID = 0x580
+SDO_TIMEOUT_S = 0.5
+LOOK_S = 0.0002
+"""How often an awaited frame is looked for."""
+
+ABSENT = (ABORT_NO_OBJECT, ABORT_NO_SUBINDEX)
+
+
+class LinkNetwork(canopen.Network):
+    """The ``canopen`` package's network, sending by a link. It receives nothing."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__()
+        self.link = link
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Send one frame. Raises DriverError (``connection_lost``)."""
+        self.link.send([CanFrame(can_id, bytes(data), remote=remote)])
+
+
+class _LinkSdoClient(SdoClient):
+    """An SDO client that waits by letting the link go on, and never repeats or logs."""
+
+    def __init__(self, node_id: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
+        super().__init__(SDO_REQUEST_ID + node_id, SDO_RESPONSE_ID + node_id, dictionary)
+        self.network = LinkNetwork(link)
+        self.link = link
+        self.heard: list[CanFrame] = []
+
+    def request_response(self, sdo_request: bytes) -> bytes:
+        self.heard.clear()
+        self.network.send_message(self.rx_cobid, sdo_request)
+        deadline_ns = self.link.now_ns() + round(SDO_TIMEOUT_S * 1e9)
+        while not self.heard:
+            if self.link.now_ns() >= deadline_ns:
+                raise SdoCommunicationError(f"no response within {SDO_TIMEOUT_S} s")
+            self.link.wait(LOOK_S)
+        response = self.heard.pop(0).data
+        if len(response) != 8:
+            raise SdoCommunicationError(f"a response of {len(response)} bytes, not 8")
+        if response[0] == 0x80:
+            raise SdoAbortedError(int.from_bytes(response[4:], "little"))
+        return response
+
+    def abort(self, abort_code: int = 0x08000000) -> None:
+        self.network.send_message(self.rx_cobid, b"\x80\0\0\0" + abort_code.to_bytes(4, "little"))
+
+
+class RemoteDrive:
+    """The drive of ``axis`` over ``link``, its objects as ``dictionary`` (an EDS) has them. Use it as a context."""
+
+    def __init__(self, link: Link, axis: Axis, dictionary: canopen.ObjectDictionary) -> None:
+        self.axis = axis
+        self.node_id = axis.node_id
+        self.name = f"node {axis.node_id} ({axis.joint.name})"
+        self.dictionary = dictionary
+        self._link = link
+        self._client = _LinkSdoClient(axis.node_id, dictionary, link)
+        self._nmt = NmtMaster(axis.node_id)
+        self._nmt.network = self._client.network
+
+    def __enter__(self) -> RemoteDrive:
+        self._link.subscribe(self._client.tx_cobid, self._client.heard)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._link.unsubscribe(self._client.tx_cobid, self._client.heard)
+
+    def nmt(self, command: str) -> None:
+        """NMT command of CiA 301 by name: ``OPERATIONAL``, ``PRE-OPERATIONAL``, ``RESET COMMUNICATION``."""
+        self._nmt.send_command(NMT_COMMANDS[command])
+
+    def variable(self, index: int, subindex: int = 0) -> ODVariable | None:
+        """The EDS's entry, None where it has none."""
+        return self.dictionary.get_variable(index, subindex)
+
+    def object_name(self, index: int, subindex: int = 0) -> str:
+        """For people: ``0x6085:0 (Quick stop deceleration)``."""
+        variable = self.variable(index, subindex)
+        label = f"0x{index:04X}:{subindex}"
+        if variable is None:
+            return label
+        parent = variable.parent
+        whole = "" if parent is self.dictionary else f"{parent.name}: "
+        return f"{label} ({whole}{variable.name})"
+
+    def read(self, index: int, subindex: int = 0) -> int:
+        """An object's value. Raises DriverError (``sdo_abort``, ``sdo_timeout``)."""
+        try:
+            data = ReadableStream(self._client, index, subindex).read()
+        except (SdoAbortedError, SdoCommunicationError) as error:
+            raise self._failed("reading", index, subindex, None, error) from error
+        variable = self.variable(index, subindex)
+        signed = variable is not None and variable.data_type in SIGNED_TYPES
+        if variable is not None and variable.fixed_size:
+            data = data[: len(variable) // 8]
+        return int.from_bytes(data, "little", signed=signed)
+
+    def read_if_there(self, index: int, subindex: int = 0) -> int | None:
+        """As ``read``; None where EDS or drive lack the object."""
+        if self.variable(index, subindex) is None:
+            return None
+        try:
+            return self.read(index, subindex)
+        except DriverError as error:
+            if error.data.get("abort_code") in ABSENT:
+                return None
+            raise
+
+    def write(self, index: int, subindex: int, value: int, option: str = "") -> None:
+        """Write an object of the EDS. ``option``: the cell file's, for errors.
+
+        Raises:
+            DriverError: ``wrong_eds`` (not in the EDS), ``option`` (outside the EDS's range), ``sdo_abort``,
+                ``sdo_timeout``.
+        """
+        variable = self.variable(index, subindex)
+        if variable is None:
+            raise DriverError(
+                "wrong_eds",
+                f"{self.name}: the EDS has no object 0x{index:04X}:{subindex}{_from(option)}; give the drive's own EDS",
+                **self._data(index, subindex, value),
+            )
+        size, signed = len(variable) // 8, variable.data_type in SIGNED_TYPES
+        low = -(1 << 8 * size - 1) if signed else 0
+        high = (1 << 8 * size - signed) - 1
+        low = max(low, variable.min) if variable.min is not None else low
+        high = min(high, variable.max) if variable.max is not None else high
+        if not low <= value <= high:
+            raise DriverError(
+                "option",
+                f"{self.name}: {value} for {self.object_name(index, subindex)} is outside {low} to {high} of "
+                f"the EDS{_from(option)}",
+                **self._data(index, subindex, value),
+            )
+        try:
+            WritableStream(self._client, index, subindex, size).write(
+                value.to_bytes(size, "little", signed=signed)
+            )
+        except (SdoAbortedError, SdoCommunicationError) as error:
+            raise self._failed("writing", index, subindex, value, error, option) from error
+
+    def _data(self, index: int, subindex: int, value: int | None) -> dict[str, Any]:
+        return {
+            "node_id": self.node_id,
+            "joint": self.axis.joint.name,
+            "object": f"0x{index:04X}:{subindex}",
+            "value": value,
+        }
+
+    def _failed(
+        self, doing: str, index: int, subindex: int, value: int | None, error: Exception, option: str = ""
+    ) -> DriverError:
+        what = f"{self.name}: {doing} {self.object_name(index, subindex)}"
+        if value is not None:
+            what += f" = {value}{_from(option)}"
+        data = self._data(index, subindex, value)
+        if isinstance(error, SdoAbortedError):
+            hint = abort_hint(error.code)
+            return DriverError(
+                "sdo_abort",
+                f"{what}: the drive refuses, {abort_words(error.code)}; {hint}",
+                abort_code=error.code,
+                **data,
+            )
+        return DriverError(
+            "sdo_timeout",
+            f"{what}: {error}; is the drive powered, is the cable whole and terminated, is another SDO client there?",
+            retry=True,
+            **data,
+        )
+
+
+def _from(option: str) -> str:
+    return f" [option {option}]" if option else ""
