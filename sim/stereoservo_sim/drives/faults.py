@@ -222,7 +222,7 @@ GRAMMAR: dict[str, tuple[Callable[[str, list[str]], Order], str, str]] = {
     "lose": (_lose, "lose N FRAME|0xID [COUNT]", f"its next frames are lost; FRAME: {', '.join(COB_IDS)}"),
     "late": (_late, "late N TIME|0", "everything that node N sends comes later by so much, e.g. `late 2 6ms`"),
     "duplicate": (
-        _duplicate, "duplicate N [boots|running|off]", "a second drive with number N: switched on now, or there already",
+        _duplicate, "duplicate N [boots|running|off]", "a second drive numbered N: switched on now, or there already",
     ),
     "remap": (_of_node, "remap N", "somebody changes the mapping of node N's TPDO 1"),
     "cable": (_cable, "cable [N] out|in", "the bus cable at the master, or at node N"),

@@ -79,6 +79,7 @@ class Rack:
         self.plant = plant
         self.wire = Wire(bitrate)
         self.events: deque[RackEvent] = deque(maxlen=EVENTS_KEPT)
+        self._news: list[RackEvent] = []
         self.disturbances = Disturbances()
         self.on_adapter: Callable[[bool], None] = lambda plugged: None
         self._delivered: list[tuple[int, CanFrame]] = []
@@ -136,6 +137,11 @@ class Rack:
         frames, self._delivered = self._delivered, []
         return frames
 
+    def take_news(self) -> list[RackEvent]:
+        """Events since the last call."""
+        news, self._news = self._news, []
+        return news
+
     def order(self, text: str, t_ns: int) -> str:
         """Do what ``text`` orders, at ``t_ns`` or at its own time after the start; the answer. Raises OrderError."""
         order = parse_order(text)
@@ -179,14 +185,12 @@ class Rack:
         return self.plant.at_rest()
 
     def power_off(self, t_ns: int) -> None:
-        """The supply of all drives is switched off: the axes lose their power and, where they have one, the brake
-        closes.
-        """
+        """The supply of all drives fails: nothing is heard of them, the arm stands by brakes and friction."""
         self.run_until(t_ns)
+        self.disturbances.master_connected = False
         for slot in self.slots:
-            slot.node.axis.target = 0.0
-            slot.node.axis.powered = False
-            slot.node.axis.brake_closed = True
+            slot.node.power_up(t_ns)  # a reboot: the axis loses its power
+            self.look(slot)
 
     def status(self) -> list[str]:
         """One line a node."""
@@ -309,7 +313,10 @@ class Rack:
         self.wire.start(self.t_ns)
 
     def tell(self, kind: str, node: int, text: str = "") -> None:
-        self.events.append(RackEvent(self.t_ns, kind, node, text))
+        event = RackEvent(self.t_ns, kind, node, text)
+        self.events.append(event)
+        if len(self._news) < EVENTS_KEPT:
+            self._news.append(event)
 
     def _stuck(self, due: int) -> str:
         late = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.can.load import frame_bits
 from stereoservo_sim.drives.node import NEVER_NS
 
 MASTER = 0
@@ -22,29 +23,6 @@ def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
     if frame.extended:
         return frame.id >> 18, 1, 1, frame.id & 0x3FFFF, int(frame.remote)
     return frame.id, int(frame.remote), 0, 0, 0
-
-
-def frame_bits(frame: CanFrame) -> int:
-    """Bits of ``frame`` on the wire with its stuff bits and the intermission."""
-    length = frame.length if frame.remote else len(frame.data)
-    if frame.extended:
-        head = f"0{frame.id >> 18:011b}11{frame.id & 0x3FFFF:018b}{int(frame.remote)}00{length:04b}"
-    else:
-        head = f"0{frame.id:011b}{int(frame.remote)}00{length:04b}"
-    bits = head + ("" if frame.remote else "".join(f"{byte:08b}" for byte in frame.data))
-    crc = 0
-    for bit in bits:
-        crc = (crc << 1) ^ (0x4599 if (crc >> 14 & 1) ^ (bit == "1") else 0)
-        crc &= 0x7FFF
-    bits += f"{crc:015b}"
-    stuffed, run, last = 0, 0, ""
-    for bit in bits:
-        run = run + 1 if bit == last else 1
-        last = bit
-        if run == 5:
-            stuffed += 1
-            last, run = ("0" if bit == "1" else "1"), 1
-    return len(bits) + stuffed + 13
 
 
 class Wire:

@@ -24,7 +24,7 @@ def make_axis(k: int = 0, position: float = 0.0) -> Axis:
 
 
 class ScriptedNode:
-    """Speaks as a drive does: two frames on each SYNC, one each ``beat_ns``; obeys 0x200 + id: power and target [mrad/s]."""
+    """Two frames on each SYNC, one each ``beat_ns``; obeys 0x200 + id: power on or off, target [mrad/s]."""
 
     def __init__(self, node_id: int, axis: Axis, beat_ns: int = 20 * MS) -> None:
         self.node_id = node_id

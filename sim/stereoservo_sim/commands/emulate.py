@@ -1,0 +1,129 @@
+"""``stereoservo emulate WHAT CELL``: stand-ins for a cell's hardware."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.runtime.lifeline import Termination, die_with_parent
+
+PRIORITY = 5
+"""SCHED_FIFO where it is allowed: below the servo process, above everything that only computes."""
+GRACE_S = 5.0
+
+
+def emulate(
+    what: Annotated[str, typer.Argument(help="What to stand in for: drives.")],
+    cell: Annotated[
+        str, typer.Argument(metavar="CELL", help="A cell file (*.toml), or the name of a shipped cell.")
+    ],
+    channel: Annotated[
+        str | None,
+        typer.Option(
+            "--channel",
+            help="socket://127.0.0.1:PORT (0: free), pty, or INTERFACE:CHANNEL of python-can. Default: the cell's.",
+        ),
+    ] = None,
+    bit_time: Annotated[
+        bool | None,
+        typer.Option(
+            "--bit-time/--no-bit-time", help="Frames take their time on the wire. Default: the cell's."
+        ),
+    ] = None,
+    order: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--order", help='An order, e.g. "fault node 3 0x3210 @ 2.0s"; may be repeated. `help` lists them.'
+        ),
+    ] = None,
+    parent: Annotated[int, typer.Option("--parent", help="End when the process of this number ends.")] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
+) -> None:
+    """Put emulated drives, moved by the simulated arm, in the place of a cell's real ones. Orders come from stdin."""
+    if what not in KINDS:
+        raise typer.BadParameter(
+            f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT"
+        )
+    if parent:
+        die_with_parent(parent, signal.SIGTERM)
+    termination = Termination(grace_s=GRACE_S)
+    _drives(_Settings(cell, channel, bit_time, tuple(order or ()), json), termination)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    cell: str
+    channel: str | None
+    bit_time: bool | None
+    orders: tuple[str, ...]
+    as_json: bool
+
+
+def _cell_path(cell: str) -> Path:
+    from stereoservo_sim.cells import shipped_cell_path
+
+    if cell.endswith(".toml"):
+        return Path(cell)
+    try:
+        return shipped_cell_path(cell)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="CELL") from error
+
+
+def _drives(settings: _Settings, termination: Termination) -> None:
+    from stereoservo.runtime.directories import cell_directories, create_directories
+    from stereoservo_sim.drives.building import drives_of_cell, make_rack
+    from stereoservo_sim.drives.console import Console, Printer
+    from stereoservo_sim.drives.faults import OrderError
+    from stereoservo_sim.drives.serving import RackServer, open_endpoint, served_channel
+
+    path = _cell_path(settings.cell)
+    cell = load_cell_file(path)
+    options, drives = drives_of_cell(cell)
+    if settings.bit_time is not None:
+        drives = msgspec.structs.replace(drives, bit_time=settings.bit_time)
+    directories = cell_directories(cell.cell.name)
+    create_directories(directories)
+    endpoint = open_endpoint(settings.channel or served_channel(options), options.bitrate)
+    try:
+        rack = make_rack(
+            options, drives, t_ns=time.monotonic_ns(), runtime_dir=directories.runtime, cell_dir=path.parent
+        )
+    except BaseException:
+        endpoint.close()
+        raise
+    try:
+        for text in settings.orders:
+            rack.order(text, rack.t_ns)
+    except OrderError as error:
+        endpoint.close()
+        raise typer.BadParameter(str(error), param_hint="--order") from error
+    printer = Printer(settings.as_json)
+    server = RackServer(rack, endpoint)
+    console = Console(server, printer)
+    console.attach()
+    with contextlib.suppress(OSError):  # not allowed: then without
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    gc.freeze()  # what was imported is not looked through again
+    printer.say(
+        "ready", f"listening on {server.channel}", channel=server.channel, t_ns=rack.start_ns, pid=os.getpid(),
+        nodes=[joint.node_id for joint in options.joint], bit_time=drives.bit_time,
+    )  # fmt: skip
+    try:
+        server.run(lambda: termination.asked)
+    finally:
+        printer.say("end", server.stalls.words(), **msgspec.to_builtins(server.stalls))
+        printer.end()
+
+
+KINDS = {"drives": _drives}
