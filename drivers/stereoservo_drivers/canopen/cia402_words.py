@@ -233,8 +233,10 @@ def error_words(code: int) -> str:
 
 def error_hint(code: int) -> str:
     """What to do about an error code."""
-    known = ERROR_CODES.get(code) or ERROR_CODES.get(code & 0xFF00) or ERROR_CODES.get(code & 0xF000)
-    return known[1] if known else f"look 0x{code:04X} up in the drive's manual"
+    for group in (code, code & 0xFF00, code & 0xF000):
+        if group and group in ERROR_CODES:
+            return ERROR_CODES[group][1]
+    return f"look 0x{code:04X} up in the drive's manual" if code else ""
 
 
 def is_communication_error(code: int) -> bool:
