@@ -230,8 +230,11 @@ class Rack:
                     self.wire.send(BABBLE + node_id, BABBLE_FRAME)
         if self.plant.due_ns(t_ns - 1) <= t_ns:
             self.plant.advance(t_ns)
+            moved = any(slot.moving for slot in self.slots)
             for slot in self.slots:
                 self._watch_motion(slot)
+            if moved and self.plant.at_rest():
+                self.tell("all_rest", 0)
 
     def _end_of_frame(self, t_ns: int) -> None:
         sender, frame = self.wire.finish()
@@ -302,12 +305,9 @@ class Rack:
         if slot.plant_index is None:
             return
         moving = not self.plant.at_rest(slot.plant_index)
-        if moving is slot.moving:
-            return
-        slot.moving = moving
-        self.tell("moves" if moving else "rest", slot.node.node_id)
-        if not moving and self.plant.at_rest():
-            self.tell("all_rest", 0)
+        if moving is not slot.moving:
+            slot.moving = moving
+            self.tell("moves" if moving else "rest", slot.node.node_id)
 
     def _launch(self) -> None:
         self.wire.start(self.t_ns)
