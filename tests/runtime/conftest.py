@@ -196,6 +196,8 @@ class Bench:
     log: list[tuple[StepInputs, StepOutputs]] = field(default_factory=list)
     pending: list[CameraObservation] = field(default_factory=list)
     encoder: np.ndarray | None = None
+    loads: Callable[[Bench], tuple[np.ndarray, np.ndarray]] | None = None
+    """Efforts and following errors (6,), (6,) that the drives tell; None: they do not."""
 
     def step(self, *commands: Command, **inputs: object) -> StepOutputs:
         period_ns = round(1e9 / self.settings.rate_hz)
@@ -205,7 +207,8 @@ class Bench:
         if self.frozen_joint >= 0:
             self.encoder = self.q.copy() if self.encoder is None else self.encoder
             q_encoder[self.frozen_joint] = self.encoder[self.frozen_joint]
-        joints = JointState(self.seq, self.now_ns, q_encoder, np.zeros(6)) if self.joints_on else None
+        told = () if self.loads is None else self.loads(self)
+        joints = JointState(self.seq, self.now_ns, q_encoder, np.zeros(6), *told) if self.joints_on else None
         due = [o for o in self.pending if o.t_received_ns <= self.now_ns]
         self.pending = [o for o in self.pending if o.t_received_ns > self.now_ns]
         requests = tuple(Request(self.seq * 10 + k, "tester", c) for k, c in enumerate(commands))

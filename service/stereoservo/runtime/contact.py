@@ -35,6 +35,7 @@ REST_S = 0.05
 LEAVE_S = 1.0
 """Of motion after a contact, in which what it brought may go again: a retreat is no contact."""
 MOVING = 1e-3  # [rad/s or m/s] of commanded velocity
+ALONE = 0.05  # of the fastest joint's speed: what a joint that only holds its place may have
 GAP_S = 0.5  # without a sample for so long, means are of another time
 EFFORT_FLOOR = 0.01
 """Of the largest effort of any joint: what a joint without weight may always do."""
@@ -84,7 +85,7 @@ def watch(
     contact = state.contact
     if sample is None or sample.t_ns <= contact.seen_ns:
         return None
-    elapsed_s = (sample.t_ns - contact.seen_ns) * 1e-9
+    elapsed_s = (sample.t_ns - contact.seen_ns) * 1e-9 if contact.seen_ns else np.inf
     contact.seen_ns = sample.t_ns
     contact.efforts, contact.following_errors = sample.efforts, sample.following_errors
     speed = np.abs(state.command)
@@ -226,10 +227,11 @@ def _learn(
     loads = contact.loads
     if loads is None or loads.id != trials_id:
         loads = contact.loads = Loads(trials_id, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n))
-    loads.mover = int(speed.argmax())
     loads.velocities = np.maximum(loads.velocities, speed)
     loads.largest_efforts = np.maximum(loads.largest_efforts, np.abs(efforts))
-    loads.efforts[:, loads.mover] = np.maximum(loads.efforts[:, loads.mover], _lasting(contact.effort_excess))
+    mover = int(speed.argmax())
+    if int((speed > ALONE * speed[mover]).sum()) == 1:  # from one joint's stops to the next one's, two move
+        loads.efforts[:, mover] = np.maximum(loads.efforts[:, mover], _lasting(contact.effort_excess))
     loads.following_errors = np.maximum(loads.following_errors, _lasting(contact.following_excess))
 
 

@@ -60,8 +60,6 @@ class Loads(msgspec.Struct, eq=False):
     efforts: FloatArray
     largest_efforts: FloatArray
     following_errors: FloatArray
-    mover: int = -1
-    """The joint that was commanded fastest of late."""
 
 
 class Contact(msgspec.Struct, eq=False):
