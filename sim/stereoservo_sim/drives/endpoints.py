@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
+import select
 import socket
 import tty
 from typing import Any, Protocol
@@ -142,7 +143,11 @@ class SlcanTcp:
 
     def take(self) -> list[CanFrame]:
         """Frames of the client, if there is one."""
-        self._accept()
+        frames = self._read()
+        self._accept(frames)
+        return frames
+
+    def _read(self) -> list[CanFrame]:
         if self._line is None:
             return []
         try:
@@ -174,13 +179,16 @@ class SlcanTcp:
         """Close the connection; nobody listens any more."""
         self.plug(False)
 
-    def _accept(self) -> None:
+    def _accept(self, frames: list[CanFrame]) -> None:
         if self._listener is None:
             return
         try:
             client, _ = self._listener.accept()
         except BlockingIOError:
             return
+        # Whoever closes a connection may open the next at once: what the old one still says comes first.
+        while self._client is not None and select.select([self._client], [], [], 0)[0]:
+            frames += self._read()
         if self._client is not None:
             client.close()
             return
