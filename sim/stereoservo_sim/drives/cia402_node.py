@@ -53,6 +53,8 @@ class Cia402Node:
         identity = {4: node_id} | {k: v for k, v in asked.items() if v is not None} | settings.identity
         self._t_ns = 0
         self._boot_ns = NEVER_NS
+        self._due_ns: int | None = None
+        self._words: str | None = None
         self._out: list[CanFrame] = []
         self._reset_refused = False
         self.dictionary = Dictionary(eds, node_id)
@@ -135,12 +137,7 @@ class Cia402Node:
 
     def _reset_communication(self) -> None:
         self._connection_aborted(COMMUNICATION)
-        errors = {
-            key: self.dictionary.get(*key) for key in self.dictionary.entries if key[0] in (0x1001, 0x1003)
-        }
-        self.dictionary.restore(0x1000, 0x1FFF, self._stored)
-        for key, value in errors.items():
-            self.dictionary.set(*key, value)
+        self._objects.reset_communication()
         self._reset_refused = False
         self._set_up_communication()
         self._boot()
@@ -289,6 +286,7 @@ class Cia402Node:
         self.motion.warning = bool(self.emergencies.active)
         self._out += self._pdo.events(t_ns)
         self._send_emergencies()
+        self._due_ns = self._words = None
 
     def _send_emergencies(self) -> None:
         if self.nmt in (Nmt.PRE_OPERATIONAL, Nmt.OPERATIONAL):
@@ -296,6 +294,11 @@ class Cia402Node:
 
     def due_ns(self) -> int:
         """See ``EmulatedNode``."""
+        if self._due_ns is None:
+            self._due_ns = self._next_due_ns()
+        return self._due_ns
+
+    def _next_due_ns(self) -> int:
         if self.nmt is Nmt.OFF:
             return NEVER_NS
         motion = self.motion.due_ns(self._t_ns)
@@ -314,6 +317,11 @@ class Cia402Node:
 
     def state(self) -> str:
         """NMT state, power state, errors."""
+        if self._words is None:
+            self._words = self._in_words()
+        return self._words
+
+    def _in_words(self) -> str:
         words = [self.nmt.name.lower().replace("_", "-"), str(self.machine.state)]
         words += [f"error 0x{code:04X}" for code in self.emergencies.active]
         return ", ".join(words)
