@@ -15,6 +15,7 @@ from stereoservo.kinematics.model import (
     CameraModel,
     CellModel,
     FitStatistics,
+    JointLoads,
     JointStatistics,
     ModelFileError,
     check_model,
@@ -209,6 +210,37 @@ def test_a_file_of_the_first_schema_is_read_as_pinholes_that_stand_still():
     assert model.mount == "eye_to_hand"
     assert not model.tip_first
     assert [camera.lens[0] for camera in model.cameras] == [0.0, 0.0]
+
+
+LOADS = JointLoads(
+    np.array([0.5, 0.1]), np.array([[3.0, 0.1], [1 / 3, 4.0]]), np.array([5.0, 9.0]), np.full(2, 1e-3)
+)
+
+
+def test_loads_come_back_and_a_file_without_them_is_read():
+    for loads in (LOADS, JointLoads(np.ones(2)), JointLoads(np.ones(2), following_errors=np.zeros(2))):
+        back = decode_model(encode_model(make_model(loads=loads))).loads
+        for field in JointLoads.__struct_fields__:
+            assert np.array_equal(getattr(back, field), getattr(loads, field)), field
+    tree = json.loads(encode_model(make_model()))
+    del tree["loads"]
+    assert decode_model(json.dumps(tree).encode()).loads is None
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "fields"),
+    [
+        ("loads.efforts", r"shape \(2,\); \(2, 2\)", {"efforts": np.ones(2)}),
+        ("loads.velocities", "negative or not finite", {"velocities": np.array([1.0, -0.1])}),
+        ("loads.following_errors", "negative or not finite", {"following_errors": np.array([np.nan, 0.0])}),
+        ("loads", "both or none", {"largest_efforts": None}),
+    ],
+)
+def test_refuses_loads_that_cannot_be(key, text, fields):
+    model = make_model(loads=msgspec.structs.replace(LOADS, **fields))
+    with pytest.raises(ModelFileError, match=text) as caught:
+        check_model(model)
+    assert caught.value.key == key
 
 
 def test_nothing_but_a_file_is_replaced(tmp_path):

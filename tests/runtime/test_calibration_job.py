@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from stereoservo.kinematics.calibration.trials import CalibrationError, check_trials
+from stereoservo.kinematics.model import JointLoads
 from stereoservo.runtime.calibration_job import CalibrationJob
 from stereoservo.runtime.cycle import Event, Sample
 from stereoservo.runtime.settings import CameraSettings, CoreSettings
@@ -64,3 +65,15 @@ def test_no_stop_is_an_error_with_its_code(settings: CoreSettings) -> None:
     with pytest.raises(CalibrationError, match="no stop") as caught:
         CalibrationJob(settings).trials()
     assert caught.value.code == "too_few_stops"
+
+
+def test_loads_are_those_of_the_same_calibration(settings: CoreSettings) -> None:
+    loads = JointLoads(np.ones(6), following_errors=np.full(6, 1e-3))
+    job = CalibrationJob(settings)
+    job.add(stop(1, 0, sample("left", [1])))
+    job.add(Event(2, 2, "calibration_finished", id="another", loads=JointLoads(np.zeros(6))))
+    assert job.trials().loads is None
+    job.add(Event(3, 3, "calibration_finished", id="a", loads=loads))
+    assert job.trials().loads is loads
+    job.add(stop(4, 0, sample("left", [1]), goal="b"))
+    assert job.trials().loads is None

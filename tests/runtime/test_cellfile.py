@@ -65,6 +65,21 @@ def test_a_range_may_be_left_out_and_a_spread_stays_inside_the_limits(tmp_path: 
     assert alone.spread_offsets == pytest.approx([-0.6, -0.2, 0.2, 0.6])
 
 
+def test_contact_is_watched_by_default_and_thresholds_stand_in_joint_order(tmp_path: Path) -> None:
+    plain = settings(tmp_path, GOOD).contact
+    assert plain is not None
+    assert (plain.enabled, plain.factor, plain.samples, plain.effort_units) == (True, 1.5, 5, ("N m",))
+    assert np.isnan(plain.efforts).all()
+    assert np.isnan(plain.following_errors).all()
+    section = (
+        "[safety.contact]\neffort = { j1 = 12 }\nfactor = 2\nsamples = 3\nenabled = false\n[calibration]"
+    )
+    given = settings(tmp_path, GOOD.replace("[calibration]", section)).contact
+    assert given is not None
+    assert (given.enabled, given.factor, given.samples) == (False, 2.0, 3)
+    assert given.efforts.tolist() == [12.0]
+
+
 CASES = {
     "unknown key": ("velocity = 0.5", "velocity = 0.5\nspeed = 1.0", ["speed", "acceleration"]),
     "unknown section": ("[calibration]", "[extra]\na = 1\n[calibration]", ["extra", "zenoh"]),
@@ -121,6 +136,31 @@ CASES = {
         "range = { j1 = 0.3 }",
         'spread = { joint = "j1", count = 3 }',
         ["calibration.spread", "count", "positions"],
+    ),
+    "contact of an unknown joint": (
+        "[calibration]",
+        "[safety.contact]\neffort = { j7 = 12.0 }\n[calibration]",
+        ["safety.contact.effort", "j7", "joints with limits: j1"],
+    ),
+    "negative contact threshold": (
+        "[calibration]",
+        "[safety.contact]\nfollowing = { j1 = -0.02 }\n[calibration]",
+        ["safety.contact.following.j1", "-0.02", "above 0"],
+    ),
+    "contact threshold of nothing": (
+        "[calibration]",
+        "[safety.contact]\neffort = { j1 = 0 }\n[calibration]",
+        ["safety.contact.effort.j1", "0", "above 0"],
+    ),
+    "contact factor below what was learnt": (
+        "[calibration]",
+        "[safety.contact]\nfactor = 0.5\n[calibration]",
+        ["safety.contact.factor", "0.5", ">= 1"],
+    ),
+    "unknown key of contact": (
+        "[calibration]",
+        "[safety.contact]\nforce = { j1 = 1.0 }\n[calibration]",
+        ["safety.contact", "force", "effort", "following", "samples"],
     ),
     "not TOML": ("schema = 1", "schema = = 1", ["TOML"]),
 }

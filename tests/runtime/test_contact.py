@@ -338,7 +338,7 @@ def test_the_way_out_is_open_and_the_way_in_is_not(bench: Any) -> None:
     outputs = bench.run(1.0)
     assert bench.q[1] < at - 0.1
     assert "CONTACT_EFFORT" not in [r.code for r in outputs.status.reasons]
-    assert bench.reply(Jog({"j2": 0.2}, 2.0)).accepted
+    assert bench.reply(Jog({"j2": 0.4}, 1.0)).accepted
     bench.until(lambda e: e.kind == "stopped", 3.0)
 
 
@@ -382,7 +382,7 @@ def test_trial_motions_teach_thresholds_that_bear_a_goal_and_not_a_wall(bench: A
     assert bench.until(lambda e: e.id == "0000000a" and e.kind != "goal_started", 20.0).kind == "goal_reached"
 
     bench.loads = arm(wall=float(bench.q[1]) + 0.1)
-    assert bench.reply(Jog({"j2": 0.5}, 2.0)).accepted
+    assert bench.reply(Jog({"j2": 0.5}, 1.0)).accepted
     stopped = bench.until(lambda e: e.kind == "stopped", 2.0)
     assert stopped.reasons[0].subject == "j2"
 

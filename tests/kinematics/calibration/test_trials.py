@@ -15,6 +15,7 @@ from stereoservo.kinematics.calibration.trials import (
     load_trials,
     save_trials,
 )
+from stereoservo.kinematics.model import JointLoads
 
 
 @pytest.fixture
@@ -37,6 +38,28 @@ def test_round_trip_bit_for_bit(trials, tmp_path):
         assert getattr(again, field) == getattr(trials, field)
     assert not again.visible[0, 3, 2]
     assert [path.name for path in tmp_path.iterdir()] == ["trials.npz"]
+
+
+def test_loads_of_the_joints_come_back_and_may_be_missing(trials):
+    n = len(trials.joint_names)
+    assert decode_trials(encode_trials(trials)).loads is None
+    efforts = np.arange(float(n * n)).reshape(n, n) / 3.0
+    for loads in (
+        JointLoads(np.ones(n), efforts, np.ones(n), np.full(n, 1e-3)),
+        JointLoads(np.ones(n), following_errors=np.zeros(n)),
+    ):
+        again = decode_trials(encode_trials(wrong(trials, loads=loads))).loads
+        for field in JointLoads.__struct_fields__:
+            assert np.array_equal(getattr(again, field), getattr(loads, field)), field
+    with pytest.raises(CalibrationError, match="negative or not finite"):
+        check_trials(wrong(trials, loads=JointLoads(-np.ones(n))))
+    data = encode_trials(trials)
+    for arrays in ({"loads_efforts": efforts}, {"loads_velocities": np.ones(n), "loads_colour": np.ones(1)}):
+        if "loads_colour" in arrays:  # of a later version: the rest is read
+            assert decode_trials(rewritten(data, **arrays)).loads.velocities.tolist() == [1.0] * n
+            continue
+        with pytest.raises(CalibrationError, match="velocities"):
+            decode_trials(rewritten(data, **arrays), "here.npz")
 
 
 def holed(positions):
