@@ -42,10 +42,16 @@ def _fault(rack: Rack, order: Order) -> str:
 
 
 def _sticky(rack: Rack, order: Order) -> str:
+    causes: set[int] | None = getattr(rack.slot(order.node).node, "sticky", None)
     if order.what == "off":
         rack.disturbances.sticky.pop(order.node, None)
+        if causes is not None:
+            causes.clear()
         return f"node {order.node}: the cause is gone"
-    rack.disturbances.sticky[order.node] = order.number
+    if causes is None:  # a node that knows no causes: the rack trips it again after each reset
+        rack.disturbances.sticky[order.node] = order.number
+    else:
+        causes.add(order.number)
     return f"{_fault(rack, order)}; the cause stays"
 
 
