@@ -32,6 +32,7 @@ from stereoservo_drivers.canopen.cia402_words import (
     ControlWord,
     DriveState,
     NmtState,
+    drive_state,
     error_hint,
     error_words,
     is_communication_error,
@@ -91,10 +92,16 @@ class Cia402Bringup:
             find(link, drives, self._options)
             self._reset_communication(link, [drive for drive in drives if _lost_the_bus(drive)])
             self._prepare(link, drives)
-            for drive in drives:
-                self._clear_fault(link, drive)
-            self._settle(link, drives)
-            self._start(link, drives)
+            stays: DriverError | None = None
+            try:
+                for drive in drives:
+                    self._clear_fault(link, drive)
+                self._settle(link, drives)
+            except DriverError as error:
+                stays = error
+            self._start(link, drives)  # with a fault too: the arm's positions are wanted
+            if stays is not None:
+                raise stays
 
     def release(self, link: Link) -> None:
         """Process data off; the drives no longer wait for this master. Raises one DriverError for all."""
@@ -136,6 +143,10 @@ class Cia402Bringup:
             drive.nmt("PRE-OPERATIONAL")
 
     def _prepare(self, link: Link, drives: list[RemoteDrive]) -> None:
+        for drive in drives:  # those first that somebody has left moving
+            status_word = drive.read_if_there(0x6041)
+            if status_word is not None and drive_state(status_word) is DriveState.OPERATION_ENABLED:
+                drive.write(0x6040, 0, ControlWord.QUICK_STOP)
         for drive in drives:
             self.identities[drive.node_id] = identify(drive, self._options, self._eds)
             self._power_off(link, drive)

@@ -1,0 +1,530 @@
+"""Bring-up of CiA 402 drives against the emulated ones, in virtual time with bit times."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.cia402 import Cia402Codec
+from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
+from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
+from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_sim.drives.building import DrivesSettings, make_rack
+from stereoservo_sim.drives.cia402_node import Cia402Node
+from stereoservo_sim.drives.rack import Rack
+from stereoservo_sim.drives.virtual_host import VirtualHost
+
+COUNTS, GEAR = 4096, 100.0
+COUNTS_PER_RAD = COUNTS * GEAR / (2 * math.pi)
+
+
+class Host(VirtualHost):
+    """``swallow``: SDO requests for this object do not reach the bus."""
+
+    swallow: tuple[int, int] | None = None
+
+    def send(self, frames: list[CanFrame]) -> None:
+        kept = [frame for frame in frames if not self._swallowed(frame)]
+        super().send(kept)
+
+    def _swallowed(self, frame: CanFrame) -> bool:
+        if self.swallow is None or frame.id & ~0x7F != 0x600:
+            return False
+        return (int.from_bytes(frame.data[1:3], "little"), frame.data[3]) == self.swallow
+
+
+@dataclass
+class Bench:
+    """A rack and a host that is not connected yet."""
+
+    options: CanOptions
+    rack: Rack
+    cell_dir: Path
+
+    def __post_init__(self) -> None:
+        self.plug_in(self.options)
+
+    def plug_in(self, options: CanOptions) -> None:
+        """A host that knows nothing of what was before."""
+        self.codec = Cia402Codec(options)
+        self.bringup = Cia402Bringup(options, self.codec, self.cell_dir)
+        self.master = Master(self.codec, MasterSettings.of(options))
+        self.host = Host(self.rack, self.master)
+
+    def node(self, number: int) -> Cia402Node:
+        node = self.rack.slot(number).node
+        assert isinstance(node, Cia402Node)
+        return node
+
+    def object(self, number: int, index: int, subindex: int = 0) -> int:
+        value = self.node(number).dictionary.get(index, subindex)
+        assert isinstance(value, int)
+        return value
+
+    def connect(self) -> None:
+        self.bringup.connect(self.host)
+
+    def refused(self, code: str) -> str:
+        """Message of the DriverError with which ``connect`` ends."""
+        with pytest.raises(DriverError) as refusal:
+            self.connect()
+        assert refusal.value.code == code, refusal.value
+        return str(refusal.value)
+
+    def order(self, text: str) -> None:
+        self.rack.order(text, self.rack.t_ns)
+
+    def cycle(self, seconds: float, *velocities: float) -> None:
+        self.host.velocities = np.array(velocities) if velocities else np.zeros(len(self.options.joint))
+        self.host.run_until(self.host.t_ns + round(seconds * 1e9))
+
+    def run(self) -> None:
+        """Cycle, enabled."""
+        self.host.begin_cycle()
+        self.cycle(0.02)
+        self.master.request_enable(self.host.t_ns)
+        self.cycle(0.2)
+        assert self.master.mode is Mode.RUNNING, self.master.fault
+
+    def reset(self) -> None:
+        self.host.end_cycle()
+        try:
+            self.bringup.reset(self.host)
+        except DriverError:
+            self.host.resume_cycle()
+            raise
+        self.host.begin_cycle()
+        self.cycle(0.05)
+
+    def events(self, kind: str) -> list[int]:
+        return [event.node for event in self.rack.events if event.kind == kind]
+
+
+def make_joint(number: int, **changes: object) -> CanJoint:
+    values: dict[str, object] = {
+        "name": f"j{number}", "node_id": number, "counts_per_rev": COUNTS, "gear_ratio": GEAR,
+        "max_velocity": 1.0, "max_acceleration": 4.0, "quick_stop_deceleration": 10.0, "position_min": -3.0,
+        "position_max": 3.0,
+    }  # fmt: skip
+    return CanJoint(**(values | changes))  # type: ignore[arg-type]
+
+
+def make_options(*joints: CanJoint, **changes: object) -> CanOptions:
+    given = joints or tuple(make_joint(number) for number in (1, 2, 3))
+    return CanOptions(interface="virtual", channel="test", joint=given, **changes)  # type: ignore[arg-type]
+
+
+Make = Callable[..., Bench]
+
+
+@pytest.fixture
+def make_bench(tmp_path: Path) -> Make:
+    """``make_bench(options, on_bus=options of what is really there)``."""
+
+    def make(options: CanOptions | None = None, on_bus: CanOptions | None = None) -> Bench:
+        options = options or make_options()
+        settings = DrivesSettings(plant="ideal", bit_time=True, brake_ms=5.0, eds=str(SHIPPED_EDS))
+        rack = make_rack(on_bus or options, settings, t_ns=0)
+        rack.run_until(10_000_000)
+        return Bench(options, rack, tmp_path)
+
+    return make
+
+
+@pytest.fixture
+def bench(make_bench: Make) -> Bench:
+    """Three drives."""
+    return make_bench()
+
+
+# -- configuration ----------------------------------------------------------------------------------------------
+
+
+def test_drives_are_configured_as_the_options_say(bench: Bench) -> None:
+    start_ns = bench.rack.t_ns
+    bench.connect()
+    assert bench.rack.t_ns - start_ns < 500_000_000
+    for node in (1, 2, 3):
+        expected = {
+            (0x1005, 0): 0x80,
+            (0x1016, 1): 127 << 16 | 100,
+            (0x1017, 0): 20,
+            (0x6007, 0): 3,
+            (0x605A, 0): 2,
+            (0x605E, 0): 2,
+            (0x6061, 0): 9,
+            (0x607F, 0): round(COUNTS_PER_RAD),
+            (0x6080, 0): round(COUNTS_PER_RAD),
+            (0x6083, 0): round(4 * COUNTS_PER_RAD),
+            (0x6084, 0): round(4 * COUNTS_PER_RAD),
+            (0x6085, 0): round(10 * COUNTS_PER_RAD),
+            (0x1400, 2): 255,
+            (0x1400, 5): 20,
+            (0x1600, 0): 2,
+            (0x1600, 1): 0x60400010,
+            (0x1600, 2): 0x60FF0020,
+            (0x1800, 2): 1,
+            (0x1A00, 0): 2,
+            (0x1A00, 1): 0x60410010,
+            (0x1A00, 2): 0x60640020,
+            (0x1801, 2): 1,
+            (0x1A01, 0): 2,
+            (0x1A01, 1): 0x606C0020,
+            (0x1A01, 2): 0x60770010,
+        }
+        assert {key: bench.object(node, *key) for key in expected} == expected
+        for index, cob_id in ((0x1400, 0x200), (0x1800, 0x180), (0x1801, 0x280)):
+            assert bench.object(node, index, 1) & 0x800007FF == cob_id + node
+        for index in (0x1401, 0x1402, 0x1403, 0x1802, 0x1803):
+            assert bench.object(node, index, 1) >> 31 == 1, f"0x{index:04X} is not off"
+        assert bench.node(node).nmt == 5
+    assert bench.codec.status_words() == ("switch on disabled",) * 3
+    assert bench.codec.faults() == ()
+    assert bench.events("power_on") == []
+    assert bench.bringup.identities[2].serial_number == 2
+
+
+def test_all_feedback_takes_a_third_pdo(make_bench: Make) -> None:
+    bench = make_bench(make_options(feedback=("velocity", "effort", "following_error"), mode="pv"))
+    bench.connect()
+    assert bench.object(1, 0x1A02, 1) == 0x60F40020
+    assert bench.object(1, 0x1802, 1) & 0x800007FF == 0x381
+    assert bench.object(1, 0x6061) == 3
+    bench.run()
+    bench.cycle(0.2, 0.1, -0.2, 0.3)
+    sample = bench.master.sample()
+    assert sample is not None
+    assert sample.following_errors is not None
+    assert sample.velocities == pytest.approx([0.1, -0.2, 0.3], abs=2 / COUNTS_PER_RAD)
+
+
+def test_further_writes_are_made_and_replace_the_driver_s_own(make_bench: Make) -> None:
+    joint = make_joint(1, sdo={"0x60C2:1": 4, "0x6080": 123_456, "0x607D:1": -200_000})
+    bench = make_bench(make_options(joint))
+    bench.connect()
+    assert bench.object(1, 0x60C2, 1) == 4
+    assert bench.object(1, 0x6080) == 123_456
+    assert bench.object(1, 0x607D, 1) == -200_000
+
+
+def test_connecting_twice_gives_the_same(bench: Bench) -> None:
+    bench.connect()
+    communication = [key for key in bench.node(2).dictionary.entries if 0x1005 <= key[0] < 0x2000]
+    keys = [key for key in communication if not 0x1008 <= key[0] <= 0x1011]
+    before = {key: bench.object(2, *key) for key in keys}
+    bench.run()
+    bench.cycle(0.1)
+    bench.plug_in(bench.options)
+    bench.connect()
+    assert {key: bench.object(2, *key) for key in keys} == before
+    bench.run()
+
+
+@pytest.mark.parametrize("quick_stop_option", [2, 6])
+def test_a_drive_that_was_left_moving_is_brought_to_rest_and_switched_off(
+    make_bench: Make, quick_stop_option: int
+) -> None:
+    # no reaction of the drive's own to the lost master: all of it is the bring-up's
+    joint = make_joint(1)
+    bench = make_bench(make_options(joint, quick_stop_option=quick_stop_option))
+    bench.connect()
+    bench.run()
+    bench.cycle(0.5, 0.5)
+    node = bench.node(1)
+    for key in ((0x1016, 1), (0x1400, 5), (0x6007, 0)):
+        node.dictionary.set(*key, 0)
+    assert node.axis.velocity == pytest.approx(0.5, abs=1e-3)
+    bench.plug_in(bench.options)
+    bench.connect()
+    assert node.axis.velocity == 0.0
+    assert not node.axis.powered
+    assert bench.codec.status_words()[0].startswith("switch on disabled")
+    # it came to rest on its ramp and was switched off then
+    ends = [event.kind for event in bench.rack.events if event.kind in ("rest", "power_off")]
+    assert ends[-2:] == ["rest", "power_off"]
+
+
+# -- refusals ---------------------------------------------------------------------------------------------------
+
+
+def test_a_missing_node_is_named_with_those_that_answer(make_bench: Make) -> None:
+    on_bus = make_options(make_joint(1), make_joint(2), make_joint(9))
+    bench = make_bench(make_options(), on_bus)
+    message = bench.refused("node_missing")
+    assert "node 3 (j3)" in message
+    assert "1, 2, 9" in message
+
+
+def test_a_silent_bus_points_at_bitrate_and_wiring(bench: Bench) -> None:
+    bench.order("cable out")
+    message = bench.refused("node_missing")
+    assert all(word in message for word in ("no node answers", "bitrate", "termination", "node 1 (j1)"))
+
+
+def test_two_nodes_of_one_id_are_refused(bench: Bench) -> None:
+    bench.order("duplicate 2")
+    message = bench.refused("duplicate_node")
+    assert "node 2 (j2)" in message
+    assert bench.events("power_on") == []
+
+
+def test_a_device_that_is_no_drive_is_refused(bench: Bench) -> None:
+    bench.node(3).dictionary.set(0x1000, 0, 0x00030191)  # CiA 401, an I/O module
+    message = bench.refused("not_a_drive")
+    assert "profile 401" in message
+    assert "node_id" in message
+
+
+@pytest.mark.parametrize("key", ["vendor_id", "product_code", "revision", "serial_number"])
+def test_another_identity_is_refused(make_bench: Make, key: str) -> None:
+    joints = [make_joint(1), make_joint(2, **{key: 0x1234})]
+    message = make_bench(make_options(*joints), make_options(make_joint(1), make_joint(2))).refused(
+        "identity"
+    )
+    assert key in message
+    assert "4660 (0x1234)" in message
+    make_bench(make_options(*joints)).connect()
+
+
+def test_an_eds_of_another_drive_is_refused(make_bench: Make, tmp_path: Path) -> None:
+    text = SHIPPED_EDS.read_text().replace("VendorNumber=0x53455256", "VendorNumber=0x000000FB")
+    (tmp_path / "other.eds").write_text(text)
+    message = make_bench(make_options(eds="other.eds")).refused("wrong_eds")
+    assert "other.eds is for vendor 0xFB" in message
+    assert "0x53455256" in message
+
+
+def test_an_eds_without_what_is_needed_is_refused(make_bench: Make, tmp_path: Path) -> None:
+    text = SHIPPED_EDS.read_text().replace("[6085]", "[2085]").replace("=0x6085", "=0x2085")
+    (tmp_path / "poor.eds").write_text(text)
+    message = make_bench(make_options(eds="poor.eds")).refused("wrong_eds")
+    assert "0x6085:0" in message
+    assert "quick_stop_deceleration" in message
+
+
+@pytest.mark.filterwarnings("ignore:The 'warn' method:DeprecationWarning")  # canopen's
+@pytest.mark.parametrize(
+    "text", ["", "no section", "[DeviceInfo]\nVendorNumber=1\n", "[6040]\nObjectType=9\n"]
+)
+def test_a_file_that_is_no_eds_is_refused(make_bench: Make, tmp_path: Path, text: str) -> None:
+    (tmp_path / "bad.eds").write_text(text)
+    assert "bad.eds" in make_bench(make_options(eds="bad.eds")).refused("eds")
+
+
+def test_an_eds_that_is_not_there_is_refused_before_anything_is_connected(make_bench: Make) -> None:
+    with pytest.raises(DriverError, match=re.escape("there is no file")) as refusal:
+        make_bench(make_options(eds="nowhere.eds"))
+    assert refusal.value.code == "eds"
+    make_bench(make_options(eds="drive402.eds")).connect()
+
+
+def test_a_drive_without_the_mode_is_refused(bench: Bench) -> None:
+    bench.node(1).dictionary.set(0x6502, 0, 1 << 2)
+    message = bench.refused("mode")
+    assert "mode 9 (csv)" in message
+    assert "set mode to pv" in message
+
+
+def test_sdo_aborts_name_node_object_value_and_option(make_bench: Make) -> None:
+    message = make_bench(make_options(make_joint(1, sdo={"0x1018:1": 5}))).refused("sdo_abort")
+    for part in ("node 1 (j1)", "0x1018:1 (Identity object: Vendor-ID) = 5", "[option sdo]", "0x06010002"):
+        assert part in message, message
+
+
+@pytest.mark.parametrize(
+    ("sdo", "code", "part"),
+    [
+        ({"0x2000:1": 5}, "wrong_eds", "0x2000:1"),
+        ({"0x60C2:1": 256}, "option", "0 to 255"),
+        ({"0x6007": 7}, "option", "0 to 3"),
+        ({"60C2-1": 1}, "option", "0x60C2:1"),
+        ({"0x60C2:300": 1}, "option", "0x60C2:1"),
+    ],
+)
+def test_bad_further_writes_are_refused(make_bench: Make, sdo: dict[str, int], code: str, part: str) -> None:
+    assert part in make_bench(make_options(make_joint(1, sdo=sdo))).refused(code)
+
+
+def test_a_value_that_the_drive_changes_is_refused(bench: Bench) -> None:
+    dictionary = bench.node(2).dictionary
+    dictionary.changed(0x6085, lambda subindex, value: dictionary.set(0x6085, 0, value // 2))
+    message = bench.refused("read_back")
+    assert f"reads {round(10 * COUNTS_PER_RAD) // 2}" in message
+    assert "set quick_stop_deceleration" in message
+
+
+def test_a_mapping_that_the_drive_changes_is_refused(bench: Bench) -> None:
+    dictionary = bench.node(2).dictionary
+    dictionary.changed(0x1801, lambda subindex, value: dictionary.set(0x1A01, 1, 0x60770010))
+    assert "0x1A01:1" in bench.refused("read_back")
+
+
+def test_an_answer_that_does_not_come_is_told_with_its_object(bench: Bench) -> None:
+    bench.host.swallow = (0x6085, 0)
+    message = bench.refused("sdo_timeout")
+    assert "0x6085:0 (Quick stop deceleration)" in message
+    assert "powered" in message
+
+
+# -- faults -----------------------------------------------------------------------------------------------------
+
+
+def test_a_fault_at_the_start_is_reported_and_not_cleared(bench: Bench) -> None:
+    bench.order("fault 2 0x3210")
+    bench.connect()
+    (fault,) = bench.codec.faults()
+    assert (fault.code, fault.axis) == ("drive_fault", 1)
+    assert "0x3210 DC link over-voltage" in fault.message
+    bench.host.begin_cycle()
+    bench.master.request_enable(bench.host.t_ns)
+    bench.cycle(0.3)
+    assert bench.master.mode is Mode.LATCHED
+    assert bench.events("power_on") == []
+    bench.reset()
+    assert bench.master.fault is None
+    assert bench.codec.status_words() == ("switch on disabled",) * 3
+    bench.run()
+
+
+def test_a_fault_whose_cause_stays_is_not_reset(bench: Bench) -> None:
+    bench.connect()
+    bench.run()
+    bench.order("sticky 2 0x7305")
+    bench.cycle(0.3, 0.1, 0.1, 0.1)
+    assert bench.master.mode is Mode.LATCHED
+    powered = len(bench.events("power_on"))
+    for _ in range(2):
+        with pytest.raises(DriverError) as refusal:
+            bench.reset()
+        assert refusal.value.code == "fault_stays"
+        assert "node 2 (j2)" in str(refusal.value)
+        assert "0x7305 incremental encoder" in str(refusal.value)
+        seen = bench.master.statistics.complete
+        bench.cycle(0.1)
+        assert bench.master.mode is Mode.LATCHED
+        assert bench.master.statistics.complete >= seen + 20  # positions are still seen
+    bench.order("sticky 2 off")
+    bench.reset()
+    assert bench.master.fault is None
+    assert len(bench.events("power_on")) == powered
+    bench.run()
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+@pytest.mark.parametrize("abort_option", [1, 3])
+def test_reset_after_a_lost_heartbeat(make_bench: Make, abort_option: int, stubborn: bool) -> None:
+    """``stubborn``: the drives refuse a fault reset until NMT reset communication (EPOS4)."""
+    bench = make_bench(make_options(abort_option=abort_option, rpdo_deadline_ms=0))
+    for node in (1, 2, 3):
+        object.__setattr__(bench.node(node).settings, "reset_needs_communication_reset", stubborn)
+    bench.connect()
+    bench.run()
+    bench.host.cycling = False
+    bench.cycle(0.3)
+    assert bench.rack.at_rest()
+    bench.host.cycling = True
+    bench.cycle(0.05)
+    assert bench.master.mode is Mode.LATCHED
+    powered = len(bench.events("power_on"))
+    bench.reset()
+    assert bench.master.fault is None, bench.master.fault
+    assert bench.codec.at_rest_unpowered()
+    assert len(bench.events("power_on")) == powered
+    bench.run()
+    bench.cycle(0.3, 0.1, 0.1, 0.1)
+    assert bench.master.mode is Mode.RUNNING
+
+
+@pytest.mark.parametrize(
+    "fault", ["reboot 2", "remap 2", "fault 2 0x8611", "nmt stop", "nmt preop", "nmt reset"]
+)
+def test_reset_configures_anew_whatever_has_happened(bench: Bench, fault: str) -> None:
+    bench.connect()
+    bench.run()
+    bench.order(fault)
+    bench.cycle(0.3, 0.1, 0.1, 0.1)
+    assert bench.master.mode is Mode.LATCHED
+    bench.reset()
+    assert bench.master.fault is None, bench.master.fault
+    bench.run()
+    bench.cycle(0.2, 0.1, 0.1, 0.1)
+    assert bench.master.mode is Mode.RUNNING, bench.master.fault
+
+
+def test_reset_refuses_a_node_that_is_gone_and_one_that_is_there_twice(bench: Bench) -> None:
+    bench.connect()
+    bench.run()
+    for order, undo, code in (
+        ("silence 2", "speak 2", "node_missing"),
+        ("duplicate 2", "duplicate 2 off", "duplicate_node"),
+    ):
+        bench.order(order)
+        bench.cycle(0.3)
+        assert bench.master.mode is Mode.LATCHED
+        with pytest.raises(DriverError) as refusal:
+            bench.reset()
+        assert refusal.value.code == code
+        bench.order(undo)
+        bench.reset()
+        assert bench.master.fault is None, bench.master.fault
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_limit_switch_at_the_start_lets_the_joint_go_inward_only(
+    make_bench: Make, direction: int, side: int
+) -> None:
+    bench = make_bench(make_options(make_joint(1, direction=direction)))
+    bench.node(1).axis.limit_switch = side
+    bench.connect()
+    assert bench.codec.faults() == ()
+    assert "internal limit" in bench.codec.status_words()[0]
+    bench.run()
+    bench.cycle(0.1, -0.2 * side)
+    assert bench.master.mode is Mode.RUNNING, bench.master.fault
+    bench.cycle(0.1, 0.2 * side)
+    assert bench.master.fault is not None
+    assert bench.master.fault.code == "limit_switch"
+
+
+# -- release ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("abort_option", [1, 2, 3])
+def test_released_drives_do_not_miss_the_master(make_bench: Make, abort_option: int) -> None:
+    bench = make_bench(make_options(abort_option=abort_option))
+    bench.connect()
+    bench.run()
+    bench.master.request_disable()
+    bench.cycle(0.3)
+    assert bench.codec.at_rest_unpowered()
+    bench.host.end_cycle()
+    bench.bringup.release(bench.host)
+    bench.host.cycling = False
+    bench.rack.run_until(bench.rack.t_ns + 2_000_000_000)
+    for node in (1, 2, 3):
+        assert bench.node(node).emergencies.active == []
+        assert "switch on disabled" in bench.node(node).state()
+    bench.plug_in(bench.options)
+    bench.connect()
+    assert bench.codec.faults() == ()
+    bench.run()
+
+
+def test_release_tells_once_of_all_drives_that_are_gone(bench: Bench) -> None:
+    bench.connect()
+    bench.order("silence 1")
+    bench.order("silence 3")
+    with pytest.raises(DriverError, match=re.escape("2 of 3 drives")) as refusal:
+        bench.bringup.release(bench.host)
+    assert refusal.value.code == "not_released"
+    assert bench.object(2, 0x1016, 1) == 0
