@@ -26,7 +26,7 @@ class Bench:
             "max_acceleration": 4.0, "quick_stop_deceleration": 10.0, "position_min": -3.0, "position_max": 3.0,
         } | (joint or {})  # fmt: skip
         self.joint = CanJoint(**options)
-        self.axis = Axis(JointSpec("a", "revolute", -3.0, 3.0, 1.0, 4.0), position)
+        self.axis = Axis(JointSpec("a", "revolute", -3.0, 3.0, 1.0, 4.0), position, set_position=position)
         self.node = Cia402Node(node_id, self.axis, self.joint, eds=EDS, settings=NodeSettings(**settings))
         self.id = node_id
         self.t = 0
@@ -84,21 +84,30 @@ class Bench:
     def sync(self):
         return self.send(0x80)
 
+    def trip(self, code, **kind):
+        """An ordered fault; gives the frames it makes."""
+        self.node.trip(code, self.t, **kind)
+        return self._collect()
+
+    def sdo(self, command, index, sub, data=bytes(4)):
+        """The answer to one request."""
+        answers = self.send(0x600 + self.id, *struct.pack("<BHB4s", command, index, sub, data))
+        (answer,) = (f for f in answers if f.id == 0x580 + self.id)
+        return answer.data
+
     def write(self, index, sub, value, size):
         """By SDO; the abort code, 0 where it was taken."""
-        data = value.to_bytes(size, "little", signed=value < 0).ljust(4, b"\0")
-        (answer,) = (f for f in self.send(0x600 + self.id, *struct.pack("<BHB4s", 0x23 | (4 - size) << 2, index, sub, data))
-                     if f.id == 0x580 + self.id)  # fmt: skip
-        return struct.unpack_from("<L", answer.data, 4)[0] if answer.data[0] == 0x80 else 0
+        data = value.to_bytes(size, "little", signed=value < 0)
+        answer = self.sdo(0x23 | (4 - size) << 2, index, sub, data)
+        return struct.unpack_from("<L", answer, 4)[0] if answer[0] == 0x80 else 0
 
     def read(self, index, sub=0, *, signed=False):
-        """By SDO, up to four bytes."""
-        (answer,) = (f for f in self.send(0x600 + self.id, *struct.pack("<BHBL", 0x40, index, sub, 0))
-                     if f.id == 0x580 + self.id)  # fmt: skip
-        if answer.data[0] == 0x80:
-            raise LookupError(hex(struct.unpack_from("<L", answer.data, 4)[0]))
-        size = 4 - (answer.data[0] >> 2 & 3)
-        return int.from_bytes(answer.data[4 : 4 + size], "little", signed=signed)
+        """By SDO, up to four bytes. Raises LookupError with the abort code."""
+        answer = self.sdo(0x40, index, sub)
+        if answer[0] == 0x80:
+            raise LookupError(hex(struct.unpack_from("<L", answer, 4)[0]))
+        size = 4 - (answer[0] >> 2 & 3)
+        return int.from_bytes(answer[4 : 4 + size], "little", signed=signed)
 
     def quiet_pdos(self):
         """All PDOs but RPDO 1 off."""
@@ -153,3 +162,9 @@ def bench():
 @pytest.fixture
 def eds():
     return EDS
+
+
+@pytest.fixture(scope="session")
+def make_bench_of_fuzz():
+    """For hypothesis, which takes no fixtures of function scope."""
+    return Bench
