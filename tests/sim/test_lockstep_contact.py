@@ -111,7 +111,7 @@ def test_learnt_following_errors_stop_a_blocked_arm_and_let_it_go_back(
         at = float(cell.status.positions[0])
         assert cell.submit(Jog({"j1": -0.1}, 1.0)).accepted
         cell.run_for(1.2)
-        assert float(cell.status.positions[0]) < at - 0.08
+        assert float(cell.status.positions[0]) < at - 0.05  # the way less what the set-point ran ahead
         assert codes(cell) == []
         assert cell.submit(Jog({"j1": 0.3}, 1.0)).accepted
         cell.wait_for(lambda e: e.kind == "stopped", 2.0, cell.events[-1].seq)
