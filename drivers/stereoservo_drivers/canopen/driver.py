@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from stereoservo.runtime.ports import (
     CommandReport,
     DriverContext,
     DriverError,
+    Finding,
     FloatArray,
     JointDriverDescription,
     JointSpec,
@@ -110,8 +111,9 @@ class CanJointDriver:
         try:
             self._bringup.connect(self.bus)
             self._begin_cycle(self.bus)
-        except DriverError:
+        except DriverError as error:
             self._release()
+            self.master.latch(MasterFault(error.code, str(error), hint="reset connects again"))
             raise
 
     def _begin_cycle(self, bus: BusThread) -> None:
@@ -226,6 +228,13 @@ class CanJointDriver:
         if self.bus is not None:
             self.bus.end()
             self.bus = None
+
+    def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+        """What `stereoservo doctor` wants to know of bus and drives; closes the driver."""
+        from stereoservo_drivers.canopen.examination import examine  # for this one command
+
+        self._life.require("examine()", State.CREATED)
+        return examine(self, self._context.cell_dir, may_move)
 
     # -- the cycle of the caller ----------------------------------------------------------------------------
 

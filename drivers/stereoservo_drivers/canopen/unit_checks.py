@@ -49,20 +49,6 @@ def position_finding(joint: CanJoint, position: float) -> Finding:
     return Finding(name, False, message, cure)
 
 
-def limits_finding(joint: CanJoint) -> Finding | None:
-    """Limits that look like degrees, None where they do not."""
-    widest = max(abs(joint.position_min), abs(joint.position_max))
-    if joint.kind != "revolute" or joint.multi_turn or widest <= 4.0 * math.pi:
-        return None
-    return Finding(
-        f"{joint.name} limits",
-        False,
-        f"{joint.position_min:g} to {joint.position_max:g} rad are {widest / (2 * math.pi):.1f} turns",
-        f"in radians {math.radians(joint.position_min):.4f} and {math.radians(joint.position_max):.4f}; "
-        "multi_turn = true where the joint really turns so far",
-    )
-
-
 def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
     """Positions (k,) of a joint that should stand still."""
     name, unit = f"{joint.name} at rest", _unit(joint)

@@ -37,7 +37,7 @@ from stereoservo.runtime.interprocess import (
     load_plan,
 )
 from stereoservo.runtime.lifeline import Termination, say
-from stereoservo.runtime.locks import FileLock
+from stereoservo.runtime.locks import FileLock, holder
 from stereoservo.runtime.vision import Reporter
 
 READY_TIMEOUT_S = 60.0
@@ -225,11 +225,14 @@ def prepare(
 
 
 def clean(directories: CellDirectories) -> None:
-    """Remove what a run leaves in the runtime directory; the lock files stay."""
+    """Remove what a run leaves in the runtime directory; the lock files stay, and what another process (an emulator)
+    holds by a lock ``NAME.lock`` beside it.
+    """
     if not directories.runtime.is_dir():
         return
     for path in directories.runtime.iterdir():
-        if path.suffix != ".lock" and not path.is_dir():
+        held = holder(path.with_name(f"{path.name}.lock")) is not None
+        if path.suffix != ".lock" and not path.is_dir() and not held:
             path.unlink(missing_ok=True)
 
 

@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo.runtime.lifeline import Termination, die_with_parent
 
 PRIORITY = 5
@@ -82,22 +82,34 @@ def _cell_path(cell: str) -> Path:
 
 def _drives(settings: _Settings, termination: Termination) -> None:
     from stereoservo.runtime.directories import cell_directories, create_directories
+    from stereoservo.runtime.locks import FileLock
+    from stereoservo_sim.history import FILE_NAME
+
+    path = _cell_path(settings.cell)
+    cell = load_cell_file(path)
+    directories = cell_directories(cell.cell.name)
+    create_directories(directories)
+    # As long as it is held, a daemon that cleans this directory up leaves the truth alone.
+    lock = directories.runtime / f"{FILE_NAME}.lock"
+    with FileLock(lock, f"the emulated arm of cell {cell.cell.name!r}"):
+        _serve(path, cell, directories.runtime, settings, termination)
+
+
+def _serve(
+    path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination
+) -> None:
     from stereoservo_sim.drives.building import drives_of_cell, make_rack
     from stereoservo_sim.drives.console import Console, Printer
     from stereoservo_sim.drives.faults import OrderError
     from stereoservo_sim.drives.serving import RackServer, open_endpoint, served_channel
 
-    path = _cell_path(settings.cell)
-    cell = load_cell_file(path)
     options, drives = drives_of_cell(cell)
     if settings.bit_time is not None:
         drives = msgspec.structs.replace(drives, bit_time=settings.bit_time)
-    directories = cell_directories(cell.cell.name)
-    create_directories(directories)
     endpoint = open_endpoint(settings.channel or served_channel(options), options.bitrate)
     try:
         rack = make_rack(
-            options, drives, t_ns=time.monotonic_ns(), runtime_dir=directories.runtime, cell_dir=path.parent
+            options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent
         )
     except BaseException:
         endpoint.close()

@@ -19,11 +19,12 @@ from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo.runtime.daemon import DaemonProcess
 from stereoservo.runtime.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.runtime.lockstep import LockstepCell
-from stereoservo_sim.demonstration.emulated import HOST, free_port, has_emulated_drives, move_to_channel
+from stereoservo_sim.demonstration.emulated import ANY_PORT, has_emulated_drives, move_to_channel
 from stereoservo_sim.demonstration.live import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import Calibrated, perform
 from stereoservo_sim.demonstration.truth import TruthLog
+from stereoservo_sim.drives.emulator import EmulatorProcess
 from stereoservo_sim.history import JointHistory
 from stereoservo_sim.world import goals_of
 
@@ -135,11 +136,7 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
 
 def _emulate_drives(ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: Stage) -> Path:
     """Start the cell's emulated drives on a free port, to end with ``ends``; the cell file that speaks to them."""
-    from stereoservo_sim.drives.emulator import EmulatorProcess
-
-    channel = f"socket://{HOST}:{free_port()}"
-    stage.tell(f"starting emulated drives on {channel}")
-    moved = move_to_channel(cell_path, scratch, channel)
-    emulator = ends.enter_context(EmulatorProcess(moved, log=out / "drives.log"))
-    emulator.wait_ready()
-    return moved
+    drives = EmulatorProcess(cell_path, options=("--channel", ANY_PORT), log=out / "drives.log")
+    channel = ends.enter_context(drives).wait_ready()
+    stage.tell(f"emulated drives on {channel}")
+    return move_to_channel(cell_path, scratch, channel)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import tomllib
 from pathlib import Path
 
@@ -11,19 +10,13 @@ from stereoservo.runtime.cellfile import CellFile
 
 SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)
-HOST = "127.0.0.1"
+ANY_PORT = "socket://127.0.0.1:0"
+"""For an emulator: any free port of this host; it tells which."""
 
 
 def has_emulated_drives(cell: CellFile) -> bool:
     """Whether the cell file says what to put in the place of its drives."""
     return "drives" in cell.emulate
-
-
-def free_port() -> int:
-    """A TCP port of this host that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
 
 
 def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:

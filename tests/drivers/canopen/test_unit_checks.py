@@ -15,7 +15,6 @@ from stereoservo_drivers.canopen.unit_checks import (
     JogTrace,
     jog_finding,
     jog_velocity,
-    limits_finding,
     noise_finding,
     position_finding,
     resolution_finding,
@@ -117,16 +116,6 @@ def test_positions_outside_the_limits_name_the_offset_that_would_call_them_zero(
     assert "0.25 rad outside" in finding.message
     assert "offset_rad = 2.75" in finding.cure
     assert "counts_per_rev" in position_finding(JOINT, 40.0).cure
-
-
-def test_limits_in_degrees_are_recognised() -> None:
-    assert limits_finding(JOINT) is None
-    degrees = msgspec.structs.replace(JOINT, position_min=-160.0, position_max=160.0)
-    finding = limits_finding(degrees)
-    assert finding is not None
-    assert finding.ok is False
-    assert "-2.7925 and 2.7925" in finding.cure
-    assert limits_finding(msgspec.structs.replace(degrees, multi_turn=True)) is None
 
 
 def test_encoders_at_rest() -> None:

@@ -1,0 +1,301 @@
+"""What ``stereoservo doctor`` learns from a CAN arm: the bus, the drives, their cycle, their units."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stereoservo.runtime.ports import DriverError, Finding, FloatArray
+from stereoservo_drivers.can.channel import Channel
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.bus_thread import BusThread
+from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
+from stereoservo_drivers.canopen.node_checks import examine_nodes
+from stereoservo_drivers.canopen.option_checks import bus_load
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.unit_checks import (
+    JOG,
+    JogTrace,
+    jog_finding,
+    jog_velocity,
+    noise_finding,
+    position_finding,
+    resolution_finding,
+)
+
+if TYPE_CHECKING:
+    from stereoservo_drivers.canopen.driver import CanJointDriver
+
+LISTEN_S = 0.3
+WATCH_S = 1.0
+SETTLE_S = 0.4
+MISSED_SHARE = 0.01
+LATE_SHARE = 0.5
+HEARTBEAT_SHARE = 0.6
+MayMove = Callable[[str], bool]
+
+
+def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterator[Finding]:
+    """Findings, in the order in which an integrator would ask; ends early where nothing further can be known."""
+    options = driver.options
+    yield load_finding(options)
+    try:
+        try:
+            channel = Channel(options)
+        except DriverError as error:
+            yield Finding("bus", False, str(error))
+            return
+        yield Finding("bus", True, f"{channel.name} is open at {options.bitrate} bit/s")
+        yield from _look(driver, channel, cell_dir)
+        yield from _run(driver, may_move)
+    except DriverError as error:
+        yield Finding("drives", False, str(error))
+    finally:
+        driver.close()
+
+
+def load_finding(options: CanOptions) -> Finding:
+    """The bus load of the cell file's cycle, which the driver has found to be allowed."""
+    load = bus_load(options)
+    return Finding(
+        "bus load",
+        True,
+        f"{load.share:.0%} in the worst case of bit stuffing, limit {options.max_bus_load:.0%} (max_bus_load); "
+        f"{len(options.joint)} joints at {options.rate_hz:g} Hz; this bus carries {load.max_rate_hz:.0f} Hz",
+    )
+
+
+def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[Finding]:
+    """Listen, then ask the drives. Ends the channel."""
+    try:
+        heard = _listen(channel)
+        errors = [error.message for _, error in channel.take_errors()]
+    except DriverError:
+        channel.close()
+        raise
+    yield traffic_finding(driver.options, heard)
+    if errors:
+        cure = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
+        yield Finding("bus errors", False, "; ".join(dict.fromkeys(errors)), cure)
+    bus = BusThread(channel, driver.master)
+    try:
+        if isinstance(driver.master.codec, Cia402Codec):
+            yield from examine_nodes(bus, driver.options, driver.master.codec, cell_dir)
+    finally:
+        bus.end()
+
+
+def _listen(channel: Channel) -> list[CanFrame]:
+    heard: list[CanFrame] = []
+    end = time.monotonic() + LISTEN_S
+    while time.monotonic() < end:
+        heard += [frame for _, frame in channel.receive(0.01)]
+    return heard
+
+
+def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> Finding:
+    """Whether somebody else commands this bus: frames (heard in ``LISTEN_S``) that only a master sends."""
+    ids = {frame.id for frame in heard if not frame.extended}
+    commands = {RPDO_IDS[0] + joint.node_id for joint in options.joint}
+    if options.protocol == "cia402" and ids & {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}:
+        foreign = ", ".join(
+            f"0x{i:X}" for i in sorted(ids & {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands})
+        )
+        return Finding(
+            "traffic", False, f"another master is on this bus: it sends {foreign}",
+            "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
+        )  # fmt: skip
+    return Finding("traffic", True, f"{len(heard)} frames in {LISTEN_S:g} s, none of another master")
+
+
+# -- in the cycle -----------------------------------------------------------------------------------------------
+
+
+def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[Finding]:
+    """Configure, watch the cycle, jog. Raises DriverError."""
+    driver.configure()
+    yield Finding("configuration", True, "every drive took its settings, and gave them back as written")
+    positions = yield from _watch(driver)
+    fault = driver.master.fault
+    if fault is not None:
+        yield Finding("fault", False, fault.message, fault.hint)
+    usable = []
+    for k, joint in enumerate(driver.options.joint):
+        yield resolution_finding(joint)
+        place = position_finding(joint, float(positions[-1, k]))
+        yield place
+        yield noise_finding(joint, positions[:, k])
+        usable.append(place.ok is True)
+    if fault is None:
+        yield from _jog_all(driver, usable, may_move)
+
+
+def _watch(driver: CanJointDriver) -> Iterator[Finding]:
+    """A second of cycles with the arm off; returns positions (k, n)."""
+    period_s = 1.0 / driver.options.rate_hz
+    before, skipped = driver.master.statistics, driver.bus.statistics.skipped if driver.bus else 0
+    first = (before.cycles, before.incomplete)
+    heartbeats: list[CanFrame] = []
+    cia402 = driver.options.protocol == "cia402"
+    ids = [HEARTBEAT_ID + joint.node_id for joint in driver.options.joint] if cia402 else []
+    positions, answered = [], []
+    assert driver.bus is not None  # configured
+    for can_id in ids:
+        driver.bus.subscribe(can_id, heartbeats)
+    for _ in range(round(WATCH_S / period_s)):
+        positions.append(_sample(driver))
+        answered.append(driver.master.statistics.answered_ns)
+        time.sleep(period_s)
+    for can_id in ids:
+        driver.bus.unsubscribe(can_id, heartbeats)
+    now = driver.master.statistics
+    cycles, missed = now.cycles - first[0], now.incomplete - first[1]
+    yield cycles_finding(cycles, missed, driver.bus.statistics.skipped - skipped)
+    yield latency_finding(np.array(answered) * 1e-9, period_s)
+    if cia402:
+        yield from heartbeat_findings(driver.options, heartbeats)
+    return np.array(positions)
+
+
+def _sample(driver: CanJointDriver) -> FloatArray:
+    """Positions now; of a latched fault, which is told once, the sample behind it."""
+    try:
+        return driver.read_state().positions
+    except DriverError:
+        return driver.read_state().positions
+
+
+def cycles_finding(cycles: int, missed: int, skipped: int) -> Finding:
+    """Cycles that lacked an answer, and slots that this computer missed itself."""
+    message = f"{cycles} cycles, {missed} without all answers, {skipped} skipped by this computer"
+    if missed == 0 and skipped <= MISSED_SHARE * cycles:
+        return Finding("cycle", True, message)
+    if skipped > MISSED_SHARE * cycles:
+        return Finding(
+            "cycle",
+            None,
+            message,
+            "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz",
+        )
+    cure = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
+    return Finding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, cure)
+
+
+def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
+    """From a poll to its last answer [s], (k,)."""
+    median, largest = float(np.median(answered_s)), float(np.max(answered_s))
+    message = (
+        f"SYNC to last answer {median * 1e3:.2f} ms median, {largest * 1e3:.2f} ms largest, of a cycle of "
+        f"{period_s * 1e3:g} ms"
+    )
+    if median <= LATE_SHARE * period_s:
+        return Finding("latency", True, message)
+    return Finding(
+        "latency", None, message, "a faster adapter (USB ones need 1 ms a transfer), or lower rate_hz"
+    )
+
+
+def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[Finding]:
+    """Those heard in ``WATCH_S``, against what was asked of the drives."""
+    expected = WATCH_S * 1e3 / options.heartbeat_ms
+    counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in heard) for joint in options.joint]
+    rare = [
+        (joint, count)
+        for joint, count in zip(options.joint, counts, strict=True)
+        if count < HEARTBEAT_SHARE * expected
+    ]
+    for joint, count in rare:
+        yield Finding(
+            f"node {joint.node_id} ({joint.name}) heartbeat",
+            False,
+            f"{count} in {WATCH_S:g} s, {expected:.0f} were asked for",
+            "does the drive keep 0x1017? Are frames lost (cable, terminators, adapter)?",
+        )
+    if not rare:
+        message = f"from every drive, {min(counts)} to {max(counts)} in {WATCH_S:g} s"
+        yield Finding("heartbeats", True, message)
+
+
+# -- jogs ---------------------------------------------------------------------------------------------------------
+
+
+def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> Iterator[Finding]:
+    for k, joint in enumerate(driver.options.joint):
+        name = f"{joint.name} jog"
+        if not usable[k]:
+            yield Finding(name, None, "not jogged: it stands outside its limits")
+            continue
+        middle = (joint.position_min + joint.position_max) / 2
+        sign = 1.0 if float(driver.read_state().positions[k]) <= middle else -1.0
+        if not may_move(_question(joint, sign)):
+            yield Finding(name, None, "not jogged: not allowed (--jog asks)")
+            continue
+        trace, error = _jog(driver, k, sign)
+        if error is None:
+            yield jog_finding(trace)
+            continue
+        cure = jog_finding(trace).cure if trace.asked else ""
+        yield Finding(name, False, str(error), cure)
+        return
+
+
+def _question(joint: CanJoint, sign: float) -> str:
+    way = (
+        f"{math.degrees(sign * JOG['revolute']):+.0f}°"
+        if joint.kind == "revolute"
+        else f"{sign * JOG['prismatic'] * 1e3:+.0f} mm"
+    )
+    return (
+        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {way}, slowly. Is its "
+        "surrounding clear and a hand on the emergency stop?"
+    )
+
+
+def _jog(driver: CanJointDriver, k: int, sign: float) -> tuple[JogTrace, DriverError | None]:
+    """Enable, move joint ``k``, wait until it stands, switch off; what ended it early, if anything did."""
+    joint = driver.options.joint[k]
+    trace = JogTrace(joint, float(driver.read_state().positions[k]))
+    try:
+        driver.activate()
+        _hold(driver, trace, k, SETTLE_S)  # released brakes let an arm sink a little: that is not the jog
+        trace = JogTrace(joint, float(driver.read_state().positions[k]))
+        _move(driver, trace, k, sign)
+        if not trace.runs_away():
+            _hold(driver, trace, k, SETTLE_S)
+    except DriverError as error:
+        return trace, error
+    finally:
+        driver.deactivate()
+    return trace, None
+
+
+def _move(driver: CanJointDriver, trace: JogTrace, k: int, sign: float) -> None:
+    start = time.monotonic()
+    while not trace.runs_away():
+        velocity = jog_velocity(trace.joint, time.monotonic() - start, sign)
+        if velocity is None:
+            return
+        _step(driver, trace, k, velocity)
+
+
+def _hold(driver: CanJointDriver, trace: JogTrace, k: int, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        _step(driver, trace, k, 0.0)
+
+
+def _step(driver: CanJointDriver, trace: JogTrace, k: int, velocity: float) -> None:
+    """Command for one period, then look."""
+    begun = time.monotonic()
+    command = np.zeros(len(driver.options.joint))
+    command[k] = velocity
+    driver.write_velocity(command)
+    time.sleep(1.0 / driver.options.rate_hz)
+    state = driver.read_state()
+    dt_s = time.monotonic() - begun
+    trace.add(velocity * dt_s, float(state.positions[k]), float(state.velocities[k]), dt_s)

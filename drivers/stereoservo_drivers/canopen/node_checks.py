@@ -1,0 +1,140 @@
+"""What ``doctor`` asks of CiA 402 drives before anything is configured: who answers, what they are, how they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from stereoservo.runtime.ports import DriverError, Finding
+from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.cia402 import Axis, Cia402Codec
+from stereoservo_drivers.canopen.cia402_configuration import MODES, eds_path, load_eds
+from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, ask
+from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+
+MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "homing", 7: "interpolated position",
+              8: "cyclic position", 9: "cyclic velocity", 10: "cyclic torque"}  # fmt: skip
+IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
+_WIRING = "is it powered, is its cable in, are its bit rate and its node id those of the cell file?"
+
+
+def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> Iterator[Finding]:
+    """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
+    answers = scan(link)
+    strangers = [node for node in answers if node not in {axis.node_id for axis in codec.axes}]
+    dictionary = load_eds(eds_path(options, cell_dir))
+    for axis in codec.axes:
+        count = answers.get(axis.node_id, 0)
+        if count != 1:
+            yield _not_one(axis, count, strangers)
+            continue
+        with RemoteDrive(link, axis, dictionary) as drive:
+            try:
+                yield _identity(drive, axis.joint)
+                yield _state(drive)
+                yield _modes(drive, options)
+            except DriverError as error:
+                yield Finding(_name(axis), False, str(error))
+    if strangers:
+        words = ", ".join(str(node) for node in strangers)
+        yield Finding("other nodes", None, f"{words} answer too, and no joint of the cell file has them")
+
+
+def scan(link: Link) -> dict[int, int]:
+    """Ask every node id for its device type; how many answers came from each that answered."""
+    answers = ask(link, list(ALL_NODES), 0x1000, 0)
+    return {node: len(frames) for node, frames in answers.items() if frames}
+
+
+def _name(axis: Axis) -> str:
+    return f"node {axis.node_id} ({axis.joint.name})"
+
+
+def _not_one(axis: Axis, count: int, strangers: list[int]) -> Finding:
+    if count > 1:
+        return Finding(
+            _name(axis), False, f"{count} drives answer as node {axis.node_id}",
+            "give each drive a node id of its own (switches on the drive, or its vendor's tool, one drive at a time)",
+        )  # fmt: skip
+    cure = _WIRING
+    if strangers:
+        cure += f" Nodes {', '.join(map(str, strangers))} answer, which no joint has: is it one of them?"
+    return Finding(_name(axis), False, "no answer", cure)
+
+
+def _identity(drive: RemoteDrive, joint: CanJoint) -> Finding:
+    name = _name(drive.axis)
+    device = drive.read(0x1000)
+    values = {what: drive.read_if_there(0x1018, k + 1) for k, what in enumerate(IDENTITY)}
+    told = ", ".join(
+        f"{what} {value:#x}" if value is not None else f"no {what}" for what, value in values.items()
+    )
+    message = f"answers once; device type {device:#010x}, {told}"
+    if device & 0xFFFF != CIA_402:
+        return Finding(
+            name, False, f"{message}: device profile {device & 0xFFFF} is not CiA 402",
+            "another device has this node id; or protocol of the cell file",
+        )  # fmt: skip
+    wrong = [
+        (what, value)
+        for what, value in values.items()
+        if getattr(joint, what) is not None and getattr(joint, what) != value
+    ]
+    if wrong:
+        asked = ", ".join(f"{what} is {getattr(joint, what):#x} in the cell file" for what, _ in wrong)
+        mended = ", ".join(f"{what} = {value:#x}" for what, value in wrong if value is not None)
+        return Finding(name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}")
+    return Finding(name, True, message)
+
+
+def _state(drive: RemoteDrive) -> Finding:
+    name = f"{_name(drive.axis)} state"
+    state = drive_state(drive.read(0x6041))
+    register = drive.read(0x1001)
+    past = _past_errors(drive)
+    said = [state.value]
+    volts = drive.read_if_there(0x6079)
+    if volts is not None:
+        said.append(f"supply {volts * 1e-3:.1f} V")
+    switches = drive.read_if_there(0x60FD) or 0
+    said += [
+        f"{what} limit switch active"
+        for bit, what in enumerate(("negative", "positive"))
+        if switches >> bit & 1
+    ]
+    said.append(f"error register {register:#04x}" if register else "no error")
+    if past:
+        said.append(f"history {', '.join(error_words(code) for code in past)}")
+    message = "; ".join(said)
+    if state in FAULTY or register:
+        code = drive.read_if_there(0x603F) or (past[0] if past else 0)
+        words = f" ({error_words(code)})" if code else ""
+        cure = error_hint(code) if code else "look its error up in the drive's manual"
+        return Finding(name, False, f"{message}{words}", f"{cure}; then `stereoservo reset` clears it")
+    return Finding(name, None if switches & 3 else True, message)
+
+
+def _past_errors(drive: RemoteDrive) -> list[int]:
+    """0x1003, newest first."""
+    count = drive.read_if_there(0x1003, 0) or 0
+    read = (drive.read_if_there(0x1003, k) for k in range(1, min(count, 4) + 1))
+    return [value & 0xFFFF for value in read if value]
+
+
+def _modes(drive: RemoteDrive, options: CanOptions) -> Finding:
+    name = f"{_name(drive.axis)} modes"
+    supported = drive.read_if_there(0x6502)
+    wanted = MODES[options.mode]
+    if supported is None:
+        return Finding(
+            name, None, f"0x6502 is not there: whether it has mode {wanted} shows when it is configured"
+        )
+    modes = [mode for mode in range(1, 33) if supported >> (mode - 1) & 1]
+    message = ", ".join(f"{mode} {MODE_NAMES.get(mode, '')}".strip() for mode in modes)
+    if wanted in modes:
+        return Finding(name, True, message)
+    other = [mode for mode, number in MODES.items() if number in modes]
+    cure = f'mode = "{other[0]}"' if other else "this drive has no velocity mode that this driver knows"
+    return Finding(name, False, f"mode {wanted} ({options.mode}) is not among {message or 'none'}", cure)
