@@ -256,8 +256,8 @@ class Master:
         cycle = self._cycle
         if not cycle.open:
             return True
-        self._monitors.frames.note(bit)
-        self._monitors.lateness.note(bit, now_ns - cycle.poll_ns)
+        self._monitors.frames.counts[bit] += 1
+        self._monitors.lateness.arrivals[bit] = now_ns - cycle.poll_ns
         before = cycle.received
         cycle.received |= 1 << bit
         if cycle.received == self.codec.expected and before != cycle.received:
@@ -327,9 +327,9 @@ class Master:
         for fault in self.codec.faults():
             self.latch(self._from_axis(fault, now_ns))
         for trip in (
+            monitors.flood.end_cycle(),  # before what a flood makes the drives miss
             monitors.frames.verdict(self._period_s),
             monitors.lateness.end_cycle(),
-            monitors.flood.end_cycle(),
             *self._watch_encoders(cycle_ns),
         ):
             if trip is not None:

@@ -6,6 +6,7 @@ Every monitor takes what a cycle brought and gives a :class:`Trip` or None. No c
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 
 import msgspec
 import numpy as np
@@ -19,15 +20,16 @@ LATE_BASELINE_WINDOWS = 4
 LATE_EVERY = 5
 LATE_SHARE = 0.25
 """Of the period: later than its own baseline by so much, compared with the other drives, a drive is late."""
-LATE_SHARE_ALL = 0.40
-"""The same where all drives are later than they were."""
+LATE_SHARE_SINGLE = 0.5
+"""The same of an only drive, which nothing can be compared with."""
 FLOOD_WINDOW = 5
 FLOOD_SHARE = 0.30
 FLOOD_FRAME_BITS = 111
 """A data frame of 8 bytes without stuffing (CiA 301, ISO 11898-1)."""
 JUMP_FACTOR = 3.0
 JUMP_COUNTS = 16.0
-REVERSED_WINDOW_S = 0.05
+REVERSED_EVERY_S = 0.02
+REVERSED_WINDOW_S = 0.06
 REVERSED_FOR_S = 0.1
 REVERSED_SHARE = 0.3
 REVERSED_COUNTS = 8.0
@@ -51,15 +53,14 @@ class FrameCounter:
     def __init__(self, names: tuple[str, ...], max_missed: int) -> None:
         self._names = names
         self._max_missed = max_missed
-        self._counts = [0] * len(names)
+        self.counts = [0] * len(names)
+        """Frames of the cycle under way, by bit, written by who receives."""
+        self._once = [1] * len(names)
+        self._clean = False
         self._misses = [0] * len(names)
         self._doubles = [0] * len(names)
         self.lost = 0
         self.doubled = 0
-
-    def note(self, bit: int) -> None:
-        """A frame came."""
-        self._counts[bit] += 1
 
     @property
     def within_allowed_misses(self) -> bool:
@@ -68,7 +69,12 @@ class FrameCounter:
 
     def end_cycle(self) -> None:
         """Close the books on a poll's cycle."""
-        for bit, count in enumerate(self._counts):
+        every_one_once = self.counts == self._once
+        if every_one_once and self._clean:
+            self.counts[:] = [0] * len(self.counts)
+            return
+        self._clean = every_one_once
+        for bit, count in enumerate(self.counts):
             if count == 1:
                 self._misses[bit] = self._doubles[bit] = 0
             elif count == 0:
@@ -79,10 +85,12 @@ class FrameCounter:
                 self._misses[bit] = 0
                 self._doubles[bit] += 1
                 self.doubled += count - 1
-            self._counts[bit] = 0
+            self.counts[bit] = 0
 
     def verdict(self, period_s: float) -> Trip | None:
         """After ``end_cycle``."""
+        if self._clean:
+            return None
         return self._missing(period_s) or self._duplicate()
 
     def _missing(self, period_s: float) -> Trip | None:
@@ -129,69 +137,59 @@ class LatenessMonitor:
 
     A drive that is late by more than a cycle answers as often as one in time: only its phase tells. Medians over
     ``LATE_WINDOW`` cycles; the baseline is the smallest of the first medians. What all axes have in common is the
-    host's or the bus's doing and is given more room.
+    host's or the bus's doing (a loaded computer, a buffering adapter) and no reason to stop: it is taken off.
     """
 
     def __init__(self, names: tuple[str, ...], bit_axis: tuple[int, ...], period_ns: int) -> None:
         self._names = names
         self._axes = np.array(bit_axis)
         self._period_ns = period_ns
+        self._limit_ns = period_ns * (LATE_SHARE if len(set(bit_axis)) > 1 else LATE_SHARE_SINGLE)
         self._arrivals = np.zeros((LATE_WINDOW, len(names)))
-        self._now = [0.0] * len(names)
+        self.arrivals = [0] * len(names)
+        """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one stands."""
         self._cycles = 0
         self._baseline = np.full(len(names), math.inf)
 
-    def note(self, bit: int, after_ns: int) -> None:
-        """The frame of ``bit`` came ``after_ns`` after its poll."""
-        self._now[bit] = float(after_ns)
-
     def end_cycle(self) -> Trip | None:
-        """Of a frame that did not come, the last arrival stands."""
-        self._arrivals[self._cycles % LATE_WINDOW] = self._now
+        """Judges every ``LATE_EVERY`` cycles."""
+        self._arrivals[self._cycles % LATE_WINDOW] = self.arrivals
         self._cycles += 1
         if self._cycles < LATE_WINDOW or self._cycles % LATE_EVERY:
             return None
-        medians = np.median(self._arrivals, axis=0)
+        medians = np.partition(self._arrivals, LATE_WINDOW // 2, axis=0)[LATE_WINDOW // 2]
         if self._cycles <= LATE_BASELINE_WINDOWS * LATE_WINDOW:
             np.minimum(self._baseline, medians, out=self._baseline)
         return self._judge(medians - self._baseline)
 
     def _judge(self, excess: FloatArray) -> Trip | None:
-        worst = int(np.argmax(excess))
+        worst = int(excess.argmax())
+        if excess[worst] <= self._limit_ns:
+            return None
         others = excess[self._axes != self._axes[worst]]
-        common = float(max(np.min(others), 0.0)) if others.size else 0.0
-        alone = float(excess[worst]) - common
-        if alone > LATE_SHARE * self._period_ns:
-            return Trip(
-                "late",
-                f"{self._names[worst]} comes {excess[worst] * 1e-6:.2f} ms later after its poll than it used to "
-                f"(median of {LATE_WINDOW} cycles)",
-                excess[worst] * 1e-6,
-                LATE_SHARE * self._period_ns * 1e-6,
-                "the drive is overloaded, or its frames wait behind frames of higher priority",
-                bit=worst,
-            )
-        if common > LATE_SHARE_ALL * self._period_ns:
-            return Trip(
-                "late",
-                f"all drives' answers come {common * 1e-6:.2f} ms later than they used to "
-                f"(median of {LATE_WINDOW} cycles)",
-                common * 1e-6,
-                LATE_SHARE_ALL * self._period_ns * 1e-6,
-                "the adapter or the host buffers frames, or the bus is overloaded: lower rate_hz",
-            )
-        return None
+        alone = float(excess[worst]) - (max(float(others.min()), 0.0) if others.size else 0.0)
+        if alone <= self._limit_ns:
+            return None
+        return Trip(
+            "late",
+            f"{self._names[worst]} comes {alone * 1e-6:.2f} ms later after its poll than it used to, against the other "
+            f"drives (median of {LATE_WINDOW} cycles), limit {self._limit_ns * 1e-6:.2f} ms",
+            alone * 1e-6,
+            self._limit_ns * 1e-6,
+            "the drive is overloaded, or its frames wait behind others of higher priority",
+            bit=worst,
+        )
 
 
 class FloodMonitor:
-    """Frames that belong to no part of the cycle, as a share of the bus."""
+    """Frames that belong to no part of the cycle, as a share of the bus, over the last ``FLOOD_WINDOW`` cycles."""
 
     def __init__(self, bitrate: int, period_s: float) -> None:
         bits = FLOOD_SHARE * bitrate * period_s * FLOOD_WINDOW
         self._limit = max(math.ceil(bits / FLOOD_FRAME_BITS), 4 * FLOOD_WINDOW)
         self._window_s = FLOOD_WINDOW * period_s
         self._by_id: dict[int, int] = {}
-        self._cycles = 0
+        self._cycles: deque[dict[int, int]] = deque(maxlen=FLOOD_WINDOW)
         self.total = 0
 
     def note(self, can_id: int) -> None:
@@ -201,19 +199,20 @@ class FloodMonitor:
             self._by_id[can_id] = self._by_id.get(can_id, 0) + 1
 
     def end_cycle(self) -> Trip | None:
-        """Judges every ``FLOOD_WINDOW`` cycles."""
-        self._cycles += 1
-        if self._cycles % FLOOD_WINDOW:
-            return None
-        heard, self._by_id = self._by_id, {}
-        count = sum(heard.values())
+        """Judges every cycle: a flood that starves the drives' own frames is to be named before they are missed."""
+        self._cycles.append(self._by_id)
+        self._by_id = {}
+        count = sum(sum(heard.values()) for heard in self._cycles)
         if count <= self._limit:
             return None
-        loudest = max(heard, key=lambda can_id: heard[can_id])
+        heard: Counter[int] = Counter()
+        for cycle in self._cycles:
+            heard.update(cycle)
+        loudest, most = heard.most_common(1)[0]
         return Trip(
             "bus_flood",
-            f"{count} frames in {self._window_s * 1e3:.0f} ms that are not part of the cycle, limit {self._limit}; "
-            f"most of them ({heard[loudest]}) have the id 0x{loudest:X}",
+            f"{count} frames within {self._window_s * 1e3:.0f} ms that are not part of the cycle, limit "
+            f"{self._limit}; most of them ({most}) have the id 0x{loudest:X}",
             count,
             self._limit,
             f"find and silence the node that sends 0x{loudest:X}",
@@ -237,10 +236,9 @@ class JumpMonitor:
             return None
         moved = np.abs(positions - last)
         limits = JUMP_FACTOR * self._max_velocities * ((t_ns - last_ns) * 1e-9) + self._margins
-        excess = moved / limits
-        axis = int(np.argmax(excess))
-        if not excess[axis] > 1.0:
+        if (moved <= limits).all():
             return None
+        axis = int(np.argmax(moved / limits))
         return Trip(
             "encoder_jump",
             f"position jumped by {moved[axis]:.6g} within {(t_ns - last_ns) * 1e-6:.1f} ms; at "
@@ -262,8 +260,9 @@ class ReversalMonitor:
     def __init__(self, accelerations: FloatArray, resolutions: FloatArray, period_s: float) -> None:
         self._accelerations = accelerations
         self._least = REVERSED_COUNTS * resolutions
-        self._cycles = max(round(REVERSED_WINDOW_S / period_s), 2)
-        self._need = max(round(REVERSED_FOR_S / period_s), 3)
+        self._every = max(round(REVERSED_EVERY_S / period_s), 1)
+        self._window = max(round(REVERSED_WINDOW_S / (self._every * period_s)), 2)
+        self._need = max(round(REVERSED_FOR_S / (self._every * period_s)), 3)
         self.restart()
 
     def restart(self) -> None:
@@ -273,14 +272,21 @@ class ReversalMonitor:
         self._asked = np.zeros(n)
         self._history: list[tuple[FloatArray, FloatArray]] = []
         self._runs = np.zeros(n, dtype=np.int64)
+        self._cycles = 0
+        self._dt_s = 0.0
 
     def check(self, dt_s: float, command: FloatArray, positions: FloatArray) -> Trip | None:
-        """One cycle of ``dt_s``: what was sent (n,), where the axes are (n,)."""
-        step = self._accelerations * dt_s
-        self._velocities = self._velocities + np.clip(command - self._velocities, -step, step)
-        self._asked = self._asked + self._velocities * dt_s
+        """One cycle of ``dt_s``: what was sent (n,), where the axes are (n,). Judges every ``REVERSED_EVERY_S``."""
+        self._cycles += 1
+        self._dt_s += dt_s
+        if self._cycles % self._every:
+            return None
+        step = self._accelerations * self._dt_s
+        self._velocities = self._velocities + np.minimum(np.maximum(command - self._velocities, -step), step)
+        self._asked = self._asked + self._velocities * self._dt_s
+        self._dt_s = 0.0
         self._history.append((self._asked, positions))
-        if len(self._history) <= self._cycles:
+        if len(self._history) <= self._window:
             return None
         asked_then, positions_then = self._history.pop(0)
         asked, moved = self._asked - asked_then, positions - positions_then
