@@ -21,16 +21,14 @@ def limit_command(
     (NaN) do not move.
     """
     reasons: tuple[str, ...] = ()
-    excess = float(np.max(np.abs(velocities) / max_velocities))
+    excess = float((np.abs(velocities) / max_velocities).max())
     if excess > 1.0:
         velocities = velocities / excess
         reasons = ("drive_velocity_limit",)
-    inside_low = (positions > position_min) | (velocities >= 0.0)
-    inside_high = (positions < position_max) | (velocities <= 0.0)
-    allowed = inside_low & inside_high & np.isfinite(positions)
-    if not allowed.all():
-        blocked = ~allowed & (velocities != 0.0)
-        if blocked.any():
-            reasons = (*reasons, "position_limit")
-        velocities = np.where(allowed, velocities, 0.0)
-    return velocities, reasons
+    above, below = positions > position_min, positions < position_max
+    if (above & below).all():
+        return velocities, reasons
+    allowed = (above | (velocities >= 0.0)) & (below | (velocities <= 0.0)) & np.isfinite(positions)
+    if (~allowed & (velocities != 0.0)).any():
+        reasons = (*reasons, "position_limit")
+    return np.where(allowed, velocities, 0.0), reasons
