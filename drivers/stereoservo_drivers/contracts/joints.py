@@ -92,6 +92,7 @@ class JointDriverContract(PacedSuite):
             assert joint.acceleration_max > 0, joint
         assert description.rate_hz > 0
         assert description.command_timeout_s > 0
+        assert len(description.effort_units) in (0, len(names))
         assert description.call_budget_us > 0
 
     def test_description_does_not_change_with_the_lifecycle(self, driver: JointDriver) -> None:
@@ -144,6 +145,8 @@ class JointDriverContract(PacedSuite):
         assert state.positions.dtype == np.float64
         assert np.all(np.isfinite(state.positions))
         assert np.all(np.isfinite(state.velocities))
+        for loads in (state.efforts, state.following_errors):
+            assert loads is None or (loads.shape == (len(joints),) and np.all(np.isfinite(loads)))
 
     def test_stamps_and_numbers_grow_and_are_not_from_the_future(
         self, active: JointDriver, context: DriverContext

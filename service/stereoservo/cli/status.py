@@ -30,6 +30,8 @@ def describe(state: StateMessage) -> str:
         f"{state.loop.lateness_us['p99']:.0f} us, max {state.loop.lateness_us['max']:.0f} us",
         "  markers " + "  ".join(f"{camera} {count}" for camera, count in state.visible.items()),
     ]
+    if state.efforts or state.following_errors:
+        lines.append("  loads   " + _loads(state))
     if state.goal:
         said = progress_words(state)
         lines.append(f"  goal    {state.goal} ({state.law or 'joints'})" + (f": {said}" if said else ""))
@@ -41,3 +43,21 @@ def describe(state: StateMessage) -> str:
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)
+
+
+def _loads(state: StateMessage) -> str:
+    """Efforts, the following error that is nearest to its limit, and whether a contact would stop the arm."""
+    words = [f"{name} {value:+.3g}" for name, value in state.efforts.items()]
+    used = {
+        name: abs(error) / state.following_limits[name]
+        for name, error in state.following_errors.items()
+        if name in state.following_limits
+    }
+    if used:
+        name = max(used, key=used.__getitem__)
+        words.append(
+            f"following {name} {state.following_errors[name]:+.2g} of {state.following_limits[name]:.2g}"
+        )
+    if not state.effort_limits and not state.following_limits:
+        words.append("(no contact is watched for: not learnt yet, or off)")
+    return "  ".join(words)
