@@ -195,7 +195,8 @@ class BusThread:
 def follow_scheduling() -> None:
     """Run this thread just above the main thread where that runs in real time; else leave it as it is."""
     process = os.getpid()
-    if os.sched_getscheduler(process) != os.SCHED_FIFO:
+    # The servo process sets this flag beside the policy, and the kernel tells it with it.
+    if os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return
     above = os.sched_getparam(process).sched_priority + 1
     priority = min(above, os.sched_get_priority_max(os.SCHED_FIFO))
