@@ -23,6 +23,12 @@ def _calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict[st
     return run_calibration(repetitions, seed, progress)
 
 
+def _can(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.can import run_can
+
+    return run_can(repetitions, seed, progress)
+
+
 def _cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.cycle import run_cycle
 
@@ -35,7 +41,7 @@ def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     return run_features(repetitions, seed, progress)
 
 
-BENCHES: dict[str, Bench] = {"calibration": _calibration, "cycle": _cycle, "features": _features}
+BENCHES: dict[str, Bench] = {"calibration": _calibration, "can": _can, "cycle": _cycle, "features": _features}
 """By the name given on the command line."""
 
 

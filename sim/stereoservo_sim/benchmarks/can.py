@@ -1,0 +1,36 @@
+"""``bench can``: transports under a bare cycle, and six emulated drives under the driver, each beside its baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from stereoservo_sim.benchmarks.can_drives import fastest_paced, run_drives
+from stereoservo_sim.benchmarks.can_transports import TRANSPORTS, time_transport
+
+ProgressCall = Callable[[str, int, int], None]
+
+RATE_HZ = 250.0
+BACK_TO_BACK_S = 0.2
+"""For each repetition, of every transport."""
+PACED_CYCLES = 20
+DRIVES_S = 10.0 / 7.0
+"""For each repetition, at 250 Hz: 10 s unless asked otherwise, 60 s with 42 repetitions."""
+PACED_S = 3.0 / 7.0
+PACED_RATES_HZ = [400.0, 450.0, 460.0]
+"""Of 499 Hz that the bus can carry; beyond these the options refuse the load."""
+
+
+def run_can(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """Figures of all parts; ``repetitions`` scales their length, ``seed`` has nothing to decide."""
+    total = len(TRANSPORTS) + 2
+    transports = {}
+    for k, name in enumerate(TRANSPORTS):
+        progress("can", k, total)
+        transports[name] = time_transport(name, BACK_TO_BACK_S * repetitions, PACED_CYCLES * repetitions)
+    progress("can", len(TRANSPORTS), total)
+    drives = run_drives(RATE_HZ, DRIVES_S * repetitions, bit_time=False)
+    progress("can", len(TRANSPORTS) + 1, total)
+    paced = fastest_paced(PACED_RATES_HZ, PACED_S * repetitions)
+    progress("can", total, total)
+    return {"transports": transports, "six_drives_over_tcp": drives, "with_bit_times": paced}

@@ -1,0 +1,165 @@
+"""The other processes of ``bench can``: an adapter with six answering nodes, emulated drives, an empty loop.
+
+Run as a module with ``echo tcp|pty``, ``drives OPTIONS`` (JSON) or ``empty RATE_HZ SECONDS``. The first line on stdout
+says where they listen or that they begin; they end with their stdin.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import socket
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.can.slcan_adapter import SlcanAdapter
+from stereoservo_drivers.canopen.options import CanOptions
+
+AXES = 6
+SYNC = CanFrame(0x80)
+COMMANDS = [CanFrame(0x200 + node, bytes(6)) for node in range(1, AXES + 1)]
+ANSWERS = [
+    CanFrame(base + node, bytes(length))
+    for base, length in ((0x180, 6), (0x280, 4))
+    for node in range(1, AXES + 1)
+]
+"""To a SYNC: status word and position, then velocity."""
+ENDING_S = 10.0
+LOOP_PRIORITY, DRIVES_PRIORITY = 50, 5
+"""SCHED_FIFO of the driver's process and the empty loop (the default of a cell), and of the emulated drives."""
+
+
+@contextmanager
+def real_time(priority: int) -> Iterator[str]:
+    """SCHED_FIFO for this thread, as the daemon has it, where that is allowed; what it has, in words."""
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except PermissionError:
+        yield "ordinary scheduling: SCHED_FIFO is not allowed here"
+        return
+    try:
+        yield f"SCHED_FIFO {priority}"
+    finally:
+        os.sched_setscheduler(0, before & ~os.SCHED_RESET_ON_FORK, parameters)
+
+
+@contextmanager
+def peer(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Run one of these processes: it, and its first line. Ends it."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline().strip()
+        if not line:
+            raise RuntimeError(
+                f"the process {' '.join(words)!r} of the bench ended at once; its message is above"
+            )
+        yield process, line
+    finally:
+        if process.stdin is not None and not process.stdin.closed:
+            process.stdin.close()
+        try:
+            process.wait(ENDING_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def serve_echo(kind: str) -> None:
+    """An adapter whose bus has six nodes that answer every SYNC."""
+    if kind == "tcp":
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            print(f"socket://127.0.0.1:{server.getsockname()[1]}", flush=True)
+            connection, _ = server.accept()
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        fd = connection.detach()
+    else:
+        fd, slave = pty.openpty()
+        tty.setraw(slave)
+        print(os.ttyname(slave), flush=True)
+    adapter = SlcanAdapter()
+    while True:
+        ready = select.select([fd, sys.stdin], [], [])[0]
+        if sys.stdin in ready:
+            return
+        chunk = os.read(fd, 8192)
+        if not chunk:
+            return
+        frames, answer = adapter.feed(chunk)
+        for _ in range(frames.count(SYNC)):
+            answer += adapter.deliver(ANSWERS)
+        os.write(fd, answer)
+
+
+def serve_drives(text: str) -> None:
+    """Emulated drives of an ideal plant on a free TCP port. ``text``: ``{"bit_time": …, "options": …}``."""
+    from stereoservo_sim.drives.building import DrivesSettings, make_rack
+    from stereoservo_sim.drives.serving import RackServer, open_endpoint
+
+    wanted: dict[str, Any] = json.loads(text)
+    options = msgspec.convert(wanted["options"], CanOptions)
+    settings = DrivesSettings(plant="ideal", bit_time=wanted["bit_time"])
+    rack = make_rack(options, settings, t_ns=time.monotonic_ns())
+    server = RackServer(rack, open_endpoint("socket://127.0.0.1:0", options.bitrate))
+    ended = False
+
+    def end() -> None:
+        nonlocal ended
+        ended = True
+
+    server.watch(sys.stdin.fileno(), end)
+    print(server.channel, flush=True)
+    with real_time(DRIVES_PRIORITY):
+        server.run(lambda: ended)
+
+
+def empty_loop(rate_hz: float, seconds: float) -> dict[str, Any]:
+    """A loop that only waits for absolute deadlines: how late it came [µs], which slots it missed.
+
+    A slot is missed as the drivers' bus thread misses it: when more than half of its period is over.
+    """
+    period = round(1e9 / rate_hz)
+    slots = round(rate_hz * seconds)
+    first = time.monotonic_ns() + period
+    slot = missed = 0
+    lateness = []
+    while slot < slots:
+        due = first + slot * period
+        left = due - time.monotonic_ns()
+        if left > 0:
+            time.sleep(left * 1e-9)
+        late = time.monotonic_ns() - due
+        lateness.append(late * 1e-3)
+        skipped = max(-(-(late - period // 2) // period), 0)
+        missed += skipped
+        slot += 1 + skipped
+    return {"slots": slots, "missed": missed, "lateness_us": lateness}
+
+
+def _main(words: list[str]) -> None:
+    if words[0] == "echo":
+        serve_echo(words[1])
+    elif words[0] == "drives":
+        serve_drives(words[1])
+    else:
+        print("begins", flush=True)
+        with real_time(LOOP_PRIORITY):
+            figures = empty_loop(float(words[1]), float(words[2]))
+        print(json.dumps(figures), flush=True)
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1:])
