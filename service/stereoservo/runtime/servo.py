@@ -7,6 +7,7 @@ PARENT_PID``.
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 import time
@@ -318,9 +319,11 @@ def run(plan: RunPlan, termination: Termination) -> None:
     try:
         process = ServoProcess(core, driver, links, clock, rate_hz=rate_hz, dry_run=plan.dry_run)
         try:
-            _configure(process, termination)
+            # Before the drives are asked for: collecting garbage holds up every thread of this process, a driver's too.
             for warning in prepare_realtime(plan.cell.servo.priority):
                 say("servo", warning)
+            _configure(process, termination)
+            gc.freeze()
             loop = LoopClock(round(1e9 / rate_hz))
             while not termination.asked:
                 loop.wait()
