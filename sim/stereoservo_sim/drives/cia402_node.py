@@ -215,46 +215,58 @@ class Cia402Node:
             handle = self._receive_sdo
         elif can_id == 0:
             handle = self._receive_nmt
-        elif can_id == self.dictionary.get(0x1005, 0, 0x80) & 0x7FF:
-            handle = self._receive_sync
-        elif 0x700 < can_id < 0x780:
-            handle = self._receive_heartbeat
         elif self._pdo.listens(frame):
             handle = self._receive_pdo
+        elif 0x700 < can_id < 0x780:
+            handle = self._receive_heartbeat
+        elif can_id == self.dictionary.get(0x1005, 0, 0x80) & 0x7FF:
+            handle = self._receive_sync
         else:
             return
-        self.advance(t_ns)
-        if self.nmt > Nmt.BOOTING:
-            handle(frame)
+        self._t_ns = t_ns = self._producer.now_ns = max(t_ns, self._t_ns)
+        if t_ns >= self.due_ns():
+            self.advance(t_ns)
+        if self.nmt > Nmt.BOOTING and handle(frame):
             self._settle()
 
-    def _receive_sdo(self, frame: CanFrame) -> None:
+    # Each gives whether what it did is to be followed by ``_settle``.
+
+    def _receive_sdo(self, frame: CanFrame) -> bool:
         if frame.remote or self.nmt is Nmt.STOPPED:
-            return
+            return False
         self._answer(self._sdo.request(frame.data, self._t_ns))
+        return True
 
     def _answer(self, data: bytes | None) -> None:
         if data is not None and self.nmt in (Nmt.PRE_OPERATIONAL, Nmt.OPERATIONAL):
             self._out.append(CanFrame(id=0x580 + self.node_id, data=data))
 
-    def _receive_nmt(self, frame: CanFrame) -> None:
-        if not frame.remote and len(frame.data) == 2 and frame.data[1] in (0, self.node_id):
-            self._command(frame.data[0])
+    def _receive_nmt(self, frame: CanFrame) -> bool:
+        if frame.remote or len(frame.data) != 2 or frame.data[1] not in (0, self.node_id):
+            return False
+        self._command(frame.data[0])
+        return True
 
-    def _receive_sync(self, frame: CanFrame) -> None:
+    def _receive_sync(self, frame: CanFrame) -> bool:
         if frame.remote or self.nmt is not Nmt.OPERATIONAL:
-            return
+            return False
         self._sync.heard(self._t_ns)
+        self._due_ns = min(self.due_ns(), self._sync.due_ns())
+        takes_effect = self._pdo.waits_for_sync()
         self._out += self._pdo.sync(frame.data[0] if frame.data else None, self._t_ns)
+        return takes_effect
 
-    def _receive_heartbeat(self, frame: CanFrame) -> None:
+    def _receive_heartbeat(self, frame: CanFrame) -> bool:
         if frame.remote or len(frame.data) != 1 or frame.data[0] == 0:
-            return  # a boot-up frame is no heartbeat
-        if self._consumer.heard(frame.id - 0x700, self._t_ns):
-            self._recovered(HEARTBEAT_LOST)
+            return False  # a boot-up frame is no heartbeat
+        if not self._consumer.heard(frame.id - 0x700, self._t_ns):
+            return False
+        self._recovered(HEARTBEAT_LOST)
+        return True
 
-    def _receive_pdo(self, frame: CanFrame) -> None:
+    def _receive_pdo(self, frame: CanFrame) -> bool:
         self._out += self._pdo.receive(frame, self._t_ns)
+        return True
 
     # -- time ----------------------------------------------------------------------------------------------------
 

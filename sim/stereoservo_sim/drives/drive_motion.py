@@ -21,6 +21,7 @@ REACHED_SHARE = 0.01
 """Velocity window of "target reached" as a share of the largest velocity; the EDS has no 0x606D."""
 STANDING_UNITS = 1
 """Up to this velocity [velocity units] bit 12 of profile velocity says that the speed is zero (0x606F)."""
+PARAMETERS = (HALT_OPTION, 0x6065, 0x6066, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085)
 LIMIT_FACTOR = 2.0
 """Braking at the current limit, as a multiple of the quick stop deceleration."""
 
@@ -84,6 +85,30 @@ class DriveMotion:
         self._limited = False
         self._following = False
         self._beyond_since_ns = NEVER_NS
+        for index in PARAMETERS:
+            dictionary.changed(index, lambda sub, value: self.load_parameters())
+        self.load_parameters()
+
+    def load_parameters(self) -> None:
+        """Take limits and ramps over from the dictionary."""
+        get = self._dictionary.get
+        speeding_up, slowing_down, quick = (self._acceleration(index) for index in (0x6083, 0x6084, 0x6085))
+        limit = LIMIT_FACTOR * quick
+        self._speeding_up, self._slowing_down = speeding_up, slowing_down
+        self._ramps = {Ramp.SLOW_DOWN: slowing_down, Ramp.QUICK: quick, Ramp.CURRENT_LIMIT: limit}
+        self._ramps[Ramp.VOLTAGE_LIMIT] = limit
+        self._halt = Ramp(get(HALT_OPTION, 0, 1))
+        self._largest = min(get(0x607F, 0, 2**32 - 1), get(0x6080, 0, 2**32 - 1))
+        low, high = get(0x607D, 1), get(0x607D, 2)
+        self._low = low if -(2**31) < low < high else None
+        self._high = high if low < high < 2**31 - 1 else None
+        self._window = get(0x6065, 0, abs(round(self._counts * self._settings.following_window)))
+        self._window_ns = get(0x6066) * 1_000_000
+
+    def _acceleration(self, index: int) -> float:
+        """[rad/s² or m/s²]"""
+        value = self._dictionary.get(index)
+        return value / abs(self._units) if value else self.axis.joint.acceleration_max
 
     # -- what is measured ----------------------------------------------------------------------------------------
 
@@ -148,12 +173,13 @@ class DriveMotion:
         if self.machine.halted:
             return standing
         target = self._dictionary.get(0x60FF)
-        return abs(self.velocity() - target) <= max(REACHED_SHARE * self._largest(), STANDING_UNITS)
+        return abs(self.velocity() - target) <= max(REACHED_SHARE * self._largest, STANDING_UNITS)
 
     # -- what is done --------------------------------------------------------------------------------------------
 
     def power_lost(self, t_ns: int) -> None:
-        """The supply is gone or the firmware starts anew."""
+        """The supply is gone or the firmware starts anew, with its parameters."""
+        self.load_parameters()
         self._limited = self._following = False
         self._beyond_since_ns = NEVER_NS
         self._brake.move(True, t_ns)  # it closes without power
@@ -198,27 +224,13 @@ class DriveMotion:
         elif machine.state is not State.ENABLED or machine.ramp is not None:
             self._brake_with(machine.ramp or Ramp.QUICK)
         elif machine.halted:
-            self._brake_with(Ramp(self._dictionary.get(HALT_OPTION, 0, 1)))
+            self._brake_with(self._halt)
         else:
             self._follow()
 
     def _brake_with(self, ramp: Ramp) -> None:
-        quick = self._acceleration(0x6085)
-        deceleration = {Ramp.SLOW_DOWN: self._acceleration(0x6084), Ramp.QUICK: quick}.get(
-            ramp, LIMIT_FACTOR * quick
-        )
         self.axis.target = 0.0
-        self.axis.acceleration = deceleration
-
-    def _acceleration(self, index: int) -> float:
-        """[rad/s² or m/s²]"""
-        value = self._dictionary.get(index)
-        return value / abs(self._units) if value else self.axis.joint.acceleration_max
-
-    def _largest(self) -> int:
-        """Velocity limit [velocity units]; both objects count in both modes."""
-        get = self._dictionary.get
-        return min(get(0x607F, 0, 2**32 - 1), get(0x6080, 0, 2**32 - 1))
+        self.axis.acceleration = self._ramps[ramp]
 
     def _follow(self) -> None:
         """Enabled: the target velocity within the drive's limits; ramps of 0x6083 and 0x6084.
@@ -229,11 +241,10 @@ class DriveMotion:
         axis, get = self.axis, self._dictionary.get
         mode = get(0x6061)
         wanted = get(0x60FF) if mode in (PROFILE_VELOCITY, CYCLIC_VELOCITY) else 0
-        largest = self._largest()
-        allowed = max(-largest, min(largest, wanted))
+        allowed = max(-self._largest, min(self._largest, wanted))
         target = allowed / self._units
         slower = abs(target) < abs(axis.set_velocity) or target * axis.set_velocity < 0.0
-        acceleration = self._acceleration(0x6084 if slower and mode == PROFILE_VELOCITY else 0x6083)
+        acceleration = self._slowing_down if slower and mode == PROFILE_VELOCITY else self._speeding_up
         stopped = target != 0.0 and self._barred(math.copysign(1.0, target))
         if stopped:
             self._brake_with(Ramp.QUICK)
@@ -250,29 +261,23 @@ class DriveMotion:
         axis = self.axis
         if axis.limit_switch * side > 0:
             return True
-        low, high = self._dictionary.get(0x607D, 1), self._dictionary.get(0x607D, 2)
-        if low >= high:
+        outward = self._counts * side > 0
+        if (self._high if outward else self._low) is None:
             return False
-        braking = max(axis.set_velocity * side, 0.0) ** 2 / (2.0 * self._acceleration(0x6085))
+        braking = max(axis.set_velocity * side, 0.0) ** 2 / (2.0 * self._ramps[Ramp.QUICK])
         rest = self._counts * (self._measured() + side * braking + self._offset)
-        if self._counts * side > 0:
-            return high < 2**31 - 1 and rest >= high
-        return low > -(2**31) and rest <= low
+        return rest >= self._high if outward else rest <= self._low
 
     def _off_course(self, t_ns: int) -> bool:
         if not self.machine.powered:
             self._beyond_since_ns = NEVER_NS
             return False
-        if self._dictionary.has(0x6065):
-            window = self._dictionary.get(0x6065)
-            beyond = window != 2**32 - 1 and abs(self.following_error()) > window
-        else:
-            beyond = abs(self._error()) > self._settings.following_window
+        beyond = self._window != 2**32 - 1 and abs(self.following_error()) > self._window
         if not beyond:
             self._beyond_since_ns = NEVER_NS
             return False
         self._beyond_since_ns = min(self._beyond_since_ns, t_ns)
-        return t_ns - self._beyond_since_ns >= self._dictionary.get(0x6066) * 1_000_000
+        return t_ns - self._beyond_since_ns >= self._window_ns
 
     def due_ns(self, t_ns: int) -> int:
         """When ``step`` is next needed."""

@@ -81,14 +81,23 @@ class ProcessData:
 
     def _rpdo_changed(self, k: int, sub: int, value: int) -> None:
         self._rpdos[k] = self._rpdo(k)
+        self._index()
 
     def _tpdo_changed(self, k: int, sub: int, value: int) -> None:
         self._tpdos[k] = self._tpdo(k)
+        self._index()
+
+    def _index(self) -> None:
+        self._received = {p.can_id for p in self._rpdos if p.can_id is not None}
+        self._requested = {p.can_id for p in self._tpdos if p.can_id is not None and p.remote}
+        self._synchronous = [p for p in self._tpdos if p.can_id is not None and p.kind <= LAST_SYNCHRONOUS]
+        self._event_driven = [p for p in self._tpdos if p.can_id is not None and p.kind in EVENT_TYPES]
 
     def reload(self) -> None:
         """Take all parameters over from the dictionary; counts and deadlines start anew."""
         self._rpdos = [self._rpdo(k) for k in range(COUNT)]
         self._tpdos = [self._tpdo(k) for k in range(COUNT)]
+        self._index()
 
     def _rpdo(self, k: int) -> _Rpdo:
         index, get = RPDO_COMMUNICATION + k, self._dictionary.get
@@ -142,9 +151,7 @@ class ProcessData:
         """Whether the frame is one of these PDOs."""
         if not self.operational:
             return False
-        if frame.remote:
-            return any(p.can_id == frame.id and p.remote for p in self._tpdos)
-        return any(p.can_id == frame.id for p in self._rpdos)
+        return frame.id in (self._requested if frame.remote else self._received)
 
     def receive(self, frame: CanFrame, t_ns: int) -> list[CanFrame]:
         """An RPDO, or a remote request of a TPDO, that it listens to; gives what is sent at once."""
@@ -176,11 +183,15 @@ class ProcessData:
                     self._dictionary.store(o.index, o.sub, data[at : at + o.size])
             at += o.size
 
+    def waits_for_sync(self) -> bool:
+        """Whether an RPDO has come that the next SYNC makes effective."""
+        return any(rpdo.pending is not None for rpdo in self._rpdos)
+
     def sync(self, counter: int | None, t_ns: int) -> list[CanFrame]:
         """SYNC: synchronous TPDOs with values of now, then synchronous RPDOs take effect."""
         if not self.operational:
             return []
-        frames = [self._transmit(p, t_ns) for p in self._tpdos if self._due_at_sync(p, counter)]
+        frames = [self._transmit(p, t_ns) for p in self._synchronous if self._due_at_sync(p, counter)]
         for rpdo in self._rpdos:
             if rpdo.pending is not None:
                 data, rpdo.pending = rpdo.pending, None
@@ -188,8 +199,6 @@ class ProcessData:
         return frames
 
     def _due_at_sync(self, tpdo: _Tpdo, counter: int | None) -> bool:
-        if tpdo.can_id is None or tpdo.kind > LAST_SYNCHRONOUS:
-            return False
         if tpdo.kind == 0:
             return self._content(tpdo) != tpdo.sent
         if tpdo.start and counter is not None and tpdo.sent is None and tpdo.syncs == 0:
@@ -228,9 +237,7 @@ class ProcessData:
         if not self.operational:
             return []
         frames = []
-        for tpdo in self._tpdos:
-            if tpdo.can_id is None or tpdo.kind not in EVENT_TYPES:
-                continue
+        for tpdo in self._event_driven:
             if tpdo.wanted or t_ns >= tpdo.event_due_ns or self._content(tpdo) != tpdo.sent:
                 tpdo.wanted = True
                 if t_ns >= tpdo.free_ns:
@@ -241,8 +248,7 @@ class ProcessData:
         """When ``check_deadlines`` or ``events`` is next needed."""
         if not self.operational:
             return NEVER_NS
-        due = min((r.deadline_ns for r in self._rpdos), default=NEVER_NS)
-        for tpdo in self._tpdos:
-            if tpdo.can_id is not None and tpdo.kind in EVENT_TYPES:
-                due = min(due, max(tpdo.free_ns, 0) if tpdo.wanted else tpdo.event_due_ns)
+        due = min([rpdo.deadline_ns for rpdo in self._rpdos])
+        for tpdo in self._event_driven:
+            due = min(due, tpdo.free_ns if tpdo.wanted else tpdo.event_due_ns)
         return due
