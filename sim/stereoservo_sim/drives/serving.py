@@ -77,6 +77,8 @@ class RackServer:
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_read, False)
         self._requests: deque[_Request] = deque()
+        self._lock = threading.Lock()
+        self._over = False
         self._watched: dict[int, Callable[[], None]] = {}
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
@@ -105,8 +107,11 @@ class RackServer:
     def order(self, text: str, timeout_s: float = 10.0) -> str:
         """An order, from any other thread. Raises OrderError."""
         request = _Request(text)
-        self._requests.append(request)
-        os.write(self._wake_write, b"\0")
+        with self._lock:
+            if self._over:
+                raise OrderError(f"{text!r}: the server has ended")
+            self._requests.append(request)
+            os.write(self._wake_write, b"\0")
         if not request.done.wait(timeout_s):
             raise OrderError(f"{text!r}: no answer within {timeout_s:g} s; the server does not run")
         if request.error is not None:
@@ -130,8 +135,17 @@ class RackServer:
         finally:
             self.endpoint.close()
             self.rack.close()
+            self._end_requests()
+
+    def _end_requests(self) -> None:
+        with self._lock:
+            self._over = True
             os.close(self._wake_read)
             os.close(self._wake_write)
+            while self._requests:
+                request = self._requests.popleft()
+                request.error = OrderError(f"{request.text!r}: the server has ended")
+                request.done.set()
 
     def turn(self) -> None:
         """Wait for the next event or input, and let the bus go on to the present."""
