@@ -1,0 +1,47 @@
+"""What ``stereoservo status`` says of the joints' loads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from stereoservo.cli.status import describe
+from stereoservo.gateway.messages import LoopInfo, StateMessage, decode, encode
+
+STATE = StateMessage(
+    cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
+    goal="", law="", level="ok", reasons=(), joints={"j1": 0.1}, velocities={}, command={}, error_px=None,
+    task_error=(), innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0, "max": 2.0}, {}),
+)  # fmt: skip
+
+
+def loads(**fields: Any) -> list[str]:
+    lines = describe(msgspec.structs.replace(STATE, **fields)).splitlines()
+    return [line for line in lines if line.startswith("  loads")]
+
+
+def test_drives_that_tell_nothing_are_not_spoken_of() -> None:
+    assert loads() == []
+
+
+def test_the_following_error_nearest_to_its_limit_is_named() -> None:
+    (line,) = loads(
+        efforts={"j1": 3.21, "j2": -40.0},
+        following_errors={"j1": 0.009, "j2": -0.004, "j3": 0.5},
+        following_limits={"j1": 0.02, "j2": 0.005},
+        effort_limits={"j1": 9.0},
+    )
+    assert line == "  loads   j1 +3.21  j2 -40  following j2 -0.004 of 0.005"
+
+
+def test_loads_that_nothing_watches_say_so() -> None:
+    (line,) = loads(efforts={"j1": 3.0})
+    assert "no contact is watched for" in line
+
+
+def test_a_state_of_an_older_daemon_is_read() -> None:
+    tree = msgspec.json.decode(encode(STATE))
+    for field in ("efforts", "following_errors", "effort_limits", "following_limits"):
+        del tree[field]
+    assert decode(msgspec.json.encode(tree), StateMessage) == STATE
