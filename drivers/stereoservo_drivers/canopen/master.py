@@ -327,7 +327,7 @@ class Master:
         for fault in self.codec.faults():
             self.latch(self._from_axis(fault, now_ns))
         for trip in (
-            monitors.flood.end_cycle(),  # before what a flood makes the drives miss
+            monitors.flood.end_cycle(cycle_ns),  # before what a flood makes the drives miss
             monitors.frames.verdict(self._period_s),
             monitors.lateness.end_cycle(),
             *self._watch_encoders(cycle_ns),

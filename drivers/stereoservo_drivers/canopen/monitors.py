@@ -15,6 +15,8 @@ from stereoservo.runtime.ports import FloatArray
 
 DOUBLES_IN_A_ROW = 3
 """One double may be a frame that waited on a busy bus; several in a row are two drives with one node id."""
+OWED_CYCLES = 25
+"""So long a frame that was missed may still come, beside that of its cycle: a held-up host or adapter is no double."""
 LATE_WINDOW = 25
 LATE_BASELINE_WINDOWS = 4
 LATE_EVERY = 5
@@ -59,6 +61,8 @@ class FrameCounter:
         self._clean = False
         self._misses = [0] * len(names)
         self._doubles = [0] * len(names)
+        self._owed = [0] * len(names)
+        self._calm = 0
         self.lost = 0
         self.doubled = 0
 
@@ -72,18 +76,25 @@ class FrameCounter:
         every_one_once = self.counts == self._once
         if every_one_once and self._clean:
             self.counts[:] = [0] * len(self.counts)
+            self._calm += 1
+            if self._calm == OWED_CYCLES:
+                self._owed = [0] * len(self._owed)
             return
         self._clean = every_one_once
+        self._calm = 0
         for bit, count in enumerate(self.counts):
             if count == 1:
                 self._misses[bit] = self._doubles[bit] = 0
             elif count == 0:
                 self._misses[bit] += 1
                 self._doubles[bit] = 0
+                self._owed[bit] += 1
                 self.lost += 1
             else:
+                late = min(count - 1, self._owed[bit])
+                self._owed[bit] -= late
                 self._misses[bit] = 0
-                self._doubles[bit] += 1
+                self._doubles[bit] = self._doubles[bit] + 1 if count - 1 > late else 0
                 self.doubled += count - 1
             self.counts[bit] = 0
 
@@ -182,39 +193,42 @@ class LatenessMonitor:
 
 
 class FloodMonitor:
-    """Frames that belong to no part of the cycle, as a share of the bus, over the last ``FLOOD_WINDOW`` cycles."""
+    """Frames that belong to no part of the cycle: one id's share of the bus over the last ``FLOOD_WINDOW`` cycles.
+
+    By id, since after a stall of the host or the adapter the heartbeats and emergencies of all nodes come at once.
+    """
 
     def __init__(self, bitrate: int, period_s: float) -> None:
-        bits = FLOOD_SHARE * bitrate * period_s * FLOOD_WINDOW
-        self._limit = max(math.ceil(bits / FLOOD_FRAME_BITS), 4 * FLOOD_WINDOW)
-        self._window_s = FLOOD_WINDOW * period_s
+        self._frames_per_ns = FLOOD_SHARE * bitrate / FLOOD_FRAME_BITS * 1e-9
+        self._least = max(math.ceil(self._frames_per_ns * period_s * 1e9 * FLOOD_WINDOW), 4 * FLOOD_WINDOW)
         self._by_id: dict[int, int] = {}
-        self._cycles: deque[dict[int, int]] = deque(maxlen=FLOOD_WINDOW)
-        self.total = 0
+        self._cycles: deque[tuple[int, dict[int, int]]] = deque(maxlen=FLOOD_WINDOW)
 
     def note(self, can_id: int) -> None:
         """A frame that is nobody's."""
-        self.total += 1
         if can_id in self._by_id or len(self._by_id) < 256:
             self._by_id[can_id] = self._by_id.get(can_id, 0) + 1
 
-    def end_cycle(self) -> Trip | None:
+    def end_cycle(self, cycle_ns: int) -> Trip | None:
         """Judges every cycle: a flood that starves the drives' own frames is to be named before they are missed."""
-        self._cycles.append(self._by_id)
+        self._cycles.append((cycle_ns, self._by_id))
         self._by_id = {}
-        count = sum(sum(heard.values()) for heard in self._cycles)
-        if count <= self._limit:
+        if sum(sum(heard.values()) for _, heard in self._cycles) <= self._least:
             return None
-        heard: Counter[int] = Counter()
-        for cycle in self._cycles:
-            heard.update(cycle)
-        loudest, most = heard.most_common(1)[0]
+        total: Counter[int] = Counter()
+        for _, heard in self._cycles:
+            total.update(heard)
+        loudest, count = total.most_common(1)[0]
+        elapsed_ns = sum(elapsed for elapsed, _ in self._cycles)
+        limit = max(math.ceil(self._frames_per_ns * elapsed_ns), self._least)
+        if count <= limit:
+            return None
         return Trip(
             "bus_flood",
-            f"{count} frames within {self._window_s * 1e3:.0f} ms that are not part of the cycle, limit "
-            f"{self._limit}; most of them ({most}) have the id 0x{loudest:X}",
+            f"{count} frames 0x{loudest:X} within {elapsed_ns * 1e-6:.0f} ms, limit {limit}; they are not part of the "
+            "cycle",
             count,
-            self._limit,
+            limit,
             f"find and silence the node that sends 0x{loudest:X}",
         )
 

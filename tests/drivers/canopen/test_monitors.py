@@ -79,6 +79,28 @@ def test_two_answers_in_three_cycles_in_a_row_are_two_drives(bus) -> None:
     assert (bus.master.fault.code, bus.master.fault.axis) == ("duplicate", "j1")
 
 
+def test_answers_that_were_held_up_are_not_two_drives(bus) -> None:
+    """Two cycles bring nothing, the next two bring two answers each: an adapter or host that was held up."""
+    bus.enable()
+
+    def held_up(cycle: int, answers: list) -> list:
+        return [item for item in answers for _ in range((0, 0, 2, 2, 1)[cycle % 5])]
+
+    bus.answers = held_up
+    bus.run(0.1, 0.1, cycles=100)
+    assert bus.master.fault is None
+    assert bus.master.statistics.doubled >= 150
+
+
+def test_two_drives_are_seen_soon_after_a_frame_was_lost(bus) -> None:
+    bus.enable()
+    bus.answers = without(0x181)
+    bus.run(0.1, 0.1, cycles=2)
+    bus.answers = twice
+    assert until_latched(bus, 20, 0.1, 0.1) <= 6
+    assert bus.master.fault.code == "duplicate"
+
+
 def test_doubles_now_and_then_are_not(bus) -> None:
     bus.enable()
     bus.answers = lambda cycle, answers: twice(cycle, answers) if cycle % 3 else answers
@@ -158,6 +180,14 @@ def test_a_babbling_node_is_named(bus) -> None:
     assert until_latched(bus, 20, 0.1, 0.1) <= 11
     assert bus.master.fault.code == "bus_flood"
     assert "0x123" in bus.master.fault.message
+
+
+def test_what_all_nodes_say_after_a_stall_is_no_flood(bus) -> None:
+    bus.enable()
+    burst = [(k * 20_000, CanFrame(0x701 + k % 12, b"\x05")) for k in range(150)]
+    bus.answers = lambda cycle, answers: answers + (burst if cycle % 10 == 0 else [])
+    bus.run(0.1, 0.1, cycles=60)
+    assert bus.master.fault is None
 
 
 def test_service_traffic_is_no_flood(bus) -> None:
