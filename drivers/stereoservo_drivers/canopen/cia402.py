@@ -269,6 +269,7 @@ class Cia402Codec:
         if state == NmtState.BOOT_UP:
             message = "booted while in use"
             hint = "its supply broke down, it was reset, or another node has its id; reset configures it anew"
+            axis.counts.reset()  # what it counts from now on goes on from nothing
             self._event(axis, "rebooted", message, state, hint)
         else:
             self._event(

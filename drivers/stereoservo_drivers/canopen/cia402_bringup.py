@@ -21,6 +21,7 @@ from stereoservo_drivers.canopen.cia402_configuration import (
     PDO_OFF,
     Write,
     eds_path,
+    identifier_writes,
     load_eds,
     parameter_writes,
     pdo_writes,
@@ -173,14 +174,21 @@ class Cia402Bringup:
         options, joint = self._options, drive.axis.joint
         parameters = parameter_writes(options, joint, drive.dictionary)
         pdos = pdo_writes(options, drive.node_id)
+        identifiers = [write for write in identifier_writes(drive.node_id) if self._differs(drive, write)]
         off = [write for index in unused_pdos(options, drive.dictionary) for write in self._off(drive, index)]
-        for write in (*off, *parameters, *pdos):
+        for write in (*identifiers, *off, *parameters, *pdos):
             drive.write(write.index, write.subindex, write.value, write.option)
-        for write in {write[:2]: write for write in (*off, *parameters, *pdos)}.values():
+        for write in {write.key: write for write in (*identifiers, *off, *parameters, *pdos)}.values():
             self._compare(drive, write)
         mode = MODES[options.mode]
         if not until(link, lambda: drive.read(0x6061) == mode, STATE_S):
             self._compare(drive, Write(0x6061, 0, mode))
+
+    @staticmethod
+    def _differs(drive: RemoteDrive, write: Write) -> bool:
+        """Not where the drive lacks the object: what it would be is then fixed."""
+        found = drive.read_if_there(write.index, write.subindex)
+        return found is not None and not write.agrees(found)
 
     @staticmethod
     def _off(drive: RemoteDrive, index: int) -> list[Write]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import configparser
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from stereoservo.runtime.ports import DriverError
-from stereoservo_drivers.canopen.cia402 import COMMAND, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.cia402 import COMMAND, EMCY_ID, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale
 
@@ -34,7 +35,8 @@ PDO_RANGE = 0x200
 _OBJECT = re.compile(r"\s*(0[xX][0-9a-fA-F]{1,4})\s*(?::\s*(\d{1,3}|0[xX][0-9a-fA-F]{1,2}))?\s*")
 
 
-class Write(NamedTuple):
+@dataclass(frozen=True)
+class Write:
     """``value`` to an object; read back, it must agree in the bits of ``mask``. ``option``: where it comes from."""
 
     index: int
@@ -42,6 +44,11 @@ class Write(NamedTuple):
     value: int
     mask: int = _WHOLE
     option: str = ""
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Index and sub-index."""
+        return self.index, self.subindex
 
     def agrees(self, read: int) -> bool:
         """Whether a value read back is the one written."""
@@ -61,6 +68,14 @@ def parse_object(name: str, joint: str) -> tuple[int, int]:
     return int(match[1], 16), int(match[2] or "0", 0)
 
 
+def identifier_writes(node_id: int) -> list[Write]:
+    """COB-IDs of SYNC (which the drive must not produce: bit 30) and EMCY, for drives that have them otherwise."""
+    return [
+        Write(0x1005, 0, SYNC_ID, 0x400007FF),
+        Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF),
+    ]
+
+
 def parameter_writes(
     options: CanOptions, joint: CanJoint, dictionary: canopen.ObjectDictionary
 ) -> list[Write]:
@@ -73,7 +88,6 @@ def parameter_writes(
     limit = scale.rate_units(joint.max_velocity)
     acceleration = scale.rate_units(joint.max_acceleration)
     always = [
-        Write(0x1005, 0, SYNC_ID),
         Write(0x1017, 0, options.heartbeat_ms, option="heartbeat_ms"),
         Write(0x6007, 0, options.abort_option, option="abort_option"),
         Write(0x605A, 0, options.quick_stop_option, option="quick_stop_option"),
@@ -88,8 +102,8 @@ def parameter_writes(
         Write(0x6084, 0, acceleration, option="max_acceleration"),
     ]
     own = [Write(*parse_object(name, joint.name), value, option="sdo") for name, value in joint.sdo.items()]
-    there = [write for write in where_there if dictionary.get_variable(*write[:2]) is not None]
-    return list({write[:2]: write for write in (*always, *there, *own)}.values())
+    there = [write for write in where_there if dictionary.get_variable(*write.key) is not None]
+    return list({write.key: write for write in (*always, *there, *own)}.values())
 
 
 def _pdo_writes(

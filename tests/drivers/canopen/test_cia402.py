@@ -291,6 +291,17 @@ def test_nmt_states_while_watched(enabled: Cia402Codec, state: int, code: str) -
     assert codes(enabled) == []
 
 
+def test_counts_of_a_drive_that_booted_unasked_start_anew() -> None:
+    codec = codec_of(n=1)
+    codec.watch()
+    for counts in (2**31 - 10, -(2**31) + 10):
+        codec.receive(tpdo1(1, DISABLED, counts))
+    assert codec.feedback.positions[0] == pytest.approx((2**31 + 10) / COUNTS_PER_RAD, rel=1e-12)
+    codec.receive(CanFrame(0x701, b"\0"))
+    codec.receive(tpdo1(1, DISABLED, -(2**31) + 10))
+    assert codec.feedback.positions[0] == pytest.approx((-(2**31) + 10) / COUNTS_PER_RAD, rel=1e-12)
+
+
 def test_what_happened_before_watching_is_forgotten() -> None:
     codec = codec_of()
     codec.receive(CanFrame(0x181, bytes(5)))

@@ -216,6 +216,14 @@ def test_further_writes_are_made_and_replace_the_driver_s_own(make_bench: Make) 
     assert bench.object(1, 0x607D, 1) == -200_000
 
 
+def test_other_identifiers_of_sync_and_emergencies_are_set_right(bench: Bench) -> None:
+    bench.node(1).dictionary.set(0x1005, 0, 0x91)
+    bench.node(1).dictionary.set(0x1014, 0, 0x80000081)
+    bench.connect()
+    assert bench.object(1, 0x1005) == 0x80
+    assert bench.object(1, 0x1014) == 0x81
+
+
 def test_connecting_twice_gives_the_same(bench: Bench) -> None:
     bench.connect()
     communication = [key for key in bench.node(2).dictionary.entries if 0x1005 <= key[0] < 0x2000]
