@@ -87,7 +87,8 @@ def watch(
         return None
     elapsed_s = (sample.t_ns - contact.seen_ns) * 1e-9 if contact.seen_ns else np.inf
     contact.seen_ns = sample.t_ns
-    contact.efforts, contact.following_errors = sample.efforts, sample.following_errors
+    contact.efforts = None if sample.efforts is None else sample.efforts.copy()
+    contact.following_errors = None if sample.following_errors is None else sample.following_errors.copy()
     speed = np.abs(state.command)
     if elapsed_s > GAP_S or state.lifecycle != Lifecycle.ACTIVE:
         _forget(contact, sample)
@@ -174,11 +175,11 @@ def _readings(contact: Contact, sample: JointState) -> tuple[FloatArray, FloatAr
 
 def _excess(contact: Contact, efforts: FloatArray, following: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Signed distances from what is expected: the mean and zero, or anything that a contact brought of late."""
-    low, high = contact.mean_efforts, contact.mean_efforts
-    behind, ahead = np.zeros_like(following), np.zeros_like(following)
-    if contact.leave_s > 0.0:
-        low, high = np.minimum(low, contact.low[0]), np.maximum(high, contact.high[0])
-        behind, ahead = np.minimum(behind, contact.low[1]), np.maximum(ahead, contact.high[1])
+    mean = contact.mean_efforts
+    if contact.leave_s <= 0.0:
+        return efforts - mean, following
+    low, high = np.minimum(mean, contact.low[0]), np.maximum(mean, contact.high[0])
+    behind, ahead = np.minimum(contact.low[1], 0.0), np.maximum(contact.high[1], 0.0)
     return (
         efforts - np.minimum(np.maximum(efforts, low), high),
         following - np.minimum(np.maximum(following, behind), ahead),
