@@ -110,6 +110,26 @@ def test_doubles_now_and_then_are_not(bus) -> None:
     assert bus.master.statistics.doubled == 40
 
 
+def test_answers_that_were_held_up_and_come_with_later_ones_are_no_doubles(bus) -> None:
+    """A host that stalls: nothing for some cycles, then two at a time until all have come."""
+    bus.enable()
+    bus.run(0.1, 0.1, cycles=4)
+
+    def held_up(cycle: int, answers: list) -> list:
+        phase = cycle % 40
+        return [] if phase < 3 else answers * 2 if phase < 6 else answers
+
+    bus.answers = held_up
+    bus.run(0.1, 0.1, cycles=200)
+    assert bus.master.fault is None
+    assert bus.master.statistics.doubled > 0
+    # Old losses excuse nobody.
+    bus.answers = lambda cycle, answers: answers
+    bus.run(0.1, 0.1, cycles=40)
+    bus.answers = twice
+    assert until_latched(bus, 20, 0.1, 0.1) == 4
+
+
 def delayed(axis_ids: tuple[int, ...], by_ns: int, jitter: np.random.Generator | None = None):
     def change(cycle: int, answers: list) -> list:
         return [
