@@ -26,21 +26,18 @@ class Abort(IntEnum):
     TIMED_OUT = 0x05040000
     COMMAND = 0x05040001
     OUT_OF_MEMORY = 0x05040005
-    UNSUPPORTED_ACCESS = 0x06010000
     WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
     NOT_MAPPABLE = 0x06040041
     MAPPING_TOO_LONG = 0x06040042
     INCOMPATIBLE = 0x06040043
-    LENGTH = 0x06070010
     TOO_LONG = 0x06070012
     TOO_SHORT = 0x06070013
     NO_SUB_INDEX = 0x06090011
     INVALID_VALUE = 0x06090030
     TOO_HIGH = 0x06090031
     TOO_LOW = 0x06090032
-    GENERAL = 0x08000000
     NOT_STORABLE = 0x08000020
     DEVICE_STATE = 0x08000022
     NO_DATA = 0x08000024
@@ -122,7 +119,7 @@ class Entry:
         if len(data) != self.size:
             raise SdoError(Abort.TOO_LONG if len(data) > self.size else Abort.TOO_SHORT)
         if self.data_type in _REALS:
-            return _REALS[self.data_type].unpack(data)[0]
+            return float(_REALS[self.data_type].unpack(data)[0])
         return int.from_bytes(data, "little", signed=_INTEGERS[self.data_type][1])
 
 
@@ -159,7 +156,7 @@ class Dictionary:
         self._guards: dict[int, Guard] = {}
         self._changed: dict[int, Changed] = {}
         self._live: dict[tuple[int, int], Callable[[], int]] = {}
-        self._sealed: dict[int, Callable[[int], None]] = {}
+        self._readings: dict[int, Callable[[int], None]] = {}
 
     def guard(self, index: int, check: Guard) -> None:
         """Ask ``check`` before the bus changes the object."""
@@ -176,7 +173,7 @@ class Dictionary:
 
     def reading(self, index: int, check: Callable[[int], None]) -> None:
         """Ask ``check(sub)`` before the bus reads the object; it raises SdoError."""
-        self._sealed[index] = check
+        self._readings[index] = check
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Whether the EDS has it."""
@@ -211,8 +208,8 @@ class Dictionary:
         """Read by SDO. Raises SdoError."""
         if not self.find(index, sub).readable:
             raise SdoError(Abort.WRITE_ONLY)
-        if index in self._sealed:
-            self._sealed[index](sub)
+        if index in self._readings:
+            self._readings[index](sub)
         return self.encoded(index, sub)
 
     def writable(self, index: int, sub: int) -> Entry:

@@ -262,11 +262,12 @@ class DriveMotion:
         if axis.limit_switch * side > 0:
             return True
         outward = self._counts * side > 0
-        if (self._high if outward else self._low) is None:
+        limit = self._high if outward else self._low
+        if limit is None:
             return False
         braking = max(axis.set_velocity * side, 0.0) ** 2 / (2.0 * self._ramps[Ramp.QUICK])
         rest = self._counts * (self._measured() + side * braking + self._offset)
-        return rest >= self._high if outward else rest <= self._low
+        return rest >= limit if outward else rest <= limit
 
     def _off_course(self, t_ns: int) -> bool:
         if not self.machine.powered:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from stereoservo_sim.drives.dictionary import Abort, Dictionary, SdoError, Value
 from stereoservo_sim.drives.drive_motion import CYCLIC_VELOCITY, PROFILE_VELOCITY, DriveMotion
 from stereoservo_sim.drives.settings import NodeSettings
@@ -46,7 +48,7 @@ class DriveObjects:
         dictionary.guard(0x6060, self._check_mode)
         dictionary.changed(0x6060, lambda sub, value: dictionary.set(0x6061, 0, value))
         for index in OPTION_CODES:
-            dictionary.guard(index, lambda sub, value, index=index: self._check_option(index, value))
+            dictionary.guard(index, partial(self._check_option, index))
         dictionary.guard(0x1005, self._check_sync)
         dictionary.guard(0x1010, lambda sub, value: self._check_signature(sub, value, SAVE))
         dictionary.changed(0x1010, lambda sub, value: self._save())
@@ -59,7 +61,7 @@ class DriveObjects:
             raise SdoError(Abort.INVALID_VALUE)
 
     @staticmethod
-    def _check_option(index: int, value: int) -> None:
+    def _check_option(index: int, sub: int, value: int) -> None:
         if value not in OPTION_CODES[index]:
             raise SdoError(Abort.INVALID_VALUE)
 

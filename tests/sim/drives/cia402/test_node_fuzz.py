@@ -36,8 +36,25 @@ commands = st.builds(
 )
 syncs = st.just(CanFrame(id=0x80))
 waits = st.integers(-10, 200)
+handshakes = st.sampled_from(
+    [
+        (6, 7, 15),
+        (6, 15),
+        (0, 0x80, 6, 15),
+        (0, 0x80, 0, 6, 7, 15),
+        (7, 15),
+        (15, 6),
+        (6, 7),
+        (0x8F, 15),
+        (11, 15),
+        (0x10F, 15),
+    ]
+)
 trips = st.sampled_from(["0x3210", "reboot", "limit", "invert"])
-steps = st.lists(st.one_of(anything, words, words, words, writes, commands, syncs, waits, trips), max_size=60)
+mixed = st.one_of(
+    anything, words, handshakes, handshakes, handshakes, writes, commands, syncs, waits, waits, trips
+)
+steps = st.lists(mixed, min_size=5, max_size=60)
 
 
 class Handshake:
@@ -70,6 +87,9 @@ def test_no_sequence_raises_or_powers_without_the_handshake(steps, make_bench_of
             bench.run(max(step, 0))
         elif isinstance(step, CanFrame):
             bench.node.receive(step, bench.t)
+        elif isinstance(step, tuple):
+            for word in step:
+                bench.word(word)
         elif step == "reboot":
             bench.node.power_up(bench.t)
             handshake.ready = handshake.enable = False

@@ -153,6 +153,16 @@ def test_synchronous_tpdo_holds_the_values_of_its_sync(quiet):
         assert abs(counts / (4096 * 100) * 6.283185307179586 - position) < 1e-5
 
 
+def test_sync_start_value(quiet):
+    remap(quiet, 1, STATUS, transmit=True, kind=3)
+    assert quiet.write(0x1800, 1, 0x183 | OFF, 4) == 0
+    assert quiet.write(0x1800, 6, 4, 1) == 0
+    assert quiet.write(0x1800, 1, 0x183, 4) == 0
+    quiet.nmt(1)
+    counters = [k % 10 + 1 for k in range(20)]
+    assert [c for c in counters if quiet.send(0x80, c)] == [4, 7, 10, 3, 6, 9]
+
+
 def test_acyclic_synchronous_tpdo_only_when_changed(quiet):
     remap(quiet, 1, POSITION, transmit=True, kind=0)
     quiet.nmt(1)
