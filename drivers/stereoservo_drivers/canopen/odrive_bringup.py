@@ -78,8 +78,9 @@ class OdriveBringup:
     def reset(self, link: Link) -> None:
         """Set up anew (a drive may have rebooted), clear errors, read them. Enables nothing.
 
-        Raises DriverError (``reset_refused``, ``no_answer``, ``not_idle``).
+        Raises DriverError (``node_missing``, ``reset_refused``, ``no_answer``, ``not_idle``).
         """
+        self._hear_all(link)
         self._set_up(link)
         link.send([CanFrame(frame_id(node, odrive.CLEAR_ERRORS), bytes(8)) for node in self._nodes])
         link.wait(STEP_S)

@@ -35,20 +35,35 @@ def _cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any
     return run_cycle(repetitions, seed, progress)
 
 
+def _faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.faults import run_faults
+
+    return run_faults(repetitions, seed, progress)
+
+
 def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.features import run_features
 
     return run_features(repetitions, seed, progress)
 
 
-BENCHES: dict[str, Bench] = {"calibration": _calibration, "can": _can, "cycle": _cycle, "features": _features}
+BENCHES: dict[str, Bench] = {
+    "calibration": _calibration,
+    "can": _can,
+    "cycle": _cycle,
+    "faults": _faults,
+    "features": _features,
+}
 """By the name given on the command line."""
 
 
 def bench(
     what: Annotated[str, typer.Argument(help="Which one: " + ", ".join(BENCHES) + ".")],
     repetitions: Annotated[
-        int, typer.Option(min=1, help="Timed fits of `calibration`; the others take a multiple of it.")
+        int,
+        typer.Option(
+            min=1, help="Timed fits of `calibration`, trials of each of `faults`; the others take a multiple."
+        ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
@@ -85,7 +100,12 @@ def _find(what: str) -> Bench:
 
 
 def _show(answer: dict[str, Any], console: Console) -> None:
-    """One line a figure, nested names joined by points."""
+    """One line a figure, nested names joined by points; of faults, tables."""
+    if answer["bench"] == "faults":
+        from stereoservo_sim.benchmarks.faults import show_faults
+
+        show_faults(answer, console)
+        answer = {key: value for key, value in answer.items() if key not in ("rows", "wall")}
     for name, value in _flat(answer, ""):
         console.print(f"{name:<44} {f'{value:.4g}' if isinstance(value, float) else value}", soft_wrap=True)
 

@@ -8,6 +8,7 @@ was powered again by itself afterwards.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -31,7 +32,7 @@ RAMP_COUNTS_S2 = 4e6
 BOOT_S = 1.5
 """Time that the drives get to boot before bring-up."""
 ENABLE_S = 1.0
-SETTLE_S = 0.2
+SETTLE_S = 0.1
 """After the fault, at least: in this time the axes must come to rest, and what is tolerated must not latch."""
 
 
@@ -141,9 +142,20 @@ class Rig:
         return self.rack.at_rest()
 
 
-def run_trial(case: FaultCase, protocol: str, rng: np.random.Generator, *, run_on_s: float = 1.0) -> Trial:
-    """One trial. ``run_on_s``: how long after rest nothing may move by itself. Raises TrialError."""
-    rig = Rig(case, protocol)
+def run_trial(
+    case: FaultCase,
+    protocol: str,
+    rng: np.random.Generator,
+    *,
+    run_on_s: float = 1.0,
+    rig: Callable[[FaultCase, str], Rig] = Rig,
+) -> Trial:
+    """One trial on a new ``rig``. ``run_on_s``: how long after rest nothing may move by itself. Raises TrialError."""
+    return _run(rig(case, protocol), rng, run_on_s)
+
+
+def _run(rig: Rig, rng: np.random.Generator, run_on_s: float) -> Trial:
+    case = rig.case
     if case.stage == "start":
         return _start_trial(rig, run_on_s)
     speed = trial_speed() * rng.choice([-1.0, 1.0], AXES)

@@ -1,0 +1,131 @@
+"""``bench faults``: every fault of the CAN arm, injected; when it was known and when all axes stood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from stereoservo_sim.benchmarks.faults_wall import run_wall
+from stereoservo_sim.drives.fault_cases import CASES
+from stereoservo_sim.drives.fault_table import run_row
+from stereoservo_sim.drives.fault_trials import AXES, RAMP_COUNTS_S2, RATE_HZ, SPEED_COUNTS_S, TrialError
+from stereoservo_sim.experiments.errors import ExperimentError
+
+ProgressCall = Callable[[str, int, int], None]
+
+WALL_SHARE = 3
+"""For so many trials in bit time one in real time, which takes seconds."""
+
+
+def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """``rows``: in the emulator's bit time, ``repetitions`` trials a fault, alike for one seed. ``wall``: in real time.
+
+    Raises ExperimentError where a trial cannot begin or the emulated drives end.
+    """
+    cases = [(protocol, case) for protocol, those in CASES.items() for case in those]
+    rows = []
+    for k, (protocol, case) in enumerate(cases):
+        try:
+            rows.append(run_row(case, protocol, repetitions, seed))
+        except TrialError as error:
+            raise ExperimentError("fault_trial", f"{protocol}, {case.name}: {error}") from error
+        progress("faults in bit time", k + 1, len(cases))
+    wall = run_wall(
+        max(repetitions // WALL_SHARE, 1), lambda done, total: progress("faults in real time", done, total)
+    )
+    return {
+        "axes": AXES,
+        "rate_hz": RATE_HZ,
+        "ramp_ms": SPEED_COUNTS_S / RAMP_COUNTS_S2 * 1e3,
+        "ok": all(row.ok for row in rows),
+        "rows": [msgspec.to_builtins(row) for row in rows],
+        "wall": wall,
+    }
+
+
+def show_faults(figures: dict[str, Any], console: Console) -> None:
+    """The two tables."""
+    console.print(_bit_time_table(figures))
+    for row in figures["rows"]:
+        for problem in row["problems"]:
+            console.print(f"{row['protocol']}, {row['fault']}: {problem}")
+    console.print(_wall_table(figures["wall"]))
+    loop = figures["wall"]["emulator_loop"]
+    if loop is not None:
+        console.print(
+            f"the emulator's loop came {loop['latest_ns'] * 1e-6:.2f} ms late at most, "
+            f"{loop['stalls']} stalls in {loop['turns']} turns"
+        )
+
+
+def _bit_time_table(figures: dict[str, Any]) -> Table:
+    title = (
+        f"{figures['axes']} axes at {figures['rate_hz']:g} Hz, ramps of {figures['ramp_ms']:g} ms, "
+        f"in the emulator's bit time; "
+        f"{figures['rows'][0]['trials']} trials each; [ms] after the fault, median / max"
+    )
+    table = Table(title=title, title_justify="left")
+    for name in (
+        "protocol",
+        "fault",
+        "known",
+        "cycles",
+        "all at rest",
+        "bound",
+        "by",
+        "latched",
+        "restarts",
+        "ok",
+    ):
+        table.add_column(name, justify="right" if name in ("cycles", "bound", "restarts") else "left")
+    for row in figures["rows"]:
+        table.add_row(
+            row["protocol"],
+            row["fault"],
+            _pair(row["detected_ms_median"], row["detected_ms_max"]),
+            "-" if row["detected_cycles"] is None else str(row["detected_cycles"]),
+            _pair(row["rest_ms_median"], row["rest_ms_max"]),
+            "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
+            row["by"],
+            ", ".join(f"{code} {count}" for code, count in row["codes"].items()) or "-",
+            str(row["restarts"]),
+            "yes" if row["ok"] else "NO",
+        )
+    return table
+
+
+def _wall_table(wall: dict[str, Any]) -> Table:
+    table = Table(title="real time, two processes, slcan over TCP; [ms], median / max", title_justify="left")
+    for name in (
+        "fault",
+        "known",
+        "all at rest",
+        "bound in bit time",
+        "latched",
+        "restarts",
+        "stalled before",
+    ):
+        table.add_column(name)
+    for row in wall["rows"]:
+        table.add_row(
+            row["fault"],
+            _summary(row["detected_ms"]),
+            _summary(row["rest_ms"]) + (f" ({row['never_at_rest']} never)" if row["never_at_rest"] else ""),
+            f"{row['bound_ms_in_bit_time']:g}",
+            ", ".join(row["codes"]) or "-",
+            str(row["restarts"]),
+            str(len(row["stalled"])),
+        )
+    return table
+
+
+def _pair(median: float | None, largest: float | None) -> str:
+    return "-" if median is None or largest is None else f"{median:.1f} / {largest:.1f}"
+
+
+def _summary(figures: dict[str, Any] | None) -> str:
+    return "-" if figures is None else _pair(figures["median"], figures["max"])

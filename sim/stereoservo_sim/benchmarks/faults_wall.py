@@ -1,0 +1,233 @@
+"""Faults in real time: driver and emulated drives in two processes over serial-line CAN on TCP.
+
+From the order (or the signal) to the last axis's rest, by the emulator's events; both are CLOCK_MONOTONIC. Machines are
+shared: a fault that comes before it was ordered is a stall's, is counted and tried again; beside the times stand
+how late the emulator's loop came.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo_drivers.canopen.options import CanOptions
+from stereoservo_sim.benchmarks.timing import summary
+from stereoservo_sim.cells import shipped_cell_path
+from stereoservo_sim.drives.building import drives_of_cell
+from stereoservo_sim.drives.emulator import EmulatorProcess
+from stereoservo_sim.experiments.errors import ExperimentError
+
+CELL = "hil-can"
+SPEED = 0.125
+"""[rad/s]; at the cell's quick-stop deceleration a ramp of 12.5 ms."""
+STRICT = {
+    "heartbeat_timeout_ms": 100,
+    "rpdo_deadline_ms": 0,
+    "max_missed_cycles": 3,
+    "command_timeout_s": 0.1,
+    "loop_timeout_ms": 100,
+}
+"""The table's settings: the options' defaults; the drives' own watch is on the heartbeat alone."""
+TRIES = 4
+REST_LIMIT_S = 2.0
+RUN_ON_S = 0.5
+START_LIMIT_S = 60.0
+
+ORDERED = (
+    ("drive fault with emergency", "fault 3 0x3210", "", 40.0),
+    ("node silent", "silence 4", "speak 4", 60.0),
+    ("node reboots", "reboot 5", "", 60.0),
+    ("TPDOs late by 6 ms", "late 2 6ms", "late 2 0", 150.0),
+    ("duplicate node id running", "duplicate 2 running", "duplicate 2 off", 60.0),
+    ("mapping changed", "remap 3", "", 40.0),
+    ("bus cable out", "cable out", "cable in", 150.0),
+    ("SYNC lost", "drop-sync", "pass-sync", 60.0),
+    ("NMT stop by a stranger", "nmt stop", "nmt start", 60.0),
+    ("babbling node", "flood 1", "calm 1", 60.0),
+    ("adapter gone", "adapter out", "adapter in", 150.0),
+)
+"""Fault, order, what ends it, bound [ms] in bit time."""
+DONE_TO_THE_MASTER = ("master killed", "master process hangs", "servo loop hangs")
+MASTER_BOUND_MS = 150.0
+
+
+class StalledError(Exception):
+    """The machine stood still: the fault was there before it was ordered."""
+
+
+class _Master:
+    """The driver's process."""
+
+    def __init__(self, options: CanOptions, speed: float) -> None:
+        command = [sys.executable, "-m", "stereoservo_sim.benchmarks.faults_master"]
+        settings = json.dumps(msgspec.to_builtins(options))
+        self.process = subprocess.Popen(
+            [*command, settings, repr(speed)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.lines: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, name="master-lines", daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(json.loads(line))
+        self.lines.put({"event": "ended"})
+
+    def expect(self, event: str, limit_s: float) -> dict[str, Any]:
+        """The next line, which has to be ``event``. Raises StalledError with what came instead."""
+        try:
+            line = self.lines.get(timeout=limit_s)
+        except queue.Empty:
+            raise StalledError(f"no {event!r} within {limit_s:g} s") from None
+        if line["event"] != event:
+            raise StalledError(f"{line.get('code', line['event'])}: {line.get('message', '')}")
+        return line
+
+    def fault(self) -> dict[str, Any] | None:
+        """The first fault that it told of, if it did."""
+        while not self.lines.empty():
+            line = self.lines.get()
+            if line["event"] == "fault":
+                return line
+        return None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(START_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join()
+
+
+def _strike(emulator: EmulatorProcess, master: _Master, fault: str, order: str) -> int:
+    """Make the fault happen; when [ns]."""
+    if order:
+        emulator.order(order)
+        return int([event for event in emulator.events if event.get("event") == "order"][-1]["t_ns"])
+    if fault == "servo loop hangs":
+        assert master.process.stdin is not None
+        master.process.stdin.write("hang\n")
+        master.process.stdin.flush()
+        return int(master.expect("hangs", 1.0)["t_ns"])
+    now = time.monotonic_ns()
+    master.process.send_signal(signal.SIGKILL if fault == "master killed" else signal.SIGSTOP)
+    return now
+
+
+def _events(emulator: EmulatorProcess, since_ns: int, *kinds: str) -> list[dict[str, Any]]:
+    return [e for e in list(emulator.events) if e.get("event") in kinds and e["t_ns"] >= since_ns]
+
+
+def _trial(
+    emulator: EmulatorProcess, options: CanOptions, speed: float, fault: str, order: str
+) -> dict[str, Any]:
+    """One trial. Raises StalledError."""
+    with _Master(options, speed) as master:
+        master.expect("moving", START_LIMIT_S)
+        t0 = _strike(emulator, master, fault, order)
+        until = time.monotonic() + REST_LIMIT_S
+        while not (rests := _events(emulator, t0, "all_rest")) and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(RUN_ON_S)
+        told = master.fault()
+        if told is not None and told["t_ns"] < t0:
+            raise StalledError(f"{told['code']}: {told['message']}")
+        restarted = bool(rests and _events(emulator, rests[0]["t_ns"], "moves", "power_on"))
+    return {
+        "rest_ms": (rests[0]["t_ns"] - t0) * 1e-6 if rests else None,
+        "detected_ms": (told["t_ns"] - t0) * 1e-6 if told is not None else None,
+        "code": told["code"] if told is not None else "",
+        "restarted": restarted,
+    }
+
+
+def _settle(emulator: EmulatorProcess, cure: str) -> None:
+    """The cause goes away, the drives stand."""
+    if cure:
+        emulator.order(cure)
+    time.sleep(0.2)
+
+
+def run_wall(repetitions: int, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Rows of all faults, ``repetitions`` trials each, and how steadily the emulator's loop ran.
+
+    Raises ExperimentError where the emulated drives end.
+    """
+    cases = [*ORDERED, *((fault, "", "", MASTER_BOUND_MS) for fault in DONE_TO_THE_MASTER)]
+    options, _ = drives_of_cell(load_cell_file(shipped_cell_path(CELL)))
+    with tempfile.TemporaryDirectory() as folder:
+        text = shipped_cell_path(CELL).read_text(encoding="utf-8")
+        cell = Path(folder) / f"{CELL}.toml"
+        cell.write_text(text.replace('plant = "pybullet"', 'plant = "ideal"'), encoding="utf-8")
+        directories = {"STEREOSERVO_RUNTIME_DIR": folder, "STEREOSERVO_STATE_DIR": folder}
+        channel = ("--channel", "socket://127.0.0.1:0", "--bit-time")
+        with EmulatorProcess(
+            cell, options=channel, environment=directories, log=Path(folder) / "log"
+        ) as emulator:
+            options = msgspec.structs.replace(options, channel=emulator.wait_ready(), **STRICT)
+            rows = []
+            for k, (fault, order, cure, bound_ms) in enumerate(cases):
+                rows.append(_row(emulator, options, fault, order, cure, bound_ms, repetitions))
+                progress(k + 1, len(cases))
+        stalls = [event for event in emulator.events if event.get("event") == "end"]
+    loop = {key: value for key, value in stalls[-1].items() if key != "event"} if stalls else None
+    return {"rows": rows, "emulator_loop": loop, "load": list(os.getloadavg())}
+
+
+def _row(
+    emulator: EmulatorProcess,
+    options: CanOptions,
+    fault: str,
+    order: str,
+    cure: str,
+    bound_ms: float,
+    repetitions: int,
+) -> dict[str, Any]:
+    trials: list[dict[str, Any]] = []
+    stalled: list[str] = []
+    while len(trials) < repetitions and len(stalled) < TRIES:
+        speed = SPEED if (len(trials) + len(stalled)) % 2 else -SPEED
+        try:
+            trials.append(_trial(emulator, options, speed, fault, order))
+        except StalledError as error:
+            stalled.append(str(error))
+        if emulator.process.poll() is not None:
+            raise ExperimentError("emulator", f"{fault}: the emulated drives ended: {emulator.output()}")
+        _settle(emulator, cure)
+    rests = [trial["rest_ms"] for trial in trials if trial["rest_ms"] is not None]
+    seen = [trial["detected_ms"] for trial in trials if trial["detected_ms"] is not None]
+    return {
+        "fault": fault,
+        "rest_ms": summary(rests) if rests else None,
+        "detected_ms": summary(seen) if seen and order else None,
+        "bound_ms_in_bit_time": bound_ms,
+        "never_at_rest": len(trials) - len(rests),
+        "codes": sorted({trial["code"] for trial in trials if trial["code"]}),
+        "restarts": sum(trial["restarted"] for trial in trials),
+        "stalled": stalled,
+    }
