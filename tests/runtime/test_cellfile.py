@@ -68,15 +68,15 @@ def test_a_range_may_be_left_out_and_a_spread_stays_inside_the_limits(tmp_path: 
 def test_contact_is_watched_by_default_and_thresholds_stand_in_joint_order(tmp_path: Path) -> None:
     plain = settings(tmp_path, GOOD).contact
     assert plain is not None
-    assert (plain.enabled, plain.factor, plain.samples, plain.effort_units) == (True, 1.5, 5, ("N m",))
+    assert (plain.enabled, plain.factor, plain.samples, plain.effort_units) == (True, 2.0, 5, ("N m",))
     assert np.isnan(plain.efforts).all()
     assert np.isnan(plain.following_errors).all()
     section = (
-        "[safety.contact]\neffort = { j1 = 12 }\nfactor = 2\nsamples = 3\nenabled = false\n[calibration]"
+        "[safety.contact]\neffort = { j1 = 12 }\nfactor = 3\nsamples = 3\nenabled = false\n[calibration]"
     )
     given = settings(tmp_path, GOOD.replace("[calibration]", section)).contact
     assert given is not None
-    assert (given.enabled, given.factor, given.samples) == (False, 2.0, 3)
+    assert (given.enabled, given.factor, given.samples) == (False, 3.0, 3)
     assert given.efforts.tolist() == [12.0]
 
 

@@ -107,7 +107,7 @@ def _text(
         "# [safety.contact]",
         "# effort = { j1 = 12.0 }         # beyond its moving mean [N m or N]",
         "# following = { j1 = 0.02 }      # set less actual position [rad or m]",
-        "# factor = 1.5                   # of what the motions showed",
+        "# factor = 2.0                   # of what the motions showed",
         "",
         "# Trial motions: each joint moves alone from base, as far as the markers stay in view (see",
         "# docs/calibration.md). Choose base such that every camera sees the markers there.",

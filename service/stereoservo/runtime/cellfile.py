@@ -99,7 +99,7 @@ class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     effort: dict[str, float] = {}
     following: dict[str, float] = {}
-    factor: Annotated[float, Meta(ge=1, le=100)] = 1.5
+    factor: Annotated[float, Meta(ge=1, le=100)] = 2.0
     samples: Annotated[int, Meta(ge=1, le=100)] = 5
     enabled: bool = True
 
