@@ -1,7 +1,7 @@
 """The other processes of ``bench can``: an adapter with six answering nodes, emulated drives, an empty loop.
 
 Run as a module with ``echo tcp|pty``, ``drives OPTIONS`` (JSON) or ``empty RATE_HZ SECONDS``. The first line on stdout
-says where they listen or that they begin; they end with their stdin.
+says where they listen; they end with their stdin. The empty loop is ``ready`` then and begins with a line on stdin.
 """
 
 from __future__ import annotations
@@ -90,6 +90,11 @@ def serve_echo(kind: str) -> None:
         fd, slave = pty.openpty()
         tty.setraw(slave)
         print(os.ttyname(slave), flush=True)
+    with real_time(DRIVES_PRIORITY):
+        _answer_syncs(fd)
+
+
+def _answer_syncs(fd: int) -> None:
     adapter = SlcanAdapter()
     while True:
         ready = select.select([fd, sys.stdin], [], [])[0]
@@ -155,7 +160,8 @@ def _main(words: list[str]) -> None:
     elif words[0] == "drives":
         serve_drives(words[1])
     else:
-        print("begins", flush=True)
+        print("ready", flush=True)
+        sys.stdin.readline()
         with real_time(LOOP_PRIORITY):
             figures = empty_loop(float(words[1]), float(words[2]))
         print(json.dumps(figures), flush=True)

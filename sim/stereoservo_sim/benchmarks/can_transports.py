@@ -10,7 +10,7 @@ from typing import Any
 from stereoservo.runtime.ports import DriverError
 from stereoservo_drivers.can.channel import Channel, ChannelSettings
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_sim.benchmarks.can_peer import ANSWERS, COMMANDS, SYNC, peer
+from stereoservo_sim.benchmarks.can_peer import ANSWERS, COMMANDS, LOOP_PRIORITY, SYNC, peer, real_time
 from stereoservo_sim.benchmarks.timing import summary
 
 CYCLE = [SYNC, *COMMANDS]
@@ -91,7 +91,7 @@ def _line(transport: str) -> Iterator[_Line]:
 
 def time_transport(transport: str, seconds: float, paced_cycles: int) -> dict[str, Any]:
     """Cycles back to back for ``seconds``, then paced ones. ``latency_ms``: SYNC sent to the last answer."""
-    with _line(transport) as line:
+    with real_time(LOOP_PRIORITY), _line(transport) as line:
         for _ in range(5):
             line.cycle()
         cycles = lost = 0
