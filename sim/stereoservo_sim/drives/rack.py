@@ -46,16 +46,12 @@ class Slot:
     def __init__(self, node: EmulatedNode, index: int, plant_index: int | None) -> None:
         self.node = node
         self.index = index
+        self.sender = index + 1  # its number on the wire
         self.plant_index = plant_index
         self.due_ns = node.due_ns()
         self.state = node.state()
         self.powered = node.axis.powered
         self.moving = False
-
-    @property
-    def sender(self) -> int:
-        """Its number on the wire."""
-        return self.index + 1
 
 
 class Rack:
@@ -239,16 +235,17 @@ class Rack:
     def _end_of_frame(self, t_ns: int) -> None:
         sender, frame = self.wire.finish()
         self.plant.observe(t_ns)
-        master_hears = sender != MASTER and self.disturbances.master_connected
-        if master_hears:
+        cut = self.disturbances.cut
+        if not self.disturbances.master_connected:
+            if sender == MASTER:
+                return
+        elif sender != MASTER:
             self._delivered.append((t_ns, frame))
-        from_master = sender == MASTER
         for slot in self.slots:
-            if slot.sender == sender or sender == BABBLE + slot.node.node_id or not self._connected(slot):
+            node = slot.node
+            if slot.sender == sender or node.node_id in cut or sender == BABBLE + node.node_id:
                 continue
-            if from_master and not self.disturbances.master_connected:
-                continue
-            slot.node.receive(frame, t_ns)
+            node.receive(frame, t_ns)
             self.look(slot)
 
     def _obey_late(self, order: Order) -> None:
@@ -256,9 +253,6 @@ class Rack:
             self.obey(order)
         except OrderError as error:
             self.tell("order", order.node, f"refused: {error}")
-
-    def _connected(self, slot: Slot) -> bool:
-        return slot.node.node_id not in self.disturbances.cut
 
     def remove(self, slots: list[Slot]) -> None:
         """Take nodes that ``add`` put there off the bus."""
@@ -287,7 +281,7 @@ class Rack:
             slot.powered = slot.node.axis.powered
             self.tell("power_on" if slot.powered else "power_off", slot.node.node_id)
         state = slot.node.state()
-        if state != slot.state:
+        if state is not slot.state and state != slot.state:
             slot.state = state
             self.tell("state", slot.node.node_id, state)
             self._stick(slot)
