@@ -154,10 +154,10 @@ class SlcanBus(can.BusABC):
         except (OSError, ValueError) as error:
             raise can.CanOperationError(f"{self._port.name}: {error}") from error
         for line in self._splitter.feed(chunk):
-            if line in _SENT:
-                self._answers.append(line)
-            elif line[0] in _FRAMES:
+            if line and line[0] in _FRAMES:
                 self._take_frame(line)
+            elif line in _SENT:
+                self._answers.append(line)
             elif line == BEL:
                 with self._refusal_lock:
                     self._refusals += 1
