@@ -183,13 +183,19 @@ class BusThread:
         self.statistics.late_max_ns = max(self.statistics.late_max_ns, late)
         with self._send_lock:
             self._channel.send(self._master.tick(now))
-        self._next_ns += self._period_ns
-        # The drives need time to answer before the next poll: a slot that is nearly over is left out.
-        behind = now + self._period_ns // 2 - self._next_ns
-        if behind > 0:
-            slots = -(-behind // self._period_ns)
-            self.statistics.skipped += slots
-            self._next_ns += slots * self._period_ns
+        self._next_ns, skipped = next_slot(self._next_ns, now, self._period_ns)
+        self.statistics.skipped += skipped
+
+
+def next_slot(slot_ns: int, now_ns: int, period_ns: int) -> tuple[int, int]:
+    """The slot of the grid to wait for after the one of ``slot_ns`` was served at ``now_ns``; how many are left out.
+
+    Slots are never made up for, and the drives get at least half a period to answer before the next poll.
+    """
+    following = slot_ns + period_ns
+    behind = now_ns + period_ns // 2 - following
+    skipped = -(-behind // period_ns) if behind > 0 else 0
+    return following + skipped * period_ns, skipped
 
 
 def follow_scheduling() -> None:

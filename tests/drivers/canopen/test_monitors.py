@@ -172,6 +172,15 @@ def test_jitter_and_delays_that_all_have_in_common_do_not_stop_the_arm(bus, by_m
     assert bus.master.statistics.answered_ns > by_ms * MS
 
 
+def test_one_axis_that_is_late_in_every_other_cycle_is_a_busy_host(bus) -> None:
+    bus.enable()
+    bus.run(0.1, 0.1, cycles=120)
+    late = delayed((0x182, 0x282), 2_000_000)
+    bus.answers = lambda cycle, answers: late(cycle, answers) if cycle % 2 else answers
+    bus.run(0.1, 0.1, cycles=200)
+    assert bus.master.fault is None
+
+
 @pytest.mark.parametrize("by_ms", [1.5, 2.5])
 def test_an_only_drive_is_compared_with_itself(make_bus, by_ms: float) -> None:
     bus = make_bus(1)
