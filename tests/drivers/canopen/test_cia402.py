@@ -302,6 +302,13 @@ def test_counts_of_a_drive_that_booted_unasked_start_anew() -> None:
     assert codec.feedback.positions[0] == pytest.approx((-(2**31) + 10) / COUNTS_PER_RAD, rel=1e-12)
 
 
+def test_emergencies_of_bring_up_are_no_faults(enabled: Cia402Codec) -> None:
+    enabled.ignore()
+    enabled.receive(CanFrame(0x81, struct.pack("<HB5x", 0x8130, 0x11)))
+    assert codes(enabled) == []
+    assert "0x8130" in enabled.status_words()[0]
+
+
 def test_what_happened_before_watching_is_forgotten() -> None:
     codec = codec_of()
     codec.receive(CanFrame(0x181, bytes(5)))
@@ -361,3 +368,15 @@ def test_a_limit_stops_all_and_lets_the_joint_go_inward_only(direction: int, out
     assert codes(codec) == [("limit_switch", 1)]
     codec.receive(tpdo1(2, ENABLED))
     assert codes(codec) == []
+
+
+def test_the_side_of_a_limit_is_forgotten_with_it(enabled: Cia402Codec) -> None:
+    enabled.command(np.array([0.2, 0.0]))
+    enabled.receive(tpdo1(1, ENABLED | 0x0800))
+    assert codes(enabled)[0] == ("limit_switch", 0)
+    enabled.idle()
+    enabled.receive(tpdo1(1, DISABLED))
+    enabled.receive(tpdo1(1, DISABLED | 0x0800))  # by hand, onto whatever side
+    enabled.receive(tpdo1(1, ENABLED | 0x0800))
+    enabled.command(np.array([0.2, 0.0]))
+    assert codes(enabled) == []

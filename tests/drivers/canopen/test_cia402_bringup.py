@@ -26,15 +26,24 @@ from stereoservo_sim.drives.virtual_host import VirtualHost
 COUNTS, GEAR = 4096, 100.0
 COUNTS_PER_RAD = COUNTS * GEAR / (2 * math.pi)
 
+FAULT_RESET = bytes.fromhex("2b 40 60 00 80 00 00 00")
+"""SDO download of two bytes, 0x80, to 0x6040."""
+
 
 class Host(VirtualHost):
-    """``swallow``: SDO requests for this object do not reach the bus."""
+    """``swallow``: SDO requests for this object do not reach the bus. ``after_reset``: ordered 15 ms after every
+    fault reset.
+    """
 
     swallow: tuple[int, int] | None = None
+    after_reset = ""
 
     def send(self, frames: list[CanFrame]) -> None:
         kept = [frame for frame in frames if not self._swallowed(frame)]
         super().send(kept)
+        if self.after_reset and any(frame.data == FAULT_RESET for frame in frames):
+            at_us = (self.t_ns - self.rack.start_ns) // 1000 + 15_000
+            self.rack.order(f"{self.after_reset} @ {at_us}us", self.t_ns)
 
     def _swallowed(self, frame: CanFrame) -> bool:
         if self.swallow is None or frame.id & ~0x7F != 0x600:
@@ -370,6 +379,12 @@ def test_a_value_that_the_drive_changes_is_refused(bench: Bench) -> None:
     assert "set quick_stop_deceleration" in message
 
 
+def test_a_watch_on_the_heartbeat_that_the_drive_changes_is_refused(bench: Bench) -> None:
+    dictionary = bench.node(2).dictionary
+    dictionary.changed(0x1016, lambda subindex, value: dictionary.set(0x1016, 1, 0))
+    assert "0x1016:1" in bench.refused("read_back")
+
+
 def test_a_mapping_that_the_drive_changes_is_refused(bench: Bench) -> None:
     dictionary = bench.node(2).dictionary
     dictionary.changed(0x1801, lambda subindex, value: dictionary.set(0x1A01, 1, 0x60770010))
@@ -425,6 +440,20 @@ def test_a_fault_whose_cause_stays_is_not_reset(bench: Bench) -> None:
     assert bench.master.fault is None
     assert len(bench.events("power_on")) == powered
     bench.run()
+
+
+def test_a_cause_that_shows_itself_a_little_later_is_not_reset_either(bench: Bench) -> None:
+    bench.order("fault 2 0x7305")
+    bench.connect()
+    bench.host.begin_cycle()
+    bench.cycle(0.05)
+    bench.host.after_reset = "fault 2 0x7306"
+    with pytest.raises(DriverError, match=re.escape("0x7306 incremental encoder 2")) as refusal:
+        bench.reset()
+    assert refusal.value.code == "fault_stays"
+    bench.host.after_reset = ""
+    bench.reset()
+    assert bench.master.fault is None, bench.master.fault
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
@@ -520,6 +549,7 @@ def test_released_drives_do_not_miss_the_master(make_bench: Make, abort_option: 
     bench.host.cycling = False
     bench.rack.run_until(bench.rack.t_ns + 2_000_000_000)
     for node in (1, 2, 3):
+        assert bench.object(node, 0x6007) == (0 if abort_option == 1 else abort_option)
         assert bench.node(node).emergencies.active == []
         assert "switch on disabled" in bench.node(node).state()
     bench.plug_in(bench.options)
