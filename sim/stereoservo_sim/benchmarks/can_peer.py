@@ -16,7 +16,7 @@ import sys
 import time
 import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import msgspec
@@ -90,7 +90,10 @@ def serve_echo(kind: str) -> None:
         fd, slave = pty.openpty()
         tty.setraw(slave)
         print(os.ttyname(slave), flush=True)
-    with real_time(DRIVES_PRIORITY):
+    with (
+        real_time(DRIVES_PRIORITY),
+        suppress(ConnectionError),
+    ):  # the host may go before it has read everything
         _answer_syncs(fd)
 
 
