@@ -372,8 +372,9 @@ def test_nmt_commands_while_moving_obey_0x6007(bench, command, option, state):
     assert bench.axis.powered is not bool(option)
 
 
-def test_reset_node_while_moving_stops_by_the_ramp_first(bench):
-    bench.enable(x6007=3, x6085=500_000)
+@pytest.mark.parametrize("quick_stop", [2, 6])
+def test_reset_node_while_moving_stops_by_the_ramp_first(bench, quick_stop):
+    bench.enable(x6007=3, x6085=500_000, x605A=quick_stop)
     bench.velocity(50_000)
     bench.run(600)
     assert bench.axis.set_velocity > 0.5
