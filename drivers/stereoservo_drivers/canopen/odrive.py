@@ -31,6 +31,9 @@ VELOCITY_CONTROL, PASSTHROUGH = 2, 1
 SHARE = 2
 """Axes a cycle that are asked for errors, and likewise for torques."""
 
+RESOLUTION_TURNS = 2.0**-12
+"""Taken for the smallest step of a position, which is no count here: of a coarse encoder."""
+
 _U32X2 = struct.Struct("<II")
 _F32X2 = struct.Struct("<ff")
 _STATE = struct.Struct("<IB")

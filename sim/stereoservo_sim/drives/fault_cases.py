@@ -7,14 +7,15 @@ from typing import Any, Literal
 import msgspec
 
 Host = Literal["runs", "killed", "cycle_hangs", "loop_hangs", "adapter_gone"]
-Stage = Literal["running", "start", "reset"]
+Stage = Literal["running", "standing", "start", "reset"]
 
 
 class FaultCase(msgspec.Struct, frozen=True, kw_only=True):
     """One line of the table.
 
-    ``orders``: given to the rack at the moment of the fault (``stage`` running), before bring-up (start), or a fault
-    whose reset is then tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
+    ``orders``: given to the rack at the moment of the fault (``stage`` running), when the arm is enabled and about to
+    move (standing; times count from its first command), before bring-up (start), or a fault whose reset is then
+    tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
     the master may latch first or bring-up may refuse with, one or several by the fault's phase; empty: nothing
     latches, motion goes on. ``bound_ms``: from the fault to all axes at rest. ``by``: who ends motion.
     ``afterwards``: ordered once the axes rest: the cause goes away, and nothing may move again by itself.
@@ -176,6 +177,23 @@ CIA402_CASES = (
         afterwards=("invert 3 off",),
     ),
     FaultCase(
+        name="limit switch active before motion",
+        orders=("limit 3 +",),
+        towards=3,
+        stage="standing",
+        codes=("limit_switch", "emergency", "drive_fault"),
+        bound_ms=40,
+        afterwards=("limit 3 off",),
+    ),
+    FaultCase(
+        name="encoder against the command from the start",
+        orders=("invert 3",),
+        stage="standing",
+        codes=("encoder_reversed",),
+        bound_ms=200,
+        afterwards=("invert 3 off",),
+    ),
+    FaultCase(
         name="duplicate node id at start",
         orders=("duplicate 2 running",),
         codes=("duplicate_node",),
@@ -245,6 +263,23 @@ ODRIVE_CASES = (
         codes=("drive_fault",),
         bound_ms=40,
         afterwards=("limit 3 off",),
+    ),
+    FaultCase(
+        name="limit switch active before motion",
+        orders=("limit 3 +",),
+        towards=3,
+        stage="standing",
+        codes=("limit_switch", "emergency", "drive_fault"),
+        bound_ms=40,
+        afterwards=("limit 3 off",),
+    ),
+    FaultCase(
+        name="encoder against the command from the start",
+        orders=("invert 3",),
+        stage="standing",
+        codes=("encoder_reversed",),
+        bound_ms=200,
+        afterwards=("invert 3 off",),
     ),
     FaultCase(
         name="duplicate node id at start",

@@ -117,8 +117,8 @@ class Rig:
             self.master.port_called(self.host.t_ns)
             self.host.wait(1.0 / RATE_HZ)
 
-    def start(self, speed: FloatArray) -> None:
-        """Bring-up, enable, drive at ``speed``. Raises TrialError."""
+    def start(self) -> None:
+        """Bring-up and enable. Raises TrialError."""
         try:
             self.bringup.connect(self.host)
         except DriverError as error:
@@ -128,6 +128,10 @@ class Rig:
         self.enable()
         if self.master.mode is not Mode.RUNNING:
             raise TrialError(f"not enabled: {self.master.fault}, {self.master.codec.status_words()}")
+        self.host.velocities = np.zeros(AXES)
+
+    def warm_up(self, speed: FloatArray) -> None:
+        """Drive at ``speed`` (n,). Raises TrialError."""
         self.host.velocities = speed
         self.host.wait(self.case.warm_s)
         if self.master.fault is not None or not self.all_move(speed):
@@ -161,10 +165,13 @@ def _run(rig: Rig, rng: np.random.Generator, run_on_s: float) -> Trial:
     speed = trial_speed() * rng.choice([-1.0, 1.0], AXES)
     if case.towards:
         speed[case.towards - 1] = trial_speed()
-    rig.start(speed)
+    rig.start()
+    if case.stage != "standing":
+        rig.warm_up(speed)
     rig.host.wait(rng.uniform(0.0, 1.0) / RATE_HZ)
     t0 = rig.host.t_ns
     rig.order(case.orders)
+    rig.host.velocities = speed
     _strike(rig)
     if case.by == "nobody":
         return _tolerated(rig, speed)
