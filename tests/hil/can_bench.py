@@ -1,0 +1,183 @@
+"""A cell on a CAN bus under test: emulated drives in a process of their own, or, by ``--hil``, real ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoservo.gateway.client import Client, ClientError
+from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.runtime.daemon import DaemonProcess
+from stereoservo.runtime.directories import CellDirectories, cell_directories
+from stereoservo_sim.cells import shipped_cell_path
+from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
+from stereoservo_sim.drives.emulator import EmulatorProcess
+from stereoservo_sim.history import FILE_NAME, JointHistory
+
+from .conftest import at_rest, eventually
+
+NAME = "can"
+RESTS_S = 0.2
+STANDS = 2e-4
+"""[rad] Rigid bodies that hold their place move less in ``RESTS_S``."""
+RANGE = 0.15
+
+CAMERAS = {
+    "features": """
+driver = "fake"
+mount = "eye_to_hand"
+options = { rate_hz = 30.0 }
+""",
+    "images": """
+driver = "pybullet"
+detector = "dots"
+mount = "eye_to_hand"
+options = { rate_hz = 15.0, latency_s = 0.012, noise = 2.0, background = "plain" }
+""",
+}
+
+
+def cell_text(cameras: str) -> str:
+    """The shipped CAN cell with ``cameras`` of CAMERAS and a quick calibration."""
+    text = shipped_cell_path("hil-can").read_text(encoding="utf-8")
+    head, _, tail = text.partition("# -- cameras")
+    servo = tail[tail.index("[servo]") : tail.index("# Trial motions")]
+    base = tail[tail.index("base = {") :].partition("\n")[0]
+    names = [f"j{k}" for k in range(1, 7)]
+    ranges = ", ".join(f"{name} = {RANGE}" for name in names)
+    sections = "".join(f'\n[[camera]]\nname = "{name}"{CAMERAS[cameras]}' for name in ("left", "right"))
+    calibration = f"[calibration]\n{base}\nrange = {{ {ranges} }}\nstops = 5\nframes = 2\nsettle_s = 0.05\n"
+    head = head.replace('name = "hil-can"', f'name = "{NAME}"', 1)
+    return f"{head}{sections}\n{servo}\n{calibration}"
+
+
+@dataclass
+class CanBench:
+    """Daemon and drives, and what a test does with them. ``emulator`` is None on hardware."""
+
+    cell: Path
+    logs: Path
+    emulator: EmulatorProcess | None
+    daemon: DaemonProcess | None = None
+    starts: int = 0
+    name: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.name = load_cell_file(self.cell).cell.name
+
+    @classmethod
+    def emulated(cls, folder: Path, cameras: str) -> CanBench:
+        """Emulated drives on a free port, no daemon yet."""
+        folder.mkdir()
+        (folder / "copy").mkdir()
+        path = folder / f"{NAME}.toml"
+        path.write_text(cell_text(cameras), encoding="utf-8")
+        emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=folder / "drives-0.log")
+        channel = emulator.wait_ready()
+        return cls(move_to_channel(path, folder / "copy", channel), folder, emulator)
+
+    @property
+    def directories(self) -> CellDirectories:
+        """Where the cell lives."""
+        return cell_directories(self.name)
+
+    def start_daemon(self) -> DaemonProcess:
+        """A daemon of the cell; the one before must have ended."""
+        self.starts += 1
+        self.daemon = DaemonProcess(self.cell, log=self.logs / f"daemon-{self.starts}.log")
+        self.daemon.wait_ready()
+        return self.daemon
+
+    def restart_drives(self) -> None:
+        """Emulated drives anew on the same channel, where the arm was left."""
+        self.emulator = EmulatorProcess(self.cell, log=self.logs / f"drives-{self.starts}-again.log")
+        self.emulator.wait_ready()
+
+    def end(self) -> None:
+        """End what was started."""
+        if self.daemon is not None:
+            self.daemon.stop()
+        if self.emulator is not None:
+            self.emulator.stop()
+
+    def order(self, text: str) -> str:
+        """A fault; skips the test on hardware."""
+        if self.emulator is None:
+            pytest.skip("needs emulated drives: it orders faults of them")
+        return self.emulator.order(text)
+
+    # -- the truth ------------------------------------------------------------------------------------------
+
+    def truth(self) -> tuple[int, np.ndarray]:
+        """When and where the emulated arm was last recorded, (n,) [rad]."""
+        history = JointHistory.open(self.directories.runtime / FILE_NAME)
+        try:
+            newest = history.newest()
+        finally:
+            history.close()
+        assert newest is not None
+        return newest[0], newest[1]
+
+    def stands(self) -> bool:
+        """Whether the arm stands: by the truth where drives are emulated, else by its encoders."""
+        before = self._where()
+        time.sleep(RESTS_S)
+        return bool(np.abs(self._where() - before).max() < STANDS)
+
+    def _where(self) -> np.ndarray:
+        if self.emulator is not None:
+            return self.truth()[1]
+        with Client(self.name) as client:
+            return np.array(list(client.status().joints.values()))
+
+    def told(self, kind: str, after_ns: int) -> bool:
+        """Whether the emulator has told of ``kind`` after a time."""
+        assert self.emulator is not None
+        return any(
+            event["event"] == kind and event["t_ns"] > after_ns for event in list(self.emulator.events)
+        )
+
+
+def codes(client: Client) -> str:
+    """What the cell's reasons say, in one text."""
+    return "; ".join(f"{reason.code} {reason.hint}" for reason in client.status().reasons)
+
+
+def lifecycle(client: Client, wanted: str) -> Callable[[], bool]:
+    """Whether the cell is in that state."""
+    return lambda: client.status().lifecycle == wanted
+
+
+def recover(client: Client) -> None:
+    """Reset where there is a fault, then enable: two acts, by an operator."""
+    if client.status().lifecycle == "fault":
+        client.reset()
+        eventually(f"reset: {codes(client)}", lifecycle(client, "inactive"))
+    if client.status().lifecycle != "active":
+        client.enable()
+
+
+def moving(bench: CanBench, client: Client) -> None:
+    """The arm on its way: j1 and j4 through half a radian, or a twentieth on hardware."""
+    joints = client.status().joints
+    share = 1.0 if bench.emulator is not None else 0.1
+    sign = -1.0 if joints["j1"] > 0.1 else 1.0
+    client.goal({"j1": joints["j1"] + 0.6 * sign * share, "j4": joints["j4"] + 0.9 * sign * share}).abandon()
+    eventually("the arm moves", lambda: not at_rest(client))
+
+
+def reset_is_refused(client: Client) -> None:
+    """A reset is tried and the fault stays, as long as its cause does."""
+    try:
+        reply = client.reset()
+        assert reply.accepted
+    except ClientError:
+        pass  # an earlier reset is still at work
+    for _ in range(10):
+        assert client.status().lifecycle == "fault"
+        time.sleep(0.1)
