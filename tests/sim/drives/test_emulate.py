@@ -82,6 +82,19 @@ def test_drives_in_a_process_take_orders_and_frames_and_end_at_rest(cell_file):
 
 
 @pytest.mark.process
+def test_clients_that_vanish_with_answers_under_way_do_not_end_the_drives(cell_file):
+    with EmulatorProcess(cell_file, options=FREE) as drives:
+        host, port = drives.wait_ready().removeprefix("socket://").split(":")
+        for _ in range(8):
+            with socket.create_connection((host, int(port)), timeout=20.0) as client:
+                client.sendall(b"O\r")
+                assert client.recv(1) in (b"\r", b"")  # turned away while the last one is being dropped
+                client.sendall(b"t00028100\r" * 20)  # each one boots six drives
+        assert "node 6" in drives.order("status")
+        assert drives.stop() == 0
+
+
+@pytest.mark.process
 def test_over_a_pty_and_killed_by_a_signal(cell_file):
     with EmulatorProcess(cell_file, options=("--channel", "pty", "--bit-time")) as drives:
         channel = drives.wait_ready()
