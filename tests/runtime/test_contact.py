@@ -237,6 +237,14 @@ def test_learnt_thresholds_by_hand(bench: Any) -> None:
     assert following == pytest.approx(np.array([0.03, 0.03, 0.06, 0.015, 0.03, 0.0]) + cycle)
 
 
+def test_floors_are_among_joints_of_one_unit(bench: Any) -> None:
+    units = ("N m", "N m", "N m", "of rated", "of rated", "of rated")
+    loads = JointLoads(np.full(N, 1.0), np.zeros((N, N)), np.array([4.0, 50.0, 20.0, 0.3, 0.2, 0.0]))
+    watched = msgspec.structs.replace(stated(), effort_units=units)
+    efforts, _ = contact.thresholds(with_contact(bench.settings, watched), loads)
+    assert efforts == pytest.approx([0.5, 0.5, 0.5, 0.003, 0.003, 0.003])
+
+
 def test_stated_thresholds_come_before_learnt_ones(bench: Any) -> None:
     settings = with_contact(bench.settings, stated(effort={0: 3.0}, following={5: 0.5}))
     efforts, following = contact.thresholds(settings, LOADS)

@@ -29,7 +29,7 @@ from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFault, MasterSettings, Mode
 from stereoservo_drivers.canopen.option_checks import check_options
-from stereoservo_drivers.canopen.options import CanOptions
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.protocols import make_bringup, make_codec
 from stereoservo_drivers.lifecycle import DriverLifecycle, State
 from stereoservo_drivers.options import decode_options
@@ -75,6 +75,7 @@ class CanJointDriver:
             ),
             rate_hz=self.options.rate_hz,
             pacing="clock",
+            effort_units=tuple(_effort_unit(joint, self.options.protocol) for joint in self.options.joint),
             command_timeout_s=self.options.command_timeout_s,
             call_budget_us=CALL_BUDGET_US,
         )
@@ -291,3 +292,10 @@ class CanJointDriver:
                 return until()
             time.sleep(_POLL_S)
         return True
+
+
+def _effort_unit(joint: CanJoint, protocol: str) -> str:
+    """CiA 402 tells torques in permille of a rated torque (0x6077) that only the cell file may know; ODrive in N m."""
+    if protocol == "cia402" and joint.rated_torque is None:
+        return "of rated"
+    return "N m" if joint.kind == "revolute" else "N"

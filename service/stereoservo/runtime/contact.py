@@ -25,7 +25,7 @@ from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.runtime.cycle import Lifecycle
 from stereoservo.runtime.ports import FloatArray, JointState
-from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.settings import ContactSettings, CoreSettings
 from stereoservo.runtime.state import Contact, CoreState, Loads, Trials
 
 MEAN_S = 0.25
@@ -38,7 +38,7 @@ MOVING = 1e-3  # [rad/s or m/s] of commanded velocity
 ALONE = 0.05  # of the fastest joint's speed: what a joint that only holds its place may have
 GAP_S = 0.5  # without a sample for so long, means are of another time
 EFFORT_FLOOR = 0.01
-"""Of the largest effort of any joint: what a joint without weight may always do."""
+"""Of the largest effort of any joint with the same unit: what a joint without weight may always do."""
 
 
 def thresholds(settings: CoreSettings, loads: JointLoads | None) -> tuple[FloatArray, FloatArray] | None:
@@ -65,7 +65,7 @@ def learnt_thresholds(settings: CoreSettings, loads: JointLoads | None) -> tuple
     faster = np.maximum(speeds / tried, 1.0)
     if loads.efforts is not None and loads.largest_efforts is not None and loads.largest_efforts.any():
         together = (loads.efforts * faster).sum(axis=1)
-        efforts = factor * together + EFFORT_FLOOR * loads.largest_efforts.max()
+        efforts = factor * together + EFFORT_FLOOR * _largest_alike(settings.contact, loads.largest_efforts)
     if loads.following_errors is not None and loads.following_errors.any():
         # Samples of set and actual position may be a cycle apart.
         following = factor * loads.following_errors * faster + speeds / settings.rate_hz
@@ -149,6 +149,12 @@ def told(contact: Contact, limits: tuple[FloatArray, FloatArray] | None) -> dict
         "effort_limits": effort_limits,
         "following_limits": following_limits,
     }
+
+
+def _largest_alike(contact: ContactSettings, largest: FloatArray) -> FloatArray:
+    """For each joint, the largest of the efforts that are in its own unit (n,)."""
+    units = contact.effort_units
+    return np.array([max(largest[k] for k in range(len(units)) if units[k] == unit) for unit in units])
 
 
 # -- parts --------------------------------------------------------------------------------------------------
