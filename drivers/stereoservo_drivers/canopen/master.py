@@ -10,15 +10,14 @@ Threads: ``tick`` and ``receive`` belong to one; the rest may be called from ano
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 
-import msgspec
 import numpy as np
 
 from stereoservo.runtime.ports import FloatArray, JointState
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import AxisFault, Codec
 from stereoservo_drivers.canopen.limits import limit_command
+from stereoservo_drivers.canopen.master_data import MasterFault, MasterSettings, MasterStatistics, Mode
 from stereoservo_drivers.canopen.monitors import (
     FloodMonitor,
     FrameCounter,
@@ -27,8 +26,9 @@ from stereoservo_drivers.canopen.monitors import (
     ReversalMonitor,
     Trip,
 )
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale
+
+__all__ = ["ENABLE_LIMIT_S", "Master", "MasterFault", "MasterSettings", "MasterStatistics", "Mode"]
 
 ENABLE_LIMIT_S = 1.5
 STOP_MARGIN_S = 0.1
@@ -38,76 +38,6 @@ REST_CYCLES = 3
 FRESH_CYCLES = 2
 RESOLUTION_SAID = 1e-3
 """[rad/s or m/s] A command that the wire's resolution changes by more is reported."""
-
-
-class Mode(StrEnum):
-    """What the master does with the axes."""
-
-    OFF = "off"
-    ENABLING = "enabling"
-    RUNNING = "running"
-    STOPPING = "stopping"
-    LATCHED = "latched"
-
-
-class MasterFault(msgspec.Struct, frozen=True):
-    """What ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: where there are some."""
-
-    code: str
-    message: str
-    axis: str = ""
-    value: float | None = None
-    limit: float | None = None
-    hint: str = ""
-    t_ns: int = 0
-
-    def text(self) -> str:
-        """All of it as one sentence for people."""
-        return self.message + (f": {self.hint}" if self.hint else "")
-
-
-class MasterSettings(msgspec.Struct, frozen=True):
-    """What the master needs of the cell file's options."""
-
-    joints: tuple[CanJoint, ...]
-    rate_hz: float
-    bitrate: int
-    heartbeat_ms: int
-    max_missed_cycles: int
-    command_timeout_s: float
-    loop_timeout_ms: int
-
-    @classmethod
-    def of(cls, options: CanOptions) -> MasterSettings:
-        """The settings in ``options``."""
-        return cls(
-            joints=options.joint,
-            rate_hz=options.rate_hz,
-            bitrate=options.bitrate,
-            heartbeat_ms=options.heartbeat_ms,
-            max_missed_cycles=options.max_missed_cycles,
-            command_timeout_s=options.command_timeout_s,
-            loop_timeout_ms=options.loop_timeout_ms,
-        )
-
-
-@dataclass
-class MasterStatistics:
-    """Since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two ticks.
-
-    ``answered_ns``: from the newest complete cycle's poll to its last frame; ``answered_max_ns``: the largest.
-    """
-
-    cycles: int = 0
-    complete: int = 0
-    incomplete: int = 0
-    lost: int = 0
-    doubled: int = 0
-    foreign: int = 0
-    heartbeats: int = 0
-    longest_cycle_ns: int = 0
-    answered_ns: int = 0
-    answered_max_ns: int = 0
 
 
 @dataclass
@@ -146,7 +76,8 @@ class Master:
         self._acceleration = np.array([joint.max_acceleration for joint in joints])
         self._low = np.array([joint.position_min for joint in joints])
         self._high = np.array([joint.position_max for joint in joints])
-        self._resolution = np.array([JointScale.of(joint).resolution for joint in joints])
+        counts = settings.resolution_counts
+        self._resolution = np.array([counts * JointScale.of(joint).resolution for joint in joints])
         self._zero = np.zeros(self._n)
         self.stop_limit_s = float(np.max(self._max_velocity / self._acceleration)) + STOP_MARGIN_S
         self._seq = 0
