@@ -45,6 +45,7 @@ STRICT = {
 TRIES = 4
 REST_LIMIT_S = 2.0
 RUN_ON_S = 0.5
+TOLD_LIMIT_S = 2.0
 START_LIMIT_S = 60.0
 
 ORDERED = (
@@ -127,8 +128,14 @@ class _Master:
 def _strike(emulator: EmulatorProcess, master: _Master, fault: str, order: str) -> int:
     """Make the fault happen; when [ns]."""
     if order:
+        asked_ns = time.monotonic_ns()
         emulator.order(order)
-        return int([event for event in emulator.events if event.get("event") == "order"][-1]["t_ns"])
+        until = time.monotonic() + TOLD_LIMIT_S
+        while not (done := _events(emulator, asked_ns, "order")):
+            if time.monotonic() > until:
+                raise StalledError(f"the emulator told nothing of {order!r} within {TOLD_LIMIT_S:g} s")
+            time.sleep(0.001)
+        return int(done[0]["t_ns"])
     if fault == "servo loop hangs":
         assert master.process.stdin is not None
         master.process.stdin.write("hang\n")
