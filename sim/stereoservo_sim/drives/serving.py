@@ -25,14 +25,19 @@ ASKING_NS = 200_000
 """How often an endpoint is asked that cannot be waited for."""
 STALL_NS = 2_000_000
 """A loop that wakes later than this was stalled."""
+LATE_FRAME_NS = 500_000
 ENDING_NS = 500_000_000
 """How long after power off the arm is followed until it stands."""
 
 
 class Stalls(msgspec.Struct):
-    """How late the serving loop came: the largest lateness and gap, and how often it was later than STALL_NS."""
+    """How late the serving loop came: the largest lateness and gap, how often it was later than STALL_NS, and how many
+    frames left more than LATE_FRAME_NS after their end on the bus.
+    """
 
     turns: int = 0
+    frames: int = 0
+    late_frames: int = 0
     stalls: int = 0
     latest_ns: int = 0
     longest_gap_ns: int = 0
@@ -41,7 +46,8 @@ class Stalls(msgspec.Struct):
         """For people."""
         return (
             f"server loop: {self.turns} turns, latest {self.latest_ns * 1e-6:.2f} ms, longest gap "
-            f"{self.longest_gap_ns * 1e-6:.2f} ms, {self.stalls} stalls over {STALL_NS * 1e-6:g} ms"
+            f"{self.longest_gap_ns * 1e-6:.2f} ms, {self.stalls} stalls over {STALL_NS * 1e-6:g} ms; "
+            f"{self.late_frames} of {self.frames} frames left {LATE_FRAME_NS * 1e-6:g} ms late or later"
         )
 
 
@@ -159,8 +165,7 @@ class RackServer:
         frames = self.endpoint.take()
         for t_ns, frame in self._stamped(frames, wanted, now):
             self.rack.inject(frame, t_ns)
-        self.rack.run_until(now)
-        self._give()
+        self._catch_up(now)
         if self._wake_read in ready:
             self._answer()
         for descriptor in [one for one in self._watched if one in ready]:
@@ -191,10 +196,21 @@ class RackServer:
         stalls.longest_gap_ns = max(stalls.longest_gap_ns, now - self._turned_ns)
         stalls.stalls += now - wanted > STALL_NS
 
+    def _catch_up(self, now: int) -> None:
+        """Everything up to ``now``. What has ended on the bus does not wait for the arm's next step to be computed."""
+        while (due := self.rack.due_ns()) <= now:
+            self.rack.run_until(due)
+            self._give()
+        self.rack.run_until(now)
+        self._give()
+
     def _give(self) -> None:
         delivered = self.rack.delivered()
         if delivered:
             self.endpoint.give(delivered)
+            late_ns = self._clock_ns() - delivered[0][0]
+            self.stalls.frames += len(delivered)
+            self.stalls.late_frames += len(delivered) * (late_ns > LATE_FRAME_NS)
 
     def _answer(self) -> None:
         os.read(self._wake_read, 4096)
