@@ -29,6 +29,7 @@ def can_joint(k: int, **changes: Any) -> dict[str, Any]:
 
 
 PATIENT: dict[str, Any] = {
+    "rate_hz": 125.0,
     "max_missed_cycles": 50,
     "heartbeat_timeout_ms": 1000,
     "rpdo_deadline_ms": 1000,

@@ -39,7 +39,10 @@ class Link(Protocol):
 class Bringup(Protocol):
     """Bring-up of one protocol."""
 
-    codec: Codec
+    @property
+    def codec(self) -> Codec:
+        """The codec of the same drives."""
+        ...
 
     def connect(self, link: Link) -> None:
         """Find every drive, check it, configure it, start its cyclic frames. Raises DriverError. Nothing moves."""

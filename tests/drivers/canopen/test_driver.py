@@ -24,6 +24,7 @@ from stereoservo_sim.drives.serving import RackServer
 
 OPTIONS: dict[str, Any] = {
     "interface": "stereoservo_slcan",
+    "rate_hz": 125.0,
     "max_missed_cycles": 40,
     "heartbeat_timeout_ms": 1000,
     "rpdo_deadline_ms": 1000,
@@ -58,7 +59,7 @@ class Arm:
         for _ in range(cycles):
             self.driver.read_state()
             self.driver.write_velocity(ASK)
-            time.sleep(0.004)
+            time.sleep(0.008)
 
     def drive_until_fault(self, limit_s: float = 3.0) -> DriverError:
         until = time.monotonic() + limit_s
@@ -118,7 +119,7 @@ def arm(make_arm: Callable[..., Arm]) -> Arm:
 
 def test_the_description_is_the_cell_files(arm: Arm) -> None:
     description = arm.driver.describe()
-    assert (description.rate_hz, description.pacing, description.command_timeout_s) == (250.0, "clock", 0.1)
+    assert (description.rate_hz, description.pacing, description.command_timeout_s) == (125.0, "clock", 0.1)
     assert [joint.name for joint in description.joints] == ["j1", "j2"]
     first = description.joints[0]
     assert (first.position_min, first.position_max, first.velocity_max) == (-2.0, 2.5, 1.0)
@@ -212,7 +213,7 @@ def test_a_drive_that_is_in_fault_at_the_start(arm: Arm) -> None:
 
 
 def test_an_adapter_that_is_pulled_out_and_put_in_again(make_arm: Callable[..., Arm]) -> None:
-    arm = make_arm(heartbeat_timeout_ms=100)
+    arm = make_arm(heartbeat_timeout_ms=400)
     driver = arm.active()
     arm.server.order("adapter out")
     error = arm.drive_until_fault()
@@ -232,7 +233,7 @@ def test_an_adapter_that_is_pulled_out_and_put_in_again(make_arm: Callable[..., 
 
 
 def test_a_loop_that_hangs_is_stopped_and_told(make_arm: Callable[..., Arm]) -> None:
-    arm = make_arm(loop_timeout_ms=150)
+    arm = make_arm(loop_timeout_ms=400)
     driver = arm.active()
     assert arm.rests()
     until = time.monotonic() + 2.0
@@ -246,7 +247,7 @@ def test_a_loop_that_hangs_is_stopped_and_told(make_arm: Callable[..., Arm]) -> 
 def test_what_is_raised_in_the_bus_thread_stops_the_arm(
     make_arm: Callable[..., Arm], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arm = make_arm(heartbeat_timeout_ms=100)
+    arm = make_arm(heartbeat_timeout_ms=400)
     driver = arm.active()
 
     def broken(*_: object) -> int:
