@@ -264,6 +264,20 @@ def test_images_that_contradict_the_model_make_it_suspect_and_abort(bench: Any) 
     assert refused.reasons[0].code == "MODEL_SUSPECT"
 
 
+def test_images_while_the_joints_are_silent_tell_nothing_of_the_model(bench: Any) -> None:
+    """Drives that say nothing while the arm brakes or is pushed: what cameras see then is not the model's fault."""
+    bench.ready()
+    before = bench.log[-1][1].status.model
+    bench.joints_on = False
+    bench.run(0.1)
+    bench.q = bench.q + 0.4 * DISPLACED
+    bench.run(2.0)
+    assert bench.log[-1][1].status.model == before
+    bench.joints_on = True
+    bench.run(1.0)
+    assert bench.log[-1][1].status.model == before
+
+
 def test_goal_can_be_taught_and_reached_again(bench: Any) -> None:
     bench.ready()
     shown = bench.q + 0.6 * DISPLACED

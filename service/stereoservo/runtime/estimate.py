@@ -36,6 +36,8 @@ MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
 TIMING_SIGMA_S = 0.003  # uncertainty of a shutter stamp against the joint stamps
 FIRST_SIGHT_SIGMA_PX = 6.0  # before a marker's innovation is known
 CORRECTION_DAMPING = 1e-4  # relative to the largest diagonal of the normal matrix
+UNKNOWN_NS = 100_000_000
+"""A frame that is so much later than the newest joint sample (drives that are silent) is compared with nothing."""
 SUSPECT_FRAMES = 8  # refused ones in a row, of one camera
 TRUSTED_FRAMES = 30  # agreeing ones in a row, of every camera
 AGREEING_PX = 1.5
@@ -167,12 +169,14 @@ def remember_joints(history: JointHistory, sample: JointState) -> None:
 def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
     """Joint positions at ``t_ns`` by linear interpolation; None when the history does not reach there.
 
-    Past the newest sample it extrapolates by up to the last sample interval.
+    Past the newest sample it extrapolates by up to the last sample interval; ``UNKNOWN_NS`` past it, nobody knows.
     """
     filled = min(history.count, HISTORY)
     if filled < 2:
         return None
     newest = history.count - 1
+    if t_ns - int(history.t_ns[newest % HISTORY]) > UNKNOWN_NS:
+        return None
     for back in range(filled - 1):
         later, earlier = (newest - back) % HISTORY, (newest - back - 1) % HISTORY
         t1, t0 = int(history.t_ns[later]), int(history.t_ns[earlier])
