@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from stereoservo.cli import interruption
 from stereoservo.cli.output import (
     EXIT_FAILED,
     CellArgument,
@@ -97,7 +98,9 @@ def calibrate(
             except NotRunningError:
                 note("no daemon runs for this cell: starting one")
                 stack.enter_context(DaemonProcess(Path(cell))).wait_ready()
-        client = stack.enter_context(Client(cell, endpoint=endpoint, operator=operator))
+        client = stack.enter_context(
+            Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check)
+        )
         if unattended:
             _must_be_idle(client)
         elif client.status().lifecycle == "inactive":

@@ -55,7 +55,9 @@ def doctor(
     plan = make_plan(cell.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
     checks.append(Check("drivers", True, _drivers(plan)))
     checks += [check(plan, directories) for check in CHECKS]
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # an adapter that hangs up is a finding, no end without a word
+    signal.signal(
+        signal.SIGPIPE, signal.SIG_IGN
+    )  # an adapter that hangs up is a finding, no end without a word
     for found in examine_joints(plan, may_move):
         checks.append(Check(found.name, found.ok, found.message, found.cure))
     failed = [check for check in checks if check.ok is False]

@@ -11,6 +11,7 @@ from typing import Annotated, Any, cast
 import msgspec
 import typer
 
+from stereoservo.cli import interruption
 from stereoservo.cli.goal_input import (
     adaptive,
     make_goal,
@@ -172,7 +173,7 @@ def goal(
         wanted = make_goal(target, options)
     if wait and wanted.lease_s is None:
         wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
         if check or wanted.check:
             reply = client.check(wanted)
             emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stereoservo.cli import interruption
 from stereoservo.cli.goal import follow
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption
 from stereoservo.gateway.client import Client
@@ -19,5 +20,8 @@ def home(
     json: JsonOption = False,
 ) -> None:
     """Move every joint to the cell's home position. Ctrl-C cancels."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client, client.home(speed_scale) as handle:
+    with (
+        Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client,
+        client.home(speed_scale) as handle,
+    ):
         follow(handle, json)

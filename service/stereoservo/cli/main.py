@@ -15,6 +15,7 @@ from typer.main import get_command
 from typer.models import CommandInfo
 
 import stereoservo
+from stereoservo.cli import interruption
 from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
 from stereoservo.runtime import plugins
 
@@ -150,6 +151,7 @@ def invoke(arguments: list[str]) -> int:
 def main() -> None:
     """Entry point of the command line."""
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    interruption.install()
     sys.exit(invoke(sys.argv[1:]))
 
 

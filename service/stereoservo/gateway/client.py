@@ -80,6 +80,7 @@ class Client:
 
     ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
     host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
+    ``while_waiting``: called again and again while an event is waited for; what it raises ends the wait.
 
     Raises NotRunningError, SessionError.
     """
@@ -92,6 +93,7 @@ class Client:
         operator: str | None = None,
         timeout_s: float = 2.0,
         tls: Path | None = None,
+        while_waiting: Callable[[], None] = lambda: None,
     ) -> None:
         if endpoint is None:
             info = find_daemon(cell)
@@ -101,6 +103,7 @@ class Client:
         self.keys = KeySpace(cell)
         self._goal_key = self.keys.goal(self.operator)
         self._timeout_s = timeout_s
+        self.while_waiting = while_waiting
         self._session = open_session(client_config(endpoint, _tls_directory() if tls is None else tls))
         self._declared: list[Any] = []
         self._closed = False

@@ -115,6 +115,7 @@ class EventWatch:
             for event in self.poll():
                 if wanted(event):
                     return event
+            self._client.while_waiting()
             if time.monotonic() > until:
                 raise TimedOutError(f"{what}: nothing within {timeout_s:g} s")
             time.sleep(POLL_S)

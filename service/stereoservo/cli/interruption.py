@@ -1,0 +1,25 @@
+"""Ctrl-C as an exception and as a flag: raised in a destructor or a library's callback, the exception alone is lost."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType
+
+_asked = False
+
+
+def install() -> None:
+    """From now on an interrupt raises KeyboardInterrupt and is remembered."""
+    signal.signal(signal.SIGINT, _interrupt)
+
+
+def check() -> None:
+    """Raise KeyboardInterrupt where one was asked for. For loops that wait while the arm moves."""
+    if _asked:
+        raise KeyboardInterrupt
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    global _asked  # noqa: PLW0603  a process has one
+    _asked = True
+    raise KeyboardInterrupt
