@@ -1,4 +1,4 @@
-"""Speed of the stereo control step, kernels beside the reference: ``pytest tests/benchmarks --benchmark-enable``.
+"""Speed of the stereo control step, kernels beside the reference: ``pytest -n 0 tests/benchmarks --benchmark-enable``.
 
 Without that option each runs once and only the results are compared. Figures are medians; times are never asserted.
 """
