@@ -21,7 +21,6 @@ from stereoservo_sim.history import FILE_NAME, JointHistory
 
 from .conftest import at_rest, eventually
 
-NAME = "can"
 RESTS_S = 0.2
 STANDS = 2e-4
 """[rad] Rigid bodies that hold their place move less in ``RESTS_S``."""
@@ -42,17 +41,17 @@ options = { rate_hz = 15.0, latency_s = 0.012, noise = 2.0, background = "plain"
 }
 
 
-def cell_text(cameras: str) -> str:
-    """The shipped CAN cell with ``cameras`` of CAMERAS and a quick calibration."""
+def cell_text(name: str, cameras: str) -> str:
+    """The shipped CAN cell as ``name``, with ``cameras`` of CAMERAS and a quick calibration."""
     text = shipped_cell_path("hil-can").read_text(encoding="utf-8")
     head, _, tail = text.partition("# -- cameras")
     servo = tail[tail.index("[servo]") : tail.index("# Trial motions")]
     base = tail[tail.index("base = {") :].partition("\n")[0]
-    names = [f"j{k}" for k in range(1, 7)]
-    ranges = ", ".join(f"{name} = {RANGE}" for name in names)
-    sections = "".join(f'\n[[camera]]\nname = "{name}"{CAMERAS[cameras]}' for name in ("left", "right"))
-    calibration = f"[calibration]\n{base}\nrange = {{ {ranges} }}\nstops = 5\nframes = 2\nsettle_s = 0.05\n"
-    head = head.replace('name = "hil-can"', f'name = "{NAME}"', 1)
+    ranges = ", ".join(f"j{k} = {RANGE}" for k in range(1, 7))
+    sections = "".join(f'\n[[camera]]\nname = "{side}"{CAMERAS[cameras]}' for side in ("left", "right"))
+    speed = "stops = 4\nframes = 2\nsettle_s = 0.05\nspeed_scale = 0.8\n"
+    calibration = f"[calibration]\n{base}\nrange = {{ {ranges} }}\n{speed}"
+    head = head.replace('name = "hil-can"', f'name = "{name}"', 1)
     return f"{head}{sections}\n{servo}\n{calibration}"
 
 
@@ -72,11 +71,11 @@ class CanBench:
 
     @classmethod
     def emulated(cls, folder: Path, cameras: str) -> CanBench:
-        """Emulated drives on a free port, no daemon yet."""
+        """Emulated drives on a free port, no daemon yet; the cell has the folder's name."""
         folder.mkdir()
         (folder / "copy").mkdir()
-        path = folder / f"{NAME}.toml"
-        path.write_text(cell_text(cameras), encoding="utf-8")
+        path = folder / "cell.toml"
+        path.write_text(cell_text(folder.name, cameras), encoding="utf-8")
         emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=folder / "drives-0.log")
         channel = emulator.wait_ready()
         return cls(move_to_channel(path, folder / "copy", channel), folder, emulator)

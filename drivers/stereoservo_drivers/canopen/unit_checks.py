@@ -26,8 +26,10 @@ DOUBLING_S = 0.06
 RUNAWAY = 3.0
 TOLERANCE = 0.15
 LAG_S = 0.15
-SURE = 1.6
-"""A named unit within this factor of what would fit is meant: a joint stopped early has not come up to speed."""
+SURE = 1.3
+"""A named unit within this factor of what would fit is meant."""
+STOPPED_EARLY = 6.0
+"""The same for a joint that was stopped before it had come up to speed."""
 NAMED_UNITS = {1.0: "rev/s", 60.0: "rpm", 600.0: "rpm/10", 6000.0: "rpm/100", 60_000.0: "rpm/1000"}
 
 
@@ -133,7 +135,10 @@ def jog_finding(trace: JogTrace) -> Finding:
     name = f"{joint.name} jog"
     asked, travel = _told(joint, trace.asked), _told(joint, trace.travel)
     ratio = trace.travel / trace.asked if trace.asked else math.inf
-    if trace.runs_away() or ratio > 1.0 + TOLERANCE:
+    if trace.runs_away():
+        cure = _units_cure(joint, ratio, at_least=True)
+        return Finding(name, False, f"asked for {asked}, moved {travel} before it was stopped", cure)
+    if ratio > 1.0 + TOLERANCE:
         return Finding(
             name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
         )
@@ -171,15 +176,20 @@ def jog_finding(trace: JogTrace) -> Finding:
     )  # fmt: skip
 
 
-def _units_cure(joint: CanJoint, ratio: float) -> str:
+def _units_cure(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:
+    """``at_least``: the joint was stopped while it was still gaining speed; the true ratio is larger."""
     configured = joint.velocity_units_per_rev_s or joint.counts_per_rev
-    true = configured / abs(ratio) if ratio else math.inf
+    if not 0.0 < abs(ratio) < math.inf:
+        return f"velocity_units_per_rev_s is {configured:g}, counts_per_rev {joint.counts_per_rev:g}: both right?"
+    fits = configured / abs(ratio)
+    low, high = (fits / STOPPED_EARLY, fits * SURE) if at_least else (fits / SURE, fits * SURE)
     named = {**NAMED_UNITS, joint.counts_per_rev: "counts/s"}
-    near = min(named, key=lambda value: abs(math.log(value / true)) if 0.0 < true < math.inf else math.inf)
-    if 0.0 < true < math.inf and near != configured and abs(math.log(near / true)) < math.log(SURE):
-        return f"velocity_units_per_rev_s = {near:g} ({named[near]})? it is {configured:g}"
+    near = [value for value in named if low <= value <= high and value != configured]
+    if near:
+        unit = max(near) if at_least else min(near, key=lambda value: abs(math.log(value / fits)))
+        return f"velocity_units_per_rev_s = {unit:g} ({named[unit]})? it is {configured:g}"
     return (
-        f"velocity_units_per_rev_s is {configured:g}; about {_rounded(true)} would fit this travel, if counts_per_rev "
+        f"velocity_units_per_rev_s is {configured:g}; about {_rounded(fits)} would fit this travel, if counts_per_rev "
         f"({joint.counts_per_rev:g}) is right"
     )
 
