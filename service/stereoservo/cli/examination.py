@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
 import typer
 
@@ -12,6 +14,7 @@ from stereoservo.cli.output import CommandError
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.interprocess import RunPlan
 from stereoservo.runtime.locks import AlreadyRunningError, FileLock, hardware_lock_path, holder
+from stereoservo.runtime.loop import prepare_realtime
 from stereoservo.runtime.ports import DriverError, ExaminableJointDriver, Finding
 from stereoservo.runtime.servo import make_driver
 
@@ -60,7 +63,21 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
         except AlreadyRunningError as error:
             yield Finding("drives", None, f"not examined: {error}")
             return
+        locks.enter_context(_scheduled(plan.cell.servo.priority))
         try:
             yield from driver.examine(may_move)
         except DriverError as error:
             yield Finding("drives", False, str(error))
+
+
+@contextmanager
+def _scheduled(priority: int) -> Iterator[None]:
+    """As the daemon's servo process is scheduled, so that what is measured is what it would see."""
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    prepare_realtime(priority)  # where it is not allowed, the check "scheduling" says so
+    try:
+        yield
+    finally:
+        # The flag may be set, and not be cleared, without privileges.
+        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
+        gc.unfreeze()
