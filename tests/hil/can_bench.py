@@ -104,10 +104,14 @@ class CanBench:
         if self.emulator is not None:
             self.emulator.stop()
 
-    def order(self, text: str) -> str:
-        """A fault; skips the test on hardware."""
+    def needs_emulated_drives(self, why: str) -> None:
+        """Skip the test on hardware."""
         if self.emulator is None:
-            pytest.skip("needs emulated drives: it orders faults of them")
+            pytest.skip(f"needs emulated drives: {why}")
+
+    def order(self, text: str) -> str:
+        """A fault of the emulated drives."""
+        assert self.emulator is not None
         return self.emulator.order(text)
 
     # -- the truth ------------------------------------------------------------------------------------------
@@ -162,11 +166,14 @@ def recover(client: Client) -> None:
 
 
 def moving(bench: CanBench, client: Client) -> None:
-    """The arm on its way: j1 and j4 through half a radian, or a twentieth on hardware."""
+    """The arm on its way: its first and fourth joint through half a radian, or a twentieth on hardware."""
     joints = client.status().joints
     share = 1.0 if bench.emulator is not None else 0.1
-    sign = -1.0 if joints["j1"] > 0.1 else 1.0
-    client.goal({"j1": joints["j1"] + 0.6 * sign * share, "j4": joints["j4"] + 0.9 * sign * share}).abandon()
+    names = list(joints)
+    first, fourth = names[0], names[min(3, len(names) - 1)]
+    sign = -1.0 if joints[first] > 0.1 else 1.0
+    ways = {fourth: 0.9, first: 0.6}
+    client.goal({name: joints[name] + way * sign * share for name, way in ways.items()}).abandon()
     eventually("the arm moves", lambda: not at_rest(client))
 
 

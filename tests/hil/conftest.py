@@ -59,16 +59,20 @@ def processes(directories: CellDirectories) -> dict[str, int]:
 
 
 @pytest.fixture(scope="session")
-def roots() -> Iterator[Path]:
-    """Short directories of their own (a socket's path is limited) for everything that these tests start."""
+def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
+    """Short directories of their own (a socket's path is limited) for everything that these tests start.
+
+    On hardware (``--hil``) the runtime directory is the user's: its locks keep two daemons off one arm.
+    """
     root = Path(tempfile.mkdtemp(prefix="sshil", dir="/tmp"))
     before = {key: os.environ.get(key) for key in ("STEREOSERVO_RUNTIME_DIR", "STEREOSERVO_STATE_DIR")}
-    os.environ["STEREOSERVO_RUNTIME_DIR"] = str(root / "r")
+    if request.config.getoption("--hil") is None:
+        os.environ["STEREOSERVO_RUNTIME_DIR"] = str(root / "r")
     os.environ["STEREOSERVO_STATE_DIR"] = str(root / "s")
     yield root
     for key, value in before.items():
         if value is None:
-            os.environ.pop(key)
+            os.environ.pop(key, None)
         else:
             os.environ[key] = value
     shutil.rmtree(root)

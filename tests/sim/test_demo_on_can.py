@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tomllib
@@ -60,3 +61,18 @@ def test_an_eds_file_beside_the_cell_file_is_still_found(tmp_path: Path) -> None
     path.write_text(text.replace("channel = ", "canal = "))
     with pytest.raises(ValueError, match=r"needs a line `channel = …` under \[joints\.options\]"):
         move_to_channel(path, tmp_path / "copy", "x")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_demonstration_converges_through_emulated_can_drives(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "stereoservo.cli.main", "demo", "--cell", "hil-can", "--json", "--out", str(tmp_path)],
+        capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    result = json.loads(done.stdout)
+    assert result["converged"] is True, result
+    assert result["replay"]["identical"] is True
+    for goal in result["goals"]:
+        assert goal["final_error_px"] <= 0.3
+        assert goal["final_error_mm"] <= 0.5
