@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from binascii import Error as HexError
 from binascii import hexlify, unhexlify
+from functools import cache
 
 from stereoservo_drivers.can.frames import CanFrame
 
@@ -61,6 +62,8 @@ def encode_frame(frame: CanFrame) -> bytes:
     Raises:
         ValueError: id, data or length that no classical frame has.
     """
+    if not (frame.remote or frame.extended):
+        return _head(frame.id, len(frame.data)) + hexlify(frame.data).upper() + CR
     highest = 0x1FFFFFFF if frame.extended else 0x7FF
     if not 0 <= frame.id <= highest:
         raise ValueError(f"id 0x{frame.id:X} of a frame; valid here: 0 to 0x{highest:X}")
@@ -71,8 +74,17 @@ def encode_frame(frame: CanFrame) -> bytes:
         if frame.data:
             raise ValueError(f"a remote frame with {len(frame.data)} data bytes; it has none")
         return (b"R%08X%d\r" if frame.extended else b"r%03X%d\r") % (frame.id, length)
-    line = b"T%08X%d%b\r" if frame.extended else b"t%03X%d%b\r"
-    return line % (frame.id, length, hexlify(frame.data).upper())
+    return b"T%08X%d%b\r" % (frame.id, length, hexlify(frame.data).upper())
+
+
+@cache
+def _head(can_id: int, length: int) -> bytes:
+    """Of a data frame with 11 bits, up to its data."""
+    if not 0 <= can_id <= 0x7FF:
+        raise ValueError(f"id 0x{can_id:X} of a frame; valid here: 0 to 0x7FF")
+    if length > 8:
+        raise ValueError(f"{length} data bytes in a frame; at most 8")
+    return b"t%03X%d" % (can_id, length)
 
 
 def decode_frame(line: bytes) -> CanFrame:

@@ -34,6 +34,8 @@ class SlcanPort:
         self.name = name
         self._descriptor = descriptor
         self._fd = [descriptor.fileno()]
+        # A terminal's read may be as empty because nothing has come: it is asked before.
+        self._tells_its_end = isinstance(descriptor, socket.socket)
 
     def fileno(self) -> int:
         """For ``select``."""
@@ -46,7 +48,7 @@ class SlcanPort:
             PortLostError: the other side is gone.
             OSError: anything else that the system says.
         """
-        if not select.select(self._fd, (), (), timeout_s)[0]:
+        if not (timeout_s == 0 and self._tells_its_end) and not select.select(self._fd, (), (), timeout_s)[0]:
             return b""
         try:
             chunk = os.read(self._fd[0], CHUNK)

@@ -50,6 +50,7 @@ STATUS_AND_POSITION = (0x60410010, 0x60640020)
 COMMAND = (0x60400010, 0x60FF0020)
 _COMMAND = struct.Struct("<Hi")
 _STATUS_AND_POSITION = struct.Struct("<Hi")
+_ENABLE_OPERATION = int(ControlWord.ENABLE_OPERATION)
 _PDO_BYTES = 8
 _CODES_KEPT = 4
 _PERMILLE = 1e-3
@@ -78,6 +79,7 @@ def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
 class Axis:
     """What is known of one drive. ``codes``: its emergencies since the last error reset, newest last.
 
+    ``enabled``, ``faulty``: what ``state`` says. ``heard_poll``: number of the poll before its last heartbeat.
     ``limit_side``: 1 or -1 where the drive's internal limit is known to lie on that side of the joint, else 0.
     """
 
@@ -85,13 +87,16 @@ class Axis:
         self.index = index
         self.joint = joint
         self.node_id = joint.node_id
+        self.command_id = RPDO_IDS[0] + joint.node_id
         self.scale = JointScale.of(joint)
         self.counts = Unwrapper()
         self.effort_unit = joint.direction * _PERMILLE * (joint.rated_torque or 1.0)
         self.status_word: int | None = None
         self.state = DriveState.UNKNOWN
+        self.enabled = False
+        self.faulty = False
         self.codes: list[int] = []
-        self.heartbeat_age = 0
+        self.heard_poll = 0
         self.limit_side = 0
         self.commanded = 0.0
 
@@ -104,6 +109,8 @@ class Axis:
         """The newest status word."""
         self.status_word = status_word
         self.state = drive_state(status_word)
+        self.enabled = self.state is DriveState.OPERATION_ENABLED
+        self.faulty = self.state in FAULTY
         if not self.at_limit:
             self.limit_side = 0
 
@@ -152,6 +159,7 @@ class Cia402Codec:
         self._heartbeat_timeout_ms = options.heartbeat_timeout_ms
         self._watching = False
         self._commanding = False
+        self._polls = 0
         self._events: list[AxisFault] = []
         self._sync = [CanFrame(SYNC_ID)]
         self._heartbeat = [CanFrame(HEARTBEAT_ID + options.master_id, bytes([NmtState.OPERATIONAL]))]
@@ -171,7 +179,7 @@ class Cia402Codec:
 
     @staticmethod
     def _rpdo(axis: Axis, word: ControlWord) -> CanFrame:
-        return CanFrame(RPDO_IDS[0] + axis.node_id, _COMMAND.pack(word, 0))
+        return CanFrame(axis.command_id, _COMMAND.pack(word, 0))
 
     # -- receiving ------------------------------------------------------------------------------------------
 
@@ -189,13 +197,16 @@ class Cia402Codec:
 
     def _status_and_position(self, axis: Axis, bit: int) -> Callable[[bytes], int]:
         positions, k = self.feedback.positions, axis.index
+        unpack, size = _STATUS_AND_POSITION.unpack, _STATUS_AND_POSITION.size
+        position, unwrapped = axis.scale.position, axis.counts.update
 
         def take(data: bytes) -> int:
-            if len(data) != _STATUS_AND_POSITION.size:
-                return self._wrong_length(axis, "TPDO1", len(data), _STATUS_AND_POSITION.size)
-            word, counts = _STATUS_AND_POSITION.unpack(data)
-            self._take_status(axis, word)
-            positions[k] = axis.scale.position(axis.counts.update(counts))
+            if len(data) != size:
+                return self._wrong_length(axis, "TPDO1", len(data), size)
+            word, counts = unpack(data)
+            if word != axis.status_word:
+                self._take_status(axis, word)
+            positions[k] = position(unwrapped(counts))
             return bit
 
         return take
@@ -209,11 +220,12 @@ class Cia402Codec:
             "following_error": (feedback.following_errors, scale.difference),
         }
         targets = [(array, convert) for array, convert in (kinds[what] for what in pdo) if array is not None]
+        unpack, size = layout.unpack, layout.size
 
         def take(data: bytes) -> int:
-            if len(data) != layout.size:
-                return self._wrong_length(axis, f"TPDO{number}", len(data), layout.size)
-            for raw, (array, convert) in zip(layout.unpack(data), targets, strict=True):
+            if len(data) != size:
+                return self._wrong_length(axis, f"TPDO{number}", len(data), size)
+            for raw, (array, convert) in zip(unpack(data), targets, strict=True):
                 array[k] = convert(raw)
             return bit
 
@@ -262,7 +274,7 @@ class Cia402Codec:
     def _take_heartbeat(self, axis: Axis, data: bytes) -> int:
         if len(data) != 1:
             return NOT_CYCLIC
-        axis.heartbeat_age = 0
+        axis.heard_poll = self._polls
         state = data[0] & 0x7F
         if not self._watching or state == NmtState.OPERATIONAL:
             return NOT_CYCLIC
@@ -287,7 +299,7 @@ class Cia402Codec:
         """Drives are configured and operational: from now on what they do unasked is a fault."""
         self._events = []
         for axis in self.axes:
-            axis.heartbeat_age = 0
+            axis.heard_poll = self._polls
         self._watching = True
 
     def ignore(self) -> None:
@@ -298,17 +310,23 @@ class Cia402Codec:
     def faults(self) -> tuple[AxisFault, ...]:
         """Events since the last call; drives in fault, off unasked, silent, or commanded against a limit."""
         events, self._events = self._events, []
-        levels = (fault for axis in self.axes for fault in self._levels(axis))
-        return (*events, *levels)
+        for axis in self.axes:
+            if (
+                axis.faulty
+                or (self._commanding and not (axis.enabled and axis.limit_side == 0))
+                or (self._watching and self._polls - axis.heard_poll > self._heartbeat_polls)
+            ):
+                events += self._levels(axis)
+        return tuple(events)
 
     def _levels(self, axis: Axis) -> list[AxisFault]:
         who, found = f"node {axis.node_id}", []
-        if axis.state in FAULTY:
+        if axis.faulty:
             hint = error_hint(axis.codes[-1]) if axis.codes else "remove the cause, then reset"
             found.append(
                 AxisFault(axis.index, "drive_fault", f"{who}: {axis.words()}", axis.status_word, hint)
             )
-        elif self._commanding and axis.state is not DriveState.OPERATION_ENABLED:
+        elif self._commanding and not axis.enabled:
             message = f"{who} left operation enabled unasked: {axis.words()}"
             hint = "look at the drive's enable input, its supply and the emergency stop's circuit"
             found.append(AxisFault(axis.index, "disabled", message, axis.status_word, hint))
@@ -318,7 +336,7 @@ class Cia402Codec:
             found.append(
                 AxisFault(axis.index, "limit_switch", message, axis.status_word, "move the joint inward")
             )
-        if self._watching and axis.heartbeat_age > self._heartbeat_polls:
+        if self._watching and self._polls - axis.heard_poll > self._heartbeat_polls:
             message = f"{who}: no heartbeat for {self._heartbeat_timeout_ms} ms"
             found.append(
                 AxisFault(axis.index, "heartbeat_lost", message, None, "check its supply and the bus cable")
@@ -327,7 +345,7 @@ class Cia402Codec:
 
     def enabled(self) -> bool:
         """Every axis in operation enabled."""
-        return all(axis.state is DriveState.OPERATION_ENABLED for axis in self.axes)
+        return all(axis.enabled for axis in self.axes)
 
     def at_rest_unpowered(self) -> bool:
         """Every axis in a state without torque."""
@@ -341,8 +359,7 @@ class Cia402Codec:
 
     def poll(self) -> list[CanFrame]:
         """SYNC."""
-        for axis in self.axes:
-            axis.heartbeat_age += 1
+        self._polls += 1
         return self._sync
 
     def heartbeat(self) -> list[CanFrame]:
@@ -374,14 +391,16 @@ class Cia402Codec:
     def command(self, velocities: FloatArray) -> list[CanFrame]:
         """Enable operation (halt bit clear) with target velocities (n,) [rad/s or m/s]."""
         self._commanding = True
-        frames = []
-        for axis, velocity in zip(self.axes, velocities.tolist(), strict=True):
-            axis.commanded = velocity
-            units = axis.scale.velocity_units(velocity)
-            frames.append(
-                CanFrame(RPDO_IDS[0] + axis.node_id, _COMMAND.pack(ControlWord.ENABLE_OPERATION, units))
-            )
-        return frames
+        return [
+            self._velocity(axis, velocity)
+            for axis, velocity in zip(self.axes, velocities.tolist(), strict=True)
+        ]
+
+    @staticmethod
+    def _velocity(axis: Axis, velocity: float) -> CanFrame:
+        axis.commanded = velocity
+        units = axis.scale.velocity_units(velocity)
+        return CanFrame(axis.command_id, _COMMAND.pack(_ENABLE_OPERATION, units))
 
     def quick_stop(self) -> list[CanFrame]:
         """Quick stop, target zero: it takes the place of the stored cyclic control word."""

@@ -9,6 +9,7 @@ Threads: ``tick`` and ``receive`` belong to one; the rest may be called from ano
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -176,6 +177,11 @@ class Master:
 
     # -- the bus --------------------------------------------------------------------------------------------
 
+    @property
+    def awaits_answers(self) -> bool:
+        """Whether answers to the newest poll are still missing."""
+        return self._cycle.received != self.codec.expected
+
     def receive(self, frame: CanFrame, now_ns: int) -> bool:
         """Take a frame that arrived at ``now_ns``; gives whether it belongs to the cycle."""
         bit = self.codec.receive(frame)
@@ -200,14 +206,12 @@ class Master:
         poll_ns = self._cycle.poll_ns
         positions = feedback.positions.copy()
         velocities = feedback.velocities.copy()
-        unknown = np.isnan(velocities)
-        if unknown.any():  # drives that do not send it
+        if math.isnan(velocities[0]):  # a complete set: either all drives send it or none
             last = self._sample
             if last is None:
-                velocities[unknown] = 0.0
+                velocities = np.zeros(self._n)
             else:
-                change = (positions - last.positions) / (max(poll_ns - last.t_ns, 1) * 1e-9)
-                velocities = np.where(unknown, change, velocities)
+                velocities = (positions - last.positions) / (max(poll_ns - last.t_ns, 1) * 1e-9)
         self._seq += 1
         sample = JointState(
             seq=self._seq,
@@ -270,7 +274,7 @@ class Master:
     def _watch_encoders(self, cycle_ns: int) -> list[Trip | None]:
         trips = []
         for sample in self._cycle.states:
-            trips.append(self._monitors.jump.check(sample.t_ns, sample.positions))
+            trips.append(self._monitors.jump.check(sample.t_ns, sample.positions.tolist()))
             if self.mode is Mode.RUNNING:
                 trips.append(self._monitors.reversal.check(cycle_ns * 1e-9, self._sent, sample.positions))
         return trips

@@ -21,6 +21,7 @@ LATE_WINDOW = 25
 LATE_RANK = LATE_WINDOW // 5
 LATE_BASELINE_WINDOWS = 4
 LATE_EVERY = 5
+"""Cycles; divides the window."""
 LATE_SHARE = 0.25
 """Of the period: later than its own baseline by so much, compared with the other drives, a drive is late."""
 LATE_SHARE_SINGLE = 0.5
@@ -161,14 +162,20 @@ class LatenessMonitor:
         self._arrivals = np.zeros((LATE_WINDOW, len(names)))
         self.arrivals = [0] * len(names)
         """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one stands."""
+        self._newest: list[list[int]] = []
         self._cycles = 0
         self._baseline = np.full(len(names), math.inf)
 
     def end_cycle(self) -> Trip | None:
         """Judges every ``LATE_EVERY`` cycles."""
-        self._arrivals[self._cycles % LATE_WINDOW] = self.arrivals
+        self._newest.append(self.arrivals.copy())
         self._cycles += 1
-        if self._cycles < LATE_WINDOW or self._cycles % LATE_EVERY:
+        if self._cycles % LATE_EVERY:
+            return None
+        first = (self._cycles - LATE_EVERY) % LATE_WINDOW
+        self._arrivals[first : first + LATE_EVERY] = self._newest
+        self._newest.clear()
+        if self._cycles < LATE_WINDOW:
             return None
         usual = np.partition(self._arrivals, LATE_RANK, axis=0)[LATE_RANK]
         if self._cycles <= LATE_BASELINE_WINDOWS * LATE_WINDOW:
@@ -204,18 +211,24 @@ class FloodMonitor:
         self._frames_per_ns = FLOOD_SHARE * bitrate / FLOOD_FRAME_BITS * 1e-9
         self._least = max(math.ceil(self._frames_per_ns * period_s * 1e9 * FLOOD_WINDOW), 4 * FLOOD_WINDOW)
         self._by_id: dict[int, int] = {}
-        self._cycles: deque[tuple[int, dict[int, int]]] = deque(maxlen=FLOOD_WINDOW)
+        self._cycles: deque[tuple[int, dict[int, int]]] = deque([(0, {})] * FLOOD_WINDOW, FLOOD_WINDOW)
+        self._heard = 0
+        """Frames of all ids within the window."""
 
     def note(self, can_id: int) -> None:
         """A frame that is nobody's."""
         if can_id in self._by_id or len(self._by_id) < 256:
             self._by_id[can_id] = self._by_id.get(can_id, 0) + 1
+            self._heard += 1
 
     def end_cycle(self, cycle_ns: int) -> Trip | None:
         """Judges every cycle: a flood that starves the drives' own frames is to be named before they are missed."""
+        forgotten = self._cycles[0][1]
+        if forgotten:
+            self._heard -= sum(forgotten.values())
         self._cycles.append((cycle_ns, self._by_id))
         self._by_id = {}
-        if sum(sum(heard.values()) for _, heard in self._cycles) <= self._least:
+        if self._heard <= self._least:
             return None
         total: Counter[int] = Counter()
         for _, heard in self._cycles:
@@ -239,28 +252,30 @@ class JumpMonitor:
     """Positions that change by more than the axis can move."""
 
     def __init__(self, max_velocities: FloatArray, resolutions: FloatArray) -> None:
-        self._max_velocities = max_velocities
-        self._margins = JUMP_COUNTS * resolutions
-        self._positions: FloatArray | None = None
+        fastest = (JUMP_FACTOR * max_velocities).tolist()
+        self._axes = list(zip(fastest, (JUMP_COUNTS * resolutions).tolist(), strict=True))
+        self._positions: list[float] | None = None
         self._t_ns = 0
 
-    def check(self, t_ns: int, positions: FloatArray) -> Trip | None:
-        """A complete set (n,) with its stamp."""
-        last, last_ns = self._positions, self._t_ns
+    def check(self, t_ns: int, positions: list[float]) -> Trip | None:
+        """A complete set (n,) with its stamp. Of several axes that jump, the first is told."""
+        last, elapsed_s = self._positions, (t_ns - self._t_ns) * 1e-9
         self._positions, self._t_ns = positions, t_ns
         if last is None:
             return None
-        moved = np.abs(positions - last)
-        limits = JUMP_FACTOR * self._max_velocities * ((t_ns - last_ns) * 1e-9) + self._margins
-        if (moved <= limits).all():
-            return None
-        axis = int(np.argmax(moved / limits))
+        for axis, (fastest, margin) in enumerate(self._axes):
+            moved, limit = abs(positions[axis] - last[axis]), fastest * elapsed_s + margin
+            if not moved <= limit:
+                return self._trip(axis, moved, limit, elapsed_s)
+        return None
+
+    def _trip(self, axis: int, moved: float, limit: float, elapsed_s: float) -> Trip:
         return Trip(
             "encoder_jump",
-            f"position jumped by {moved[axis]:.6g} within {(t_ns - last_ns) * 1e-6:.1f} ms; at "
-            f"{JUMP_FACTOR:g} times max_velocity it is {limits[axis]:.3g}",
-            float(moved[axis]),
-            float(limits[axis]),
+            f"position jumped by {moved:.6g} within {elapsed_s * 1e3:.1f} ms; at "
+            f"{JUMP_FACTOR:g} times max_velocity it is {limit:.3g}",
+            moved,
+            limit,
             "check the encoder, its cable, and counts_per_rev and gear_ratio",
             axis=axis,
         )

@@ -14,7 +14,9 @@ UINT32_MAX = 2**32 - 1
 
 def clamp_int32(value: float) -> int:
     """``value`` rounded, within the range of a signed 32-bit integer."""
-    return round(min(max(value, INT32_MIN), INT32_MAX))
+    if INT32_MIN <= value <= INT32_MAX:
+        return round(value)
+    return round(min(max(value, INT32_MIN), INT32_MAX))  # NaN goes on to here, and round refuses it
 
 
 @dataclass(frozen=True)
