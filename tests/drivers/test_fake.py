@@ -93,7 +93,7 @@ def test_a_restarted_arm_stands_where_it_was_left(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rate": 250}, "options of this driver: .*rate_hz"),
+        ({"rate": 250}, "no option 'rate'.* valid: .*rate_hz"),
         ({"rate_hz": 5}, "rate_hz"),
         ({"start": {"j9": 0.0}}, "no joint 'j9'; joints: j1, j2"),
         ({"start": {"j1": 9.0}}, "its range is -2.79"),

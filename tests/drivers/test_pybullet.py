@@ -107,7 +107,7 @@ def test_a_process_loads_only_what_it_needs(tmp_path, module, driver, absent):
     [
         ({"noise": -1.0}, "noise"),
         ({"background": "beach"}, "beach"),
-        ({"blurr": 1.0}, "options of this driver: .*blur"),
+        ({"blurr": 1.0}, "did you mean 'blur'.* valid: .*blur"),
     ],
 )
 def test_bad_camera_options_are_refused(tmp_path, options, message):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -187,3 +189,15 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "deep.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
     with pytest.raises(CellFileError):
         load_cell_file(tmp_path / "deep.toml")
+
+
+@pytest.mark.parametrize(("key", "lacks"), [("effort", "efforts"), ("following", "following_errors")])
+def test_thresholds_for_what_the_drives_do_not_tell_are_refused(
+    tmp_path: Path, key: str, lacks: Literal["efforts", "following_errors"]
+) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(f"{GOOD}\n[safety.contact]\n{key} = {{ j1 = 0.5 }}\n")
+    cell = load_cell_file(path)
+    core_settings(cell, DRIVE, (CAMERA,))
+    with pytest.raises(CellFileError, match=f"safety.contact.{key}: states thresholds, and driver 'fake'"):
+        core_settings(cell, msgspec.structs.replace(DRIVE, lacks=(lacks,)), (CAMERA,))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import errno
 import socket
+import termios
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -163,7 +164,7 @@ class Channel:
                 ignore_config=True,
                 **dict(options.interface_options),
             )
-        except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
+        except Exception as error:  # interfaces of others, without their maker's library, raise anything
             raise self._not_opened(error) from error
         if options.interface == "socketcan":
             socketcan.enlarge_receive_buffer(bus)
@@ -197,10 +198,21 @@ class Channel:
             cure = "This kernel has no CAN: `modprobe can_raw`; in a container, on the host"
         elif socketcan_name:
             cure = f"Check `ip link show {self._options.channel}`; deploy/can sets interfaces up"
+        elif number in (errno.EISDIR, errno.ENOTTY):
+            cure = "That is no serial port; they are listed by `ls -l /dev/serial/by-id`"
+        elif isinstance(error.__cause__ or error, socket.gaierror):
+            cure = "No such host: check the name, or give its address"
+        elif isinstance(error, TypeError):
+            cure = (
+                f"Check `interface_options` ({', '.join(self._options.interface_options) or 'none given'}) against "
+                f"what python-can's manual lists for interface {self._options.interface!r}"
+            )
         elif number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
             cure = "Is the adapter plugged in (`ls -l /dev/serial/by-id`, `dmesg | tail`)?"
-        elif isinstance(error, (TypeError, ValueError)):
+        elif isinstance(error, ValueError):
             cure = "Check `channel`, `bitrate` and `interface_options` of the cell file"
+        elif isinstance(error, (ImportError, NameError, AttributeError)):
+            cure = f"What interface {self._options.interface!r} needs is not installed: its maker's library"
         else:
             cure = "Is the adapter plugged in and powered, its driver installed, and nobody else using it?"
         return self._error("can_open", f"cannot be opened: {cause}. {cure}", retry=not _wrong(error))
@@ -260,7 +272,7 @@ def _errno(error: BaseException | None) -> int | None:
     while error is not None:
         number = getattr(error, "errno", None)
         if number is None:
-            number = getattr(error, "error_code", None)
+            number = error.args[0] if isinstance(error, termios.error) else getattr(error, "error_code", None)
         if isinstance(number, int):
             return number
         error = error.__cause__ or error.__context__

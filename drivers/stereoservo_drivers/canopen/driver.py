@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,6 +41,11 @@ OFF_MARGIN_S = 1.0
 SWITCH_INTERVAL_S = 0.0005
 """How long Python lets another thread of the process compute before the bus thread may go on."""
 _POLL_S = 0.001
+_LOADS: dict[Literal["efforts", "following_errors"], str] = {
+    "efforts": "effort",
+    "following_errors": "following_error",
+}
+"""What ``feedback`` has to name for a sample to carry it."""
 
 
 class CanJointDriver:
@@ -76,6 +81,7 @@ class CanJointDriver:
             rate_hz=self.options.rate_hz,
             pacing="clock",
             effort_units=tuple(_effort_unit(joint, self.options.protocol) for joint in self.options.joint),
+            lacks=tuple(what for what, needed in _LOADS.items() if needed not in self.options.feedback),
             command_timeout_s=self.options.command_timeout_s,
             call_budget_us=CALL_BUDGET_US,
         )

@@ -24,24 +24,26 @@ ODRIVE_HEARTBEATS_S = 10.0
 
 
 def parse_sdo_key(key: str) -> tuple[int, int]:
-    """``"0x60C2:1"`` as (index, sub-index). Raises ValueError."""
+    """``"0x60C2:1"`` as (index, sub-index). Raises ValueError, which says what is valid."""
     if SDO_KEY.fullmatch(key):
         index, subindex = (int(part, 0) for part in key.split(":"))
         if index and subindex <= 0xFF:
             return index, subindex
-    raise ValueError(f'{key!r} is not an object; valid: index and sub-index such as "0x60C2:1"')
+    raise ValueError('index and sub-index such as "0x60C2:1"')
 
 
 def check_options(options: CanOptions) -> None:
     """Raises DriverError (``option``): names the joint, the value, and what would be valid."""
     if not options.joint:
         raise _refusal("joint", "[]", "at least one [[joints.options.joint]] with its name and node_id")
+    _check_bus(options)
     _check_unique(options, "node_id", lambda joint: joint.node_id)
     _check_unique(options, "name", lambda joint: joint.name)
     for joint in options.joint:
         if joint.node_id == options.master_id:
             valid = f"an id that is not master_id ({options.master_id}), which is this computer's"
             raise _refusal("node_id", joint.node_id, valid, joint)
+        _check_identity(options, joint)
         _check_geometry(joint)
         _check_limits(joint)
         if options.protocol == "cia402":
@@ -62,6 +64,18 @@ def check_options(options: CanOptions) -> None:
             "option", f"driver 'canopen': {why}", option="rate_hz", value=options.rate_hz,
             load=bus_load(options).share,
         )  # fmt: skip
+
+
+def _check_bus(options: CanOptions) -> None:
+    for k, joint in enumerate(options.joint):
+        if not joint.name.strip():
+            raise _refusal(f"joint[{k}] (node_id {joint.node_id}): name", repr(joint.name), "a name")
+    for what in options.feedback:
+        if options.feedback.count(what) > 1:
+            raise _refusal("feedback", list(options.feedback), f"each once; {what!r} is there twice")
+    for code in options.emcy_ignore:
+        if not 1 <= code <= 0xFFFF:
+            raise _refusal("emcy_ignore", f"{code:#x}", "codes of 16 bits, 0x1 to 0xffff, e.g. 0x4210")
 
 
 def bus_load(options: CanOptions) -> BusLoad:
@@ -87,6 +101,22 @@ def _check_unique(options: CanOptions, option: str, of: Callable[[CanJoint], Any
         if other is not joint:
             who = f"joint {other.name!r} (node {other.node_id})"
             raise _refusal(option, of(joint), f"one that {who} does not have already", joint)
+
+
+def _check_identity(options: CanOptions, joint: CanJoint) -> None:
+    largest = _largest_identity(options)
+    for option in ("vendor_id", "product_code", "revision", "serial_number"):
+        value = getattr(joint, option)
+        if value is not None and not 0 <= value <= largest:
+            raise _refusal(option, value, f"0 to {largest:#x}; `stereoservo doctor` shows the drive's", joint)
+    if joint.current_limit is not None and options.protocol == "cia402":
+        valid = "left out: it is an ODrive's; a CiA 402 drive's is set with the maker's tool, or by sdo"
+        raise _refusal("current_limit", joint.current_limit, valid, joint)
+
+
+def _largest_identity(options: CanOptions) -> int:
+    """0x1018 has 32 bits (CiA 301, 7.5.2.19); serial numbers of ODrives have 48."""
+    return UINT32_MAX if options.protocol == "cia402" else 2**48 - 1
 
 
 def _check_geometry(joint: CanJoint) -> None:

@@ -93,6 +93,19 @@ def _daemon(plan: RunPlan, directories: CellDirectories) -> Check:
     return Check("daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`")
 
 
+def _rates(plan: RunPlan, directories: CellDirectories) -> Check:
+    servo, joints = plan.cell.servo.rate_hz, plan.joints.rate_hz
+    told = f"loop {servo:g} Hz, joints {joints:g} Hz"
+    if servo <= joints:
+        return Check("rates", True, told)
+    return Check(
+        "rates",
+        None,
+        f"{told}: some cycles see no new sample, and their command waits for the next",
+        f"servo.rate_hz = {joints:g}",
+    )
+
+
 def _wire(plan: RunPlan, directories: CellDirectories) -> Check:
     try:
         config = gateway_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
@@ -154,6 +167,7 @@ def _disk(plan: RunPlan, directories: CellDirectories) -> Check:
 
 CHECKS: tuple[Callable[[RunPlan, CellDirectories], Check], ...] = (
     _daemon,
+    _rates,
     _wire,
     _model,
     _taught,

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
@@ -43,6 +45,15 @@ class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     record: str = ""
 
 
+@contextmanager
+def _named(cell_path: Path, section: str) -> Iterator[None]:
+    """A driver knows its options and not where they stand: name file and section."""
+    try:
+        yield
+    except DriverError as error:
+        raise DriverError(error.code, f"{cell_path}: {section}: {error}", **error.data) from error
+
+
 def describe_cell(
     cell: CellFile, cell_path: Path, runtime: Path, clock: Clock, *, seed: int = 0
 ) -> tuple[JointDriverDescription, tuple[CameraDescription, ...]]:
@@ -58,9 +69,10 @@ def describe_cell(
         "seed": seed,
     }
     joint_context = DriverContext(**common)  # type: ignore[arg-type]
-    joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
-        cell.joints.options, joint_context
-    ).describe()
+    with _named(cell_path, "joints.options"):
+        joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
+            cell.joints.options, joint_context
+        ).describe()
     if joints.pacing != "clock":
         raise CellFileError(
             cell_path,
@@ -70,7 +82,8 @@ def describe_cell(
     cameras = []
     for section in cell.camera:
         context = DriverContext(**common, camera=section.name, mount=section.mount)  # type: ignore[arg-type]
-        driver, detector = make_camera(section, context)
+        with _named(cell_path, f"camera {section.name!r}"):
+            driver, detector = make_camera(section, context)
         cameras.append(describe_camera(section, driver, detector, cell_path))
     return joints, tuple(cameras)
 

@@ -61,6 +61,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
 
     ``home``: a configuration in which the arm may well stand (in joint order; empty: the driver knows none).
     ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
+    ``lacks``: which of ``efforts`` and ``following_errors`` its samples do not carry, as far as it is known beforehand.
     """
 
     driver: str
@@ -71,6 +72,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     call_budget_us: float
     home: tuple[float, ...] = ()
     effort_units: tuple[str, ...] = ()
+    lacks: tuple[Literal["efforts", "following_errors"], ...] = ()
 
 
 class CameraDescription(msgspec.Struct, frozen=True):

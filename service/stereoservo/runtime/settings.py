@@ -192,6 +192,14 @@ def core_settings(
 
 def _contact_settings(cell: CellFile, joints: JointDriverDescription) -> ContactSettings:
     section = cell.safety.contact
+    for key, what in (("effort", "efforts"), ("following", "following_errors")):
+        if getattr(section, key) and what in joints.lacks:
+            raise CellFileError(
+                cell.cell.name,
+                f"safety.contact.{key}",
+                f"states thresholds, and driver {joints.driver!r} is not set to tell {what.replace('_', ' ')}: nothing "
+                f"would ever stop for them. Let the drives send them ([joints.options] feedback), or leave {key} out",
+            )
     units = joints.effort_units or tuple("N m" if j.kind == "revolute" else "N" for j in joints.joints)
     return ContactSettings(
         enabled=section.enabled,

@@ -7,6 +7,7 @@ import gc
 import os
 import signal
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +55,9 @@ def emulate(
         raise typer.BadParameter(
             f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT"
         )
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a master that hangs up in the middle of a write ends nothing
+    signal.signal(
+        signal.SIGPIPE, signal.SIG_IGN
+    )  # a master that hangs up in the middle of a write ends nothing
     if parent:
         die_with_parent(parent, signal.SIGTERM)
     termination = Termination(grace_s=GRACE_S)
@@ -96,6 +99,20 @@ def _drives(settings: _Settings, termination: Termination) -> None:
         _serve(path, cell, directories.runtime, settings, termination)
 
 
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """What is wrong with a cell's options, with the file that they stand in."""
+    from stereoservo.runtime.ports import DriverError
+    from stereoservo_sim.drives.building import EmulationError
+
+    try:
+        yield
+    except EmulationError as error:
+        raise EmulationError(f"{path}: {error}") from error
+    except DriverError as error:
+        raise DriverError(error.code, f"{path}: joints.options: {error}", **error.data) from error
+
+
 def _serve(
     path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination
 ) -> None:
@@ -104,14 +121,16 @@ def _serve(
     from stereoservo_sim.drives.faults import OrderError
     from stereoservo_sim.drives.serving import RackServer, open_endpoint, served_channel
 
-    options, drives = drives_of_cell(cell)
+    with _named(path):
+        options, drives = drives_of_cell(cell)
     if settings.bit_time is not None:
         drives = msgspec.structs.replace(drives, bit_time=settings.bit_time)
     endpoint = open_endpoint(settings.channel or served_channel(options), options.bitrate)
     try:
-        rack = make_rack(
-            options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent
-        )
+        with _named(path):
+            rack = make_rack(
+                options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent
+            )
     except BaseException:
         endpoint.close()
         raise

@@ -15,7 +15,7 @@ import stereoservo_drivers.canopen
 from stereoservo.runtime.cellfile import CellFile
 from stereoservo.runtime.ports import JointSpec
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_drivers.options import decode_options
+from stereoservo_drivers.options import decode_options, invalid
 from stereoservo_sim.drives.axis import Axis
 from stereoservo_sim.drives.bank import IdealPlant, Plant
 from stereoservo_sim.drives.node import EmulatedNode
@@ -72,10 +72,8 @@ def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
     try:
         settings = msgspec.convert(cell.emulate.get("drives", {}), DrivesSettings)
     except msgspec.ValidationError as error:
-        known = ", ".join(field.encode_name for field in msgspec.structs.fields(DrivesSettings))
-        raise EmulationError(
-            f"cell {cell.cell.name!r}: emulate.drives: {error}; valid keys: {known}"
-        ) from error
+        what = invalid(DrivesSettings, cell.emulate["drives"], error)
+        raise EmulationError(f"cell {cell.cell.name!r}: emulate.drives: {what}") from error
     return options, settings
 
 
@@ -100,15 +98,27 @@ def make_rack(
                 raise EmulationError(f"emulate.drives.{key}: no joint {name!r}; joints: {', '.join(names)}")
     history = _history(runtime_dir, len(names), t_ns)
     newest = history.newest() if history is not None and settings.resume else None
-    positions = newest[1] if newest is not None else _start(options, settings)
+    start = _start(options, settings)
+    positions = newest[1] if newest is not None else start
     plant, rated = _plant(options, settings, positions)
     axes = [Axis(_joint(joint), float(q)) for joint, q in zip(options.joint, positions, strict=True)]
-    eds = SHIPPED_EDS if not (settings.eds or options.eds) else cell_dir / (settings.eds or options.eds)
+    eds = _eds(options, settings, cell_dir)
     nodes = [
         _node(options, joint, axis, settings, eds) for joint, axis in zip(options.joint, axes, strict=True)
     ]
     moved = AxisPlant(axes, plant, settings.machine, t_ns=t_ns, history=history, rated=rated)
     return Rack(nodes, moved, bitrate=options.bitrate if settings.bit_time else None, t_ns=t_ns)
+
+
+def _eds(options: CanOptions, settings: DrivesSettings, cell_dir: Path) -> Path:
+    named = settings.eds or options.eds
+    path = cell_dir / named
+    if not named or (path.name == SHIPPED_EDS.name and not path.exists()):
+        return SHIPPED_EDS
+    if not path.is_file():
+        key = "emulate.drives.eds" if settings.eds else "joints.options.eds"
+        raise EmulationError(f"{key} = {named!r}: there is no file {path}; leave eds out for the shipped one")
+    return path
 
 
 def _joint(joint: CanJoint) -> JointSpec:

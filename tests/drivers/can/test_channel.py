@@ -309,3 +309,33 @@ def test_a_silent_restart_is_noted(monkeypatch):
 def test_socketcan_without_the_interface_or_the_kernel():
     error = refused(ChannelSettings("socketcan", "nocan7"))
     assert "modprobe can_raw" in str(error) or "ip link show nocan7" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "cure"),
+    [
+        ("stereoservo_slcan", "/", "That is no serial port"),
+        ("stereoservo_slcan", "/dev/null", "That is no serial port"),
+        ("socketcand", "x", "Check `interface_options` (none given) against"),
+    ],
+)
+def test_what_is_no_adapter_is_told_as_such(interface, channel, cure):
+    assert cure in str(refused(ChannelSettings(interface, channel)))
+
+
+def test_whatever_the_interface_of_another_raises_is_told(monkeypatch):
+    def broken(**_: object) -> None:
+        raise NameError("name 'canGetNumberOfChannels' is not defined")
+
+    monkeypatch.setattr(can, "Bus", broken)
+    error = refused(ChannelSettings("kvaser", 0))
+    assert "canGetNumberOfChannels" in str(error)
+    assert "not installed" in str(error)
+
+
+def test_a_host_that_is_not_known(monkeypatch):
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    assert "No such host" in str(refused(ChannelSettings("stereoservo_slcan", "socket://nobody:5400")))

@@ -119,6 +119,7 @@ def arm(make_arm: Callable[..., Arm]) -> Arm:
 
 def test_the_description_is_the_cell_files(arm: Arm) -> None:
     description = arm.driver.describe()
+    assert description.lacks == ("following_errors",)
     assert (description.rate_hz, description.pacing, description.command_timeout_s) == (125.0, "clock", 0.1)
     assert [joint.name for joint in description.joints] == ["j1", "j2"]
     first = description.joints[0]

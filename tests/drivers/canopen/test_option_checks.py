@@ -131,3 +131,14 @@ def test_sdo_keys_and_values() -> None:
     assert parse_sdo_key("0x1f80:0x1F") == (0x1F80, 0x1F)
     check_options(options(joint(sdo={"0x60C2:1": -(2**31), "0x60C2:2": 2**32 - 1})))
     assert "32 bits" in refused(joint(sdo={"0x60C2:1": 2**32}))
+
+
+def test_what_would_be_ignored_or_cannot_be() -> None:
+    assert "feedback = ['effort', 'effort']; valid: each once" in refused(feedback=["effort", "effort"])
+    assert "emcy_ignore = 0x142100; valid: codes of 16 bits" in refused(emcy_ignore=[0x142100])
+    assert "joint[1] (node_id 2): name = ''" in refused(joint(1), joint(2, name=""))
+    assert "joint 'j1': vendor_id = -1; valid: 0 to 0xffffffff" in refused(joint(vendor_id=-1))
+    assert "joint 'j1': serial_number = 4294967296" in refused(joint(serial_number=2**32))
+    assert "joint 'j1': current_limit = 5.0; valid: left out" in refused(joint(current_limit=5.0))
+    odrive = joint(counts_per_rev=1, serial_number=2**47, current_limit=5.0)
+    check_options(options(odrive, protocol="odrive", feedback=["velocity", "effort"]))

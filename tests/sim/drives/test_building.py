@@ -137,7 +137,7 @@ def test_cells_without_can_drives_are_refused():
 @pytest.mark.parametrize(
     ("drives", "told"),
     [
-        ({"plnat": "ideal"}, "valid keys: plant, bit_time"),
+        ({"plnat": "ideal"}, "no option 'plnat'; did you mean 'plant'\\? valid: plant, bit_time"),
         ({"plant": "gazebo"}, "plant"),
         ({"brake_ms": -1.0}, "brake_ms"),
         ({"machine": {"mass": 3.0}}, "mass"),
@@ -158,6 +158,10 @@ def test_other_tables_of_emulation_are_refused(cell):
     [
         (DrivesSettings(plant="ideal", start={"j9": 0.0}), "no joint 'j9'; joints: j1"),
         (DrivesSettings(plant="ideal", start={"j1": 90.0}), "90 is outside the joint's range"),
+        (
+            DrivesSettings(plant="ideal", eds="none.eds"),
+            r"emulate\.drives\.eds = 'none\.eds': there is no file none\.eds; leave eds out",
+        ),
         (DrivesSettings(plant="ideal", rated_torques={"j9": 1.0}), "rated_torques: no joint 'j9'"),
     ],
 )
