@@ -206,6 +206,16 @@ class Cia402Node:
 
     # -- the bus -------------------------------------------------------------------------------------------------
 
+    def hears(self, frame: CanFrame) -> bool:
+        """See ``EmulatedNode``."""
+        can_id = frame.id
+        return (
+            self._pdo.listens(frame)
+            or can_id in (0, 0x600 + self.node_id)
+            or 0x700 < can_id < 0x780
+            or can_id == self._sync.can_id
+        )
+
     def receive(self, frame: CanFrame, t_ns: int) -> None:
         """See ``EmulatedNode``. The axis is to stand where it is at ``t_ns``: SYNC samples it."""
         if self.nmt <= Nmt.BOOTING or frame.extended:
@@ -219,7 +229,7 @@ class Cia402Node:
             handle = self._receive_pdo
         elif 0x700 < can_id < 0x780:
             handle = self._receive_heartbeat
-        elif can_id == self.dictionary.get(0x1005, 0, 0x80) & 0x7FF:
+        elif can_id == self._sync.can_id:
             handle = self._receive_sync
         else:
             return

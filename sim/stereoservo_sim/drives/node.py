@@ -20,6 +20,10 @@ class EmulatedNode(Protocol):
         """Boot: says so on the bus. A reboot likewise; the axis loses its power."""
         ...
 
+    def hears(self, frame: CanFrame) -> bool:
+        """Whether a frame can mean anything to it; others need not be given to ``receive``."""
+        ...
+
     def receive(self, frame: CanFrame, t_ns: int) -> None:
         """A frame of somebody else has ended on the bus at ``t_ns``."""
         ...

@@ -89,6 +89,10 @@ class OdriveNode:
         self._queue.clear()
         self._boot_end_ns = t_ns + self.settings.boot_ns
 
+    def hears(self, frame: CanFrame) -> bool:
+        """Every frame: with it the encoder is followed."""
+        return True
+
     def receive(self, frame: CanFrame, t_ns: int) -> None:
         """Answer a remote frame, take a command."""
         self.advance(t_ns)

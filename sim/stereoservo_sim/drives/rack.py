@@ -234,16 +234,18 @@ class Rack:
 
     def _end_of_frame(self, t_ns: int) -> None:
         sender, frame = self.wire.finish()
-        self.plant.observe(t_ns)
         cut = self.disturbances.cut
         if not self.disturbances.master_connected:
             if sender == MASTER:
                 return
         elif sender != MASTER:
             self._delivered.append((t_ns, frame))
-        for slot in self.slots:
+        hearers = [slot for slot in self.slots if slot.sender != sender and slot.node.hears(frame)]
+        if hearers:
+            self.plant.observe(t_ns)
+        for slot in hearers:
             node = slot.node
-            if slot.sender == sender or node.node_id in cut or sender == BABBLE + node.node_id:
+            if node.node_id in cut or sender == BABBLE + node.node_id:
                 continue
             node.receive(frame, t_ns)
             self.look(slot)

@@ -162,7 +162,8 @@ class RackServer:
         ready = self._sleep([*descriptors, self._wake_read, *self._watched], wanted)
         now = self._clock_ns()
         self._count(now, wanted)
-        frames = self.endpoint.take()
+        come = not descriptors or not set(ready).isdisjoint(descriptors)
+        frames = self.endpoint.take() if come else []
         for t_ns, frame in self._stamped(frames, wanted, now):
             self.rack.inject(frame, t_ns)
         self._catch_up(now)

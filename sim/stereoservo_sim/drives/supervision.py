@@ -5,7 +5,7 @@ from __future__ import annotations
 from stereoservo_sim.drives.dictionary import Abort, Dictionary, SdoError
 from stereoservo_sim.drives.node import NEVER_NS
 
-CONSUMER, PRODUCER, SYNC_PERIOD = 0x1016, 0x1017, 0x1006
+CONSUMER, PRODUCER, SYNC_ID, SYNC_PERIOD = 0x1016, 0x1017, 0x1005, 0x1006
 
 
 class HeartbeatConsumer:
@@ -87,16 +87,25 @@ class HeartbeatProducer:
 
 
 class SyncWatch:
-    """0x1006 [us]: after ``factor`` periods without SYNC the node says so, once; from the first SYNC on."""
+    """0x1006 [us]: after ``factor`` periods without SYNC the node says so, once; from the first SYNC on.
+
+    ``can_id``: of SYNC, from 0x1005.
+    """
 
     def __init__(self, dictionary: Dictionary, factor: float) -> None:
         self._dictionary = dictionary
         self._factor = factor
         self._deadline_ns = NEVER_NS
+        self.reset()
         dictionary.changed(SYNC_PERIOD, lambda sub, value: self.reset())
+        dictionary.changed(SYNC_ID, lambda sub, value: self._listen())
+
+    def _listen(self) -> None:
+        self.can_id = self._dictionary.get(SYNC_ID, 0, 0x80) & 0x7FF
 
     def reset(self) -> None:
         """Wait for a first SYNC anew."""
+        self._listen()
         self._deadline_ns = NEVER_NS
 
     def heard(self, t_ns: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
 
 from stereoservo_drivers.can.frames import CanFrame
@@ -40,7 +41,8 @@ class Wire:
         self.end_ns = NEVER_NS
         """When the frame on the wire ends."""
         self._queues: dict[int, deque[CanFrame]] = {}
-        self._waiting = 0
+        self._heads: list[tuple[tuple[int, int, int, int, int], int]] = []
+        """Every sender's first waiting frame, by its arbitration field: a heap."""
         self._sending: tuple[int, CanFrame] | None = None
 
     def send(self, sender: int, frame: CanFrame) -> None:
@@ -50,7 +52,11 @@ class Wire:
             self.lost += 1
             return
         queue.append(frame)
-        self._waiting += 1
+        if len(queue) == 1:
+            self._compete(sender, frame)
+
+    def _compete(self, sender: int, frame: CanFrame) -> None:
+        heapq.heappush(self._heads, (arbitration_key(frame), sender))
 
     def waiting(self, sender: int) -> int:
         """Frames of ``sender`` that are not on the wire yet."""
@@ -58,14 +64,13 @@ class Wire:
 
     def start(self, t_ns: int) -> None:
         """Where the bus is free at ``t_ns``, put the frame on it that wins the arbitration."""
-        if self._sending is not None or self._waiting == 0:
+        if self._sending is not None or not self._heads:
             return
-        sender = min(
-            (sender for sender, queue in self._queues.items() if queue),
-            key=lambda one: (arbitration_key(self._queues[one][0]), one),
-        )
-        frame = self._queues[sender].popleft()
-        self._waiting -= 1
+        sender = heapq.heappop(self._heads)[1]
+        queue = self._queues[sender]
+        frame = queue.popleft()
+        if queue:
+            self._compete(sender, queue[0])
         self._sending = sender, frame
         duration = self.duration_ns(frame)
         self.busy_ns += duration

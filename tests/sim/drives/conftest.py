@@ -41,6 +41,9 @@ class ScriptedNode:
         self._out.append(CanFrame(0x700 + self.node_id, b"\0"))
         self._beat = t_ns + self.beat_ns
 
+    def hears(self, frame: CanFrame) -> bool:
+        return True
+
     def receive(self, frame: CanFrame, t_ns: int) -> None:
         self.heard.append((t_ns, frame))
         if frame.id == 0x80:
