@@ -27,7 +27,15 @@ from stereoservo_drivers.canopen.cia402_configuration import (
     pdo_writes,
     unused_pdos,
 )
-from stereoservo_drivers.canopen.cia402_presence import Identity, find, identify, listening, until
+from stereoservo_drivers.canopen.cia402_presence import (
+    Identity,
+    alone,
+    find,
+    identify,
+    listening,
+    unbroken,
+    until,
+)
 from stereoservo_drivers.canopen.cia402_words import (
     FAULTY,
     ControlWord,
@@ -50,6 +58,8 @@ STATE_S = 0.5
 REST_S = 2.0
 """Time for a quick stop of a drive that was found moving."""
 BOOT_S = 3.0
+TAKEN_S = 0.01
+"""Process data that was sent has arrived: an NMT command sent after it must not overtake it."""
 SETTLE_S = 0.03
 """A cause that is still there trips a drive again within this time."""
 STANDS_SHARE = 0.01
@@ -73,14 +83,19 @@ class Cia402Bringup:
 
         A drive in fault stays in fault: the codec reports it. Raises DriverError: ``node_missing``,
         ``duplicate_node``, ``not_a_drive``, ``identity``, ``wrong_eds``, ``eds``, ``mode``, ``option``, ``sdo_abort``,
-        ``sdo_timeout``, ``read_back``, ``not_off``, ``not_operational``.
+        ``sdo_timeout``, ``read_back``, ``not_off``, ``not_operational``, ``second_master``, ``rebooted``.
         """
         self.codec.ignore()
         with self._drives(link) as drives:
-            self._quiet(drives)
-            find(link, drives, self._options)
-            self._prepare(link, drives)
-            self._start(link, drives)
+            alone(link, drives)
+            # Whom a master that died has left moving: before anything that can fail, and while they take process data.
+            link.send(self.codec.quick_stop())
+            link.wait(TAKEN_S)
+            with unbroken(link, drives):
+                self._quiet(drives)
+                find(link, drives, self._options)
+                self._prepare(link, drives)
+                self._start(link, drives)
 
     def reset(self, link: Link) -> None:
         """Configure anew and clear the faults of all drives, by NMT reset communication where they were of the bus.
@@ -92,25 +107,31 @@ class Cia402Bringup:
             self._quiet(drives)
             find(link, drives, self._options)
             self._reset_communication(link, [drive for drive in drives if _lost_the_bus(drive)])
-            self._prepare(link, drives)
-            stays: DriverError | None = None
-            try:
-                for drive in drives:
-                    self._clear_fault(link, drive)
-                self._settle(link, drives)
-            except DriverError as error:
-                stays = error
-            self._start(link, drives)  # with a fault too: the arm's positions are wanted
-            if stays is not None:
-                raise stays
+            with unbroken(link, drives):
+                self._prepare(link, drives)
+                stays: DriverError | None = None
+                try:
+                    for drive in drives:
+                        self._clear_fault(link, drive)
+                    self._settle(link, drives)
+                except DriverError as error:
+                    stays = error
+                self._start(link, drives)  # with a fault too: the arm's positions are wanted
+                if stays is not None:
+                    raise stays
 
     def release(self, link: Link) -> None:
-        """Process data off; the drives no longer wait for this master. Raises one DriverError for all."""
+        """Process data off; the drives no longer wait for this master. Raises one DriverError for all.
+
+        A drive that is still enabled is stopped and switched off first; one that cannot be keeps its watch.
+        """
         self.codec.ignore()
         failed: list[DriverError] = []
         with self._drives(link) as drives:
             for drive in drives:
                 try:
+                    if _state(drive) is DriveState.OPERATION_ENABLED:
+                        self._power_off(link, drive)
                     if self._options.abort_option == 1:  # leaving operational would make a fault of it
                         drive.write(0x6007, 0, 0)
                     drive.nmt("PRE-OPERATIONAL")

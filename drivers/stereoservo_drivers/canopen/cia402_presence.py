@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from stereoservo.runtime.ports import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
 from stereoservo_drivers.canopen.cia402_configuration import MODES, SHIPPED_EDS
 from stereoservo_drivers.canopen.options import CanOptions
 
@@ -20,6 +21,11 @@ if TYPE_CHECKING:
 STEP_S = 0.001
 PROBE_S = 0.05
 """Two nodes of one id both answer within this time."""
+PATIENCE_S = 0.5
+"""A drive may be so slow to answer (CiA 301 sets no limit)."""
+ALONE_S = 0.05
+"""Whoever runs these drives sends them commands within this time."""
+BOOT_UP = b"\0"
 CIA_402 = 402
 ALL_NODES = range(1, 128)
 
@@ -56,19 +62,68 @@ def listening(link: Link, ids: list[int]) -> Iterator[dict[int, list[CanFrame]]]
             link.unsubscribe(can_id, frames)
 
 
-def ask(link: Link, nodes: list[int], index: int, subindex: int) -> dict[int, list[CanFrame]]:
-    """All answers of ``nodes`` to one SDO read each, within ``PROBE_S``."""
+def alone(link: Link, drives: list[RemoteDrive]) -> None:
+    """Listens before anything is sent. Raises DriverError (``second_master``) where somebody commands these drives."""
+    with listening(link, [RPDO_IDS[0] + drive.node_id for drive in drives]) as heard:
+        link.wait(ALONE_S)
+    for drive in drives:
+        count = len(heard[RPDO_IDS[0] + drive.node_id])
+        if count:
+            raise DriverError(
+                "second_master",
+                f"{drive.name}: somebody else commands this drive, {count} frames 0x{RPDO_IDS[0] + drive.node_id:X} "
+                f"within {ALONE_S * 1e3:.0f} ms; end the other master (another daemon or doctor on this bus, a "
+                "maker's commissioning tool) first",
+                retry=True,
+                node_id=drive.node_id,
+                frames=count,
+            )
+
+
+@contextmanager
+def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
+    """Raises DriverError (``rebooted``) at its end where a drive has booted meanwhile: its configuration is gone."""
+    with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+        try:
+            yield
+        except DriverError as error:
+            _check_boots(drives, heard, error)
+            raise
+    _check_boots(drives, heard, None)
+
+
+def _check_boots(
+    drives: list[RemoteDrive], heard: dict[int, list[CanFrame]], consequence: DriverError | None
+) -> None:
+    for drive in drives:
+        if any(frame.data == BOOT_UP for frame in heard[HEARTBEAT_ID + drive.node_id]):
+            raise DriverError(
+                "rebooted",
+                f"{drive.name}: booted while it was configured and has forgotten what was written; is its supply "
+                "sound, does another master reset it? Try again",
+                retry=True,
+                node_id=drive.node_id,
+            ) from consequence
+
+
+def ask(
+    link: Link, nodes: list[int], index: int, subindex: int, patience_s: float = PROBE_S
+) -> dict[int, list[CanFrame]]:
+    """All answers of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
     request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
     with listening(link, [0x580 + node for node in nodes]) as heard:
         for node in nodes:
             link.send([CanFrame(0x600 + node, request)])
         link.wait(PROBE_S)
+        if patience_s > PROBE_S and not all(heard.values()):
+            until(link, lambda: all(heard.values()), patience_s - PROBE_S)
+            link.wait(PROBE_S)
     return {node: heard[0x580 + node] for node in nodes}
 
 
 def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
     """One answer of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
-    answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4)
+    answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
     missing = [drive for drive in drives if not answers[drive.node_id]]
     if missing:
         raise _missing(link, missing, drives, options)
@@ -104,7 +159,7 @@ def _missing(
         )
     return DriverError(
         "node_missing",
-        f"no answer of {names} within {PROBE_S * 1e3:.0f} ms; {found}",
+        f"no answer of {names} within {PATIENCE_S * 1e3:.0f} ms; {found}",
         retry=True,
         missing=absent,
         present=present,

@@ -118,6 +118,14 @@ class Bench:
         return [event.node for event in self.rack.events if event.kind == kind]
 
 
+def watch_nobody(bench: Bench) -> None:
+    """No drive of ``bench`` reacts to a lost master any more."""
+    with bench.bringup._drives(bench.host) as drives:
+        for drive in drives:
+            for index, subindex in ((0x1016, 1), (0x6007, 0)):
+                drive.write(index, subindex, 0)
+
+
 def make_joint(number: int, **changes: object) -> CanJoint:
     values: dict[str, object] = {
         "name": f"j{number}", "node_id": number, "counts_per_rev": COUNTS, "gear_ratio": GEAR,
@@ -239,7 +247,10 @@ def test_connecting_twice_gives_the_same(bench: Bench) -> None:
     keys = [key for key in communication if not 0x1008 <= key[0] <= 0x1011]
     before = {key: bench.object(2, *key) for key in keys}
     bench.run()
-    bench.cycle(0.1)
+    bench.master.request_disable()
+    bench.cycle(0.2)
+    bench.host.end_cycle()
+    bench.bringup.release(bench.host)
     bench.plug_in(bench.options)
     bench.connect()
     assert {key: bench.object(2, *key) for key in keys} == before
@@ -252,13 +263,12 @@ def test_a_drive_that_was_left_moving_is_brought_to_rest_and_switched_off(
 ) -> None:
     # no reaction of the drive's own to the lost master: all of it is the bring-up's
     joint = make_joint(1)
-    bench = make_bench(make_options(joint, quick_stop_option=quick_stop_option))
+    bench = make_bench(make_options(joint, quick_stop_option=quick_stop_option, rpdo_deadline_ms=0))
     bench.connect()
     bench.run()
     bench.cycle(0.5, 0.5)
     node = bench.node(1)
-    for key in ((0x1016, 1), (0x1400, 5), (0x6007, 0)):
-        node.dictionary.set(*key, 0)
+    watch_nobody(bench)
     assert node.axis.velocity == pytest.approx(0.5, abs=1e-3)
     bench.plug_in(bench.options)
     bench.connect()
@@ -566,3 +576,74 @@ def test_release_tells_once_of_all_drives_that_are_gone(bench: Bench) -> None:
         bench.bringup.release(bench.host)
     assert refusal.value.code == "not_released"
     assert bench.object(2, 0x1016, 1) == 0
+
+
+def test_a_drive_that_is_still_enabled_is_stopped_before_it_is_left(make_bench: Make) -> None:
+    bench = make_bench(make_options(rpdo_deadline_ms=0))
+    bench.connect()
+    bench.run()
+    bench.cycle(0.5, 0.5, 0.5, 0.5)
+    bench.host.end_cycle()
+    bench.bringup.release(bench.host)
+    for node in (1, 2, 3):
+        assert (bench.node(node).axis.velocity, bench.node(node).axis.powered) == (0.0, False)
+        ends = [
+            event.kind
+            for event in bench.rack.events
+            if event.node == node and event.kind in ("rest", "power_off")
+        ]
+        assert ends[-2:] == ["rest", "power_off"]
+
+
+# -- who else is there --------------------------------------------------------------------------------------------
+
+
+def test_drives_that_somebody_else_commands_are_left_alone(bench: Bench, monkeypatch) -> None:
+    sent: list[CanFrame] = []
+    subscribe, send = bench.host.subscribe, bench.host.send
+
+    def hear(can_id: int, heard: list[CanFrame]) -> None:
+        subscribe(can_id, heard)
+        if can_id == 0x202:
+            heard.extend([CanFrame(0x202, bytes(6))] * 12)
+
+    monkeypatch.setattr(bench.host, "subscribe", hear)
+    monkeypatch.setattr(bench.host, "send", lambda frames: (sent.extend(frames), send(frames)))
+    message = bench.refused("second_master")
+    assert all(part in message for part in ("node 2 (j2)", "12 frames 0x202", "another daemon"))
+    assert {frame.id for frame in sent} <= {0x700 + bench.options.master_id}
+
+
+def test_a_moving_arm_is_stopped_though_another_of_its_drives_is_missing(make_bench: Make) -> None:
+    bench = make_bench(make_options(rpdo_deadline_ms=0))
+    bench.connect()
+    bench.run()
+    bench.cycle(0.5, 0.5, 0.5, 0.5)
+    watch_nobody(bench)
+    assert [bench.node(number).axis.velocity for number in (1, 2, 3)] == pytest.approx([0.5] * 3, abs=1e-3)
+    bench.order("silence 3")
+    bench.plug_in(bench.options)
+    bench.refused("node_missing")
+    assert [bench.node(number).axis.velocity for number in (1, 2, 3)] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("at_ms", [100, 150])
+def test_a_drive_that_boots_while_it_is_configured_is_refused(bench: Bench, at_ms: int) -> None:
+    bench.connect()
+    bench.plug_in(bench.options)
+    at_us = (bench.rack.t_ns - bench.rack.start_ns) // 1000 + at_ms * 1000
+    bench.rack.order(f"reboot 1 @ {at_us}us", bench.rack.t_ns)
+    with pytest.raises(DriverError) as refusal:
+        bench.connect()
+    assert refusal.value.code == "rebooted"
+    assert refusal.value.retry
+    bench.cycle(1.0)
+    bench.connect()
+    bench.run()
+
+
+def test_a_drive_that_answers_slowly_is_found_and_configured(make_bench: Make) -> None:
+    bench = make_bench(make_options(make_joint(1)))
+    bench.order("late 1 80ms")
+    bench.connect()
+    assert bench.object(1, 0x1400, 5) == bench.options.rpdo_deadline_ms
