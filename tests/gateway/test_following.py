@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from stereoservo.control.reasons import Reason
-from stereoservo.gateway.client import Client
+from stereoservo.gateway.client import Client, ClientError
 from stereoservo.gateway.following import GoalHandle, GoalProgress
 from stereoservo.gateway.messages import EventMessage, LoopInfo, MessageError, Reply, StateMessage
 from stereoservo.runtime.commands import AdaptiveGain, Centre, FeatureTarget, Goal, JointTarget, TaughtTarget
@@ -86,6 +86,20 @@ def test_a_stream_puts_what_comes_until_the_goal_ends(parts: tuple[GoalHandle, A
     assert watch.closed
     assert handle.wait().outcome == "aborted"
     assert handle.stream([(None, TARGET)]) == 0
+
+
+def test_a_goal_that_a_fault_ended_tells_the_fault(parts: tuple[GoalHandle, Any, Any]) -> None:
+    handle, _, watch = parts
+    reasons = (
+        Reason("NOT_ACTIVE", "hold", hint="the cell became fault"),
+        Reason("X", "fault", hint="no TPDO1 of node 4"),
+    )
+    watch.events.append(
+        EventMessage(1, "b", 0, 0.0, "goal_aborted", "the cell became fault", id=ID, reasons=reasons)
+    )
+    handle.stream([(None, TARGET)])
+    with pytest.raises(ClientError, match="was aborted: the cell became fault: no TPDO1 of node 4"):
+        handle.reached()
 
 
 def test_a_handle_acknowledges_its_goal(parts: tuple[GoalHandle, Any, Any]) -> None:

@@ -210,6 +210,6 @@ def follow(handle: GoalHandle, as_json: bool) -> None:
     result = handle.wait()
     if result.outcome != "reached":
         tree = cast("dict[str, Any]", msgspec.to_builtins(result))
-        raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.message}", goal=tree)
+        raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.why}", goal=tree)
     error = "" if result.error_px is None else f", error {result.error_px:.3f} px"
     emit(result, f"reached in {result.seconds:.2f} s{error}", as_json)

@@ -67,8 +67,9 @@ def reset(
 ) -> None:
     """Leave a fault whose cause is gone; the arm stays off until `enable`."""
     with Client(cell, endpoint=endpoint, operator=operator) as client:
-        reply = client.reset()
-    emit(reply, reply.message, json)
+        client.reset()
+        state = client.status()
+    emit(state, f"{state.lifecycle}: the fault is cleared; `stereoservo enable {cell}` switches on", json)
 
 
 def acknowledge(

@@ -71,6 +71,10 @@ TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
 DRAIN = 32
 GOAL_TIMEOUT_S = 7.0
 """A goal is planned before it is answered; the daemon itself gives up after five seconds."""
+RESET_TIMEOUT_S = 12.0
+"""Drives are connected and configured anew; the daemon itself gives up after ten seconds."""
+NEWEST = 2**53
+"""No event has such a number: what is asked from it on is only where the next one will stand."""
 
 _T = TypeVar("_T")
 
@@ -177,9 +181,22 @@ class Client:
         """Go on after hold or stop."""
         return self.command("resume", Resume())
 
-    def reset(self) -> Reply:
-        """Leave FAULT."""
-        return self.command("reset", Reset())
+    def reset(self, timeout_s: float = RESET_TIMEOUT_S) -> None:
+        """Leave FAULT; returns once the cell is INACTIVE. Raises RefusedError, TimedOutError, ClientError (failed)."""
+        number = self.events(NEWEST).next
+        self._ask("reset", self.keys.command("reset", self.operator), encode(Reset()), timeout_s)
+        until = time.monotonic() + timeout_s
+        while time.monotonic() < until:
+            news = self.events(number)
+            for event in news.events:
+                if event.kind == "fault":
+                    raise ClientError(f"the reset failed: {event.message}")
+                if event.kind == "lifecycle" and event.name == "inactive":
+                    self.wait_state(lambda state: state.lifecycle != "fault", "out of the fault", timeout_s)
+                    return
+            number = news.next
+            time.sleep(0.02)
+        raise TimedOutError(f"the cell is {self.status().lifecycle} {timeout_s:g} s after the reset")
 
     def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
         """Joint velocities for ``lease_s``; call again within it to go on (a dead man's switch)."""

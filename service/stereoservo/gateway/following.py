@@ -40,6 +40,12 @@ class GoalResult(msgspec.Struct, frozen=True):
     reasons: tuple[Any, ...]
     seconds: float
 
+    @property
+    def why(self) -> str:
+        """The message, and the fault where one ended the goal."""
+        faults = [reason.hint for reason in self.reasons if reason.level == "fault"]
+        return ": ".join([self.message, *faults])
+
 
 class GoalProgress(msgspec.Struct, frozen=True):
     """How far a goal is: ``progress`` of its way [0, 1] and ``seconds_left`` where known, ``reasons`` in words.
@@ -187,7 +193,7 @@ class GoalHandle:
         """Like :meth:`wait`, and raises ClientError unless the goal was reached."""
         result = self.wait(timeout_s)
         if result.outcome != "reached":
-            raise ClientError(f"goal {self.id} was {result.outcome}: {result.message}")
+            raise ClientError(f"goal {self.id} was {result.outcome}: {result.why}")
         return result
 
     @property

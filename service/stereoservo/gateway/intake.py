@@ -28,6 +28,7 @@ from stereoservo.runtime.commands import (
     Goal,
     IncidenceTarget,
     RenewGoal,
+    Reset,
     RunGoal,
     TaughtTarget,
     Teach,
@@ -38,6 +39,9 @@ from stereoservo.runtime.cycle import Event
 REPLY_TIMEOUT_S = 1.0
 PLANNED_REPLY_TIMEOUT_S = 5.0
 """A goal is planned, a slice a cycle, before it is answered."""
+RESET_REPLY_TIMEOUT_S = 10.0
+"""A driver that connects anew and configures its drives answers nothing meanwhile."""
+PATIENCE_S: dict[type, float] = {RunGoal: PLANNED_REPLY_TIMEOUT_S, Reset: RESET_REPLY_TIMEOUT_S}
 KNOWN_GOALS = 1000
 TOLD_EVERY_S = 1.0
 """Refused set-points of a stream, which nobody waits for, are told by events no more often than this."""
@@ -120,7 +124,7 @@ class Intake:
         except _Answered as answered:
             self._answer(query, answered.reply, operator or key, streamed)
         else:
-            seconds = PLANNED_REPLY_TIMEOUT_S if isinstance(command, RunGoal) else REPLY_TIMEOUT_S
+            seconds = PATIENCE_S.get(type(command), REPLY_TIMEOUT_S)
             deadline = time.monotonic() + seconds
             self._pending[number] = _Pending(query, command, operator, deadline, seconds, self._note)
             if isinstance(command, Teach):

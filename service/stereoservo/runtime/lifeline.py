@@ -28,8 +28,8 @@ def die_with_parent(parent: int, how: signal.Signals) -> None:
 
 
 class Termination:
-    """SIGTERM and SIGINT as a flag. After the first one the process has ``grace_s`` to end; then SIGALRM
-    kills it.
+    """SIGTERM, SIGINT and the terminal's end (SIGHUP, unless it is ignored: nohup) as a flag. After the first one
+    the process has ``grace_s`` to end; then SIGALRM kills it.
     """
 
     def __init__(self, grace_s: float = 5.0) -> None:
@@ -38,6 +38,8 @@ class Termination:
         self._grace_s = grace_s
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
+        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+            signal.signal(signal.SIGHUP, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.signals += 1
