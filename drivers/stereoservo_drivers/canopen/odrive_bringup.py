@@ -25,7 +25,7 @@ HEARTBEAT_WAIT_S = 0.5
 """Heartbeats come every 100 ms unless configured otherwise."""
 ANSWER_WAIT_S = 0.05
 QUIET_S = 0.05
-"""Time in which no encoder estimates may come unasked."""
+"""Time in which no encoder estimates may come unasked, and nobody else may command."""
 PROTOCOL_VERSION = 2
 ALL_NODES = tuple(range(63))
 
@@ -66,8 +66,12 @@ class OdriveBringup:
         """Check every node, set velocity control and limits, leave it idle.
 
         Errors of drives are not cleared: the codec reports them. Raises DriverError: ``node_missing``, ``no_answer``,
-        ``duplicate_node``, ``identity``, ``version``, ``cyclic_messages``, ``no_feedback``, ``not_idle``.
+        ``duplicate_node``, ``identity``, ``version``, ``cyclic_messages``, ``no_feedback``, ``not_idle``,
+        ``second_master``.
         """
+        self._check_alone(link)
+        # Whom a master that died has left moving: before anything that can fail, and long before the idle state.
+        link.send([axis.velocity(0.0) for axis in self.codec.axes])
         self._hear_all(link)
         self._check_identities(link)
         self._check_versions(link)
@@ -121,6 +125,21 @@ class OdriveBringup:
                     node_id=node,
                 )
         return answers
+
+    def _check_alone(self, link: Link) -> None:
+        """Nobody else sends velocities to these axes."""
+        with _listening(link, self._nodes, odrive.SET_INPUT_VEL) as heard:
+            link.wait(QUIET_S)
+        for node, frames in heard.items():
+            if frames:
+                raise DriverError(
+                    "second_master",
+                    f"{self._axes[node].name}: somebody else commands this axis, {len(frames)} velocities within "
+                    f"{QUIET_S} s; end the other master (another daemon or doctor on this bus) first",
+                    retry=True,
+                    node_id=node,
+                    frames=len(frames),
+                )
 
     def _hear_all(self, link: Link) -> None:
         """Wait for every node's heartbeat, at most ``HEARTBEAT_WAIT_S``."""

@@ -326,3 +326,28 @@ def test_an_error_that_stays_refuses_the_reset():
     with pytest.raises(DriverError, match="gate driver") as refusal:
         start.reset(link)
     assert refusal.value.code == "reset_refused"
+
+
+def test_axes_that_somebody_else_commands_are_left_alone():
+    link = Drives()
+    wait = link.wait
+
+    def wait_beside_another(seconds):
+        wait(seconds)
+        link.deliver(CanFrame(3 << 5 | 0x0D, struct.pack("<ff", 1.0, 0.0)))
+
+    link.wait = wait_beside_another
+    with pytest.raises(DriverError, match="another daemon") as refusal:
+        bringup().connect(link)
+    assert refusal.value.code == "second_master"
+    assert link.sent == []
+
+
+def test_axes_that_were_left_moving_are_stopped_though_one_is_missing():
+    link = Drives(nodes=(3,))
+    with pytest.raises(DriverError) as refusal:
+        bringup(joint(), joint(name="other", node_id=4)).connect(link)
+    assert refusal.value.code == "node_missing"
+    stops = [f for f in link.sent if f.id & 31 == 0x0D]
+    assert [(f.id >> 5, struct.unpack("<ff", f.data)) for f in stops] == [(3, (0.0, 0.0)), (4, (0.0, 0.0))]
+    assert states_asked(link.sent, 3) == []
