@@ -265,6 +265,8 @@ class Cia402Codec:
             )
 
     def _take_emergency(self, axis: Axis, data: bytes) -> int:
+        if len(data) < 2:  # no error code, and not the error reset that zeros would be
+            return NOT_CYCLIC
         code = int.from_bytes(data[:2], "little")
         axis.take_code(code)
         if code and code not in self._ignored and self._watching:
@@ -276,12 +278,14 @@ class Cia402Codec:
             return NOT_CYCLIC
         axis.heard_poll = self._polls
         state = data[0] & 0x7F
+        if state == NmtState.BOOT_UP and (self._watching or not axis.joint.multi_turn):
+            # What it counts from now on goes on from nothing; but bring-up makes drives boot that count on.
+            axis.counts.reset()
         if not self._watching or state == NmtState.OPERATIONAL:
             return NOT_CYCLIC
         if state == NmtState.BOOT_UP:
             message = "booted while in use"
             hint = "its supply broke down, it was reset, or another node has its id; reset configures it anew"
-            axis.counts.reset()  # what it counts from now on goes on from nothing
             self._event(axis, "rebooted", message, state, hint)
         else:
             self._event(

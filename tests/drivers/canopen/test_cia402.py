@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -300,6 +301,28 @@ def test_counts_of_a_drive_that_booted_unasked_start_anew() -> None:
     codec.receive(CanFrame(0x701, b"\0"))
     codec.receive(tpdo1(1, DISABLED, -(2**31) + 10))
     assert codec.feedback.positions[0] == pytest.approx((-(2**31) + 10) / COUNTS_PER_RAD, rel=1e-12)
+
+
+@pytest.mark.parametrize("multi_turn", [False, True])
+def test_a_drive_that_boots_while_nobody_watches_keeps_its_turn_only_where_it_may_have_turned(
+    multi_turn: bool,
+) -> None:
+    plain = options(n=1)
+    joint = msgspec.structs.replace(plain.joint[0], multi_turn=multi_turn)
+    codec = Cia402Codec(msgspec.structs.replace(plain, joint=(joint,)))
+    codec.receive(tpdo1(1, DISABLED, 2**31 - 10))
+    codec.receive(CanFrame(0x701, b"\0"))
+    codec.receive(tpdo1(1, DISABLED, -(2**31) + 10))
+    counts = 2**31 + 10 if multi_turn else -(2**31) + 10
+    assert codec.feedback.positions[0] == pytest.approx(counts / COUNTS_PER_RAD, rel=1e-12)
+
+
+@pytest.mark.parametrize("data", [b"", b"\0"])
+def test_an_emergency_without_a_code_is_no_error_reset(enabled: Cia402Codec, data: bytes) -> None:
+    enabled.receive(CanFrame(0x81, struct.pack("<HB5x", 0x3210, 4)))
+    enabled.receive(CanFrame(0x81, data))
+    enabled.receive(tpdo1(1, FAULT))
+    assert "0x3210" in enabled.status_words()[0]
 
 
 def test_emergencies_of_bring_up_are_no_faults(enabled: Cia402Codec) -> None:
