@@ -184,6 +184,8 @@ class BusThread:
     def _receive(self, timeout_s: float) -> None:
         for t_ns, frame in self._channel.receive(timeout_s):
             self._master.receive(frame, t_ns)
+            if frame.extended:  # 29 bits of another protocol are no identifier of ours
+                continue
             for heard in self._subscribers.get(frame.id, ()):
                 heard.append(frame)
 

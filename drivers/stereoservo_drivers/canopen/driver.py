@@ -118,9 +118,10 @@ class CanJointDriver:
         try:
             self._bringup.connect(self.bus)
             self._begin_cycle(self.bus)
-        except DriverError as error:
+        except BaseException as error:  # nobody would stop a pump that goes on with its heartbeats
             self._release()
-            self.master.latch(MasterFault(error.code, str(error), hint="reset connects again"))
+            code = error.code if isinstance(error, DriverError) else "internal"
+            self.master.latch(MasterFault(code, str(error), hint="reset connects again"))
             raise
 
     def _begin_cycle(self, bus: BusThread) -> None:

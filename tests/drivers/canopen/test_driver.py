@@ -267,6 +267,20 @@ def test_what_is_raised_in_the_bus_thread_stops_the_arm(
     arm.drive(5)
 
 
+def test_a_bring_up_that_fails_with_a_defect_leaves_no_pump_behind(
+    arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise KeyError("a defect")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(arm.driver._bringup, "connect", broken)
+        with pytest.raises(KeyError, match="a defect"):
+            arm.driver.configure()
+    assert arm.driver.bus is None
+    arm.active()
+
+
 def test_stop_keeps_the_drives_enabled(arm: Arm) -> None:
     driver = arm.active()
     driver.stop()
