@@ -82,11 +82,20 @@ def test_init_with_an_unknown_driver_lists_those_there_are(tmp_path: Path, run: 
     assert "fake" in result["error"]["message"]
 
 
+def test_init_with_a_driver_that_needs_options_says_where_to_begin(tmp_path: Path, run: Run) -> None:
+    code, result, _ = run("init", str(tmp_path / "x.toml"), "--joint-driver", "canopen")
+    assert (code, result["error"]["code"]) == (1, "option")
+    assert "interface is missing" in result["error"]["message"]
+    assert "hil-can.toml" in result["error"]["message"]
+    assert not (tmp_path / "x.toml").exists()
+
+
 def test_doctor_checks_a_good_cell(run: Run, cell: Path) -> None:
     code, result, _ = run("doctor", str(cell))
     assert code == 0
     found = {check["name"]: check["ok"] for check in result["checks"]}
     assert found["drivers"] is True
+    assert found["rates"] is True
     assert found["zenoh"] is True
     assert found["model"] is None  # none yet
 

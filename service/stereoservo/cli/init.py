@@ -12,7 +12,7 @@ from stereoservo.runtime import plugins
 from stereoservo.runtime.cellfile import check_joints, load_cell_file
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.directories import CELL_NAME
-from stereoservo.runtime.ports import CameraDescription, DriverContext, JointDriverDescription
+from stereoservo.runtime.ports import CameraDescription, DriverContext, DriverError, JointDriverDescription
 
 
 def init(
@@ -35,7 +35,18 @@ def init(
         raise CommandError("exists", f"{file} exists already; --force writes over it")
     cameras = camera or ["left", "right"]
     context = DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent)
-    joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, joint_driver)({}, context).describe()
+    try:
+        joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, joint_driver)(
+            {}, context
+        ).describe()
+    except DriverError as error:
+        if error.code != "option":
+            raise
+        raise CommandError(
+            "option",
+            f"{error}. Driver {joint_driver!r} tells its joints only once it knows [joints.options]: copy a cell file "
+            "that uses it (deploy/cells/ in the source, e.g. hil-can.toml for 'canopen') and change it",
+        ) from error
     described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
         {},
         DriverContext(

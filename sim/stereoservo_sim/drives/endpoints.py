@@ -254,8 +254,9 @@ class PythonCanEndpoint:
         self._error = can.CanError
         try:
             self._bus = can.Bus(interface=interface, channel=channel, **options)
-        except (can.CanError, OSError, ValueError) as error:
-            raise EndpointError(f"python-can cannot open {self.channel}: {error}") from error
+        except Exception as error:  # interfaces without their maker's library raise anything
+            what = str(error) or type(error).__name__
+            raise EndpointError(f"python-can cannot open {self.channel}: {what}") from error
         self._plugged = True
         self.lost = 0
 

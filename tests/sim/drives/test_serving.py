@@ -260,3 +260,12 @@ def test_the_cells_own_channel():
     assert served_channel(options("socketcan", "vcan0")) == "socketcan:vcan0"
     with pytest.raises(EndpointError, match="--channel pty"):
         served_channel(options("stereoservo_slcan", "/dev/ttyACM0"))
+
+
+def test_an_interface_without_its_makers_library_is_told(monkeypatch):
+    def broken(**_):
+        raise NameError("name 'canGetNumberOfChannels' is not defined")
+
+    monkeypatch.setattr(can, "Bus", broken)
+    with pytest.raises(EndpointError, match="cannot open kvaser:0: name 'canGetNumberOfChannels'"):
+        PythonCanEndpoint("kvaser", "0")
