@@ -215,6 +215,8 @@ def test_gateway_silence_holds_a_moving_arm_and_only_then(bench: Bench) -> None:
     assert bench.arm.written[-1].any()
     bench.run(round(0.8 * GATEWAY_SILENCE_S * RATE_HZ), beat=False)
     assert bench.kinds().count("held") == 1
+    (held,) = [event for event in bench.events if event.kind == "held"]
+    assert "its gateway said nothing for 0.5 s" in held.message  # nobody asked for it: say why
     assert not bench.arm.written[-1].any()
 
 

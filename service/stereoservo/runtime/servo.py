@@ -54,6 +54,8 @@ from stereoservo.runtime.warmup import warm_up
 
 GATEWAY_SILENCE_S = 0.5
 """Without a heartbeat of the gateway for so long, a moving arm is held."""
+SILENCE = f"the servo process: its gateway said nothing for {GATEWAY_SILENCE_S:g} s (a busy computer?)"
+"""Who holds then, as the event `held` tells it."""
 STATE_RATE_HZ = 50.0
 STATISTICS_EVERY_S = 0.5
 FAULT_READ_EVERY_S = 0.1
@@ -201,7 +203,7 @@ class ServoProcess:
         if self._heard_ns and not self._silent and now_ns - self._heard_ns > GATEWAY_SILENCE_S * 1e9:
             self._silent = True
             if self._moving:
-                requests.append(Request(-1, "servo", Hold()))
+                requests.append(Request(-1, SILENCE, Hold()))
         return tuple(requests), model
 
     def _observe(self) -> tuple[CameraObservation, ...]:
