@@ -264,7 +264,7 @@ class Master:
         for trip in (
             monitors.flood.end_cycle(cycle_ns),  # before what a flood makes the drives miss
             monitors.frames.verdict(self._period_s),
-            monitors.lateness.end_cycle(),
+            monitors.lateness.end_cycle(monitors.frames.owing),
             *self._watch_encoders(cycle_ns),
         ):
             if trip is not None:

@@ -19,7 +19,8 @@ OWED_CYCLES = 25
 """So long a frame that was missed may still come, beside that of its cycle: a held-up host or adapter is no double."""
 LATE_WINDOW = 25
 LATE_RANK = LATE_WINDOW // 5
-LATE_BASELINE_WINDOWS = 4
+LATE_BASELINES = 16
+"""So many looks at windows in which no frame was owed make the baseline."""
 LATE_EVERY = 5
 """Cycles; divides the window."""
 LATE_SHARE = 0.25
@@ -65,6 +66,8 @@ class FrameCounter:
         self._doubles = [0] * len(names)
         self._owed = [0] * len(names)
         self._calm = 0
+        self.owing = False
+        """Whether a frame was missed that may still come."""
         self.lost = 0
         self.doubled = 0
 
@@ -81,6 +84,7 @@ class FrameCounter:
             self._calm += 1
             if self._calm == OWED_CYCLES:
                 self._owed = [0] * len(self._owed)
+                self.owing = False
             return
         self._clean = every_one_once
         self._calm = 0
@@ -99,6 +103,7 @@ class FrameCounter:
                 self._doubles[bit] = self._doubles[bit] + 1 if count - 1 > late else 0
                 self.doubled += count - 1
             self.counts[bit] = 0
+        self.owing = any(self._owed)
 
     def verdict(self, period_s: float) -> Trip | None:
         """After ``end_cycle``."""
@@ -150,8 +155,9 @@ class LatenessMonitor:
 
     A drive that is late by more than a cycle answers as often as one in time: only its phase tells. Of the arrivals in
     ``LATE_WINDOW`` cycles the one counts that a fifth of them undercut: a drive that is late is so in nearly all
-    cycles, a busy host in some. The baseline is the smallest such value of the first windows. What all axes have in
-    common is the host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
+    cycles, a busy host in some. The baseline is the smallest such value of the first windows in which no frame was
+    owed: after a miss an early frame may be the late one of the cycle before. What all axes have in common is the
+    host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
     """
 
     def __init__(self, names: tuple[str, ...], bit_axis: tuple[int, ...], period_ns: int) -> None:
@@ -165,9 +171,12 @@ class LatenessMonitor:
         self._newest: list[list[int]] = []
         self._cycles = 0
         self._baseline = np.full(len(names), math.inf)
+        self._settled = 0
+        self._looks = 0
 
-    def end_cycle(self) -> Trip | None:
-        """Judges every ``LATE_EVERY`` cycles."""
+    def end_cycle(self, owing: bool) -> Trip | None:
+        """Judges every ``LATE_EVERY`` cycles, once there is a baseline. ``owing``: a frame was missed and may come."""
+        self._settled = 0 if owing else self._settled + 1
         self._newest.append(self.arrivals.copy())
         self._cycles += 1
         if self._cycles % LATE_EVERY:
@@ -178,7 +187,8 @@ class LatenessMonitor:
         if self._cycles < LATE_WINDOW:
             return None
         usual = np.partition(self._arrivals, LATE_RANK, axis=0)[LATE_RANK]
-        if self._cycles <= LATE_BASELINE_WINDOWS * LATE_WINDOW:
+        if self._looks < LATE_BASELINES and self._settled >= LATE_WINDOW:
+            self._looks += 1
             np.minimum(self._baseline, usual, out=self._baseline)
         return self._judge(usual - self._baseline)
 

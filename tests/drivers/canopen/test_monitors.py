@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.monitors import LatenessMonitor
 
 MS = 1_000_000
 
@@ -287,3 +288,15 @@ def test_an_arm_at_rest_that_is_pushed_is_no_reversed_encoder(bus) -> None:
         bus.run(0.0, 0.0)
         bus.positions = bus.positions + 0.0005
     assert bus.master.fault is None
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_frames_a_cycle_late_after_a_miss_make_no_baseline(told: bool) -> None:
+    """Told of nothing owed, the monitor takes the late frames of a bus that was overloaded at first for early ones."""
+    monitor = LatenessMonitor(("a", "b", "c"), (0, 1, 2), 4 * MS)
+    trips = []
+    for cycle in range(200):
+        monitor.arrivals[:] = [MS // 10 if cycle < 20 else 3 * MS, MS, MS]
+        trips.append(monitor.end_cycle(cycle < 20 and told))
+    tripped = [trip.bit for trip in trips if trip is not None]
+    assert tripped == [] if told else set(tripped) == {0}
