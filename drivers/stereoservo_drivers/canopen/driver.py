@@ -22,7 +22,6 @@ from stereoservo.runtime.ports import (
     Finding,
     FloatArray,
     JointDriverDescription,
-    JointSpec,
     JointState,
 )
 from stereoservo_drivers.can.channel import Channel
@@ -67,17 +66,7 @@ class CanJointDriver:
         """Joints and limits of the cell file; the servo's clock paces."""
         return JointDriverDescription(
             driver=DRIVER,
-            joints=tuple(
-                JointSpec(
-                    name=joint.name,
-                    kind=joint.kind,
-                    position_min=joint.position_min,
-                    position_max=joint.position_max,
-                    velocity_max=joint.max_velocity,
-                    acceleration_max=joint.max_acceleration,
-                )
-                for joint in self.options.joint
-            ),
+            joints=tuple(joint.spec() for joint in self.options.joint),
             rate_hz=self.options.rate_hz,
             pacing="clock",
             effort_units=tuple(_effort_unit(joint, self.options.protocol) for joint in self.options.joint),

@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from stereoservo.runtime.ports import JointSpec
+
 Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
 NodeId = Annotated[int, Meta(ge=1, le=126)]
 Feedback = Literal["velocity", "effort", "following_error"]
 
@@ -46,6 +47,17 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     revision: int | None = None
     serial_number: int | None = None
     sdo: dict[str, int] = {}
+
+    def spec(self) -> JointSpec:
+        """The joint as the service knows it."""
+        return JointSpec(
+            name=self.name,
+            kind=self.kind,
+            position_min=self.position_min,
+            position_max=self.position_max,
+            velocity_max=self.max_velocity,
+            acceleration_max=self.max_acceleration,
+        )
 
 
 class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

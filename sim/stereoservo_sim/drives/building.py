@@ -13,7 +13,6 @@ from msgspec import Meta
 
 import stereoservo_drivers.canopen
 from stereoservo.runtime.cellfile import CellFile
-from stereoservo.runtime.ports import JointSpec
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.options import decode_options, invalid
 from stereoservo_sim.drives.axis import Axis
@@ -101,7 +100,7 @@ def make_rack(
     start = _start(options, settings)
     positions = newest[1] if newest is not None else start
     plant, rated = _plant(options, settings, positions)
-    axes = [Axis(_joint(joint), float(q)) for joint, q in zip(options.joint, positions, strict=True)]
+    axes = [Axis(joint.spec(), float(q)) for joint, q in zip(options.joint, positions, strict=True)]
     eds = _eds(options, settings, cell_dir)
     nodes = [
         _node(options, joint, axis, settings, eds) for joint, axis in zip(options.joint, axes, strict=True)
@@ -119,17 +118,6 @@ def _eds(options: CanOptions, settings: DrivesSettings, cell_dir: Path) -> Path:
         key = "emulate.drives.eds" if settings.eds else "joints.options.eds"
         raise EmulationError(f"{key} = {named!r}: there is no file {path}; leave eds out for the shipped one")
     return path
-
-
-def _joint(joint: CanJoint) -> JointSpec:
-    return JointSpec(
-        name=joint.name,
-        kind=joint.kind,
-        position_min=joint.position_min,
-        position_max=joint.position_max,
-        velocity_max=joint.max_velocity,
-        acceleration_max=joint.max_acceleration,
-    )
 
 
 def _node(

@@ -41,14 +41,7 @@ AFTER_A_HANG = ("emergency", "left_operational", "drive_fault", "disabled", "bus
 NO_DEADLINE = {"rpdo_deadline_ms": 0}
 """The drives' deadline for commands off: their watch on the master's heartbeat (0x1016) acts alone."""
 
-CIA402_CASES = (
-    FaultCase(
-        name="drive fault with emergency",
-        orders=("fault 3 0x3210",),
-        codes=("emergency", "drive_fault"),
-        bound_ms=40,
-    ),
-    FaultCase(name="emergency alone", orders=("emcy 5 0x4210",), codes=("emergency",), bound_ms=40),
+EITHER_PROTOCOL = (
     FaultCase(
         name="node silent",
         orders=("silence 4",),
@@ -56,6 +49,57 @@ CIA402_CASES = (
         bound_ms=60,
         afterwards=("speak 4",),
     ),
+    FaultCase(
+        name="duplicate node id running",
+        orders=("duplicate 2 running",),
+        codes=("duplicate",),
+        bound_ms=60,
+        afterwards=("duplicate 2 off",),
+    ),
+    FaultCase(
+        name="limit switch active before motion",
+        orders=("limit 3 +",),
+        towards=3,
+        stage="standing",
+        codes=("limit_switch", "emergency", "drive_fault"),
+        bound_ms=40,
+        afterwards=("limit 3 off",),
+    ),
+    FaultCase(
+        name="encoder against the command from the start",
+        orders=("invert 3",),
+        stage="standing",
+        codes=("encoder_reversed",),
+        bound_ms=200,
+        afterwards=("invert 3 off",),
+    ),
+    FaultCase(
+        name="duplicate node id at start",
+        orders=("duplicate 2 running",),
+        codes=("duplicate_node",),
+        by="bring-up",
+        stage="start",
+    ),
+    FaultCase(
+        name="node missing at start",
+        orders=("silence 4",),
+        codes=("node_missing",),
+        by="bring-up",
+        stage="start",
+    ),
+    FaultCase(name="servo loop hangs", host="loop_hangs", codes=("loop_hung",), bound_ms=150),
+)
+"""What looks the same to drives of both protocols."""
+
+CIA402_CASES = (
+    *EITHER_PROTOCOL,
+    FaultCase(
+        name="drive fault with emergency",
+        orders=("fault 3 0x3210",),
+        codes=("emergency", "drive_fault"),
+        bound_ms=40,
+    ),
+    FaultCase(name="emergency alone", orders=("emcy 5 0x4210",), codes=("emergency",), bound_ms=40),
     FaultCase(
         name="node's cable out",
         orders=("cable 4 out",),
@@ -78,13 +122,6 @@ CIA402_CASES = (
         name="duplicate node id boots",
         orders=("duplicate 2 boots",),
         codes=("rebooted", "duplicate", "left_operational"),
-        bound_ms=60,
-        afterwards=("duplicate 2 off",),
-    ),
-    FaultCase(
-        name="duplicate node id running",
-        orders=("duplicate 2 running",),
-        codes=("duplicate",),
         bound_ms=60,
         afterwards=("duplicate 2 off",),
     ),
@@ -123,7 +160,6 @@ CIA402_CASES = (
         bound_ms=60,
         by="drives",
     ),
-    FaultCase(name="servo loop hangs", host="loop_hangs", codes=("loop_hung",), bound_ms=150),
     FaultCase(
         name="adapter gone",
         orders=("adapter out",),
@@ -177,37 +213,6 @@ CIA402_CASES = (
         afterwards=("invert 3 off",),
     ),
     FaultCase(
-        name="limit switch active before motion",
-        orders=("limit 3 +",),
-        towards=3,
-        stage="standing",
-        codes=("limit_switch", "emergency", "drive_fault"),
-        bound_ms=40,
-        afterwards=("limit 3 off",),
-    ),
-    FaultCase(
-        name="encoder against the command from the start",
-        orders=("invert 3",),
-        stage="standing",
-        codes=("encoder_reversed",),
-        bound_ms=200,
-        afterwards=("invert 3 off",),
-    ),
-    FaultCase(
-        name="duplicate node id at start",
-        orders=("duplicate 2 running",),
-        codes=("duplicate_node",),
-        by="bring-up",
-        stage="start",
-    ),
-    FaultCase(
-        name="node missing at start",
-        orders=("silence 4",),
-        codes=("node_missing",),
-        by="bring-up",
-        stage="start",
-    ),
-    FaultCase(
         name="drive in fault at start",
         orders=("fault 3 0x3210",),
         codes=("drive_fault", "emergency"),
@@ -224,10 +229,8 @@ CIA402_CASES = (
 """Of six CiA 402 drives at 250 Hz with ramps of 12.5 ms."""
 
 ODRIVE_CASES = (
+    *EITHER_PROTOCOL,
     FaultCase(name="drive error", orders=("fault 3 0x20",), codes=("drive_fault",), bound_ms=40),
-    FaultCase(
-        name="node silent", orders=("silence 4",), codes=("silent",), bound_ms=60, afterwards=("speak 4",)
-    ),
     FaultCase(name="node reboots", orders=("reboot 5",), codes=("silent",), bound_ms=60),
     FaultCase(name="one answer lost", orders=("lose 2 0x049",), by="nobody"),
     FaultCase(
@@ -239,13 +242,6 @@ ODRIVE_CASES = (
         afterwards=("late 2 0",),
     ),
     FaultCase(
-        name="duplicate node id running",
-        orders=("duplicate 2 running",),
-        codes=("duplicate",),
-        bound_ms=60,
-        afterwards=("duplicate 2 off",),
-    ),
-    FaultCase(
         name="bus cable out",
         orders=("cable out",),
         codes=("bus_silent",),
@@ -255,7 +251,6 @@ ODRIVE_CASES = (
     ),
     FaultCase(name="master killed", host="killed", bound_ms=150, by="drives"),
     FaultCase(name="cycle thread hangs", host="cycle_hangs", codes=AFTER_A_HANG, bound_ms=150, by="drives"),
-    FaultCase(name="servo loop hangs", host="loop_hangs", codes=("loop_hung",), bound_ms=150),
     FaultCase(
         name="end stop",
         orders=("limit 3 +",),
@@ -263,37 +258,6 @@ ODRIVE_CASES = (
         codes=("drive_fault",),
         bound_ms=40,
         afterwards=("limit 3 off",),
-    ),
-    FaultCase(
-        name="limit switch active before motion",
-        orders=("limit 3 +",),
-        towards=3,
-        stage="standing",
-        codes=("limit_switch", "emergency", "drive_fault"),
-        bound_ms=40,
-        afterwards=("limit 3 off",),
-    ),
-    FaultCase(
-        name="encoder against the command from the start",
-        orders=("invert 3",),
-        stage="standing",
-        codes=("encoder_reversed",),
-        bound_ms=200,
-        afterwards=("invert 3 off",),
-    ),
-    FaultCase(
-        name="duplicate node id at start",
-        orders=("duplicate 2 running",),
-        codes=("duplicate_node",),
-        by="bring-up",
-        stage="start",
-    ),
-    FaultCase(
-        name="node missing at start",
-        orders=("silence 4",),
-        codes=("node_missing",),
-        by="bring-up",
-        stage="start",
     ),
     FaultCase(
         name="drive in error at start", orders=("fault 3 0x20",), codes=("drive_fault",), stage="start"
