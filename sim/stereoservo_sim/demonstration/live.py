@@ -10,10 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.gateway.client import Client
+from stereoservo.gateway.errors import ClientError, TimedOutError
+from stereoservo.gateway.following import GoalHandle, GoalResult
 from stereoservo.gateway.messages import EventMessage
 from stereoservo.kinematics.model import load_model
 from stereoservo.runtime.commands import JointTarget, LawName
 from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
+
+LOOK_EVERY_S = 2.0
+RECENT_EVENTS = 50
 
 
 class LiveDemonstrator:
@@ -40,7 +45,7 @@ class LiveDemonstrator:
 
     def move(self, joints: dict[str, float]) -> None:
         """Joint goal."""
-        self._client.goal(JointTarget(joints)).reached()
+        self._reach(self._client.goal(JointTarget(joints)))
 
     def teach(self, name: str, frames: int) -> None:
         """Teach what is seen."""
@@ -48,7 +53,7 @@ class LiveDemonstrator:
 
     def home(self) -> None:
         """Move home."""
-        self._client.home().reached()
+        self._reach(self._client.home())
 
     def joints(self) -> npt.NDArray[np.float64]:
         """Measured joint positions (n,)."""
@@ -62,8 +67,33 @@ class LiveDemonstrator:
 
     def servo(self, target: VisualTarget, law: LawName) -> str:
         """Run a goal to its end, under a lease."""
-        result = self._client.goal(target, law=law, lease_s=2.0).wait()
+        result = self._ended(self._client.goal(target, law=law, lease_s=2.0))
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
+
+    def _ended(self, handle: GoalHandle) -> GoalResult:
+        """Wait for a goal's end. Raises ClientError where the cell is held, since nobody here would resume it."""
+        while True:
+            try:
+                return handle.wait(LOOK_EVERY_S)
+            except TimedOutError:
+                self._require_not_held()
+
+    def _require_not_held(self) -> None:
+        state = self._client.status()
+        if not any(reason.code == "HELD" for reason in state.reasons):
+            return
+        told = [
+            event.message
+            for event in self._client.events(max(1, state.last_event - RECENT_EVENTS)).events
+            if event.kind == "held"
+        ]
+        raise ClientError(
+            f"the cell was held and nobody resumed it: {told[-1] if told else 'no event says why'}"
+        )
+
+    def _reach(self, handle: GoalHandle) -> None:
+        self._ended(handle)
+        handle.reached()
 
     def rest(self, seconds: float) -> None:
         """Wait."""
