@@ -11,8 +11,8 @@ import pytest
 PROGRAM = """
 import signal, sys, time
 from stereoservo.runtime.lifeline import Termination
-if sys.argv[1:] == ["nohup"]:
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+# Whatever this test was started under: an ignored signal is inherited.
+signal.signal(signal.SIGHUP, signal.SIG_IGN if sys.argv[1:] == ["nohup"] else signal.SIG_DFL)
 termination = Termination(grace_s=30.0)
 print("ready", flush=True)
 while not termination.asked:
@@ -29,7 +29,10 @@ def ended_by(*numbers: int, arguments: tuple[str, ...] = ()) -> str:
         assert child.stdout.readline() == "ready\n"
         for number in numbers:
             child.send_signal(number)
-        output, _ = child.communicate(timeout=60.0)
+        try:
+            output, _ = child.communicate(timeout=60.0)
+        finally:
+            child.kill()
     return output.strip()
 
 
