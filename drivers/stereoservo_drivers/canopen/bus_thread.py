@@ -20,8 +20,10 @@ from stereoservo_drivers.canopen.master import Master, MasterFault
 PUMP_WAIT_S = 0.002
 HAND_OVER_S = 1.0
 READS_A_PERIOD = 8
+FIRST_READ = 2
 """Waking for every frame costs more than decoding it, and nothing is decided before the next tick: while answers are
-awaited the thread reads so often, which is also how finely arrivals are told apart; then just before the tick.
+awaited the thread reads so often, which is also how finely arrivals are told apart; then just before the tick. The
+first of these reads that is worth a wake-up is the ``FIRST_READ``th.
 """
 FOLLOW_EVERY_NS = 500_000_000
 
@@ -54,6 +56,7 @@ class BusThread:
         self._cycling = False
         self._ending = False
         self._next_ns = 0
+        self._first_read_ns = 0
         self._heartbeat_ns = 0
         self._follow_ns = 0
         self._thread = threading.Thread(target=self._run, name="can-bus", daemon=True)
@@ -169,7 +172,7 @@ class BusThread:
         """Whatever has come when a slot begins belongs to the cycle that ends there."""
         wake_ns = self._next_ns
         if self._master.awaits_answers:
-            wake_ns = min(wake_ns, now + self._read_every_ns)
+            wake_ns = min(wake_ns, max(now + self._read_every_ns, self._first_read_ns))
         time.sleep((wake_ns - now) * 1e-9)
         self._receive(0.0)
 
@@ -193,6 +196,7 @@ class BusThread:
         self.statistics.late_max_ns = max(self.statistics.late_max_ns, now - self._next_ns)
         with self._send_lock:
             self._channel.send(self._master.tick(now))
+        self._first_read_ns = now + FIRST_READ * self._read_every_ns
         self._next_ns, skipped = next_slot(self._next_ns, now, self._period_ns)
         self.statistics.skipped += skipped
 

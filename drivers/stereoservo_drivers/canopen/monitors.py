@@ -23,8 +23,9 @@ LATE_BASELINES = 16
 """So many looks at windows in which no frame was owed make the baseline."""
 LATE_EVERY = 5
 """Cycles; divides the window."""
-LATE_SHARE = 0.25
-"""Of the period: later than its own baseline by so much, compared with the other drives, a drive is late."""
+LATE_SHARE = 0.35
+"""Of the period: later than its own baseline by so much, compared with the other drives, a drive is late. A quarter,
+and a tenth because arrivals are only told apart as finely as the bus is read (an eighth of the period)."""
 LATE_SHARE_SINGLE = 0.5
 """The same of an only drive, which nothing can be compared with."""
 FLOOD_WINDOW = 5
