@@ -15,7 +15,8 @@ from stereoservo_sim.drives.fault_cases import ODRIVE_CASES, FaultCase
 
 @pytest.fixture
 def one_case(monkeypatch):
-    monkeypatch.setattr(faults, "CASES", {"odrive": ODRIVE_CASES[:1]})
+    drive_error = next(case for case in ODRIVE_CASES if case.name == "drive error")
+    monkeypatch.setattr(faults, "CASES", {"odrive": (drive_error,)})
 
 
 WALL = {
