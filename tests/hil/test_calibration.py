@@ -46,8 +46,8 @@ def test_check_report_and_damaged_models(
     damaged = directories.models / "model-000090.json"
     damaged.write_text("{")
     code, result = run("doctor", str(calibrated))
+    assert code == 0, result
     line = next(check for check in result["checks"] if check["name"] == "model")
-    assert code == 0
     assert line["ok"] is None
     assert "epoch" in line["message"]
     assert str(damaged) in line["message"]

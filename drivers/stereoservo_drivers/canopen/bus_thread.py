@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import defaultdict
 from dataclasses import dataclass
 
 from stereoservo.runtime.ports import DriverError
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.listening import Subscriptions
 from stereoservo_drivers.canopen.master import Master, MasterFault
 
 PUMP_WAIT_S = 0.002
@@ -36,7 +36,7 @@ class ThreadStatistics:
     late_max_ns: int = 0
 
 
-class BusThread:
+class BusThread(Subscriptions):
     """A pumped bus (:class:`~stereoservo_drivers.canopen.bringup.Link`) that can also run the master's cycle.
 
     It ends by itself when the connection is lost or something unforeseen is raised in it: that fault is latched in the
@@ -44,6 +44,7 @@ class BusThread:
     """
 
     def __init__(self, channel: Channel, master: Master) -> None:
+        super().__init__()
         self.error: DriverError | None = None
         self.statistics = ThreadStatistics()
         self._channel = channel
@@ -51,7 +52,6 @@ class BusThread:
         self._period_ns = round(1e9 / master.settings.rate_hz)
         self._read_every_ns = self._period_ns // READS_A_PERIOD
         self._send_lock = threading.Lock()
-        self._subscribers: defaultdict[int, list[list[CanFrame]]] = defaultdict(list)
         self._cycle_wanted = False
         self._cycling = False
         self._ending = False
@@ -69,14 +69,6 @@ class BusThread:
         self._require()
         with self._send_lock:
             self._channel.send(frames)
-
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        """Append frames of ``can_id`` to ``heard`` from now on."""
-        self._subscribers[can_id] = [*self._subscribers[can_id], heard]
-
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        """End it."""
-        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not heard]
 
     def wait(self, seconds: float) -> None:
         """Let the bus go on. Raises DriverError once it is lost."""
@@ -189,8 +181,7 @@ class BusThread:
             self._master.receive(frame, t_ns)
             if frame.extended:  # 29 bits of another protocol are no identifier of ours
                 continue
-            for heard in self._subscribers.get(frame.id, ()):
-                heard.append(frame)
+            self.tell(frame)
 
     def _tick(self, now: int) -> None:
         self.statistics.late_max_ns = max(self.statistics.late_max_ns, now - self._next_ns)

@@ -87,6 +87,7 @@ class Axis:
         self.index = index
         self.joint = joint
         self.node_id = joint.node_id
+        self.name = f"node {joint.node_id} ({joint.name})"
         self.command_id = RPDO_IDS[0] + joint.node_id
         self.scale = JointScale.of(joint)
         self.counts = Unwrapper()

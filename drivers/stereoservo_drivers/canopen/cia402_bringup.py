@@ -32,9 +32,7 @@ from stereoservo_drivers.canopen.cia402_presence import (
     alone,
     find,
     identify,
-    listening,
     unbroken,
-    until,
 )
 from stereoservo_drivers.canopen.cia402_words import (
     FAULTY,
@@ -46,6 +44,7 @@ from stereoservo_drivers.canopen.cia402_words import (
     error_words,
     is_communication_error,
 )
+from stereoservo_drivers.canopen.listening import listening, until
 from stereoservo_drivers.canopen.options import CanOptions
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +13,12 @@ from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import Link
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
 from stereoservo_drivers.canopen.cia402_configuration import MODES, SHIPPED_EDS
+from stereoservo_drivers.canopen.listening import listening, until
 from stereoservo_drivers.canopen.options import CanOptions
 
 if TYPE_CHECKING:
     from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 
-STEP_S = 0.001
 PROBE_S = 0.05
 """Two nodes of one id both answer within this time."""
 PATIENCE_S = 0.5
@@ -28,6 +28,8 @@ ALONE_S = 0.05
 BOOT_UP = b"\0"
 CIA_402 = 402
 ALL_NODES = range(1, 128)
+IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
+"""Of 0x1018, subindex 1 to 4; options of a joint are called likewise."""
 
 
 @dataclass(frozen=True)
@@ -38,28 +40,6 @@ class Identity:
     product_code: int
     revision: int
     serial_number: int
-
-
-def until(link: Link, done: Callable[[], bool], limit_s: float) -> bool:
-    """Wait for ``done``; gives whether it came within ``limit_s``."""
-    deadline_ns = link.now_ns() + round(limit_s * 1e9)
-    while not done():
-        if link.now_ns() >= deadline_ns:
-            return False
-        link.wait(STEP_S)
-    return True
-
-
-@contextmanager
-def listening(link: Link, ids: list[int]) -> Iterator[dict[int, list[CanFrame]]]:
-    heard: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
-    for can_id, frames in heard.items():
-        link.subscribe(can_id, frames)
-    try:
-        yield heard
-    finally:
-        for can_id, frames in heard.items():
-            link.unsubscribe(can_id, frames)
 
 
 def alone(link: Link, drives: list[RemoteDrive]) -> None:
@@ -178,7 +158,7 @@ def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
             device_type=device_type,
         )
     identity = Identity(*(drive.read(0x1018, subindex) for subindex in (1, 2, 3, 4)))
-    for key in ("vendor_id", "product_code", "revision", "serial_number"):
+    for key in IDENTITY:
         wanted, found = getattr(drive.axis.joint, key), getattr(identity, key)
         if wanted is not None and wanted != found:
             raise DriverError(

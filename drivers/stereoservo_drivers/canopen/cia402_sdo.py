@@ -85,7 +85,7 @@ class RemoteDrive:
     def __init__(self, link: Link, axis: Axis, dictionary: canopen.ObjectDictionary) -> None:
         self.axis = axis
         self.node_id = axis.node_id
-        self.name = f"node {axis.node_id} ({axis.joint.name})"
+        self.name = axis.name
         self.dictionary = dictionary
         self._link = link
         self._client = _LinkSdoClient(axis.node_id, dictionary, link)

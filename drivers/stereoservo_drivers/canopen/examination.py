@@ -15,6 +15,7 @@ from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
+from stereoservo_drivers.canopen.listening import listening
 from stereoservo_drivers.canopen.node_checks import examine_nodes
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
@@ -100,12 +101,11 @@ def _listen(channel: Channel) -> list[CanFrame]:
 
 def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> Finding:
     """Whether somebody else commands this bus: frames (heard in ``LISTEN_S``) that only a master sends."""
-    ids = {frame.id for frame in heard if not frame.extended}
     commands = {RPDO_IDS[0] + joint.node_id for joint in options.joint}
-    if options.protocol == "cia402" and ids & {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}:
-        foreign = ", ".join(
-            f"0x{i:X}" for i in sorted(ids & {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands})
-        )
+    of_a_master = {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}
+    found = {frame.id for frame in heard if not frame.extended} & of_a_master
+    if options.protocol == "cia402" and found:
+        foreign = ", ".join(f"0x{can_id:X}" for can_id in sorted(found))
         return Finding(
             "traffic", False, f"another master is on this bus: it sends {foreign}",
             "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
@@ -140,25 +140,23 @@ def _watch(driver: CanJointDriver) -> Iterator[Finding]:
     period_s = 1.0 / driver.options.rate_hz
     before, skipped = driver.master.statistics, driver.bus.statistics.skipped if driver.bus else 0
     first = (before.cycles, before.incomplete)
-    heartbeats: list[CanFrame] = []
     cia402 = driver.options.protocol == "cia402"
     ids = [HEARTBEAT_ID + joint.node_id for joint in driver.options.joint] if cia402 else []
     positions, answered = [], []
     assert driver.bus is not None  # configured
-    for can_id in ids:
-        driver.bus.subscribe(can_id, heartbeats)
-    for _ in range(round(WATCH_S / period_s)):
-        positions.append(_sample(driver))
-        answered.append(driver.master.statistics.answered_ns)
-        time.sleep(period_s)
-    for can_id in ids:
-        driver.bus.unsubscribe(can_id, heartbeats)
+    with listening(driver.bus, ids) as heard:
+        for _ in range(round(WATCH_S / period_s)):
+            positions.append(_sample(driver))
+            answered.append(driver.master.statistics.answered_ns)
+            time.sleep(period_s)
     now = driver.master.statistics
     cycles, missed = now.cycles - first[0], now.incomplete - first[1]
     yield cycles_finding(cycles, missed, driver.bus.statistics.skipped - skipped)
     yield latency_finding(np.array(answered) * 1e-9, period_s)
     if cia402:
-        yield from heartbeat_findings(driver.options, heartbeats)
+        yield from heartbeat_findings(
+            driver.options, [frame for frames in heard.values() for frame in frames]
+        )
     return np.array(positions)
 
 

@@ -9,14 +9,13 @@ from stereoservo.runtime.ports import DriverError, Finding
 from stereoservo_drivers.canopen.bringup import Link
 from stereoservo_drivers.canopen.cia402 import Axis, Cia402Codec
 from stereoservo_drivers.canopen.cia402_configuration import MODES, eds_path, load_eds
-from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, ask
+from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 
 MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "homing", 7: "interpolated position",
               8: "cyclic position", 9: "cyclic velocity", 10: "cyclic torque"}  # fmt: skip
-IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
 _WIRING = "is it powered, is its cable in, are its bit rate and its node id those of the cell file?"
 
 
@@ -36,7 +35,7 @@ def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir:
                 yield _state(drive)
                 yield _modes(drive, options)
             except DriverError as error:
-                yield Finding(_name(axis), False, str(error))
+                yield Finding(axis.name, False, str(error))
     if strangers:
         words = ", ".join(str(node) for node in strangers)
         yield Finding("other nodes", None, f"{words} answer too, and no joint of the cell file has them")
@@ -48,24 +47,20 @@ def scan(link: Link) -> dict[int, int]:
     return {node: len(frames) for node, frames in answers.items() if frames}
 
 
-def _name(axis: Axis) -> str:
-    return f"node {axis.node_id} ({axis.joint.name})"
-
-
 def _not_one(axis: Axis, count: int, strangers: list[int]) -> Finding:
     if count > 1:
         return Finding(
-            _name(axis), False, f"{count} drives answer as node {axis.node_id}",
+            axis.name, False, f"{count} drives answer as node {axis.node_id}",
             "give each drive a node id of its own (switches on the drive, or its vendor's tool, one drive at a time)",
         )  # fmt: skip
     cure = _WIRING
     if strangers:
         cure += f" Nodes {', '.join(map(str, strangers))} answer, which no joint has: is it one of them?"
-    return Finding(_name(axis), False, "no answer", cure)
+    return Finding(axis.name, False, "no answer", cure)
 
 
 def _identity(drive: RemoteDrive, joint: CanJoint) -> Finding:
-    name = _name(drive.axis)
+    name = drive.axis.name
     device = drive.read(0x1000)
     values = {what: drive.read_if_there(0x1018, k + 1) for k, what in enumerate(IDENTITY)}
     told = ", ".join(
@@ -90,7 +85,7 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> Finding:
 
 
 def _state(drive: RemoteDrive) -> Finding:
-    name = f"{_name(drive.axis)} state"
+    name = f"{drive.axis.name} state"
     state = drive_state(drive.read(0x6041))
     register = drive.read(0x1001)
     past = _past_errors(drive)
@@ -124,7 +119,7 @@ def _past_errors(drive: RemoteDrive) -> list[int]:
 
 
 def _modes(drive: RemoteDrive, options: CanOptions) -> Finding:
-    name = f"{_name(drive.axis)} modes"
+    name = f"{drive.axis.name} modes"
     supported = drive.read_if_there(0x6502)
     wanted = MODES[options.mode]
     if supported is None:

@@ -9,7 +9,7 @@ speed, before you trust it. Nor can limits and the controller's mode be read bac
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from stereoservo.runtime.ports import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen import odrive
 from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.listening import listening, until
 from stereoservo_drivers.canopen.odrive import OdriveCodec, frame_id
 from stereoservo_drivers.canopen.options import CanOptions
 
@@ -35,22 +36,8 @@ Heard = dict[int, list[CanFrame]]
 
 @contextmanager
 def _listening(link: Link, nodes: tuple[int, ...], command: int) -> Iterator[Heard]:
-    heard: Heard = {node: [] for node in nodes}
-    for node in nodes:
-        link.subscribe(frame_id(node, command), heard[node])
-    try:
-        yield heard
-    finally:
-        for node in nodes:
-            link.unsubscribe(frame_id(node, command), heard[node])
-
-
-def _wait_until(link: Link, done: Callable[[], bool], limit_s: float) -> bool:
-    waited = 0.0
-    while not done() and waited < limit_s:
-        link.wait(STEP_S)
-        waited += STEP_S
-    return done()
+    with listening(link, [frame_id(node, command) for node in nodes]) as heard:
+        yield {node: heard[frame_id(node, command)] for node in nodes}
 
 
 class OdriveBringup:
@@ -144,7 +131,7 @@ class OdriveBringup:
     def _hear_all(self, link: Link) -> None:
         """Wait for every node's heartbeat, at most ``HEARTBEAT_WAIT_S``."""
         with _listening(link, ALL_NODES, odrive.HEARTBEAT) as heard:
-            _wait_until(link, lambda: all(heard[node] for node in self._nodes), HEARTBEAT_WAIT_S)
+            until(link, lambda: all(heard[node] for node in self._nodes), HEARTBEAT_WAIT_S, STEP_S)
         present = [node for node, frames in heard.items() if frames]
         missing = [node for node in self._nodes if not heard[node]]
         if missing:
@@ -225,7 +212,7 @@ class OdriveBringup:
             return all(frames and frames[-1].data[4:5] == bytes([odrive.IDLE]) for frames in heard.values())
 
         with _listening(link, self._nodes, odrive.HEARTBEAT) as heard:
-            idle = _wait_until(link, all_idle, HEARTBEAT_WAIT_S)
+            idle = until(link, all_idle, HEARTBEAT_WAIT_S, STEP_S)
         for frames in heard.values():
             for frame in frames[-1:]:
                 self.codec.receive(frame)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 
 import typer
 
@@ -14,7 +12,7 @@ from stereoservo.cli.output import CommandError
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.interprocess import RunPlan
 from stereoservo.runtime.locks import AlreadyRunningError, FileLock, hardware_lock_path, holder
-from stereoservo.runtime.loop import prepare_realtime
+from stereoservo.runtime.loop import realtime_for_a_while
 from stereoservo.runtime.ports import DriverError, ExaminableJointDriver, Finding
 from stereoservo.runtime.servo import make_driver
 
@@ -63,21 +61,10 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
         except AlreadyRunningError as error:
             yield Finding("drives", None, f"not examined: {error}")
             return
-        locks.enter_context(_scheduled(plan.cell.servo.priority))
+        # As the servo process is scheduled, so that what is measured is what it would see; where that is not allowed,
+        # the check "scheduling" says so.
+        locks.enter_context(realtime_for_a_while(plan.cell.servo.priority))
         try:
             yield from driver.examine(may_move)
         except DriverError as error:
             yield Finding("drives", False, str(error))
-
-
-@contextmanager
-def _scheduled(priority: int) -> Iterator[None]:
-    """As the daemon's servo process is scheduled, so that what is measured is what it would see."""
-    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    prepare_realtime(priority)  # where it is not allowed, the check "scheduling" says so
-    try:
-        yield
-    finally:
-        # The flag may be set, and not be cleared, without privileges.
-        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
-        gc.unfreeze()

@@ -10,7 +10,8 @@ from __future__ import annotations
 import gc
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import msgspec
 
@@ -157,3 +158,15 @@ def prepare_realtime(priority: int) -> list[str]:
             "or servo.priority = 0 in the cell file to stop asking"
         ]
     return []
+
+
+@contextmanager
+def realtime_for_a_while(priority: int) -> Iterator[list[str]]:
+    """As :func:`prepare_realtime`, for a program that goes on afterwards. Gives the warnings."""
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield prepare_realtime(priority)
+    finally:
+        # The flag may be set, and not be cleared, without privileges.
+        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
+        gc.unfreeze()

@@ -21,6 +21,7 @@ from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.load import cycle_load, frame_bits
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC, Codec
 from stereoservo_drivers.canopen.driver import CanJointDriver
+from stereoservo_drivers.canopen.listening import Subscriptions
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.canopen.protocols import make_bringup, make_codec
 from stereoservo_sim.benchmarks.can_peer import AXES, LOOP_PRIORITY, peer, real_time
@@ -177,12 +178,12 @@ def _empty_figures(process: subprocess.Popen[str]) -> dict[str, Any]:
     return figures
 
 
-class _Pump:
+class _Pump(Subscriptions):
     """A link for the bring-up, and the cycle after it, in one thread."""
 
     def __init__(self, channel: Channel) -> None:
+        super().__init__()
         self._channel = channel
-        self._heard: dict[int, list[list[CanFrame]]] = {}
         self.bits = 0
 
     def send(self, frames: list[CanFrame]) -> None:
@@ -193,15 +194,8 @@ class _Pump:
         frames = [frame for _, frame in self._channel.receive(timeout_s)]
         for frame in frames:
             self.bits += frame_bits(frame)
-            for heard in self._heard.get(frame.id, ()):
-                heard.append(frame)
+            self.tell(frame)
         return frames
-
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        self._heard.setdefault(can_id, []).append(heard)
-
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        self._heard[can_id] = [other for other in self._heard[can_id] if other is not heard]
 
     def wait(self, seconds: float) -> None:
         until = time.monotonic() + seconds

@@ -21,6 +21,7 @@ from typing import Any
 
 import msgspec
 
+from stereoservo.runtime.loop import realtime_for_a_while
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.slcan_adapter import SlcanAdapter
 from stereoservo_drivers.canopen.options import CanOptions
@@ -42,16 +43,8 @@ LOOP_PRIORITY, DRIVES_PRIORITY = 50, 5
 @contextmanager
 def real_time(priority: int) -> Iterator[str]:
     """SCHED_FIFO for this thread, as the daemon has it, where that is allowed; what it has, in words."""
-    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
-    except PermissionError:
-        yield "ordinary scheduling: SCHED_FIFO is not allowed here"
-        return
-    try:
-        yield f"SCHED_FIFO {priority}"
-    finally:
-        os.sched_setscheduler(0, before & ~os.SCHED_RESET_ON_FORK, parameters)
+    with realtime_for_a_while(priority) as refused:
+        yield "ordinary scheduling: SCHED_FIFO is not allowed here" if refused else f"SCHED_FIFO {priority}"
 
 
 @contextmanager

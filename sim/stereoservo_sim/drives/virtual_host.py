@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-
 from stereoservo.runtime.ports import FloatArray
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.listening import Subscriptions
 from stereoservo_drivers.canopen.master import Master, MasterFault
 from stereoservo_sim.drives.rack import Rack
 
 
-class VirtualHost:
+class VirtualHost(Subscriptions):
     """A link for bring-up and, once ``begin_cycle`` was called, the master's ticks on an absolute grid.
 
     Frames are handed to the wire at the tick's time and reach the master when they end on the bus. ``velocities`` (n,)
@@ -20,6 +19,7 @@ class VirtualHost:
     """
 
     def __init__(self, rack: Rack, master: Master) -> None:
+        super().__init__()
         self.rack = rack
         self.master = master
         self.t_ns = rack.t_ns
@@ -30,7 +30,6 @@ class VirtualHost:
         self._next_ns: int | None = None
         self._heartbeat_ns = self.t_ns
         self._waiting: list[tuple[int, CanFrame]] = []
-        self._subscribers: defaultdict[int, list[list[CanFrame]]] = defaultdict(list)
         rack.on_adapter = self._adapter
 
     # -- link -----------------------------------------------------------------------------------------------
@@ -39,14 +38,6 @@ class VirtualHost:
         """Queue on the wire now."""
         for frame in frames:
             self.rack.inject(frame, self.t_ns)
-
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        """Append frames of ``can_id`` to ``heard``."""
-        self._subscribers[can_id].append(heard)
-
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        """End it."""
-        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not heard]
 
     def wait(self, seconds: float) -> None:
         """Let the bus go on."""
@@ -91,8 +82,7 @@ class VirtualHost:
         arrived, self._waiting = self._waiting, []
         for when_ns, frame in arrived:
             self.master.receive(frame, when_ns)
-            for heard in self._subscribers.get(frame.id, ()):
-                heard.append(frame)
+            self.tell(frame)
 
     def _act(self) -> None:
         """What is due at ``t_ns``: a heartbeat between the cycles, else a tick."""
