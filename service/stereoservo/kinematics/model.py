@@ -149,6 +149,10 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     mount: Mount = "eye_to_hand"
     covariance: ModelCovariance | None = None
     loads: JointLoads | None = None
+    scene_ids: tuple[int, ...] = ()
+    scene_points: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4)))
+    """Static scene points (s, 4) of height 1, with ``scene_covariances`` (s, 4, 4) at that scale."""
+    scene_covariances: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     @property
     def tip_first(self) -> bool:
@@ -429,6 +433,10 @@ def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
         raise ModelFileError(path, where.rstrip("`").removeprefix("$").lstrip("."), text) from error
     if model.covariance is not None:
         model = msgspec.structs.replace(model, covariance=_shaped(model.covariance))
+    if not model.scene_ids:
+        model = msgspec.structs.replace(
+            model, scene_points=np.zeros((0, 4)), scene_covariances=np.zeros((0, 4, 4))
+        )
     check_model(model, path)
     return model
 

@@ -55,6 +55,15 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     detector_options: dict[str, Any] = {}
 
 
+class SceneSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[scene]``: ``static``, marker ids that stand still for good: of nothing that the arm moves (a plate on a wall).
+
+    Calibration triangulates them; a camera that is bumped is known, and re-anchored, by them.
+    """
+
+    static: tuple[Annotated[int, Meta(ge=0)], ...] = ()
+
+
 class ServoSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[servo]``: the loop and the defaults of goals."""
 
@@ -184,8 +193,11 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     calibration: CalibrationSection | None = None
     servo: ServoSection = ServoSection()
     zenoh: ZenohSection = ZenohSection()
+    scene: SceneSection = SceneSection()
     emulate: dict[str, Any] = {}
-    """``[emulate.drives]``: what `stereoservo emulate` puts in the place of the hardware; not read by the daemon."""
+    """``[emulate.drives]``, ``[emulate.cameras]``: what `stereoservo emulate` puts in the place of the hardware; the
+    daemon does not read it.
+    """
 
 
 def load_cell_file(path: Path) -> CellFile:
@@ -362,7 +374,7 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
         "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
         "safety.contact": ContactSection,
         "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
-        "zenoh.tls": TlsSection,
+        "zenoh.tls": TlsSection, "scene": SceneSection,
     }  # fmt: skip
     section = sections.get(".".join(part.split("[")[0] for part in key.split(".")))
     if section is None:

@@ -41,9 +41,13 @@ class DriverFault(msgspec.Struct, frozen=True):
 
 
 class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
-    """A model enters the core: only at rest, with an epoch."""
+    """A model enters the core: only at rest, with an epoch.
+
+    ``reanchored``: cameras whose matrices alone are new, in the same frame as before: a suspended goal goes on.
+    """
 
     model: CellModel
+    reanchored: tuple[str, ...] = ()
 
 
 class StepInputs(msgspec.Struct, frozen=True, eq=False):
@@ -86,6 +90,7 @@ EventKind = Literal[
     "calibration_finished",
     "calibration_aborted",
     "check_finished",
+    "reanchor",  # cameras have moved, the arm rests, and these are the sights to re-anchor them by
     "taught",
     "warning",
 ]

@@ -280,6 +280,29 @@ class CameraDriver(Protocol):
         ...
 
 
+class CameraStatistics(msgspec.Struct, frozen=True):
+    """What a camera driver has counted since ``activate``: ``frames`` that its source gave, ``dropped`` ones that never
+    came (gaps of its sequence or its grid), ``frozen`` ones withheld since they repeat the one before, ``reconnects``.
+
+    ``settings``: what the source was asked for and what it says it does, by name, e.g. ``{"exposure": (10.0, 12.0)}``.
+    """
+
+    frames: int = 0
+    dropped: int = 0
+    frozen: int = 0
+    reconnects: int = 0
+    settings: dict[str, tuple[float | None, float | None]] = {}
+
+
+@runtime_checkable
+class CountingCameraDriver(Protocol):
+    """A camera driver that tells its counts."""
+
+    def statistics(self) -> CameraStatistics:
+        """Counts since ``activate``; any state."""
+        ...
+
+
 @runtime_checkable
 class Detector(Protocol):
     """Finds markers in one camera's images. Constructed as ``Detector(options, context)``."""
