@@ -82,20 +82,25 @@ class PybulletCameraDriver(SimulatedCamera):
         """
         super().configure()
         if self._renderer is None:
-            from stereoservo_sim.rendering import Renderer, RenderSettings
-
-            options = self._render
-            settings = RenderSettings(
-                blur_px=options.blur, noise_grey=options.noise, background=options.background
-            )
-            self._renderer = Renderer(self.cell, self.camera, settings)
+            self._renderer = self._draw_anew()
             self._renderer.render(self.cell.base, np.random.default_rng(0))
+
+    def _draw_anew(self) -> Renderer:
+        from stereoservo_sim.rendering import Renderer, RenderSettings
+
+        options = self._render
+        settings = RenderSettings(
+            blur_px=options.blur, noise_grey=options.noise, background=options.background
+        )
+        return Renderer(self.cell, self.camera, settings)
 
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
     ) -> Frame:
         """The image with the arm at ``q`` (n,)."""
         assert self._renderer is not None  # active: the lifecycle was checked
+        if self._renderer.camera is not self.camera:  # it was bumped
+            self._renderer = self._draw_anew()
         return Frame(
             camera=self.name,
             seq=seq,

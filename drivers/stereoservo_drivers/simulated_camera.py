@@ -15,7 +15,7 @@ from msgspec import Meta
 from stereoservo.runtime.ports import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
 from stereoservo_drivers.lifecycle import DriverLifecycle, State
 from stereoservo_sim.history import FILE_NAME, HistoryError, JointHistory
-from stereoservo_sim.workpiece import Moved, WorkpieceFile, WorkpieceFileError
+from stereoservo_sim.workpiece import Moved, MovedFile, MovedFileError
 from stereoservo_sim.world import SimulatedCell, simulated_cell, workpiece_cell
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,13 +23,21 @@ NonNegative = Annotated[float, Meta(ge=0)]
 HOLD_NS = 100_000_000
 
 
+class Bump(Moved, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``at_s`` after activation the camera is where this takes it from its place in the rig, in its own frame."""
+
+    at_s: NonNegative
+
+
 class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of every simulated camera.
 
     ``view``: which camera of the simulated rig it is (default: the one with the driver's own name). ``k1``: how its
     lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole. ``moved``: how far the
-    camera was moved from its place in the rig, in its own frame. ``workpiece``: one stands beside the body; where, the
-    file ``simulated-workpiece.json`` in the runtime directory tells for every frame (`stereoservo_sim.workpiece`).
+    camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
+    what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: one stands
+    beside the body; where, the file ``simulated-workpiece.json`` there tells for every frame
+    (`stereoservo_sim.workpiece`).
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later. ``drop_rate``: chance
     that a frame is lost; ``dropouts``: spans [s, s] after activation without frames; ``freeze_after_s``:
     from then on the picture stands still though frames keep coming. ``seed``: of noise and losses
@@ -39,6 +47,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     view: str = ""
     k1: float = 0.0
     moved: Moved = Moved()
+    bumps: tuple[Bump, ...] = ()
     workpiece: bool = False
     rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 30.0
     latency_s: NonNegative = 0.012
@@ -75,6 +84,8 @@ class SimulatedCamera:
             ) from error
         except ValueError as error:
             raise DriverError("option", f"driver {self.driver!r}: moved: {error}") from error
+        self._place = self._given = options.moved
+        self._bumped = MovedFile(context.runtime_dir, f"simulated-camera-{self.name}.json")
         if not self.camera.sees_whole_image:
             raise DriverError(
                 "option",
@@ -89,7 +100,7 @@ class SimulatedCamera:
         self._next = 0
         self._activated_ns = 0
         self._frozen: FloatArray | None = None
-        self._workpiece = WorkpieceFile(context.runtime_dir)
+        self._workpiece = MovedFile(context.runtime_dir)
         self._workpiece_pose: FloatArray | None = None
         self.blackout = False
 
@@ -98,6 +109,26 @@ class SimulatedCamera:
     ) -> Frame | CameraObservation:
         """What this camera gives for the arm at ``q`` (n,) and the workpiece where it stands."""
         raise NotImplementedError
+
+    def bump(self, moved: Moved) -> None:
+        """From the next shutter on it stands where ``moved`` takes it from its place in the rig. Raises ValueError."""
+        self._given = moved
+        self._put(moved)
+
+    def _put(self, moved: Moved) -> None:
+        if moved != self._place:
+            self.camera = self.cell.camera(self._options.view or self.name, self._options.k1, moved)
+            self._place = moved
+
+    def _stand(self, t_shutter_ns: int) -> None:
+        """Stand where it was moved to until then: by the file, else by the newest bump. Raises DriverError."""
+        since = (t_shutter_ns - self._activated_ns) * 1e-9
+        due = [bump for bump in self._options.bumps if bump.at_s <= since]
+        given = self._given if not due else Moved(due[-1].shift_m, due[-1].turn_deg)
+        try:
+            self._put(self._bumped.now(given))
+        except MovedFileError as error:
+            raise DriverError("moved", str(error), path=str(self._bumped.path)) from error
 
     def workpiece_pose(self) -> FloatArray | None:
         """Where the workpiece stands in the world, (4, 4); None where the cell has none."""
@@ -143,6 +174,8 @@ class SimulatedCamera:
         if q is None:
             return []
         self._workpiece_pose = self._workpiece_at(t_shutter_ns)
+        if not self._stands_still(t_shutter_ns):
+            self._stand(t_shutter_ns)
         self._next = k + 1
         rng = np.random.default_rng((self._seed & 0xFFFFFFFF, zlib.crc32(self.name.encode()), k))
         if self._lost(t_shutter_ns, rng):
@@ -203,7 +236,7 @@ class SimulatedCamera:
             return self._workpiece_pose
         try:
             return part.pose(self._workpiece.now())
-        except WorkpieceFileError as error:
+        except MovedFileError as error:
             raise DriverError("workpiece", str(error), path=str(self._workpiece.path)) from error
 
     def _open_history(self, now_ns: int) -> JointHistory | None:

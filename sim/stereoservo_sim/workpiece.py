@@ -27,8 +27,8 @@ FILE_NAME = "simulated-workpiece.json"
 TILT = float(np.deg2rad(25.0))
 
 
-class WorkpieceFileError(Exception):
-    """The file that moves the workpiece says nothing sensible: names the file and what would be valid."""
+class MovedFileError(Exception):
+    """The file that moves a thing says nothing sensible: names the file and what would be valid."""
 
 
 class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,24 +87,27 @@ def plate_body(tilt: float = TILT) -> MarkerBody:
     return MarkerBody(faces=WORKPIECE, flange_to_face=np.stack(poses))
 
 
-class WorkpieceFile:
-    """Where the workpiece stands now, of the cell whose runtime directory this is; read anew when it has changed."""
+class MovedFile:
+    """How far a thing of the cell whose runtime directory this is stands from its place now; read anew when changed.
 
-    def __init__(self, runtime_dir: Path) -> None:
-        self.path = runtime_dir / FILE_NAME
+    ``name``: of the file; by default the workpiece's.
+    """
+
+    def __init__(self, runtime_dir: Path, name: str = FILE_NAME) -> None:
+        self.path = runtime_dir / name
         self._seen: tuple[int, int, int] | None = None
         self._moved = Moved()
 
     def write(self, moved: Moved) -> None:
-        """Move the workpiece: atomically, from the next shutter on. Raises OSError, ValueError."""
+        """Move it: atomically, from the next shutter on. Raises OSError, ValueError."""
         if not np.isfinite(moved.matrix).all():
             raise ValueError(f"{moved} is no displacement")
         fresh = self.path.with_name(f"{self.path.name}.{os.getpid()}")
         fresh.write_bytes(msgspec.json.encode(moved) + b"\n")
         fresh.replace(self.path)
 
-    def now(self) -> Moved:
-        """How far it was moved; not at all where there is no file. Raises WorkpieceFileError."""
+    def now(self, otherwise: Moved = Moved()) -> Moved:  # noqa: B008 - frozen
+        """How far it was moved; ``otherwise`` where there is no file. Raises MovedFileError."""
         try:
             status = self.path.stat()
             seen = (status.st_ino, status.st_mtime_ns, status.st_size)
@@ -112,9 +115,10 @@ class WorkpieceFile:
                 self._moved = msgspec.json.decode(self.path.read_bytes(), type=Moved)
                 self._seen = seen
         except FileNotFoundError:
-            self._moved, self._seen = Moved(), None
+            self._seen = None
+            return otherwise
         except (OSError, msgspec.MsgspecError) as error:
-            raise WorkpieceFileError(
+            raise MovedFileError(
                 f'{self.path}: {error}; such a file holds {{"shift_m": [x, y, z], "turn_deg": [x, y, z]}}'
             ) from error
         return self._moved

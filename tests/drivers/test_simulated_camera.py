@@ -15,6 +15,7 @@ from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_drivers.fake import FakeCameraDriver, FakeJointDriver
 from stereoservo_drivers.pybullet import PybulletCameraDriver
 from stereoservo_sim.history import FILE_NAME, JointHistory
+from stereoservo_sim.workpiece import Moved, MovedFile
 from stereoservo_sim.world import demo_cell, simulated_cell
 
 MS = 1_000_000
@@ -255,3 +256,19 @@ def test_an_unknown_view_and_another_arm_are_refused(tmp_path):
     context.clock.advance_to(2_000 * MS)
     with pytest.raises(DriverError, match="has 1 joints"):
         camera.poll()
+
+
+def test_camera_that_is_bumped_sees_from_elsewhere_until_the_file_puts_it_back(tmp_path):
+    bump = {"at_s": 0.5, "turn_deg": (0.0, 5.0, 0.0), "shift_m": (0.03, 0.0, 0.0)}
+    cell = Cell(tmp_path, [fake(view="left", bumps=(bump,), noise_px=0.0)])
+    before, after = cell.run(0.4)[0], cell.run(0.4)[0][-1]
+    moved = CELL.camera("left", 0.0, Moved((0.03, 0.0, 0.0), (0.0, 5.0, 0.0)))
+    truth = moved.image_of(CELL.marker_positions(CELL.base))[0]
+    shown = np.searchsorted(CELL.body.ids, after.ids)
+    assert np.abs(after.pixels - truth[shown]).max() < 1e-9
+    MovedFile(tmp_path, "simulated-camera-left.json").write(Moved())
+    back = cell.run(0.2)[0][-1]
+    assert np.array_equal(back.pixels, before[-1].pixels)
+    MovedFile(tmp_path, "simulated-camera-left.json").path.write_text("{")
+    with pytest.raises(DriverError, match=r"simulated-camera-left.json: .*such a file holds"):
+        cell.run(0.2)

@@ -30,7 +30,7 @@ from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.history import JointHistory
 from stereoservo_sim.rendering import Renderer, RenderSettings
-from stereoservo_sim.workpiece import FILE_NAME, Moved, WorkpieceFile, WorkpieceFileError
+from stereoservo_sim.workpiece import FILE_NAME, Moved, MovedFile, MovedFileError
 from stereoservo_sim.world import DEMO_GOALS, workpiece_cell
 
 CELL = workpiece_cell()
@@ -85,9 +85,9 @@ def test_it_moves_about_its_own_middle_by_the_worlds_axes() -> None:
 
 
 def test_the_file_moves_it_and_nonsense_is_refused_with_what_would_be_valid(tmp_path: Path) -> None:
-    file = WorkpieceFile(tmp_path)
+    file = MovedFile(tmp_path)
     assert file.now() == Moved()
-    WorkpieceFile(tmp_path).write(MOVED)
+    MovedFile(tmp_path).write(MOVED)
     assert file.now() == MOVED
     (tmp_path / FILE_NAME).write_text(
         '{"shift_m": [0.02, 0, 0.01], "turn_deg": [0, 0, 15]}\n'
@@ -101,7 +101,7 @@ def test_the_file_moves_it_and_nonsense_is_refused_with_what_would_be_valid(tmp_
         '{"shift_m": [11, 0, 0]}',
     ):
         (tmp_path / FILE_NAME).write_text(text)
-        with pytest.raises(WorkpieceFileError, match=r"simulated-workpiece.json: .*such a file holds"):
+        with pytest.raises(MovedFileError, match=r"simulated-workpiece.json: .*such a file holds"):
             file.now()
     (tmp_path / FILE_NAME).unlink()
     assert file.now() == Moved()
@@ -210,7 +210,7 @@ class Bench:
         self.teaching = Teaching(self.store, self.sights, lambda: self.model, EventLog("b", lambda _: None))
         self.operator = LockstepOperator(self.cell)
         self.operator._epoch = 0 if model is None else model.epoch
-        self.workpiece = WorkpieceFile(path)
+        self.workpiece = MovedFile(path)
 
     def _heed(self, inputs: Any, _: Any) -> None:
         for observation in inputs.observations:
