@@ -16,7 +16,7 @@ from stereoservo.runtime.daemon import DaemonProcess
 from stereoservo.runtime.directories import CellDirectories, cell_directories
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
-from stereoservo_sim.drives.emulator import EmulatorProcess
+from stereoservo_sim.emulation.process import EmulatorProcess
 from stereoservo_sim.history import FILE_NAME, JointHistory
 
 from .conftest import at_rest, eventually

@@ -28,7 +28,7 @@ from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.drives.building import drives_of_cell
-from stereoservo_sim.drives.emulator import EmulatorProcess
+from stereoservo_sim.emulation.process import EmulatorProcess
 from stereoservo_sim.experiments.errors import ExperimentError
 
 CELL = "hil-can"

@@ -103,7 +103,7 @@ def _drives(settings: _Settings, termination: Termination) -> None:
 def _named(path: Path) -> Iterator[None]:
     """What is wrong with a cell's options, with the file that they stand in."""
     from stereoservo.runtime.ports import DriverError
-    from stereoservo_sim.drives.building import EmulationError
+    from stereoservo_sim.emulation.errors import EmulationError
 
     try:
         yield
@@ -117,9 +117,9 @@ def _serve(
     path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination
 ) -> None:
     from stereoservo_sim.drives.building import drives_of_cell, make_rack
-    from stereoservo_sim.drives.console import Console, Printer
-    from stereoservo_sim.drives.faults import OrderError
     from stereoservo_sim.drives.serving import RackServer, open_endpoint, served_channel
+    from stereoservo_sim.emulation.console import Console, Printer
+    from stereoservo_sim.emulation.errors import OrderError
 
     with _named(path):
         options, drives = drives_of_cell(cell)

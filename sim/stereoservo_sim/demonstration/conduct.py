@@ -24,7 +24,7 @@ from stereoservo_sim.demonstration.live import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import Calibrated, perform
 from stereoservo_sim.demonstration.truth import TruthLog
-from stereoservo_sim.drives.emulator import EmulatorProcess
+from stereoservo_sim.emulation.process import EmulatorProcess
 from stereoservo_sim.history import JointHistory
 from stereoservo_sim.world import goals_of
 

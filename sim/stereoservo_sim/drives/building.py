@@ -20,6 +20,7 @@ from stereoservo_sim.drives.bank import IdealPlant, Plant
 from stereoservo_sim.drives.node import EmulatedNode
 from stereoservo_sim.drives.plant import STEP_NS, AxisPlant, PlantSettings
 from stereoservo_sim.drives.rack import Rack
+from stereoservo_sim.emulation.errors import EmulationError
 from stereoservo_sim.history import CAPACITY, FILE_NAME, HistoryError, JointHistory
 
 FloatArray = npt.NDArray[np.float64]
@@ -29,10 +30,6 @@ NonNegative = Annotated[float, Meta(ge=0)]
 SHIPPED_EDS = Path(stereoservo_drivers.canopen.__file__).parent / "drive402.eds"
 DEFAULT_RATED_TORQUE = 100.0
 """[N m] of a joint of the simulated arm for which neither the driver's options nor ``[emulate.drives]`` say it."""
-
-
-class EmulationError(Exception):
-    """A cell's drives cannot be emulated as asked; says what would have been valid."""
 
 
 class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -62,10 +59,10 @@ def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
             f"cell {cell.cell.name!r}: joints.driver is {cell.joints.driver!r}; drives are emulated for 'canopen' "
             "(the shipped cell 'hil-can' is one)"
         )
-    unknown = [name for name in cell.emulate if name != "drives"]
+    unknown = [name for name in cell.emulate if name not in ("drives", "cameras")]
     if unknown:
         raise EmulationError(
-            f"cell {cell.cell.name!r}: emulate.{unknown[0]} is unknown; valid: emulate.drives"
+            f"cell {cell.cell.name!r}: emulate.{unknown[0]} is unknown; valid: emulate.drives, emulate.cameras"
         )
     options = decode_options(CanOptions, cell.joints.options, "canopen")
     try:

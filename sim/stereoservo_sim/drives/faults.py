@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 
 import msgspec
+
+from stereoservo_sim.emulation.errors import OrderError
+from stereoservo_sim.emulation.times import duration_ns
 
 COB_IDS = {
     "emcy": 0x080, "tpdo1": 0x180, "tpdo2": 0x280, "tpdo3": 0x380, "tpdo4": 0x480, "sdo": 0x580, "heartbeat": 0x700,
@@ -14,12 +16,6 @@ COB_IDS = {
 NMT = {"start": 1, "stop": 2, "preop": 128, "reset": 129, "reset-communication": 130}
 FLOOD_HZ = 5000.0
 FLOOD_HZ_MAX = 20_000.0
-_TIME_UNITS = {"us": 1e3, "ms": 1e6, "s": 1e9}
-_NUMBER = re.compile(r"(\d+(?:\.\d*)?|\.\d+)(us|ms|s)")
-
-
-class OrderError(ValueError):
-    """An order cannot be understood or done; says what would have been valid."""
 
 
 class Order(msgspec.Struct, frozen=True):
@@ -49,7 +45,7 @@ def parse_order(text: str) -> Order:
     parser, usage, _ = GRAMMAR[verb]
     try:
         order = parser(verb, words[1:])
-        return msgspec.structs.replace(order, at_ns=_duration(when.strip())) if at else order
+        return msgspec.structs.replace(order, at_ns=duration_ns(when.strip())) if at else order
     except OrderError as error:
         raise OrderError(f"{text.strip()!r}: {error}; usage: {usage}") from None
 
@@ -87,16 +83,6 @@ def _count(words: list[str], k: int) -> int:
     if not words[k].isdecimal() or not 1 <= int(words[k]) <= 1_000_000:
         raise OrderError(f"count {words[k]!r}; 1 to 1000000 is valid")
     return int(words[k])
-
-
-def _duration(word: str) -> int:
-    """[ns]"""
-    if word == "0":
-        return 0
-    match = _NUMBER.fullmatch(word)
-    if match is None:
-        raise OrderError(f"time {word!r}; a number with us, ms or s is valid, e.g. 6ms")
-    return round(float(match[1]) * _TIME_UNITS[match[2]])
 
 
 def _choice(words: list[str], k: int, valid: tuple[str, ...], default: str | None = None) -> str:
@@ -161,7 +147,7 @@ def _late(verb: str, words: list[str]) -> Order:
     node = _node(words)
     if len(words) < 2:
         raise OrderError("the delay is missing")
-    return Order(verb, node=node, duration_ns=_duration(words[1]))
+    return Order(verb, node=node, duration_ns=duration_ns(words[1]))
 
 
 def _duplicate(verb: str, words: list[str]) -> Order:

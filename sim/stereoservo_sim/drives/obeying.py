@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_sim.drives.disturbances import frame_id
-from stereoservo_sim.drives.faults import COB_IDS, Order, OrderError, help_lines
+from stereoservo_sim.drives.faults import COB_IDS, Order, help_lines
+from stereoservo_sim.emulation.errors import OrderError
 
 if TYPE_CHECKING:
     from stereoservo_sim.drives.rack import Rack

@@ -10,11 +10,12 @@ import msgspec
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_sim.drives.disturbances import Disturbances
-from stereoservo_sim.drives.faults import Order, OrderError, parse_order
+from stereoservo_sim.drives.faults import Order, parse_order
 from stereoservo_sim.drives.node import EmulatedNode
 from stereoservo_sim.drives.obeying import check, obey
 from stereoservo_sim.drives.plant import AxisPlant
 from stereoservo_sim.drives.wire import MASTER, Wire
+from stereoservo_sim.emulation.errors import OrderError
 
 BABBLE = 20_000
 """Sender of a babbling node's babble is this plus its number."""
@@ -38,6 +39,14 @@ class RackEvent(msgspec.Struct, frozen=True):
     kind: str
     node: int
     text: str = ""
+
+    def place(self) -> dict[str, int]:
+        """The node, as data."""
+        return {"node": self.node}
+
+    def where(self) -> str:
+        """The node, in words."""
+        return f"node {self.node}" if self.node else ""
 
 
 class Slot:

@@ -16,8 +16,8 @@ import msgspec
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.drives.endpoints import Endpoint, EndpointError, PythonCanEndpoint, SlcanPty, SlcanTcp
-from stereoservo_sim.drives.faults import OrderError
 from stereoservo_sim.drives.rack import Rack, RackEvent
+from stereoservo_sim.emulation.errors import OrderError
 
 SPIN_NS = 100_000
 """With bit times the last bit before an event is not slept through: a sleep ends some 60 µs late."""
@@ -91,6 +91,11 @@ class RackServer:
         self._failure: BaseException | None = None
         self._turned_ns = clock_ns()
         rack.on_adapter = endpoint.plug
+
+    @property
+    def start_ns(self) -> int:
+        """When the drives were switched on."""
+        return self.rack.start_ns
 
     @property
     def channel(self) -> str:

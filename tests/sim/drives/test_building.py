@@ -7,8 +7,9 @@ import pytest
 from stereoservo.runtime.cellfile import load_cell_file
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.drives.building import DrivesSettings, EmulationError, drives_of_cell, make_rack
+from stereoservo_sim.drives.building import DrivesSettings, drives_of_cell, make_rack
 from stereoservo_sim.drives.odrive_node import OdriveNode
+from stereoservo_sim.emulation.errors import EmulationError
 from stereoservo_sim.history import FILE_NAME, JointHistory
 from stereoservo_sim.world import demo_cell
 

@@ -15,8 +15,8 @@ import pytest
 from stereoservo.cli import main as cli
 from stereoservo.runtime.directories import cell_directories
 from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.drives.emulator import EmulatorError, EmulatorProcess
-from stereoservo_sim.drives.faults import OrderError
+from stereoservo_sim.emulation.errors import OrderError
+from stereoservo_sim.emulation.process import EmulatorError, EmulatorProcess
 from stereoservo_sim.history import FILE_NAME, JointHistory
 
 CELL = "emulated-test"

@@ -2,7 +2,8 @@
 
 import pytest
 
-from stereoservo_sim.drives.faults import GRAMMAR, Order, OrderError, help_lines, parse_order
+from stereoservo_sim.drives.faults import GRAMMAR, Order, help_lines, parse_order
+from stereoservo_sim.emulation.errors import OrderError
 
 GOOD = {
     "fault node 3 0x3210": Order("fault", node=3, number=0x3210),

@@ -5,9 +5,9 @@ import pytest
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.load import frame_bits
-from stereoservo_sim.drives.faults import OrderError
 from stereoservo_sim.drives.node import NEVER_NS
 from stereoservo_sim.drives.rack import BABBLE_FRAME, RackError
+from stereoservo_sim.emulation.errors import OrderError
 
 MS = 1_000_000
 SYNC = CanFrame(0x80)

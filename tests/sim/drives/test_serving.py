@@ -14,10 +14,10 @@ import pytest
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.drives.bank import IdealPlant
 from stereoservo_sim.drives.endpoints import EndpointError, PythonCanEndpoint, SlcanPty, SlcanTcp
-from stereoservo_sim.drives.faults import OrderError
 from stereoservo_sim.drives.plant import AxisPlant
 from stereoservo_sim.drives.rack import Rack
 from stereoservo_sim.drives.serving import RackServer, open_endpoint, served_channel
+from stereoservo_sim.emulation.errors import OrderError
 
 PATIENCE_S = 20.0
 

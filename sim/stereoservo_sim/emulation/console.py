@@ -7,18 +7,49 @@ import os
 import queue
 import sys
 import threading
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
-from stereoservo_sim.drives.faults import OrderError
-from stereoservo_sim.drives.rack import RackEvent
-from stereoservo_sim.drives.serving import RackServer
+from stereoservo_sim.emulation.errors import OrderError
 
 LINE_LIMIT = 4096
 LINES_WAITING = 10_000
 
 
+class EmulationEvent(Protocol):
+    """Something that happened at ``t_ns``: ``place`` is where as data, ``where()`` the same in words."""
+
+    @property
+    def t_ns(self) -> int: ...
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def text(self) -> str: ...
+
+    def place(self) -> dict[str, Any]: ...
+
+    def where(self) -> str: ...
+
+
+class OrderedServer(Protocol):
+    """An emulator's serving loop, as a console sees it. ``obey`` raises OrderError."""
+
+    on_event: Callable[[Any], None] | None
+
+    @property
+    def start_ns(self) -> int: ...
+
+    def watch(self, descriptor: int, act: Callable[[], None]) -> None: ...
+
+    def unwatch(self, descriptor: int) -> None: ...
+
+    def obey(self, text: str) -> str: ...
+
+
 class Printer:
-    """Lines to standard output by a thread of its own: a reader that is slow or gone must not hold up the bus."""
+    """Lines to standard output by a thread of its own: a reader that is slow or gone must not hold up the emulation."""
 
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
@@ -52,7 +83,7 @@ class Printer:
 class Console:
     """Reads orders from ``descriptor`` in the server's loop, answers through ``printer``."""
 
-    def __init__(self, server: RackServer, printer: Printer, descriptor: int = 0) -> None:
+    def __init__(self, server: OrderedServer, printer: Printer, descriptor: int = 0) -> None:
         self._server = server
         self._printer = printer
         self._descriptor = descriptor
@@ -63,16 +94,16 @@ class Console:
         self._server.on_event = self.event
         self._server.watch(self._descriptor, self._read)
 
-    def event(self, event: RackEvent) -> None:
-        """Tell of an event of the rack. Times are [s] since its start."""
-        seconds = (event.t_ns - self._server.rack.start_ns) * 1e-9
+    def event(self, event: EmulationEvent) -> None:
+        """Tell of an event. Times are [s] since the server's start."""
+        seconds = (event.t_ns - self._server.start_ns) * 1e-9
         if not self._printer.as_json and event.kind == "order":
             return  # its answer says it
-        where = f"node {event.node}: " if event.node else ""
+        where = f"{event.where()}: " if event.where() else ""
         self._printer.say(
             event.kind,
             f"{seconds:10.4f} s  {where}{event.kind.replace('_', ' ')}{f' {event.text}' if event.text else ''}",
-            t_ns=event.t_ns, t_s=round(seconds, 6), node=event.node, text=event.text,
+            t_ns=event.t_ns, t_s=round(seconds, 6), **event.place(), text=event.text,
         )  # fmt: skip
 
     def order(self, text: str) -> bool:

@@ -1,4 +1,4 @@
-"""``stereoservo emulate drives`` as a child process."""
+"""``stereoservo emulate`` as a child process."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from stereoservo_sim.drives.faults import OrderError
+from stereoservo_sim.emulation.errors import OrderError
 
 
 class EmulatorError(Exception):
-    """The emulated drives did not come up, or ended; carries what they said."""
+    """What is emulated did not come up, or ended; carries what it said."""
 
     def __init__(self, message: str, code: int | None, output: str) -> None:
         super().__init__(message)
@@ -27,28 +27,30 @@ class EmulatorError(Exception):
 
 
 class EmulatorProcess:
-    """Emulated drives of a cell in a process of their own; a context manager that ends them.
+    """Emulated drives or cameras of a cell in a process of their own; a context manager that ends them.
 
-    ``cell``: a cell file, or the name of a shipped cell. ``options``: further ones of the command. ``log``: file that
-    takes its stderr (default: inherited). ``events``: what it told so far, oldest first, times in ``t_ns``. It ends
-    with this process. Start it from a thread that lives as long.
+    ``cell``: a cell file, or the name of a shipped cell. ``what``: ``drives`` or ``cameras``. ``options``: further ones
+    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it told so far, oldest first,
+    times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
     """
 
     def __init__(
         self,
         cell: Path | str,
         *,
+        what: str = "drives",
         options: tuple[str, ...] = (),
         log: Path | None = None,
         environment: dict[str, str] | None = None,
     ) -> None:
         self.channel = ""
+        self._what = f"emulated {what}"
         self.events: list[dict[str, Any]] = []
         self._log = log
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._ready = threading.Event()
         command = [
-            sys.executable, "-m", "stereoservo.cli.main", "emulate", "drives", str(cell), "--json",
+            sys.executable, "-m", "stereoservo.cli.main", "emulate", what, str(cell), "--json",
             "--parent", str(os.getpid()), *options,
         ]  # fmt: skip
         stream = log.open("wb") if log is not None else None
@@ -64,23 +66,23 @@ class EmulatorProcess:
         self._reader.start()
 
     def wait_ready(self, timeout_s: float = 120.0) -> str:
-        """Wait until the drives can be reached; their channel. Raises EmulatorError with what they said."""
+        """Wait until it can be reached; its channel. Raises EmulatorError with what it said."""
         until = time.monotonic() + timeout_s
         while not self._ready.wait(0.05):
             code = self.process.poll()
             if code is not None:
                 self._reader.join(1.0)
                 raise EmulatorError(
-                    f"the emulated drives ended (exit code {code}): {self.output()}", code, self.output()
+                    f"the {self._what} ended (exit code {code}): {self.output()}", code, self.output()
                 )
             if time.monotonic() > until:
-                raise EmulatorError(f"no emulated drives within {timeout_s:g} s", None, self.output())
+                raise EmulatorError(f"no {self._what} within {timeout_s:g} s", None, self.output())
         return self.channel
 
     def order(self, text: str, timeout_s: float = 10.0) -> str:
-        """Give an order (`stereoservo_sim.drives.faults`); the answer. Raises OrderError, EmulatorError."""
+        """Give an order (`help` lists them); the answer. Raises OrderError, EmulatorError."""
         if self.process.stdin is None or self.process.poll() is not None:
-            raise EmulatorError("the emulated drives have ended", self.process.poll(), self.output())
+            raise EmulatorError(f"the {self._what} have ended", self.process.poll(), self.output())
         self.process.stdin.write(text.replace("\n", " ") + "\n")
         self.process.stdin.flush()
         try:
@@ -98,7 +100,7 @@ class EmulatorProcess:
         return "\n".join([part for part in (logged, *errors) if part])
 
     def stop(self, how: signal.Signals = signal.SIGTERM, timeout_s: float = 10.0) -> int:
-        """End it: drives without power, arm at rest; gives its exit code. Idempotent."""
+        """End it (drives without power, arm at rest); gives its exit code. Idempotent."""
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:

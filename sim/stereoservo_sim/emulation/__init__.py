@@ -1,0 +1,1 @@
+"""What every emulator has: a console for orders, and life as a child process."""
