@@ -77,6 +77,10 @@ class ServoSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     filter_s: NonNegative = 0.2
     """Time constant of the innovation filter [s]: 0 takes each frame as it is."""
     gate_sigma: Positive = 6.0
+    """Sights farther from their prediction are not used [sigmas]: as improbable in both axes of a pixel together (chi-
+    square of two freedoms) as so many sigmas are in one."""
+    reanchor: Literal["auto", "off"] = "auto"
+    """What becomes of a camera that was bumped: found anew while the goal waits, or the goal is aborted."""
     priority: Annotated[int, Meta(ge=0, le=98)] = 50
     """SCHED_FIFO priority of the servo process; 0 leaves the scheduler alone."""
 

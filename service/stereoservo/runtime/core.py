@@ -16,7 +16,9 @@ from stereoservo.runtime.estimate import (
     SUSPECT_FRAMES,
     TRUSTED_FRAMES,
     ModelArrays,
-    accept_observation,
+    accept_sights,
+    frame_sights,
+    ideal_observation,
     joint_correction,
     joints_at,
     marker_weights,
@@ -228,9 +230,10 @@ class ServoCore:
             fresh.append(observation)
             at_shutter = joints_at(state.history, observation.t_shutter_ns)
             if self._arrays is not None and at_shutter is not None:
-                accept_observation(
-                    estimate, camera, observation, at_shutter, state.velocities, self._arrays, self.settings
-                )
+                ideal = ideal_observation(self._arrays, camera, observation)
+                then = predict(self._arrays, at_shutter)
+                sights = frame_sights(self._arrays, camera, ideal, then, state.velocities)
+                accept_sights(estimate, sights, np.ones(sights.seen.size, bool), self.settings)
         common: dict[str, Any] = {
             "now_ns": inputs.now_ns, "dt_s": inputs.period_ns * 1e-9, "q": q, "state": state,
             "settings": self.settings, "observations": tuple(fresh), "emit": emit,

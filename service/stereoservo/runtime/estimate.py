@@ -17,6 +17,7 @@ import numpy as np
 
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import (
+    BoolArray,
     chain_forward,
     image_jacobian,
     invert4,
@@ -28,6 +29,7 @@ from stereoservo.kinematics.kernels import (
 from stereoservo.kinematics.lens_kernel import distort_expected, undistort_sights
 from stereoservo.kinematics.linear_kernels import damped_least_squares
 from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.gate_kernel import fold_in, gate_threshold, innovations
 from stereoservo.runtime.ports import CameraObservation, FloatArray, IntArray, JointState, Prior
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import HISTORY, CameraEstimate, JointHistory
@@ -206,51 +208,56 @@ def ideal_observation(arrays: ModelArrays, camera: int, observation: CameraObser
     )
 
 
-def accept_observation(
-    estimate: CameraEstimate,
+@dataclass(frozen=True)
+class FrameSights:
+    """One frame against the prediction at its shutter: ``innovation`` (m, 2) [px], its covariance ``spread`` (m, 2, 2)
+    by detector and timing, ``noise`` (m,) [px²] of a coordinate by the detector alone, and what was ``seen`` (m,).
+    """
+
+    t_shutter_ns: int
+    innovation: FloatArray
+    spread: FloatArray
+    noise: FloatArray
+    seen: BoolArray
+
+
+def frame_sights(
+    arrays: ModelArrays,
     camera: int,
     observation: CameraObservation,
-    q: FloatArray,
+    prediction: Prediction,
     speed: FloatArray,
-    arrays: ModelArrays,
-    settings: CoreSettings,
-) -> None:
-    """Gate one camera's observation (raw pixels) against the prediction at its stamp and fold it into the estimate.
+) -> FrameSights:
+    """Innovations of an observation in ideal pixels against the ``prediction`` at its shutter.
 
-    ``q``, ``speed`` (n,): joints at the shutter time. The gate is chi-square-like on the deviation from the filtered
-    innovation, with the sigmas of detector, model and timing.
+    ``speed`` (n,): of the joints then.
     """
-    observation = ideal_observation(arrays, camera, observation)
-    prediction = predict(arrays, q)
-    accepted = rejected = 0
-    squares = 0.0
-    for k in range(observation.ids.size):
-        i = arrays.index.get(int(observation.ids[k]))
-        if i is None:
-            continue
-        innovation = observation.pixels[k] - prediction.pixels[camera, i]
-        covariance = observation.covariances[k]
-        variance = 0.5 * (covariance[0, 0] + covariance[1, 1])
-        velocity = (prediction.jacobian[camera, i] * speed).sum(axis=-1)
-        motion = (
-            TIMING_SIGMA_S * TIMING_SIGMA_S * float(velocity[0] * velocity[0] + velocity[1] * velocity[1])
-        )
-        age_s = (observation.t_shutter_ns - int(estimate.seen_ns[i])) * 1e-9
-        known = estimate.seen_ns[i] > 0 and age_s <= settings.limits.coast_s + 1.0
-        model = MODEL_SIGMA_PX if known else FIRST_SIGHT_SIGMA_PX
-        deviation = innovation - estimate.innovation[i] if known else innovation
-        gate = settings.gate_sigma * settings.gate_sigma * (variance + motion + model * model)
-        if not float(deviation[0] * deviation[0] + deviation[1] * deviation[1]) <= gate:
-            rejected += 1
-            continue
-        if known and settings.filter_s > 0.0:
-            estimate.innovation[i] += deviation * (age_s / (settings.filter_s + age_s))
-        else:
-            estimate.innovation[i] = innovation
-        estimate.sigma[i] = np.sqrt(variance)
-        estimate.seen_ns[i] = observation.t_shutter_ns
-        squares += float(innovation[0] * innovation[0] + innovation[1] * innovation[1])
-        accepted += 1
+    rows = np.array([arrays.index.get(int(i), -1) for i in observation.ids], dtype=np.int64)
+    innovation, spread, seen = innovations(
+        rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
+        prediction.pixels[camera], prediction.jacobian[camera], speed, TIMING_SIGMA_S,
+    )  # fmt: skip
+    noise = np.ones(seen.size)
+    for k, row in enumerate(rows):
+        if row >= 0:
+            noise[row] = 0.5 * (observation.covariances[k, 0, 0] + observation.covariances[k, 1, 1])
+    return FrameSights(observation.t_shutter_ns, innovation, spread, noise, seen)
+
+
+def accept_sights(
+    estimate: CameraEstimate, sights: FrameSights, used: BoolArray, settings: CoreSettings
+) -> None:
+    """Gate one frame and fold it into the camera's estimate; markers that are not ``used`` (m,) are left out.
+
+    The gate is chi-square with two freedoms on the deviation from the filtered innovation, with the covariances of
+    detector, timing and model. Near the gate a sight counts less: in the filter, and in triangulation by its sigma.
+    """
+    accepted, rejected, squares = fold_in(
+        sights.innovation, sights.spread, sights.seen & used, sights.noise, sights.t_shutter_ns,
+        estimate.innovation, estimate.sigma, estimate.seen_ns,
+        settings.limits.coast_s + 1.0, settings.filter_s, gate_threshold(settings.gate_sigma), MODEL_SIGMA_PX,
+        FIRST_SIGHT_SIGMA_PX,
+    )  # fmt: skip
     estimate.last_visible = accepted
     estimate.frames += 1
     estimate.rms_px = float(np.sqrt(squares / (2 * accepted))) if accepted else 0.0
@@ -258,7 +265,7 @@ def accept_observation(
     estimate.agreeing_frames = estimate.agreeing_frames + 1 if agrees else 0
     estimate.rejected_frames = estimate.rejected_frames + 1 if rejected > accepted else 0
     if accepted >= 3:
-        estimate.accepted_ns = observation.t_shutter_ns
+        estimate.accepted_ns = sights.t_shutter_ns
 
 
 def marker_weights(cameras: list[CameraEstimate], now_ns: int, coast_s: float) -> FloatArray:

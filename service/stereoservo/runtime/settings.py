@@ -104,6 +104,10 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     watch_following: bool = True
     """Off where commands are computed and never written (dry run)."""
     contact: ContactSettings | None = None
+    scene_ids: tuple[int, ...] = ()
+    """Ids that stand still for good: ``[scene] static``."""
+    reanchor: bool = True
+    """Whether a camera that was moved is found anew by itself."""
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
@@ -187,7 +191,22 @@ def core_settings(
         gate_sigma=cell.servo.gate_sigma,
         watch_following=watch_following,
         contact=_contact_settings(cell, joints),
+        scene_ids=_scene_ids(cell, camera_settings),
+        reanchor=cell.servo.reanchor == "auto",
     )
+
+
+def _scene_ids(cell: CellFile, cameras: tuple[CameraSettings, ...]) -> tuple[int, ...]:
+    known = {marker for camera in cameras for marker in camera.marker_ids}
+    unknown = sorted(set(cell.scene.static) - known)
+    if unknown:
+        raise CellFileError(
+            cell.cell.name,
+            "scene.static",
+            f"no camera's detector reports marker(s) {', '.join(str(i) for i in unknown)}; reported: "
+            f"{', '.join(str(i) for i in sorted(known))}",
+        )
+    return tuple(sorted(set(cell.scene.static)))
 
 
 def _contact_settings(cell: CellFile, joints: JointDriverDescription) -> ContactSettings:
