@@ -28,6 +28,8 @@ SIDECAR = ".jsonl"
 LONGEST_LINE = 4096
 MOST_SURPLUS = 1000
 """Frames without a line are counted up to here."""
+SLOWEST_MS = 10_000
+"""A file that gives no frame for so long, one that goes on in a hole of gigabytes say, is taken to end there."""
 GIB = 1 << 30
 
 
@@ -333,7 +335,8 @@ class ImageReader:
             raise ImageFileError(
                 self.path, "camera", f"is a recording of camera {header.camera!r}, not of {camera!r}"
             )
-        capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, SLOWEST_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, SLOWEST_MS]
+        capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG, limits)
         if not capture.isOpened():
             capture.release()
             raise ImageFileError(
@@ -384,7 +387,7 @@ class ImageReader:
             return None, None
         line = self._line()
         if line is None:
-            self.lost = self._surplus()
+            self.lost = 0 if self.end is not None else self._surplus()
             self._done = True
             return None, None
         image: Any = None
