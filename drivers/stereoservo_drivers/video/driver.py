@@ -1,0 +1,160 @@
+"""Driver ``video``: pictures of a real camera, or of a recorded one, as frames with their stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from stereoservo.runtime.ports import (
+    CameraDescription,
+    CameraStatistics,
+    DriverContext,
+    DriverError,
+    Frame,
+)
+from stereoservo_drivers.lifecycle import DriverLifecycle, State
+from stereoservo_drivers.video.mjpeg import MjpegSource
+from stereoservo_drivers.video.options import DRIVER, decode_video_options
+from stereoservo_drivers.video.playback import Playback
+from stereoservo_drivers.video.reader import Reader
+from stereoservo_drivers.video.sources import CaptureSource, LiveSource, Settings
+from stereoservo_drivers.video.watch import Watch
+
+LIVE_BUDGET_US = 1000.0
+RECORDED_BUDGET_US = 50_000.0
+"""A poll of a recording decodes what is due in the caller's own thread."""
+
+
+class Feed(Protocol):
+    """Where frames come from: a :class:`Reader` or a :class:`Playback`, used from ``open`` to ``close`` once."""
+
+    @property
+    def settings(self) -> Settings:
+        """What was asked for and what the source says."""
+        ...
+
+    def open(self) -> None:
+        """Open the source. Raises DriverError."""
+        ...
+
+    def begin(self) -> None:
+        """Deliver from now on."""
+        ...
+
+    def take(self) -> Frame | None:
+        """The newest frame, once. Raises DriverError."""
+        ...
+
+    def close(self) -> None:
+        """Release everything. Idempotent; never raises."""
+        ...
+
+
+class VideoCameraDriver:
+    """One camera. Options: :class:`~stereoservo_drivers.video.options.VideoOptions`.
+
+    It does not reconnect by itself: a source that fails raises DriverError from :meth:`poll`, and who holds the driver
+    closes it and configures it again, which opens the source anew (an old `cv2.VideoCapture` never recovers). Counts,
+    numbers of frames and the last picture, by which a frozen camera is known, go on over that. A recording that is over
+    or damaged stays so: configured again, it says the same, rather than playing on from its beginning.
+    """
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self._options, self._place = decode_video_options(options, context.cell_dir)
+        self._context = context
+        self._life = DriverLifecycle(f"camera driver {DRIVER!r} ({context.camera})")
+        self._watch = Watch(self._options.rate_hz)
+        self._feed: Feed | None = None
+        self._over: DriverError | None = None
+        self._openings = 0
+        self._settings: Settings = {}
+
+    def describe(self) -> CameraDescription:
+        """What the options ask for; works unconnected."""
+        return CameraDescription(
+            driver=DRIVER,
+            name=self._context.camera,
+            width=self._options.width,
+            height=self._options.height,
+            rate_hz=self._options.rate_hz,
+            delivers="frames",
+            call_budget_us=LIVE_BUDGET_US if self._place.live else RECORDED_BUDGET_US,
+        )
+
+    def configure(self) -> None:
+        """Open the source and see a first picture, within ``open_timeout_s``; also after :meth:`close`.
+
+        Raises DriverError: what is wrong with the source, ``image_size``, ``open_timeout``, ``end_of_file``.
+        """
+        self._life.require("configure()", State.CREATED, State.CONFIGURED, State.CLOSED)
+        if self._life.state is State.CONFIGURED:
+            return
+        if self._over is not None:
+            raise _again(self._over)
+        feed = self._new_feed()
+        try:
+            feed.open()
+        except DriverError:
+            feed.close()
+            raise
+        self._feed = feed
+        self._openings += 1
+        self._life.state = State.CONFIGURED
+
+    def _new_feed(self) -> Feed:
+        place, options, context = self._place, self._options, self._context
+        if not place.live:
+            return Playback(place, options, context.camera, self._watch, context.clock)
+        source: LiveSource
+        if place.kind == "http":
+            source = MjpegSource(place, options, context.clock)
+        else:
+            source = CaptureSource(place, options, context.clock)
+        return Reader(source, place, options, context.camera, self._watch)
+
+    def activate(self) -> None:
+        """Frames from now on. Raises DriverError."""
+        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
+        if self._life.state is State.CONFIGURED and self._feed is not None:
+            self._feed.begin()
+        self._life.state = State.ACTIVE
+
+    def poll(self) -> list[Frame]:
+        """The newest frame since the last poll, or none. Raises DriverError: the source failed or is over."""
+        self._life.require("poll()", State.ACTIVE)
+        assert self._feed is not None
+        try:
+            frame = self._feed.take()
+        except DriverError as error:
+            if not self._place.live:
+                self._over = error
+            raise
+        return [] if frame is None else [frame]
+
+    def deactivate(self) -> None:
+        """No more frames; the source stays open. Idempotent."""
+        if self._life.state is State.ACTIVE:
+            self._life.state = State.CONFIGURED
+
+    def close(self) -> None:
+        """Release the source, waiting half a second at most. Idempotent; never raises."""
+        if self._feed is not None:
+            self._settings = self._feed.settings
+            self._feed.close()
+            self._feed = None
+        self._life.state = State.CLOSED
+
+    def statistics(self) -> CameraStatistics:
+        """Counts since the driver was first configured, over reconnections; any state."""
+        watch = self._watch
+        return CameraStatistics(
+            frames=watch.frames,
+            dropped=watch.dropped,
+            frozen=watch.frozen,
+            reconnects=max(0, self._openings - 1),
+            settings=dict(self._feed.settings if self._feed is not None else self._settings),
+        )
+
+
+def _again(error: DriverError) -> DriverError:
+    return DriverError(error.code, str(error), retry=error.retry, **error.data)

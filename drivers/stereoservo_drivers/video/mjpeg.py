@@ -1,0 +1,339 @@
+"""MJPEG over HTTP: the parts of a ``multipart/x-mixed-replace`` stream, each with the time at which it began to arrive.
+
+A reader of our own, since it stamps a picture when its first byte arrives, knows the server's number of it, and sees
+a JPEG that was cut off: decoders behind `cv2.VideoCapture` tell neither and invent times.
+"""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import select
+import socket
+import ssl
+from contextlib import suppress
+from dataclasses import dataclass, field
+from urllib.parse import SplitResult, unquote, urljoin, urlsplit
+
+import cv2
+import numpy as np
+
+from stereoservo.runtime.ports import Clock, DriverError
+from stereoservo_drivers.video.options import Place, VideoOptions
+from stereoservo_drivers.video.pictures import check_size, decoding_flag, jpeg_size
+from stereoservo_drivers.video.sources import Picture, Settings
+
+LARGEST_PART = 50_000_000
+LONGEST_HEADERS = 16384
+CHUNK = 1 << 18
+MOST_READS = 64
+SPOILED_IN_A_ROW = 10
+REDIRECTIONS = 3
+
+
+class MultipartError(Exception):
+    """The stream is not what it says: ``code`` as of DriverError."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass
+class Part:
+    """One part: when its first byte was there, its headers by name in lower case, its body; ``cut``: not all of it."""
+
+    t_ns: int
+    headers: dict[str, str] = field(default_factory=dict)
+    body: bytes = b""
+    cut: bool = False
+
+
+class MultipartParser:
+    """Bytes in as they come, whole parts out. Finds its way again after a part that is not as long as it says."""
+
+    def __init__(self, boundary: str, largest: int = LARGEST_PART) -> None:
+        # Half of the servers write the boundary's leading "--" into the header already: both end in this.
+        self._delimiter = b"--" + boundary.encode("latin-1").lstrip(b"-")
+        self._largest = largest
+        self._buffer = bytearray()
+        self._part: Part | None = None
+        self._length: int | None = None
+        self._in_body = False
+        self._scanned = 0
+
+    def feed(self, data: bytes, t_ns: int) -> list[Part]:
+        """Take ``data`` received at ``t_ns``; the parts that it completes.
+
+        Raises MultipartError: ``frame_too_large``, ``not_mjpeg``.
+        """
+        self._buffer += data
+        parts: list[Part] = []
+        while True:
+            if self._part is None:
+                if not self._find_part():
+                    return parts
+                self._part = Part(t_ns)
+            if not self._in_body and not self._read_headers(self._part):
+                return parts
+            if not self._read_body(self._part):
+                return parts
+            parts.append(self._part)
+            self._part = None
+
+    def _find_part(self) -> bool:
+        """Pass over everything to after the next boundary's line, and see that something follows."""
+        at = self._buffer.find(self._delimiter, self._scanned)
+        if at < 0:
+            keep = len(self._delimiter) - 1
+            if len(self._buffer) > self._largest:
+                raise MultipartError("not_mjpeg", "its boundary does not come")
+            self._scanned = max(0, len(self._buffer) - keep)
+            return False
+        end = self._buffer.find(b"\n", at)
+        if end < 0 or end + 1 == len(self._buffer):
+            self._scanned = at
+            self._bound_headers(len(self._buffer) - at)
+            return False
+        del self._buffer[: end + 1]
+        self._scanned = 0
+        return True
+
+    def _read_headers(self, part: Part) -> bool:
+        end, width = self._buffer.find(b"\r\n\r\n"), 4
+        if end < 0:
+            end, width = self._buffer.find(b"\n\n"), 2
+        self._bound_headers(len(self._buffer) if end < 0 else end)
+        if end < 0:
+            return False
+        for line in bytes(self._buffer[:end]).splitlines():
+            name, colon, value = line.decode("latin-1").partition(":")
+            if colon:
+                part.headers[name.strip().lower()] = value.strip()
+        del self._buffer[: end + width]
+        self._length = _number(part.headers.get("content-length"))
+        if self._length is not None and self._length > self._largest:
+            raise MultipartError(
+                "frame_too_large", f"a picture of {self._length} bytes; at most {self._largest} are taken"
+            )
+        self._in_body = True
+        self._scanned = 0
+        return True
+
+    def _bound_headers(self, length: int) -> None:
+        if length > LONGEST_HEADERS:
+            raise MultipartError("not_mjpeg", f"headers of a part above {LONGEST_HEADERS} bytes")
+
+    def _read_body(self, part: Part) -> bool:
+        length = self._length
+        boundary = self._buffer.find(b"\n" + self._delimiter, self._scanned)
+        if length is not None and (boundary < 0 or boundary + 1 >= length):
+            if len(self._buffer) < length:
+                self._rescan_from_tail()
+                return False
+            return self._complete(part, length, cut=False)
+        if boundary >= 0:
+            return self._complete(part, boundary, cut=length is not None)
+        if len(self._buffer) > self._largest:
+            raise MultipartError("frame_too_large", f"a picture above {self._largest} bytes without an end")
+        self._rescan_from_tail()
+        return False
+
+    def _rescan_from_tail(self) -> None:
+        self._scanned = max(0, len(self._buffer) - len(self._delimiter) - 1)
+
+    def _complete(self, part: Part, length: int, *, cut: bool) -> bool:
+        part.body = bytes(self._buffer[:length])
+        part.cut = cut
+        del self._buffer[:length]
+        self._in_body = False
+        self._scanned = 0
+        return True
+
+
+class MjpegSource:
+    """One MJPEG stream over HTTP or HTTPS (:class:`~stereoservo_drivers.video.sources.LiveSource`)."""
+
+    def __init__(self, place: Place, options: VideoOptions, clock: Clock) -> None:
+        self.settings: Settings = {}
+        self._place = place
+        self._options = options
+        self._clock = clock
+        self._socket: socket.socket | None = None
+        self._response: http.client.HTTPResponse | None = None
+        self._parser: MultipartParser | None = None
+        self._interrupted = False
+        self._over = False
+        self._spoiled = 0
+        self._lost = 0
+
+    def open(self) -> None:
+        """Connect and read the response's head. Raises DriverError."""
+        url = self._place.url
+        for _ in range(REDIRECTIONS + 1):
+            response = self._request(url)
+            if response.status not in (301, 302, 303, 307, 308):
+                break
+            target = urlsplit(urljoin(url.geturl(), response.getheader("Location", "")))
+            response.close()
+            if target.scheme not in ("http", "https") or not target.hostname:
+                raise self._place.error(
+                    "http", f"sent on to {target.geturl()!r}, which is no address of HTTP"
+                )
+            if target.hostname == url.hostname and not target.username:  # the password is that host's
+                target = target._replace(netloc=url.netloc.rpartition("@")[0] + "@" + target.netloc)
+            url = target
+        else:
+            raise self._place.error("http", f"sent on more than {REDIRECTIONS} times; use the last address")
+        self._response = response
+        self._parser = MultipartParser(self._boundary(response))
+        if self._socket is not None:
+            self._socket.settimeout(self._options.read_timeout_s)
+
+    def _request(self, url: SplitResult) -> http.client.HTTPResponse:
+        secure = url.scheme == "https"
+        kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+        connection = kind(url.hostname or "", url.port, timeout=self._options.open_timeout_s)
+        headers = {"Accept": "multipart/x-mixed-replace, */*", "Connection": "close"}
+        if url.username:
+            pair = f"{unquote(url.username)}:{unquote(url.password or '')}"
+            headers["Authorization"] = "Basic " + base64.b64encode(pair.encode()).decode()
+        try:
+            connection.connect()
+            self._socket = connection.sock
+            if self._interrupted:
+                raise self._place.error("closed", "the driver was closed while it connected", retry=True)
+            connection.request(
+                "GET", (url.path or "/") + (f"?{url.query}" if url.query else ""), headers=headers
+            )
+            return connection.getresponse()
+        except (OSError, http.client.HTTPException) as error:
+            connection.close()
+            raise _unreached(self._place, error, self._options.open_timeout_s) from error
+        except DriverError:
+            connection.close()
+            raise
+
+    def _boundary(self, response: http.client.HTTPResponse) -> str:
+        if response.status != 200:
+            cure = {
+                401: "Put user and password into the URL (http://user:password@host/...); Basic is supported",
+                403: "Look at the rights of the camera's user",
+                404: "Look up the path of its MJPEG stream",
+            }.get(response.status, "Look at the camera's own page")
+            raise self._place.error(
+                "http_status",
+                f"answered {response.status} {response.reason}. {cure}",
+                retry=response.status >= 500,
+                status=response.status,
+            )
+        told = response.headers.get_content_type()
+        boundary = response.headers.get_param("boundary")
+        if told != "multipart/x-mixed-replace" or not isinstance(boundary, str) or not boundary.strip("-"):
+            raise self._place.error(
+                "not_mjpeg",
+                f"sends {response.getheader('Content-Type', 'no Content-Type')!r}; an MJPEG stream is "
+                "'multipart/x-mixed-replace; boundary=...'. Look up the path of the camera's MJPEG stream",
+                content_type=told,
+            )
+        return boundary
+
+    def read(self) -> Picture | None:
+        """The newest whole picture, waiting for one; None: it was spoiled. Raises DriverError."""
+        parts: list[Part] = []
+        assert self._response is not None
+        assert self._parser is not None
+        for _ in range(MOST_READS):
+            if parts and not self._readable():
+                break
+            if self._over:
+                raise self._place.error("connection_lost", "the server ended the stream", retry=True)
+            try:
+                data = self._response.read1(CHUNK)
+            except TimeoutError as error:
+                raise self._place.error(
+                    "silent", f"nothing came for {self._options.read_timeout_s:g} s", retry=True
+                ) from error
+            except (OSError, ValueError, http.client.HTTPException) as error:
+                raise self._place.error(
+                    "connection_lost", f"the connection broke ({error})", retry=True
+                ) from error
+            self._over = not data
+            try:
+                parts += self._parser.feed(data, self._clock.now_ns())
+            except MultipartError as error:
+                raise self._place.error(error.code, str(error)) from error
+            if self._over and parts:
+                break
+        return self._decoded(parts[-1], len(parts) - 1) if parts else None
+
+    def _readable(self) -> bool:
+        connection = self._socket
+        if connection is None or connection.fileno() < 0:
+            return False
+        if isinstance(connection, ssl.SSLSocket) and connection.pending():
+            return True
+        return bool(select.select([connection], [], [], 0)[0])
+
+    def _decoded(self, part: Part, skipped: int) -> Picture | None:
+        told = part.headers.get("content-type", "image/jpeg").partition(";")[0].strip().lower()
+        if told not in ("image/jpeg", "image/jpg"):
+            raise self._place.error(
+                "not_mjpeg", f"its parts are {told!r}; image/jpeg is read", content_type=told
+            )
+        size = None if part.cut else jpeg_size(part.body)
+        image = None
+        if size is not None:
+            check_size(self._place, self._options, *size)
+            image = cv2.imdecode(np.frombuffer(part.body, np.uint8), decoding_flag(self._options.channel))
+        if image is None:
+            self._spoiled += 1
+            self._lost += 1 + skipped
+            if self._spoiled >= SPOILED_IN_A_ROW:
+                raise self._place.error(
+                    "corrupt",
+                    f"{self._spoiled} pictures in a row are cut off or are no JPEG (the last of {len(part.body)} "
+                    "bytes). Look at the camera's load and at the network",
+                    retry=True,
+                )
+            return None
+        self._spoiled = 0
+        number = _number(part.headers.get("x-sequence"))
+        return Picture(image, part.t_ns, number, skipped)
+
+    def interrupt(self) -> None:
+        """Wake the thread that waits in :meth:`open` or :meth:`read`."""
+        self._interrupted = True
+        connection = self._socket
+        if connection is not None:
+            with suppress(OSError):  # closed by the other side, or by the thread: nothing waits any more
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def release(self) -> None:
+        """Close the connection."""
+        if self._response is not None:
+            self._response.close()
+        if self._socket is not None:
+            self._socket.close()
+
+
+def _number(text: str | None) -> int | None:
+    return int(text) if text is not None and text.isascii() and text.isdigit() and len(text) < 19 else None
+
+
+def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
+    if isinstance(error, TimeoutError):
+        return place.error(
+            "open_timeout", f"did not answer within {timeout_s:g} s (open_timeout_s)", retry=True
+        )
+    if isinstance(error, ConnectionRefusedError):
+        return place.error(
+            "refused", "nobody listens there. Start the camera's server, or mend the port", retry=True
+        )
+    if isinstance(error, socket.gaierror):
+        return place.error("unknown_host", f"its host has no address ({error.strerror})", retry=True)
+    if isinstance(error, ssl.SSLError):
+        return place.error("tls", f"no trusted TLS connection ({error.reason or error})")
+    if isinstance(error, http.client.HTTPException):
+        return place.error("http", f"does not speak HTTP ({type(error).__name__})")
+    return place.error("unreachable", f"cannot be reached ({error})", retry=True)

@@ -1,0 +1,164 @@
+"""Options of the driver ``video``, and what its ``source`` names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import SplitResult, urlsplit, urlunsplit
+
+import msgspec
+from msgspec import Meta
+
+from stereoservo.runtime.ports import DriverError
+from stereoservo_drivers.options import decode_options
+
+DRIVER = "video"
+Channel = Literal["gray", "red", "green", "blue"]
+Flip = Literal["none", "horizontal", "vertical", "rotate180"]
+Pace = Literal["recorded", "every"]
+SourceKind = Literal["device", "file", "sequence", "http", "rtsp"]
+Pixels = Annotated[int, Meta(ge=16, le=16384)]
+Seconds = Annotated[float, Meta(ge=0.05, le=60)]
+
+VIDEO_FILES = (".avi", ".mkv", ".mp4")
+PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+LIVE_FROZEN_FRAMES = 10
+_DEVICE = re.compile(r"/dev/video(\d+)")
+_NUMBER = re.compile(r"%(0\d+)?d")
+_NO_URL = urlsplit("")
+VALID_SOURCES = (
+    "a device number (0) or path (/dev/video0), a file (.avi, .mkv, .mp4), numbered pictures (left-%04d.png), "
+    "http://, https:// (MJPEG), rtsp://"
+)
+
+
+class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of a camera of the driver ``video``.
+
+    ``source``: device number or path, video file, numbered pictures (one ``%04d`` in the file's name), or URL; files
+    are looked for in the directory of the cell file. ``width``, ``height`` [px]: asked of a device, and checked
+    against the first picture of any source. ``rate_hz``: asked of a device; the grid on which missing frames are
+    counted; the rate of files that carry no stamps. ``latency_s``: from the shutter to the reception, subtracted from
+    the time of reception (recordings with stamps of their own carry it already). ``exposure``, ``gain``: in units of
+    the device; ``pixel_format``: four letters such as ``MJPG``, which many USB cameras need for their full rate.
+
+    ``channel``: gray, or one colour's own. ``flip``: how the picture is turned before anything sees it.
+    ``open_timeout_s``: from connecting to the first picture. ``read_timeout_s``: without a picture for so long the
+    camera is silent. ``frozen_frames``: so many pictures without any change are a frozen camera, each of which is
+    withheld, from the first on; 0 looks for none (default: 10, and 0 for files).
+
+    Of files and pictures: ``start``, number of the first picture used; ``loop``, begin again at the end;
+    ``pace``: ``recorded``, each at its time, or ``every``, the next one at each poll.
+    """
+
+    source: int | str
+    width: Pixels
+    height: Pixels
+    rate_hz: Annotated[float, Meta(ge=0.1, le=1000)] = 30.0
+    latency_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
+    exposure: float | None = None
+    gain: float | None = None
+    pixel_format: str = ""
+    channel: Channel = "gray"
+    flip: Flip = "none"
+    open_timeout_s: Seconds = 5.0
+    read_timeout_s: Seconds = 1.0
+    frozen_frames: Annotated[int, Meta(ge=0, le=100000)] | None = None
+    start: Annotated[int, Meta(ge=0)] = 0
+    loop: bool = False
+    pace: Pace = "recorded"
+
+
+@dataclass(frozen=True)
+class Place:
+    """What ``source`` names. ``shown``: for messages, without a password."""
+
+    kind: SourceKind
+    shown: str
+    device: int | str = -1
+    path: Path = Path()
+    url: SplitResult = _NO_URL
+
+    @property
+    def live(self) -> bool:
+        """Whether pictures come by themselves."""
+        return self.kind in ("device", "http", "rtsp")
+
+    def error(self, code: str, what: str, *, retry: bool = False, **data: Any) -> DriverError:
+        """A DriverError about this source."""
+        return DriverError(code, f"{self.shown}: {what}", retry=retry, source=self.shown, **data)
+
+
+def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[VideoOptions, Place]:
+    """Options and the source they name; nothing is opened. Raises DriverError (``option``)."""
+    decoded = decode_options(VideoOptions, options, DRIVER)
+    place = place_of(decoded.source, cell_dir)
+    if place.live:
+        for name, value, usual in (
+            ("start", decoded.start, 0),
+            ("loop", decoded.loop, False),
+            ("pace", decoded.pace, "recorded"),
+        ):
+            if value != usual:
+                raise _wrong(name, value, f"is for files and numbered pictures; source is {place.shown}")
+    if decoded.pixel_format and (len(decoded.pixel_format) != 4 or not decoded.pixel_format.isascii()):
+        raise _wrong("pixel_format", decoded.pixel_format, 'valid: four letters, such as "MJPG" or "YUYV"')
+    return decoded, place
+
+
+def frozen_frames(options: VideoOptions, place: Place) -> int:
+    """So many equal pictures in a row are a frozen camera; 0: none."""
+    if options.frozen_frames is not None:
+        return options.frozen_frames
+    return LIVE_FROZEN_FRAMES if place.live else 0
+
+
+def place_of(source: int | str, cell_dir: Path) -> Place:
+    """What ``source`` names. Raises DriverError (``option``)."""
+    if isinstance(source, int):
+        if source < 0:
+            raise _wrong("source", source, f"valid: {VALID_SOURCES}")
+        return Place("device", f"/dev/video{source}", device=source)
+    if source.startswith("/dev/"):
+        number = _DEVICE.fullmatch(source)
+        return Place("device", source, device=int(number[1]) if number else source)
+    if "://" in source:
+        return _url(source)
+    path = cell_dir / source
+    suffix = path.suffix.lower()
+    if "%" in source:
+        if len(_NUMBER.findall(path.name)) != 1 or source.count("%") != 1:
+            raise _wrong("source", source, "valid: one %d or %04d, in the name of the file")
+        if suffix not in PICTURE_FILES:
+            raise _wrong("source", source, f"valid endings of numbered pictures: {', '.join(PICTURE_FILES)}")
+        return Place("sequence", str(path), path=path)
+    if suffix in VIDEO_FILES:
+        return Place("file", str(path), path=path)
+    hint = f"; a device's number stands without quotes: source = {source}" if source.isdigit() else ""
+    raise _wrong("source", source, f"valid: {VALID_SOURCES}{hint}")
+
+
+def _url(source: str) -> Place:
+    try:
+        url = urlsplit(source)
+        host, _port = url.hostname, url.port
+    except ValueError as error:
+        raise _wrong("source", source, f"not a URL ({error})") from error
+    if not host:
+        raise _wrong("source", source, "valid: a URL with a host, such as http://camera.local:8080/stream")
+    shown = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))
+    if url.scheme in ("http", "https"):
+        return Place("http", shown, url=url)
+    if url.scheme in ("rtsp", "rtsps"):
+        return Place("rtsp", shown, url=url)
+    raise _wrong("source", shown, f"valid: {VALID_SOURCES}")
+
+
+def _wrong(option: str, value: object, what: str) -> DriverError:
+    shown = f'"{value}"' if isinstance(value, str) else str(value).lower()
+    return DriverError(
+        "option", f"driver {DRIVER!r}: {option} = {shown}; {what}", driver=DRIVER, option=option, value=value
+    )

@@ -1,0 +1,70 @@
+"""One picture: its size, one channel of it, turned; and whether JPEG data are whole."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stereoservo.runtime.ports import DriverError, ImageArray
+from stereoservo_drivers.video.options import Channel, Flip, Place, VideoOptions
+
+_CHANNELS = {"blue": 0, "green": 1, "red": 2}
+_FLIPS = {"horizontal": 1, "vertical": 0, "rotate180": -1}
+_SIZE_MARKERS = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
+_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
+
+
+def decoding_flag(channel: Channel) -> int:
+    """How `cv2.imread` and `cv2.imdecode` are to decode; turning by camera orientation tags is left out."""
+    wanted = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
+    return wanted | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def one_channel(image: ImageArray, channel: Channel, flip: Flip) -> ImageArray:
+    """``(height, width)`` of ``image`` ``(height, width[, 3])``, blue first; contiguous. A gray one is any channel."""
+    if image.ndim == 3:
+        if channel == "gray":
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        else:
+            image = image[:, :, _CHANNELS[channel]]
+    if flip != "none":
+        image = cv2.flip(np.ascontiguousarray(image), _FLIPS[flip])
+    return np.ascontiguousarray(image)
+
+
+def check_size(place: Place, options: VideoOptions, width: int, height: int) -> None:
+    """Raises DriverError (``image_size``) unless it is what the cell file says."""
+    if (width, height) != (options.width, options.height):
+        raise size_error(place, options, width, height)
+
+
+def size_error(place: Place, options: VideoOptions, width: int, height: int) -> DriverError:
+    """The error of pictures that have another size than the cell file says."""
+    return place.error(
+        "image_size",
+        f"its pictures are {width}x{height} px; the cell file says {options.width}x{options.height}. Set width = "
+        f"{width} and height = {height} there, or the camera's own size",
+        got=(width, height),
+        asked=(options.width, options.height),
+    )
+
+
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of whole JPEG data, None where not whole: begin marker, frame header, end marker (then zeros).
+
+    Decoders fill up what is missing without a word; ITU-T T.81 B.1.
+    """
+    if data[:2] != b"\xff\xd8" or data.rstrip(b"\x00\r\n")[-2:] != b"\xff\xd9":
+        return None
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+        elif marker in _BARE_MARKERS:
+            at += 2
+        elif marker in _SIZE_MARKERS:
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None

@@ -1,0 +1,142 @@
+"""Opened live sources: a video device, an RTSP stream; an MJPEG stream is in ``mjpeg.py``. Used by one thread each."""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+
+from stereoservo.runtime.ports import Clock, ImageArray
+from stereoservo_drivers.video.options import Place, VideoOptions
+
+Settings = dict[str, tuple[float | None, float | None]]
+MANUAL_EXPOSURE = 1.0
+"""``V4L2_EXPOSURE_MANUAL`` of Linux' videodev2.h."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a source gives: ``image`` ``(height, width[, 3])``, when it was received, the source's number of it, and how
+    many pictures received before it were passed over.
+    """
+
+    image: ImageArray
+    t_received_ns: int
+    seq: int | None = None
+    skipped: int = 0
+
+
+class LiveSource(Protocol):
+    """A source that gives pictures by itself. ``settings``: what it was asked for and what it says."""
+
+    settings: Settings
+
+    def open(self) -> None:
+        """Connect. Blocks for the time-out of opening at most, as far as the libraries hold it. Raises DriverError."""
+        ...
+
+    def read(self) -> Picture | None:
+        """Wait for the next picture; None: one came that is not whole. Raises DriverError."""
+        ...
+
+    def interrupt(self) -> None:
+        """Wake a blocked :meth:`open` or :meth:`read`, where that is possible. From another thread; never raises."""
+        ...
+
+    def release(self) -> None:
+        """Let go of everything."""
+        ...
+
+
+class CaptureSource:
+    """A device (V4L2) or an RTSP stream (FFmpeg), by `cv2.VideoCapture`. One that failed is never used again."""
+
+    def __init__(self, place: Place, options: VideoOptions, clock: Clock) -> None:
+        self.settings: Settings = {}
+        self._place = place
+        self._options = options
+        self._clock = clock
+        self._capture: cv2.VideoCapture | None = None
+
+    def open(self) -> None:
+        """Open and set what is asked. Raises DriverError."""
+        device = self._place.kind == "device"
+        if device:
+            self._check_device()
+        self._capture = self._open_device() if device else self._open_stream()
+        if not self._capture.isOpened():
+            raise self._place.error(
+                "not_opened",
+                "opened no video: is it used by another program, or not a camera?"
+                if device
+                else f"gave no video within {self._options.open_timeout_s:g} s: look at its address, path and password",
+                retry=True,
+            )
+        if device:
+            self._set()
+
+    def _open_device(self) -> cv2.VideoCapture:
+        return cv2.VideoCapture(self._place.device, cv2.CAP_V4L2)
+
+    def _open_stream(self) -> cv2.VideoCapture:
+        times = [
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(self._options.open_timeout_s * 1e3),
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(self._options.read_timeout_s * 1e3),
+        ]  # fmt: skip
+        return cv2.VideoCapture(self._place.url.geturl(), cv2.CAP_FFMPEG, times)
+
+    def _check_device(self) -> None:
+        path = self._place.shown
+        try:
+            os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC))
+        except OSError as error:
+            code, cure = {
+                errno.ENOENT: ("missing", "no such device; `ls /dev/video*` shows those there are"),
+                errno.EACCES: ("permission", "no right to use it; the user must be in the group 'video'"),
+                errno.EBUSY: ("busy", "another program uses it"),
+            }.get(error.errno or 0, ("not_opened", f"cannot be opened ({error.strerror})"))
+            raise self._place.error(code, cure, retry=True) from error
+
+    def _set(self) -> None:
+        options = self._options
+        if options.pixel_format:
+            code = cv2.VideoWriter.fourcc(*options.pixel_format)
+            self._ask("pixel_format", cv2.CAP_PROP_FOURCC, float(code))
+        self._ask("width", cv2.CAP_PROP_FRAME_WIDTH, float(options.width))
+        self._ask("height", cv2.CAP_PROP_FRAME_HEIGHT, float(options.height))
+        self._ask("rate_hz", cv2.CAP_PROP_FPS, options.rate_hz)
+        if options.exposure is not None:
+            self._ask("manual_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE)
+            self._ask("exposure", cv2.CAP_PROP_EXPOSURE, options.exposure)
+        if options.gain is not None:
+            self._ask("gain", cv2.CAP_PROP_GAIN, options.gain)
+
+    def _ask(self, name: str, what: int, value: float) -> None:
+        """Set and read back. A device that does not know it, or knows better, is no error: the settings tell."""
+        capture = self._capture
+        assert capture is not None
+        known = capture.set(what, value)
+        self.settings[name] = value, capture.get(what) if known else None
+
+    def read(self) -> Picture | None:
+        """The next picture. Raises DriverError."""
+        capture = self._capture
+        assert capture is not None
+        if not capture.grab():
+            raise self._place.error(
+                "connection_lost", "gives no more pictures: unplugged, ended, or silent too long", retry=True
+            )
+        received_ns = self._clock.now_ns()
+        whole, image = capture.retrieve()
+        return Picture(image, received_ns) if whole else None
+
+    def interrupt(self) -> None:
+        """Nothing wakes `cv2.VideoCapture.grab`: it ends by its own time-out."""
+
+    def release(self) -> None:
+        """Give the device or the stream free."""
+        if self._capture is not None:
+            self._capture.release()
