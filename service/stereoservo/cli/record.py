@@ -4,35 +4,63 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, note
 from stereoservo.gateway.client import Client, EventWatch
+from stereoservo.runtime.image_order import ImagesRecorded
+
+LAST_WORD_S = 10.0
+"""The gateway gives its cameras 5 s to finish their files."""
 
 
 def record(
     cell: CellArgument,
     seconds: Annotated[float, typer.Option(help="For how long (default: until Ctrl-C).", min=0.0)] = math.inf,
+    images: Annotated[
+        bool,
+        typer.Option(
+            "--images", help="With what the cameras deliver, without loss, in NAME.images beside it."
+        ),
+    ] = False,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:
     """Record the flight of a live cell into a file on its host; `replay` runs it again."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
-        with EventWatch(client) as watch:
-            client.record()
-            file = client.info().recording
-            if not file:
-                file = watch.wait(lambda e: e.kind == "recording", "the recording", 5.0).message
+    recorded: ImagesRecorded | None = None
+    with Client(cell, endpoint=endpoint, operator=operator) as client, EventWatch(client) as watch:
+        client.record(images=images)
+        file = client.info().recording
+        if not file:
+            file = watch.wait(lambda e: e.kind == "recording", "the recording", 5.0).message
         note(f"recording into {file}; Ctrl-C ends it")
         until = time.monotonic() + seconds
         try:
             while time.monotonic() < until:
                 time.sleep(min(0.5, max(0.0, until - time.monotonic())))
+                for event in watch.poll():
+                    if event.kind == "images_ended":
+                        note(event.message)
+                    recorded = event.images or recorded
         except KeyboardInterrupt:
             note("ending the recording")
         finally:
             reply = client.record(on=False)
-    emit({"file": file, "message": reply.message}, reply.message, json)
+        if images and recorded is None:
+            ended = watch.wait(lambda e: e.kind == "images_recorded", "the end of the images", LAST_WORD_S)
+            recorded = ended.images
+    lines = [reply.message]
+    result: dict[str, Any] = {"file": file, "message": reply.message}
+    if recorded is not None:
+        result["images"] = msgspec.to_builtins(recorded)
+        lines += [
+            f"  {one.file}: {one.frames} frames"
+            + (f", {one.left_out} left out" if one.left_out else "")
+            + ("" if one.why == "ended" else f", {one.why}")
+            for one in recorded.cameras
+        ]
+    emit(result, "\n".join(lines), json)

@@ -202,9 +202,13 @@ class Client:
         """Joint velocities for ``lease_s``; call again within it to go on (a dead man's switch)."""
         return self.command("jog", Jog(dict(velocities), lease_s))
 
-    def record(self, on: bool = True) -> Reply:
-        """Begin or end a flight recording; the reply's message is its file on the daemon's host."""
-        return self._ask("record", self.keys.command("record", self.operator), encode(Record(on)))
+    def record(self, on: bool = True, images: bool = False) -> Reply:
+        """Begin or end a flight recording; the reply's message is its file on the daemon's host.
+
+        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is told by the event
+        ``images_recorded``. Raises RefusedError.
+        """
+        return self._ask("record", self.keys.command("record", self.operator), encode(Record(on, images)))
 
     def cancel(self, goal_id: str) -> Reply:
         """Cancel a goal."""

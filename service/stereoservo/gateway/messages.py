@@ -34,6 +34,7 @@ from stereoservo.runtime.commands import (
     Teach,
     UpdateGoal,
 )
+from stereoservo.runtime.image_order import ImagesRecorded
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
@@ -64,9 +65,13 @@ COMMANDS: dict[str, type[Command]] = {
 
 
 class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", forbid_unknown_fields=True):
-    """Begin or end a flight recording. The gateway's own business: the core does not hear of it."""
+    """Begin or end a flight recording. The gateway's own business: the core does not hear of it.
+
+    ``images``: with what the cameras deliver, in the directory ``NAME.images`` beside the recording ``NAME.mcap``.
+    """
 
     on: bool = True
+    images: bool = False
 
 
 class Synthesise(
@@ -268,6 +273,7 @@ class EventMessage(msgspec.Struct, frozen=True):
     calibration: CalibrationResult | None = None
     check: CheckReport | None = None
     reset: ZeroReset | None = None
+    images: ImagesRecorded | None = None
 
 
 class EventList(msgspec.Struct, frozen=True):

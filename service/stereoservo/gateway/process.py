@@ -43,7 +43,7 @@ from stereoservo.gateway.publisher import (
     features_message,
     state_message,
 )
-from stereoservo.gateway.recordings import Recordings
+from stereoservo.gateway.recordings import CannotRecordError, Recordings
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.session import (
     SessionError,
@@ -178,6 +178,7 @@ class Gateway:
         self._take_reports()
         for item in self._link.steps():
             self._recordings.take(item)
+        self._recordings.images.follow()
         self._calibration.follow()
         if not self._announced and self._greeted:
             self._announced = True
@@ -225,6 +226,11 @@ class Gateway:
         self._replies.reply(query, encode(reply))
 
     def _record(self, wanted: Record) -> Reply:
+        try:
+            if wanted.on and wanted.images:
+                self._recordings.want_images()
+        except CannotRecordError as error:
+            return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
         self._link.records = wanted.on
         if not wanted.on:
             steps = self._recordings.stop()
@@ -336,6 +342,8 @@ class Gateway:
         for peer in self._reports.peers:
             for data in peer.receive():
                 report = report_decoder.decode(data)
+                if report.images is not None:
+                    self._recordings.images.told(report.images)
                 self.log.add(
                     report.kind,
                     t_ns=report.t_ns,

@@ -1,13 +1,109 @@
-"""Flight recordings: step records of the servo process into files."""
+"""Flight recordings: step records of the servo process into files, and the cameras' images beside them."""
 
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 
 from stereoservo.gateway.publisher import EventLog
+from stereoservo.runtime.image_order import (
+    ImageOrder,
+    ImagesRecorded,
+    RecordedImages,
+    give_order,
+    images_directory,
+    order_path,
+)
 from stereoservo.runtime.interprocess import FromServoSteps, RecordedCheckpoint, RecordingStart, RunPlan
 from stereoservo.runtime.recorder import FlightRecorder
+
+LAST_WORD_S = 5.0
+"""How long vision processes have to finish their files before the gateway says that they did not."""
+
+
+class CannotRecordError(Exception):
+    """What was asked for cannot be recorded; the text says why."""
+
+
+class ImageOrders:
+    """Has the vision processes record, and gathers what they say came of it."""
+
+    def __init__(self, plan: RunPlan, log: EventLog) -> None:
+        self._log = log
+        self._path = order_path(plan.directories)
+        self._cameras = tuple(camera.name for camera in plan.cameras if camera.delivers == "frames")
+        self._others = tuple(camera.name for camera in plan.cameras if camera.delivers != "frames")
+        self._directory = ""
+        self._until: float | None = None
+        self._told: dict[str, RecordedImages] = {}
+        self._path.unlink(missing_ok=True)  # of a gateway before this one: its recording has ended
+
+    @property
+    def running(self) -> bool:
+        """Whether images are being recorded."""
+        return bool(self._directory) and self._until is None
+
+    def check(self) -> None:
+        """Raise CannotRecordError where no camera of the cell delivers pictures."""
+        if not self._cameras:
+            names = ", ".join(self._others)
+            raise CannotRecordError(
+                f"cameras {names} deliver observations, no pictures: there are no images to record. Record without "
+                "--images; the observations are in every recording"
+            )
+
+    def begin(self, recording: Path) -> None:
+        """Have all cameras record beside ``recording``."""
+        if self._until is not None:
+            self._until = 0.0  # the recording before has had its time
+            self.follow()
+        directory = images_directory(recording)
+        give_order(self._path, ImageOrder(time.monotonic_ns(), str(directory)))
+        self._directory, self._until, self._told = str(directory), None, {}
+        left = f"; {', '.join(self._others)} deliver observations and are not in it" if self._others else ""
+        self._log.add(
+            "images", message=f"images of {', '.join(self._cameras)} into {directory}{left}", name=str(directory),
+            origin="gateway",
+        )  # fmt: skip
+
+    def end(self) -> None:
+        """Have them end. Idempotent."""
+        if self.running:
+            self._path.unlink(missing_ok=True)
+            self._until = time.monotonic() + LAST_WORD_S
+
+    def told(self, images: RecordedImages) -> None:
+        """Take what a vision process said of its recording."""
+        if self._directory and Path(images.file).parent == Path(self._directory):
+            self._told[images.camera] = images
+
+    def follow(self) -> None:
+        """Sum up once all have told, or have had their time."""
+        if self._until is None:
+            return
+        missing = [name for name in self._cameras if name not in self._told]
+        if missing and time.monotonic() < self._until:
+            return
+        silent = {
+            name: RecordedImages(
+                name, f"{self._directory}/{name}.avi", 0, 0, 0,
+                f"its vision process has not said what it recorded within {LAST_WORD_S:g} s; see the daemon's log",
+            )
+            for name in missing
+        }  # fmt: skip
+        found = tuple((self._told | silent)[name] for name in self._cameras)
+        text = "; ".join(
+            f"{images.camera}: {images.frames} frames"
+            + (f", {images.left_out} left out" if images.left_out else "")
+            + (f", {images.why}" if images.why != "ended" else "")
+            for images in found
+        )
+        self._log.add(
+            "images_recorded", message=f"{self._directory}: {text}", name=self._directory,
+            images=ImagesRecorded(self._directory, found), origin="gateway",
+        )  # fmt: skip
+        self._directory, self._until = "", None
 
 
 class Recordings:
@@ -17,6 +113,8 @@ class Recordings:
         self._plan = plan
         self._log = log
         self._recorder: FlightRecorder | None = None
+        self._with_images = False
+        self.images = ImageOrders(plan, log)
         self.path = ""
         self.steps = 0
 
@@ -25,13 +123,23 @@ class Recordings:
         """Whether a file is being written."""
         return self._recorder is not None
 
+    def want_images(self) -> None:
+        """Record images, too: now, or with the recording that is about to begin. Raises CannotRecordError."""
+        self.images.check()
+        self._with_images = True
+        if self._recorder is not None and not self.images.running:
+            self.images.begin(self._recorder.path)
+
     def take(self, item: FromServoSteps) -> None:
         """Take what the servo process sent; its first message begins a file."""
         if isinstance(item, RecordingStart):
+            again = self._with_images
             self.stop()
             self._recorder = FlightRecorder(self._new_path(), item.settings, item.fingerprint)
             self.path = str(self._recorder.path)
             self._log.add("recording", message=self.path, origin="gateway")
+            if again:
+                self.want_images()
         elif self._recorder is None:
             return
         elif isinstance(item, RecordedCheckpoint):
@@ -50,7 +158,9 @@ class Recordings:
         return self._plan.directories.recordings / f"{self._plan.cell.cell.name}-{stamp}.mcap"
 
     def stop(self) -> int:
-        """Finish the file; gives the number of its steps. Idempotent."""
+        """Finish the file, and have the images finished; gives the number of its steps. Idempotent."""
+        self._with_images = False
+        self.images.end()
         if self._recorder is None:
             return 0
         recorder, self._recorder = self._recorder, None

@@ -99,6 +99,7 @@ class ImageLimits:
     keep_free_bytes: int = GIB
 
 
+DEFAULT_LIMITS = ImageLimits()
 _encode = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder(ImageHeader | ImageLine | ImageEnd).decode
 
@@ -136,7 +137,7 @@ class ImageWriter:
         rate_hz: float,
         *,
         driver: str = "",
-        limits: ImageLimits = ImageLimits(),
+        limits: ImageLimits = DEFAULT_LIMITS,
     ) -> None:
         """``size``: width, height [px]. Raises ImageFileError (``exists``, ``disk``, ``codec``), makes no directory."""
         self.path = video

@@ -14,6 +14,7 @@ from stereoservo.runtime.cellfile import CellFile
 from stereoservo.runtime.commands import Request
 from stereoservo.runtime.cycle import Event, Status, decode_array, encode_array
 from stereoservo.runtime.directories import CellDirectories
+from stereoservo.runtime.image_order import RecordedImages
 from stereoservo.runtime.loop import LoopStatistics
 from stereoservo.runtime.ports import CameraDescription, CameraObservation, JointDriverDescription, Prior
 from stereoservo.runtime.record import Fingerprint
@@ -133,6 +134,8 @@ class Report(msgspec.Struct, frozen=True):
     kind: str
     message: str
     t_ns: int
+    images: RecordedImages | None = None
+    """Of a recording of images that has ended."""
 
 
 class PlanError(Exception):

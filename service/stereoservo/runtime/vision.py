@@ -11,12 +11,14 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stereoservo.runtime import plugins
 from stereoservo.runtime.cameras import make_camera
 from stereoservo.runtime.channel import Channel, ChannelError
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.handover import SlotError, SlotReader, SlotWriter
+from stereoservo.runtime.image_order import RecordedImages, order_path
 from stereoservo.runtime.interprocess import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -41,6 +43,9 @@ from stereoservo.runtime.ports import (
     Prior,
 )
 
+if TYPE_CHECKING:
+    from stereoservo.runtime.image_recording import ImageRecorder
+
 FIRST_PAUSE_S = 0.2
 LONGEST_PAUSE_S = 5.0
 SILENT_CAMERA_S = 2.0
@@ -59,10 +64,10 @@ class Reporter:
         self._waiting: list[bytes] = []
         self._channel: Channel | None = None
 
-    def report(self, kind: str, message: str) -> None:
+    def report(self, kind: str, message: str, images: RecordedImages | None = None) -> None:
         """Queue a report, and log it."""
         say(self._origin, message)
-        self._waiting.append(encode(Report(self._origin, kind, message, self._clock.now_ns())))
+        self._waiting.append(encode(Report(self._origin, kind, message, self._clock.now_ns(), images)))
         del self._waiting[:-64]
         self.flush()
 
@@ -80,7 +85,7 @@ class Reporter:
 
 
 class CameraPipeline:
-    """Poll the driver, detect in the newest frame, hand the observation over."""
+    """Poll the driver, detect in the newest frame, hand the observation over; then let ``images`` record all frames."""
 
     def __init__(
         self,
@@ -89,8 +94,10 @@ class CameraPipeline:
         observations: SlotWriter,
         priors: SlotReader,
         clock: Clock,
+        images: ImageRecorder | None = None,
     ) -> None:
         self._driver = driver
+        self._images = images
         self._detector = detector
         self._observations = observations
         self._priors = priors
@@ -131,6 +138,8 @@ class CameraPipeline:
         assert isinstance(observation, CameraObservation)
         self._observations.write(encode(observation))
         self.written += 1
+        if self._images is not None:
+            self._images.take(arrived)
         return True
 
     def _fresh_prior(self) -> Prior | None:
@@ -209,6 +218,20 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     )
     driver, detector = make_camera(section, context)
     reporter = Reporter(directories.reports_socket, f"vision-{camera}", clock)
+    images: ImageRecorder | None = None
+    if description.delivers == "frames":
+        from stereoservo.runtime.image_recording import (
+            ImageRecorder,
+        )  # OpenCV: not for cameras without pictures
+
+        order = order_path(directories)
+        images = ImageRecorder(order, camera, section.driver, description.rate_hz, reporter.report)
+
+    def keep() -> None:
+        if images is not None:
+            images.look(clock.now_ns())
+        reporter.flush()
+
     try:
         with (
             SlotWriter(
@@ -217,16 +240,18 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
             SlotReader(directories.prior_slot(camera), PRIOR_LAYOUT) as priors,
         ):
             run_pipeline(
-                CameraPipeline(driver, detector, observations, priors, clock),
+                CameraPipeline(driver, detector, observations, priors, clock, images),
                 reporter.report,
                 lambda: termination.asked,
                 camera=camera,
                 poll_s=min(0.002, 0.1 / description.rate_hz),
                 now=clock.now_ns,
                 sleep=time.sleep,
-                flush=reporter.flush,
+                flush=keep,
             )
     finally:
+        if images is not None:
+            images.close()
         if lock is not None:
             lock.release()
 
