@@ -343,7 +343,7 @@ def _facing(matrices: FloatArray, views: Views) -> FloatArray:
 
 
 def _scaled_like(one: _Group, old: FloatArray, facing: FloatArray) -> _Group:
-    """The group with the scales, and the signs, of the matrices ``old`` (c, 3, 4), of which ``facing`` have points ahead.
+    """The group with the scales and signs of the matrices ``old`` (c, 3, 4); those ``facing`` have points ahead.
 
     They mean nothing in the images, but what is compared with a matrix of before need not know that.
     """
