@@ -5,9 +5,9 @@ from __future__ import annotations
 from importlib.resources import as_file, files
 from pathlib import Path
 
-CELLS = ("demo", "wide", "eye_in_hand", "workpiece", "hil-can")
+CELLS = ("demo", "wide", "eye_in_hand", "workpiece", "hil-can", "hil-video")
 """By name: the embedded cell; with lenses that bend; with the cameras on the arm; with a workpiece beside the body;
-the embedded cell on a CAN bus."""
+the embedded cell on a CAN bus; the same with cameras that are streams over HTTP."""
 
 
 def shipped_cell_path(name: str) -> Path:

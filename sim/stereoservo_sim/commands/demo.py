@@ -23,7 +23,7 @@ from stereoservo_sim.demonstration.conduct import (
     conduct_live,
     conduct_lockstep,
 )
-from stereoservo_sim.demonstration.emulated import has_emulated_drives
+from stereoservo_sim.demonstration.emulated import has_emulated_cameras, has_emulated_drives
 from stereoservo_sim.demonstration.results import summary
 from stereoservo_sim.demonstration.truth import true_cell
 
@@ -73,6 +73,17 @@ def _check(cell: CellFile, lockstep: bool) -> None:
     """Raises ValueError where a cell cannot be demonstrated: nothing is simulated that could be judged."""
     true_cell(cell)
     emulated = has_emulated_drives(cell)
+    streams = [camera.name for camera in cell.camera if camera.driver == "video"]
+    if streams and not has_emulated_cameras(cell):
+        raise ValueError(
+            f"cell {cell.cell.name!r} has real cameras ({', '.join(streams)}); the demonstration needs emulated ones: "
+            "[emulate.cameras]"
+        )
+    if streams and lockstep:
+        raise ValueError(
+            f"cell {cell.cell.name!r} has cameras that are streams in real time; lockstep has a virtual clock: leave "
+            f"--lockstep out, or take a cell with simulated cameras, e.g. {CELLS[0]}"
+        )
     if emulated and lockstep:
         raise ValueError(
             f"cell {cell.cell.name!r} drives a CAN bus, which runs in real time; lockstep has a virtual clock: leave "

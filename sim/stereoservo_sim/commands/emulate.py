@@ -24,7 +24,7 @@ GRACE_S = 5.0
 
 
 def emulate(
-    what: Annotated[str, typer.Argument(help="What to stand in for: drives.")],
+    what: Annotated[str, typer.Argument(help="What to stand in for: drives, cameras.")],
     cell: Annotated[
         str, typer.Argument(metavar="CELL", help="A cell file (*.toml), or the name of a shipped cell.")
     ],
@@ -32,25 +32,28 @@ def emulate(
         str | None,
         typer.Option(
             "--channel",
-            help="socket://127.0.0.1:PORT (0: free), pty, or INTERFACE:CHANNEL of python-can. Default: the cell's.",
+            help="drives: socket://127.0.0.1:PORT (0: free), pty, or INTERFACE:CHANNEL of python-can; cameras: "
+            "http://127.0.0.1:PORT. Default: the cell's.",
         ),
     ] = None,
     bit_time: Annotated[
         bool | None,
         typer.Option(
-            "--bit-time/--no-bit-time", help="Frames take their time on the wire. Default: the cell's."
+            "--bit-time/--no-bit-time",
+            help="drives: frames take their time on the wire. Default: the cell's.",
         ),
     ] = None,
     order: Annotated[
         list[str] | None,
         typer.Option(
-            "--order", help='An order, e.g. "fault node 3 0x3210 @ 2.0s"; may be repeated. `help` lists them.'
+            "--order",
+            help='An order, e.g. "fault 3 0x3210 @ 2.0s", "freeze left for 2s"; may be repeated. `help` lists them.',
         ),
     ] = None,
     parent: Annotated[int, typer.Option("--parent", help="End when the process of this number ends.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
 ) -> None:
-    """Put emulated drives, moved by the simulated arm, in the place of a cell's real ones. Orders come from stdin."""
+    """Put emulated drives or cameras, those of the simulated arm, in the place of real ones. Orders come from stdin."""
     if what not in KINDS:
         raise typer.BadParameter(
             f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT"
@@ -61,7 +64,7 @@ def emulate(
     if parent:
         die_with_parent(parent, signal.SIGTERM)
     termination = Termination(grace_s=GRACE_S)
-    _drives(_Settings(cell, channel, bit_time, tuple(order or ()), json), termination)
+    KINDS[what](_Settings(cell, channel, bit_time, tuple(order or ()), json), termination)
 
 
 @dataclass(frozen=True)
@@ -100,8 +103,8 @@ def _drives(settings: _Settings, termination: Termination) -> None:
 
 
 @contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """What is wrong with a cell's options, with the file that they stand in."""
+def _named(path: Path, key: str) -> Iterator[None]:
+    """What is wrong with a cell's options, with the file and the section that they stand in."""
     from stereoservo.runtime.ports import DriverError
     from stereoservo_sim.emulation.errors import EmulationError
 
@@ -110,7 +113,7 @@ def _named(path: Path) -> Iterator[None]:
     except EmulationError as error:
         raise EmulationError(f"{path}: {error}") from error
     except DriverError as error:
-        raise DriverError(error.code, f"{path}: joints.options: {error}", **error.data) from error
+        raise DriverError(error.code, f"{path}: {key}: {error}", **error.data) from error
 
 
 def _serve(
@@ -121,13 +124,13 @@ def _serve(
     from stereoservo_sim.emulation.console import Console, Printer
     from stereoservo_sim.emulation.errors import OrderError
 
-    with _named(path):
+    with _named(path, "joints.options"):
         options, drives = drives_of_cell(cell)
     if settings.bit_time is not None:
         drives = msgspec.structs.replace(drives, bit_time=settings.bit_time)
     endpoint = open_endpoint(settings.channel or served_channel(options), options.bitrate)
     try:
-        with _named(path):
+        with _named(path, "joints.options"):
             rack = make_rack(
                 options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent
             )
@@ -158,4 +161,21 @@ def _serve(
         printer.end()
 
 
-KINDS = {"drives": _drives}
+def _cameras(settings: _Settings, termination: Termination) -> None:
+    from stereoservo_sim.cameras.serving import serve_cameras
+    from stereoservo_sim.emulation.errors import OrderError
+
+    if settings.bit_time is not None:
+        raise typer.BadParameter("cameras have no bus; it is for drives", param_hint="--bit-time")
+    path = _cell_path(settings.cell)
+    with _named(path, "emulate.cameras"):
+        try:
+            serve_cameras(
+                load_cell_file(path), channel=settings.channel, orders=settings.orders, as_json=settings.as_json,
+                ended=lambda: termination.asked,
+            )  # fmt: skip
+        except OrderError as error:
+            raise typer.BadParameter(str(error), param_hint="--order") from error
+
+
+KINDS = {"drives": _drives, "cameras": _cameras}

@@ -19,7 +19,14 @@ from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo.runtime.daemon import DaemonProcess
 from stereoservo.runtime.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.runtime.lockstep import LockstepCell
-from stereoservo_sim.demonstration.emulated import ANY_PORT, has_emulated_drives, move_to_channel
+from stereoservo_sim.demonstration.emulated import (
+    ANY_PORT,
+    ANY_SERVER,
+    has_emulated_cameras,
+    has_emulated_drives,
+    move_to_channel,
+    move_to_server,
+)
 from stereoservo_sim.demonstration.live import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import Calibrated, perform
@@ -112,6 +119,8 @@ def conduct_live(cell_path: Path, out: Path, seed: int, stage: Stage) -> Demonst
         os.environ[STATE_VARIABLE] = str(scratch / "state")
         if has_emulated_drives(cell):
             cell_path = _emulate_drives(ends, cell_path, scratch, out, stage)
+        if has_emulated_cameras(cell):
+            cell_path = _emulate_cameras(ends, cell_path, scratch, out, stage)
         stage.tell("starting the daemon (the first start compiles the kernels)")
         options = ("--seed", str(seed), "--record", str(recording))
         with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
@@ -140,3 +149,15 @@ def _emulate_drives(ends: ExitStack, cell_path: Path, scratch: Path, out: Path, 
     channel = ends.enter_context(drives).wait_ready()
     stage.tell(f"emulated drives on {channel}")
     return move_to_channel(cell_path, scratch, channel)
+
+
+def _emulate_cameras(ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: Stage) -> Path:
+    """The same with the cell's cameras: they look at the arm through its history in the runtime directory."""
+    cameras = EmulatorProcess(
+        cell_path, what="cameras", options=("--channel", ANY_SERVER), log=out / "cameras.log"
+    )
+    channel = ends.enter_context(cameras).wait_ready()
+    stage.tell(f"emulated cameras at {channel}")
+    folder = scratch / "streams"
+    folder.mkdir()
+    return move_to_server(cell_path, folder, channel)

@@ -1,4 +1,4 @@
-"""A cell whose drives are emulated by a process of its own, on a channel of its own."""
+"""A cell whose drives or cameras are emulated by processes of their own, on channels of their own."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from stereoservo.runtime.cellfile import CellFile
 
 SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)
+SOURCE = re.compile(r"^(\s*source\s*=\s*)\"http://127\.0\.0\.1:\d+/", re.MULTILINE)
+ANY_SERVER = "http://127.0.0.1:0"
+"""For emulated cameras: any free port of this host; the emulator tells which."""
 ANY_PORT = "socket://127.0.0.1:0"
 """For an emulator: any free port of this host; it tells which."""
 
@@ -17,6 +20,25 @@ ANY_PORT = "socket://127.0.0.1:0"
 def has_emulated_drives(cell: CellFile) -> bool:
     """Whether the cell file says what to put in the place of its drives."""
     return "drives" in cell.emulate
+
+
+def has_emulated_cameras(cell: CellFile) -> bool:
+    """Whether the cell file says what to put in the place of its cameras."""
+    return "cameras" in cell.emulate
+
+
+def move_to_server(cell_path: Path, folder: Path, channel: str) -> Path:
+    """A copy of the cell file in ``folder`` whose cameras of driver ``video`` look at the server ``channel``.
+
+    ``channel``: ``http://127.0.0.1:PORT``. Raises ValueError where no camera's ``source`` is an address of this host.
+    """
+    text = cell_path.read_text(encoding="utf-8")
+    changed, count = SOURCE.subn(lambda found: f'{found[1]}"{channel}/', text)
+    if count == 0:
+        raise ValueError(
+            f'{cell_path}: needs cameras with source = "http://127.0.0.1:PORT/…", to be run with emulated cameras'
+        )
+    return _written(changed, cell_path, folder)
 
 
 def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
@@ -30,6 +52,10 @@ def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
     eds = options.get("eds", "")
     if eds:
         text = _replaced(text, "eds", str(cell_path.parent.absolute() / eds), cell_path)
+    return _written(text, cell_path, folder)
+
+
+def _written(text: str, cell_path: Path, folder: Path) -> Path:
     copy = folder / cell_path.name
     if copy.absolute() == cell_path.absolute():
         raise ValueError(f"{folder} is the cell file's own directory; another is needed for its copy")

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.runtime.cellfile import CellFile
+from stereoservo.runtime.cellfile import CameraSection, CellFile
+from stereoservo_sim.cameras.settings import cameras_of_cell
+from stereoservo_sim.emulation.errors import EmulationError
 from stereoservo_sim.history import FILE_NAME, JointHistory
 from stereoservo_sim.workpiece import Moved
 from stereoservo_sim.world import SimulatedCell, simulated_cell, workpiece_cell
@@ -23,20 +28,40 @@ POLL_S = 1.0
 def true_cell(cell: CellFile) -> SimulatedCell:
     """The simulated cell that a cell file's cameras show: their mount, lenses, workpiece, under its own names.
 
-    Raises ValueError where a camera is none of the simulated rig.
+    Cameras of driver ``video`` show what ``[emulate.cameras]`` puts at their address. Raises ValueError where a camera
+    is none of the simulated rig.
     """
-    shown = any(section.options.get("workpiece", False) for section in cell.camera)
+    options = [_simulated_options(section, cell) for section in cell.camera]
+    shown = any(option.get("workpiece", False) for option in options)
     simulated = workpiece_cell() if shown else simulated_cell(cell.camera[0].mount)
     cameras = []
-    for section in cell.camera:
-        view = section.options.get("view") or section.name
+    for section, option in zip(cell.camera, options, strict=True):
+        view = option.get("view") or section.name
         try:
-            moved = msgspec.convert(section.options.get("moved", {}), Moved)
-            camera = simulated.camera(view, float(section.options.get("k1", 0.0)), moved)
+            moved = msgspec.convert(option.get("moved", {}), Moved)
+            camera = simulated.camera(view, float(option.get("k1", 0.0)), moved)
         except KeyError as error:
             raise ValueError(f"camera {section.name!r} is not simulated: {error.args[0]}") from error
         cameras.append(replace(camera, name=section.name))
     return replace(simulated, rig=replace(simulated.rig, cameras=tuple(cameras)))
+
+
+def _simulated_options(section: CameraSection, cell: CellFile) -> Mapping[str, Any]:
+    """Options of the simulated camera behind a camera of the cell."""
+    if section.driver != "video" or "cameras" not in cell.emulate:
+        return section.options
+    try:
+        settings = cameras_of_cell(cell)
+    except EmulationError as error:
+        raise ValueError(str(error)) from error
+    path = urlsplit(str(section.options.get("source", ""))).path
+    stream = next((stream for stream in settings.camera if stream.stream == path), None)
+    if stream is None:
+        streams = ", ".join(stream.stream for stream in settings.camera)
+        raise ValueError(f"camera {section.name!r} shows {path!r}, which is not emulated; streams: {streams}")
+    return {
+        "view": stream.view or stream.name, "k1": stream.k1, "moved": stream.moved, "workpiece": settings.workpiece,
+    }  # fmt: skip
 
 
 class TruthLog:

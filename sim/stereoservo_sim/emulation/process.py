@@ -30,8 +30,8 @@ class EmulatorProcess:
     """Emulated drives or cameras of a cell in a process of their own; a context manager that ends them.
 
     ``cell``: a cell file, or the name of a shipped cell. ``what``: ``drives`` or ``cameras``. ``options``: further ones
-    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it told so far, oldest first,
-    times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
+    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it told so far, oldest
+    first, times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
     """
 
     def __init__(

@@ -135,7 +135,7 @@ def kept_signals():
 
 
 def test_command_lines_that_cannot_be(capsys, cell_file, kept_signals):
-    assert "there is: drives" in refused(capsys, "cameras", str(cell_file))
+    assert "there is: drives, cameras" in refused(capsys, "robots", str(cell_file))
     assert "hil-can" in refused(capsys, "drives", "nowhere")
     assert "drives are emulated for 'canopen'" in refused(capsys, "drives", "demo")
     assert "nodes: 1, 2, 3" in refused(capsys, "drives", str(cell_file), *FREE, "--order", "silence 9")

@@ -1,0 +1,63 @@
+"""Emulated cameras of a cell from start to end, as ``stereoservo emulate cameras`` runs them."""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+
+from stereoservo.runtime.cellfile import CellFile
+from stereoservo.runtime.clock import MonotonicClock
+from stereoservo.runtime.directories import cell_directories
+from stereoservo_sim.cameras.camera import EmulatedCamera
+from stereoservo_sim.cameras.server import CameraServer
+from stereoservo_sim.cameras.settings import CamerasSettings, cameras_of_cell, port_of
+from stereoservo_sim.cameras.studio import Studio
+from stereoservo_sim.emulation.console import Console, Printer
+
+
+def make_studio(cell: CellFile, settings: CamerasSettings, runtime_dir: Path) -> Studio:
+    """The cameras of ``settings``, mounted as those of the cell are. Raises DriverError."""
+    clock = MonotonicClock()
+    cameras = [
+        EmulatedCamera(stream, settings, clock=clock, mount=cell.camera[0].mount, runtime_dir=runtime_dir)
+        for stream in settings.camera
+    ]
+    return Studio(cameras, time.monotonic_ns())
+
+
+def serve_cameras(
+    cell: CellFile,
+    *,
+    channel: str | None,
+    orders: Sequence[str],
+    as_json: bool,
+    ended: Callable[[], bool],
+) -> None:
+    """Serve until ``ended``. Raises EmulationError, DriverError, OrderError."""
+    settings = cameras_of_cell(cell)
+    port = settings.port if channel is None else port_of(channel)
+    cv2.setNumThreads(1)  # on small images they only wait for each other
+    studio = make_studio(cell, settings, cell_directories(cell.cell.name).runtime)
+    for text in orders:
+        studio.order(text, studio.start_ns)
+    server = CameraServer(studio, cell=cell.cell.name, port=port, connections=settings.connections)
+    studio.open()
+    printer = Printer(as_json)
+    console = Console(server, printer)
+    console.attach()
+    gc.freeze()  # what was imported is not looked through again
+    printer.say(
+        "ready", f"listening on {server.url}: {', '.join(server.streams.values())}", channel=server.url,
+        streams={name: server.url + path for name, path in server.streams.items()}, t_ns=studio.start_ns,
+        pid=os.getpid(),
+    )  # fmt: skip
+    try:
+        server.run(ended)
+    finally:
+        printer.say("end", server.words(), pictures=server.pictures, late_ns=server.late_ns)
+        printer.end()
