@@ -1,0 +1,325 @@
+"""The tag detector: corners of ArUco tags and of AprilTags, identified by their code.
+
+The marker of corner ``c`` (0 top left as drawn, clockwise) of tag ``t`` has the id ``first_marker + 4 t + c``, unless
+``markers`` names others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from stereoservo.runtime.ports import (
+    CameraObservation,
+    DetectorDescription,
+    DriverContext,
+    DriverError,
+    FloatArray,
+    Frame,
+    ImageArray,
+    Prior,
+)
+from stereoservo_drivers.detectors import tag_registration
+from stereoservo_drivers.detectors.blobs import noise_level
+from stereoservo_drivers.detectors.tag_registration import register_tag
+from stereoservo_drivers.detectors.tags import DictionaryName, dictionary, size_of, tag_cells
+from stereoservo_drivers.options import invalid
+
+SMALLEST_IMAGE = 32
+NOISY = 3.0
+"""Noise [grey levels] from which the image that is searched, not the one that is measured, is smoothed."""
+SAME_TAG = 0.25
+"""Two finds of a tag nearer than this part of its side are one."""
+ROOM_PX = 12.0
+ROOM = 0.35
+"""Room about a prior's tag in the window that is searched: pixels, and parts of the tag's size."""
+GATE_SIGMA, GATE_PX = 5.0, 3.0
+"""How far from its prior a corner may be for the prior to decide between two tags of one id."""
+Refinement = Literal["pattern", "subpixel", "apriltag", "none"]
+_METHODS = {
+    "pattern": cv2.aruco.CORNER_REFINE_NONE,
+    "subpixel": cv2.aruco.CORNER_REFINE_SUBPIX,
+    "apriltag": cv2.aruco.CORNER_REFINE_APRILTAG,
+    "none": cv2.aruco.CORNER_REFINE_NONE,
+}
+STATED_PX: dict[str, float] = {"pattern": 0.003, "subpixel": 0.25, "apriltag": 0.15, "none": 0.9}
+"""Standard deviation [px] that each refinement states, beside the noise's where that is known."""
+APRILTAG_OFFSET = 0.5
+"""What CORNER_REFINE_APRILTAG adds to each coordinate: its pixels' centres lie at halves."""
+Id = Annotated[int, Meta(ge=0)]
+
+
+class TagMarkers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Marker ids of one's own for the four corners of a tag."""
+
+    tag: Id
+    ids: tuple[Id, Id, Id, Id]
+
+
+class TagOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[camera.detector_options]`` of the detector ``aruco``."""
+
+    tags: tuple[Id, ...]
+    """Tags of the cell; no others are reported."""
+    dictionary: DictionaryName = "36h11"
+    first_marker: Id = 0
+    """Corner c of tag t is marker ``first_marker + 4 t + c``."""
+    markers: tuple[TagMarkers, ...] = ()
+    """Other ids for the corners of some of ``tags``."""
+    refinement: Refinement = "pattern"
+    """How corners are made exact: ``pattern`` fits the whole printed tag; the others are OpenCV's."""
+    floor_px: Annotated[float, Meta(ge=0)] | None = None
+    """Systematic standard deviation [px], part of every covariance. Default: that of the refinement."""
+    image_size: tuple[int, int] | None = None
+    """(width, height) [px] that frames must have; default: that of the first frame."""
+    max_prior_age_s: Annotated[float, Meta(gt=0)] = 0.25
+    min_contrast: Annotated[int, Meta(ge=5, le=250)] = 30
+    """Least difference of white and black [grey levels]."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Corners (4, 2) [px] of a tag and their covariances (4, 2, 2) [px²]."""
+
+    corners: FloatArray
+    covariances: FloatArray
+
+
+class TagDetector:
+    """Corners of square tags with ids and covariances. One thread at a time.
+
+    A tag's identity is read from its cells in every image. With a fresh prior a tag is looked for in a window about
+    it; tags without one, and all when none is found, in the whole image. Of a tag that is seen twice nothing is
+    reported, unless a prior is near one of the two and not the other. A tag that is not whole in the image, or of
+    which a cell does not show what the code says (refinement ``pattern``), is not reported. Ids are reported in
+    ascending order. The same frame and prior give the same observation.
+
+    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for
+    frames that are not what was announced. Content never raises.
+    """
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self.camera = context.camera
+        self.options = _decoded(options, context.camera)
+        self._ids = _marker_ids(self.options, context.camera)
+        self._tag_of = {marker: (tag, c) for tag, ids in self._ids.items() for c, marker in enumerate(ids)}
+        name = self.options.dictionary
+        self._cells = {tag: tag_cells(name, tag) for tag in self._ids}
+        stated = STATED_PX[self.options.refinement]
+        self._floor_px = stated if self.options.floor_px is None else self.options.floor_px
+        self._detector = _opencv_detector(self.options)
+        self._size = self.options.image_size
+        tag_registration.compile_kernels()
+
+    def describe(self) -> DetectorDescription:
+        """The marker ids of all tags."""
+        return DetectorDescription("aruco", tuple(sorted(self._tag_of)), self._floor_px)
+
+    def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+        """Tags of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
+        image = self._checked(frame)
+        expected = self._expected(frame, prior)
+        found: dict[int, _Found] = {}
+        for tag, places in expected.items():
+            one = self._search_window(image, tag, places)
+            if one is not None:
+                found[tag] = one
+        missing = [tag for tag in self._ids if tag not in expected or not found]
+        if missing:
+            found |= self._search(image, missing, expected)
+        return self._observation(frame, found)
+
+    def _checked(self, frame: Frame) -> ImageArray:
+        image = frame.image
+        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
+            shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
+            raise DriverError(
+                "image_format",
+                f"camera {self.camera!r}: image of shape {shape}, {kind}; expected (height, width) of uint8",
+                shape=shape,
+                dtype=str(kind),
+            )
+        height, width = image.shape
+        if self._size is None and min(width, height) >= SMALLEST_IMAGE:
+            self._size = (width, height)
+        if (width, height) != self._size:
+            expected = (
+                f"{self._size[0]}x{self._size[1]}" if self._size else f"at least {SMALLEST_IMAGE} a side"
+            )
+            raise DriverError(
+                "image_size",
+                f"camera {self.camera!r}: image of {width}x{height} px; expected {expected}",
+                size=(width, height),
+                expected=self._size,
+            )
+        return np.ascontiguousarray(image)
+
+    def _expected(self, frame: Frame, prior: Prior | None) -> dict[int, tuple[FloatArray, FloatArray]]:
+        """Where a fresh prior puts all four corners of a tag: places (4, 2) and standard deviations (4,) [px]."""
+        if prior is None or abs(frame.t_shutter_ns - prior.t_ns) * 1e-9 > self.options.max_prior_age_s:
+            return {}
+        dt_s = (frame.t_shutter_ns - prior.t_ns) * 1e-9
+        corners: dict[int, dict[int, tuple[FloatArray, float]]] = {}
+        for k, marker in enumerate(prior.ids.tolist()):
+            place = prior.pixels[k] + dt_s * prior.velocities[k]
+            variance = float(np.trace(prior.covariances[k]))
+            if marker in self._tag_of and np.isfinite(place).all() and 0.0 <= variance < np.inf:
+                tag, corner = self._tag_of[marker]
+                corners.setdefault(tag, {})[corner] = (place, float(np.sqrt(variance)))
+        height, width = frame.image.shape
+        expected = {}
+        for tag, four in corners.items():
+            places = np.array([four[c][0] for c in range(4) if c in four])
+            inside = ((places > -0.5) & (places < np.array([width, height]) - 0.5)).all()
+            if len(four) == 4 and inside:
+                expected[tag] = (places, np.array([four[c][1] for c in range(4)]))
+        return expected
+
+    def _search_window(
+        self, image: ImageArray, tag: int, places: tuple[FloatArray, FloatArray]
+    ) -> _Found | None:
+        corners, sigmas = places
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        room = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
+        height, width = image.shape
+        left, top = np.maximum(np.floor(low - room), 0).astype(int).tolist()
+        right = int(min(high[0] + room + 1, width))
+        bottom = int(min(high[1] + room + 1, height))
+        if right - left < SMALLEST_IMAGE or bottom - top < SMALLEST_IMAGE:
+            return None
+        quads = self._quads(image[top:bottom, left:right], {tag}).get(tag, [])
+        origin = np.array([left, top], dtype=np.float64)
+        return self._chosen(image, tag, [quad + origin for quad in quads], places)
+
+    def _search(
+        self,
+        image: ImageArray,
+        tags: Iterable[int],
+        expected: Mapping[int, tuple[FloatArray, FloatArray]],
+    ) -> dict[int, _Found]:
+        """The ``tags`` in the whole image."""
+        chosen = {
+            tag: self._chosen(image, tag, quads, expected.get(tag))
+            for tag, quads in self._quads(image, set(tags)).items()
+        }
+        return {tag: found for tag, found in chosen.items() if found is not None}
+
+    def _quads(self, image: ImageArray, tags: set[int]) -> dict[int, list[FloatArray]]:
+        """Corners (4, 2) [px] that OpenCV reads as one of ``tags``."""
+        level = noise_level(image)
+        searched = cv2.GaussianBlur(image, (5, 5), 1.0) if level > NOISY else np.ascontiguousarray(image)
+        corners, ids, _ = self._detector.detectMarkers(searched)
+        quads: dict[int, list[FloatArray]] = {}
+        for quad, tag in zip(corners, [] if ids is None else np.ravel(ids).tolist(), strict=True):
+            if tag in tags:
+                quads.setdefault(tag, []).append(np.asarray(quad, dtype=np.float64).reshape(4, 2))
+        return quads
+
+    def _chosen(
+        self,
+        image: ImageArray,
+        tag: int,
+        quads: Iterable[FloatArray],
+        places: tuple[FloatArray, FloatArray] | None,
+    ) -> _Found | None:
+        """The one tag that ``quads`` show, or of several the one that the prior's ``places`` tell of; else None."""
+        finds: list[_Found] = []
+        for quad in quads:
+            one = self._measured(image, tag, quad)
+            if one is not None and not any(_same(one.corners, other.corners) for other in finds):
+                finds.append(one)
+        if len(finds) > 1 and places is not None:
+            corners, sigmas = places
+            gates = GATE_SIGMA * sigmas + GATE_PX
+            finds = [f for f in finds if (np.linalg.norm(f.corners - corners, axis=1) <= gates).all()]
+        return finds[0] if len(finds) == 1 else None
+
+    def _measured(self, image: ImageArray, tag: int, quad: FloatArray) -> _Found | None:
+        floor = self._floor_px**2 * np.eye(2)
+        if self.options.refinement == "pattern":
+            fit = register_tag(image, quad, self._cells[tag])
+            if fit is None or fit.contrast < self.options.min_contrast:
+                return None
+            return _Found(fit.corners, fit.covariances + floor)
+        if self.options.refinement == "apriltag":
+            quad = quad - APRILTAG_OFFSET
+        return _Found(quad, np.tile(floor, (4, 1, 1)))
+
+    def _observation(self, frame: Frame, found: Mapping[int, _Found]) -> CameraObservation:
+        ids = np.array([marker for tag in found for marker in self._ids[tag]], dtype=np.int64)
+        pixels = np.array([one.corners for one in found.values()], dtype=np.float64).reshape(-1, 2)
+        covariances = np.array([one.covariances for one in found.values()], dtype=np.float64)
+        height, width = frame.image.shape
+        inside = np.all((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5), axis=1)
+        order = np.argsort(np.where(inside, ids, np.iinfo(np.int64).max))[: int(inside.sum())]
+        return CameraObservation(
+            camera=frame.camera,
+            seq=frame.seq,
+            t_shutter_ns=frame.t_shutter_ns,
+            t_received_ns=frame.t_received_ns,
+            ids=ids[order],
+            pixels=np.ascontiguousarray(pixels[order]),
+            covariances=np.ascontiguousarray(covariances.reshape(-1, 2, 2)[order]),
+        )
+
+
+def _same(one: FloatArray, other: FloatArray) -> bool:
+    side = float(np.linalg.norm(one - np.roll(one, 1, axis=0), axis=1).max())
+    return float(np.linalg.norm(one.mean(axis=0) - other.mean(axis=0))) < SAME_TAG * side
+
+
+def _opencv_detector(options: TagOptions) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = _METHODS[options.refinement]
+    # a tag that only almost reads as another is none: what noise flips, the registration's own reading forgives
+    parameters.errorCorrectionRate = 0.6 if options.refinement == "pattern" else 0.0
+    return cv2.aruco.ArucoDetector(dictionary(options.dictionary), parameters)
+
+
+def _decoded(options: Mapping[str, Any], camera: str) -> TagOptions:
+    try:
+        return msgspec.convert(dict(options), TagOptions, strict=True)
+    except msgspec.ValidationError as error:
+        raise DriverError(
+            "option",
+            f"detector options of camera {camera!r}: {invalid(TagOptions, options, error)}",
+            options=dict(options),
+        ) from error
+
+
+def _marker_ids(options: TagOptions, camera: str) -> dict[int, tuple[int, int, int, int]]:
+    """Marker ids of the corners of each tag. Raises DriverError ``option``."""
+    where, count = f"detector options of camera {camera!r}", size_of(options.dictionary)
+    beyond = sorted({tag for tag in options.tags if tag >= count})
+    if not options.tags or beyond or len(set(options.tags)) < len(options.tags):
+        raise DriverError(
+            "option",
+            f"{where}: tags = {list(options.tags)}; valid: one or more different ids of {options.dictionary}, "
+            f"0 to {count - 1}",
+            tags=list(options.tags),
+        )
+    others = {own.tag: own.ids for own in options.markers}
+    unknown = sorted(set(others) - set(options.tags))
+    if unknown or len(others) < len(options.markers):
+        raise DriverError(
+            "option",
+            f"{where}: markers for tags {[own.tag for own in options.markers]}; valid: each of tags = "
+            f"{list(options.tags)} at most once",
+            tags=unknown,
+        )
+    first = options.first_marker
+    ids = {}
+    for tag in sorted(options.tags):
+        k = first + 4 * tag
+        ids[tag] = others.get(tag, (k, k + 1, k + 2, k + 3))
+    every = [marker for four in ids.values() for marker in four]
+    twice = sorted({marker for marker in every if every.count(marker) > 1})
+    if twice:
+        raise DriverError("option", f"{where}: marker ids {twice} are used twice; ids must differ", ids=twice)
+    return ids
