@@ -8,7 +8,7 @@ from stereoservo.runtime.ports import DriverError
 
 
 class State(StrEnum):
-    """Where a driver stands. CLOSED is final."""
+    """Where a driver stands. From CLOSED a camera driver can be configured again, a joint driver cannot."""
 
     CREATED = "created"
     CONFIGURED = "configured"

@@ -150,8 +150,8 @@ class SimulatedCamera:
         )
 
     def configure(self) -> None:
-        """Nothing to connect to: the arm may start later. Raises DriverError."""
-        self._life.require("configure()", State.CREATED, State.CONFIGURED)
+        """Nothing to connect to: the arm may start later; also after :meth:`close`. Raises DriverError."""
+        self._life.require("configure()", State.CREATED, State.CONFIGURED, State.CLOSED)
         self._life.state = State.CONFIGURED
 
     def activate(self) -> None:

@@ -145,6 +145,16 @@ class CameraDriverContract(PacedSuite):
         active.close()
         active.close()
 
+    def test_can_be_opened_again_after_close(self, active: CameraDriver, context: DriverContext) -> None:
+        """How the vision process answers every error of a camera."""
+        first = self.collect(active, context, 1)[-1]
+        active.close()
+        active.configure()
+        active.activate()
+        again = self.collect(active, context, 1)[0]
+        assert again.t_shutter_ns > first.t_shutter_ns
+        assert again.seq > first.seq
+
     def test_close_never_raises_in_any_state(self, context: DriverContext) -> None:
         fresh = self.make_driver(context)
         fresh.close()

@@ -165,7 +165,6 @@ class MjpegSource:
         self._interrupted = False
         self._over = False
         self._spoiled = 0
-        self._lost = 0
 
     def open(self) -> None:
         """Connect and read the response's head. Raises DriverError."""
@@ -288,7 +287,6 @@ class MjpegSource:
             image = cv2.imdecode(np.frombuffer(part.body, np.uint8), decoding_flag(self._options.channel))
         if image is None:
             self._spoiled += 1
-            self._lost += 1 + skipped
             if self._spoiled >= SPOILED_IN_A_ROW:
                 raise self._place.error(
                     "corrupt",

@@ -104,6 +104,12 @@ def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[Vi
         ):
             if value != usual:
                 raise _wrong(name, value, f"is for files and numbered pictures; source is {place.shown}")
+    if decoded.read_timeout_s * decoded.rate_hz < 2.0:
+        raise _wrong(
+            "read_timeout_s",
+            decoded.read_timeout_s,
+            f"valid: two periods of rate_hz or more, {2.0 / decoded.rate_hz:g} s",
+        )
     if decoded.pixel_format and (len(decoded.pixel_format) != 4 or not decoded.pixel_format.isascii()):
         raise _wrong("pixel_format", decoded.pixel_format, 'valid: four letters, such as "MJPG" or "YUYV"')
     return decoded, place

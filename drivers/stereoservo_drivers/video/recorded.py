@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import stat
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -67,7 +68,12 @@ class PlainVideo:
         self._options = options
         self._camera = camera
         self._next = options.start
-        self._capture = cv2.VideoCapture(str(place.path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+        settings = [
+            cv2.CAP_PROP_N_THREADS, 1,
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(options.open_timeout_s * 1e3),
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(options.read_timeout_s * 1e3),
+        ]  # fmt: skip
+        self._capture = cv2.VideoCapture(str(place.path), cv2.CAP_FFMPEG, settings)
         try:
             if not self._capture.isOpened():
                 raise place.error(
@@ -86,9 +92,18 @@ class PlainVideo:
             raise
 
     def read(self) -> Frame | None:
-        """The next frame. Raises DriverError (``truncated``: it says that it has more)."""
+        """The next frame. Raises DriverError (``truncated``: it says that it has more; ``silent``: it does not end)."""
+        begun_s = time.monotonic()
         if not self._capture.grab():
-            if self._next < self._said:
+            if time.monotonic() - begun_s >= self._options.read_timeout_s:
+                raise self._place.error(
+                    "silent",
+                    f"no frame {self._next} was found within {self._options.read_timeout_s:g} s (read_timeout_s): "
+                    "damaged data, or a disk that does not answer",
+                    frame=self._next,
+                )
+            # Containers without a count of frames state an estimate.
+            if self._next + 1 + self._said // 50 < self._said:
                 raise self._place.error(
                     "truncated",
                     f"ends after {self._next} frames and says that it has {self._said}: the file is cut off. Take "
