@@ -12,6 +12,7 @@ from typing import Annotated
 import msgspec
 import typer
 
+from stereoservo.cli.camera_examination import examine_cameras
 from stereoservo.cli.examination import examine_joints, permission
 from stereoservo.cli.output import CommandError, JsonOption, emit
 from stereoservo.gateway.session import SessionError, gateway_config
@@ -42,10 +43,22 @@ def doctor(
         typer.Option("--jog", help="Also turn each joint by one degree, once allowed: checks its units."),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Allow what --jog asks for.")] = False,
+    seconds: Annotated[
+        float,
+        typer.Option(
+            "--seconds", help="How long the cameras are watched; 0: not at all.", min=0.0, max=600.0
+        ),
+    ] = 2.0,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures", help="Where what each camera sees is saved (default: the cell's state directory)."
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Check cell file, drivers, drives, cameras, directories, wire, model and scheduling. Nothing moves without
-    ``--jog``; the drives are asked only while no daemon has them.
+    ``--jog``; drives and cameras are asked only while no daemon has them.
     """
     may_move = permission(jog, yes)
     loaded = load_cell_file(cell)
@@ -60,6 +73,13 @@ def doctor(
     )  # an adapter that hangs up is a finding, no end without a word
     for found in examine_joints(plan, may_move):
         checks.append(Check(found.name, found.ok, found.message, found.cure))
+    if seconds > 0:
+        settings = plan.settings()
+        model, _ = ModelStore(directories.models).newest_fitting(settings)
+        for found in examine_cameras(
+            plan, settings, model, seconds, pictures or directories.state / "doctor"
+        ):
+            checks.append(Check(found.name, found.ok, found.message, found.cure))
     failed = [check for check in checks if check.ok is False]
     text = "\n".join(_line(check) for check in checks)
     if failed:
