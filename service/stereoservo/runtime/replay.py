@@ -62,7 +62,7 @@ def replay(
     steps = checkpoints = gaps = 0
     worst = 0.0
     differs: int | None = None
-    for topic, data in _messages(path):
+    for topic, data in recorded_messages(path):
         try:
             if topic == "header":
                 first = msgspec.msgpack.decode(data)
@@ -134,7 +134,7 @@ def _compare(record: StepRecord, outputs: StepOutputs) -> tuple[bool, float]:
     return again.outputs_crc == record.outputs_crc and again.step == record.step, error
 
 
-def _messages(path: Path) -> Iterator[tuple[str, bytes]]:
+def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
     """Topic and payload in file order. Raises RecordingError naming how far the file is good."""
     steps = 0
     topics: dict[int, str] = {}
