@@ -36,7 +36,7 @@ class CameraTiming(msgspec.Struct, eq=False):
 def fold_timing(
     timing: CameraTiming, innovations: FloatArray, velocities: FloatArray, variances: FloatArray, t_ns: int
 ) -> None:
-    """Take in a frame: ``innovations`` (k, 2) [px], ``velocities`` (k, 2) [px/s], ``variances`` (k,) [px²] a coordinate.
+    """Take in a frame: ``innovations`` [px] and ``velocities`` [px/s] (k, 2), ``variances`` (k,) [px²] a coordinate.
 
     The markers of a frame share what the model is off by: they count as one sight, not as k.
     """
