@@ -277,8 +277,14 @@ def _same(one: FloatArray, other: FloatArray) -> bool:
 def _opencv_detector(options: TagOptions) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = _METHODS[options.refinement]
-    # a tag that only almost reads as another is none: what noise flips, the registration's own reading forgives
-    parameters.errorCorrectionRate = 0.6 if options.refinement == "pattern" else 0.0
+    # what noise flips, the registration's own reading forgives; without it a tag must read as what it is
+    parameters.errorCorrectionRate = 1.0 if options.refinement == "pattern" else 0.0
+    # as they come, the white margin's outline on a darker wall takes the place of the tag's: one in seven is lost
+    parameters.minMarkerDistanceRate = 0.02
+    parameters.minGroupDistance = 0.05
+    parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25
+    parameters.adaptiveThreshWinSizeMin = 5
+    parameters.adaptiveThreshWinSizeStep = 9
     return cv2.aruco.ArucoDetector(dictionary(options.dictionary), parameters)
 
 

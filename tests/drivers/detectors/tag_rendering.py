@@ -56,14 +56,14 @@ class TagScene:
         u1, v1 = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + room + 1, [width, height])
         fine_u = u0 - 0.5 + (np.arange((u1 - u0) * FINE) + 0.5) / FINE
         fine_v = v0 - 0.5 + (np.arange((v1 - v0) * FINE) + 0.5) / FINE
-        B = np.linalg.inv(H)
-        U, V = fine_u[None], fine_v[:, None]
+        B = np.linalg.inv(H).astype(np.float32)
+        U, V = fine_u[None].astype(np.float32), fine_v[:, None].astype(np.float32)
         w = B[2, 0] * U + B[2, 1] * V + B[2, 2]
         x = np.floor((B[0, 0] * U + B[0, 1] * V + B[0, 2]) / w * n).astype(int) + 1
         y = np.floor((B[1, 0] * U + B[1, 1] * V + B[1, 2]) / w * n).astype(int) + 1
         inside = (x >= 0) & (x < n + 2) & (y >= 0) & (y < n + 2)
-        below = np.kron(image[v0:v1, u0:u1], np.ones((FINE, FINE)))
-        levels = self.black + (self.white - self.black) * brightness
+        below = np.kron(image[v0:v1, u0:u1].astype(np.float32), np.ones((FINE, FINE), np.float32))
+        levels = (self.black + (self.white - self.black) * brightness).astype(np.float32)
         below[inside] = levels[y[inside], x[inside]]
         if self.lens_blur:
             below = cv2.GaussianBlur(below, (0, 0), self.lens_blur * FINE, borderType=cv2.BORDER_REPLICATE)
