@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from stereoservo.cli import interruption
+from stereoservo.cli.image_calibration import fit_images, table_of_images
 from stereoservo.cli.output import (
     EXIT_FAILED,
     CellArgument,
@@ -60,6 +61,14 @@ def calibrate(
         Path | None,
         typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
     ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            "--images",
+            metavar="DIR",
+            help="Fit trial motions recorded by `record --images`, with the cell file's detectors; nothing moves.",
+        ),
+    ] = None,
     lines: Annotated[
         Path | None,
         typer.Option(
@@ -71,7 +80,7 @@ def calibrate(
     lines_sigma: Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")] = 0.3,
     output: Annotated[
         Path | None,
-        typer.Option("--output", metavar="FILE.json", help="With --trials: where the model goes."),
+        typer.Option("--output", metavar="FILE.json", help="With --trials, --images: where the model goes."),
     ] = None,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
@@ -83,14 +92,26 @@ def calibrate(
     """
     if (reset_zeros or unattended) and not check:
         raise CommandError("argument", "--reset-zeros and --unattended go with --check")
+    if (trials is not None or images is not None) and check:
+        raise CommandError(
+            "argument", "--check moves the arm, --trials and --images do not: give one of them"
+        )
+    if trials is not None and images is not None:
+        raise CommandError("argument", "--trials and --images: one of them")
+    if images is not None:
+        if lines is not None:
+            raise CommandError("argument", "--lines go with --trials; --images keeps its trial data for that")
+        from_images = fit_images(cell, images, output)
+        emit(from_images, table_of_images(from_images), json)
+        return
     if trials is not None:
-        if check:
-            raise CommandError("argument", "--check moves the arm, --trials does not: give one of them")
         result = fit_again(cell, trials, lines, lines_sigma, output)
         emit(result, table_of_stored(result), json)
         return
     if lines is not None or output is not None:
-        raise CommandError("argument", "--lines and --output go with --trials FILE.npz")
+        raise CommandError(
+            "argument", "--lines and --output go with --trials FILE.npz, --output with --images too"
+        )
     with ExitStack() as stack:
         if not unattended and endpoint is None and cell.endswith(".toml"):
             try:

@@ -74,25 +74,9 @@ def fit_again(
     # scipy and the fit are slow to import; commands that only talk to a daemon do without.
     from stereoservo.kinematics.calibration.trials import CalibrationError, load_trials
     from stereoservo.kinematics.calibration.verdict import failed
-    from stereoservo.kinematics.model import check_writable
     from stereoservo.runtime.fit import fit_trials, report_fit
 
-    if output is not None:
-        try:
-            check_writable(output)
-        except OSError as error:
-            raise CommandError("output", f"--output: {error.filename}: {error.strerror}") from error
-    file = load_cell_file(Path(cell)) if cell.endswith(".toml") else None
-    name = cell if file is None else file.cell.name
-    directory = cell_directories(name).models
-    if output is None:
-        _must_not_run(name)
-    elif output.resolve().parent == directory.resolve():
-        raise CommandError(
-            "output",
-            f"--output: {directory} is where cell {name!r} keeps its numbered models: leave --output away to put the "
-            "model there, or give another directory",
-        )
+    file, name, directory = may_fit(cell, output)
     data = load_trials(path)
     if file is not None:
         _must_fit(file, data, path)
@@ -126,6 +110,32 @@ def fit_again(
         else f"no daemon takes this model: it lies outside of {directory}"
     )
     return StoredFit(**msgspec.structs.asdict(figures), use=use, lines=used)
+
+
+def may_fit(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
+    """The cell file, where it was given, the cell's name, and where it keeps its models.
+
+    Raises CommandError where a fit could not be kept, CellFileError.
+    """
+    from stereoservo.kinematics.model import check_writable
+
+    if output is not None:
+        try:
+            check_writable(output)
+        except OSError as error:
+            raise CommandError("output", f"--output: {error.filename}: {error.strerror}") from error
+    file = load_cell_file(Path(cell)) if cell.endswith(".toml") else None
+    name = cell if file is None else file.cell.name
+    directory = cell_directories(name).models
+    if output is None:
+        _must_not_run(name)
+    elif output.resolve().parent == directory.resolve():
+        raise CommandError(
+            "output",
+            f"--output: {directory} is where cell {name!r} keeps its numbered models: leave --output away to put the "
+            "model there, or give another directory",
+        )
+    return file, name, directory
 
 
 def _must_not_run(name: str) -> None:
