@@ -98,6 +98,12 @@ class Calibration:
         if self._job.standing:
             markers = ", ".join(str(marker) for marker in self._job.standing)
             message += f"; markers {markers} stood still: they are not of the body, and left out"
+        if self._job.strayed:
+            markers = ", ".join(str(marker) for marker in self._job.strayed)
+            message += (
+                f"; markers {markers} are static by the cell file's [scene], but moved in the images: they are left "
+                "out of the scene. Are they on the arm, did something push them?"
+            )
         self._log.add("fit_started", message=message, id=self._fit_id, progress=0.0, origin="gateway")
 
     def _start_check(self, *, reset: bool) -> None:

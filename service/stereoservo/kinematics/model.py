@@ -151,7 +151,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     loads: JointLoads | None = None
     scene_ids: tuple[int, ...] = ()
     scene_points: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4)))
-    """Static scene points (s, 4) of height 1, with ``scene_covariances`` (s, 4, 4) at that scale."""
+    """Static scene points (s, 4) of height 1, with ``scene_covariances`` (s, 4, 4) at that scale, given the cameras."""
     scene_covariances: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     @property
@@ -240,6 +240,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         _check_covariance(model, model.covariance, path)
     if model.loads is not None:
         check_loads(model.loads, n, path)
+    _check_scene(model, path)
 
 
 def check_loads(loads: JointLoads, n: int, path: Path | str = "<loads>") -> None:
@@ -311,6 +312,48 @@ def _check_metric(model: CellModel, upgrade: FloatArray, path: Path | str) -> No
                 f"does not make joint {model.joint_names[j]!r} a Euclidean "
                 f"{'rotation' if kind == 'revolute' else 'translation'}: {off:.2e} is left, with an operator of size "
                 f"{np.linalg.norm(twist):.2e}; a share of {METRIC_TOLERANCE:g} is taken",
+            )
+
+
+def _check_scene(model: CellModel, path: Path | str) -> None:
+    """Check the static points: ids of nothing on the arm, heights 1, covariances."""
+    ids, points, covariances = model.scene_ids, model.scene_points, model.scene_covariances
+    for marker in ids:
+        if ids.count(marker) > 1:
+            raise ModelFileError(path, "scene_ids", f"{marker} stands twice; entries must differ")
+        if marker in model.marker_ids:
+            raise ModelFileError(
+                path, "scene_ids", f"{marker} is in marker_ids, too; a static id is not of the arm"
+            )
+    if ids and model.mount == "eye_in_hand":
+        raise ModelFileError(
+            path, "scene_ids", "holds ids although the cameras ride on the arm; from there nothing is static"
+        )
+    for key, array, shape in (
+        ("scene_points", points, (len(ids), 4)),
+        ("scene_covariances", covariances, (len(ids), 4, 4)),
+    ):
+        if array.shape != shape:
+            raise ModelFileError(path, key, f"has shape {array.shape}; {shape} is needed")
+        if not np.isfinite(array).all():
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+            raise ModelFileError(path, key, f"entry {where} is {array[where]}; finite numbers are needed")
+    heights = points @ model.plane_at_infinity
+    if np.abs(heights - 1.0).max(initial=0.0) > ALGEBRA_TOLERANCE:
+        worst = int(np.abs(heights - 1.0).argmax())
+        raise ModelFileError(
+            path,
+            f"scene_points[{worst}]",
+            f"static marker {ids[worst]}: plane_at_infinity @ M is {heights[worst]:.6g}; 1 is needed",
+        )
+    for i, matrix in enumerate(covariances):
+        size = float(np.abs(matrix).max())
+        least = float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0])
+        if np.abs(matrix - matrix.T).max() > SYMMETRY_TOLERANCE * size or least < -SYMMETRY_TOLERANCE * size:
+            raise ModelFileError(
+                path,
+                f"scene_covariances[{i}]",
+                f"static marker {ids[i]}: is not symmetric, or has an eigenvalue of {least:.3g}; none may be negative",
             )
 
 

@@ -534,6 +534,9 @@ def explain(
         answer[0] = JOINT
     else:
         answer[0] = JOINTS
+    if answer[0] == JOINT and second >= 0 and sizes[second] > 1 and not _is_marker(second, cameras, markers):
+        # The motion of one joint is a displacement, too: what contains it and costs more is no rival.
+        return
     if (
         second >= 0
         and (chi2[second] - chi2[first]) / noise + (sizes[second] - sizes[first]) * price < UNCLEAR

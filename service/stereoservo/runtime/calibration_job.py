@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.kinematics.calibration.standing import standing_markers
+from stereoservo.kinematics.calibration.standing import standing_markers, static_sights
 from stereoservo.kinematics.calibration.trials import CalibrationError, TrialCamera, TrialData
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.runtime.cycle import Event
@@ -21,6 +21,7 @@ class CalibrationJob:
         self.id = ""
         self._stops: list[Event] = []
         self.standing: tuple[int, ...] = ()
+        self.strayed: tuple[int, ...] = ()
         self._loads: JointLoads | None = None
 
     @property
@@ -43,7 +44,8 @@ class CalibrationJob:
     def trials(self) -> TrialData:
         """All stops as trial data; markers that no camera ever saw, or that stood still (``standing``), left out.
 
-        Raises CalibrationError (``too_few_stops``) where there is no stop.
+        Ids that the cell says are static go into ``TrialData.static``, but for those that moved (``strayed``). Raises
+        CalibrationError (``too_few_stops``) where there is no stop.
         """
         if not self._stops:
             raise CalibrationError(
@@ -70,9 +72,20 @@ class CalibrationJob:
                     systematic = settings.cameras[where[0]].systematic_px ** 2
                     noise = 0.5 * np.trace(covariance) - systematic
                     sigmas[where] = np.sqrt(factors[sample.camera] * noise + systematic)
+        declared = np.array([marker in settings.scene_ids for marker in markers], dtype=bool)
+        static, self.strayed = static_sights(
+            tuple(marker for marker in markers if marker in settings.scene_ids),
+            pixels[:, :, declared],
+            sigmas[:, :, declared],
+        )
         still = standing_markers(pixels, sigmas)
-        self.standing = tuple(marker for marker, stands in zip(markers, still, strict=True) if stands)
-        markers = tuple(marker for marker in markers if marker not in self.standing)
+        self.standing = tuple(
+            marker
+            for marker, stands, known in zip(markers, still, declared, strict=True)
+            if stands and not known
+        )
+        still |= declared
+        markers = tuple(marker for marker, out in zip(markers, still, strict=True) if not out)
         return TrialData(
             joint_names=settings.joint_names,
             joint_kinds=settings.joint_kinds,
@@ -87,6 +100,7 @@ class CalibrationJob:
             sigmas=sigmas[:, :, ~still],
             images=images,
             loads=self._loads,
+            static=static,
         )
 
     def _noise_factor(self, camera: CameraSettings) -> float:

@@ -87,7 +87,8 @@ class Together:
         return found
 
     def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
-        moved: FloatArray = matrices @ exp_twist(np.tensordot(x, self.algebra, axes=1))
+        motion: FloatArray = exp_twist(np.tensordot(x, self.algebra, axes=1))
+        moved: FloatArray = matrices @ motion
         return moved
 
 
@@ -111,7 +112,7 @@ def predicted(matrices: FloatArray, lenses: FloatArray, views: Views) -> FloatAr
     images = np.einsum("kij,kj->ki", matrices[views.camera], views.points)
     ahead = images[:, 2] > 0.0
     ideal = images[:, :2] / np.where(ahead, images[:, 2], np.nan)[:, None]
-    pixels = np.empty_like(ideal)
+    pixels: FloatArray = np.empty_like(ideal)
     for c, lens in enumerate(lenses):
         mine = views.camera == c
         pixels[mine] = ideal[mine] if lens[0] == 0.0 else distort(lens, ideal[mine])

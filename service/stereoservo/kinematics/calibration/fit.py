@@ -28,6 +28,7 @@ from stereoservo.kinematics.calibration.lenses import (
 )
 from stereoservo.kinematics.calibration.mounts import common_mount, restored, reversed_trials
 from stereoservo.kinematics.calibration.report import CalibrationResult, build_result
+from stereoservo.kinematics.calibration.scene import with_scene
 from stereoservo.kinematics.calibration.separate import MIN_MARKERS, JointTrial, measurements, separate_joint
 from stereoservo.kinematics.calibration.statistics import degrees_of_freedom, rank_of, variance_factor
 from stereoservo.kinematics.calibration.strata import DEFAULTS, FitOptions, upgraded
@@ -61,7 +62,8 @@ def fit_model(
     """Fit a cell's model to its trial motions.
 
     Cameras all stand (eye-to-hand) or all ride on the tip (eye-in-hand); the model says which, and counts its
-    joints from the base either way. ``lens_priors``: by camera name, what straight lines say of its lens
+    joints from the base either way. Markers that stand for good become the model's static points. ``lens_priors``: by
+    camera name, what straight lines say of its lens
     (`geometry.distortion_lines`).
 
     ``progress(stage, fraction)`` is called as the work goes on. Raises CalibrationError with the cause where
@@ -88,12 +90,13 @@ def fit_model(
             f"the fit broke down: {error}. Are positions and markers what they are said to be?",
         )
         raise diagnosed(chain, broken, refit, options) from error
+    model = result.model if mount == "eye_to_hand" else restored(result.model)
+    model, of_scene = with_scene(model, trials.static)
     report = msgspec.structs.replace(
         result.report,
-        notes=(*result.report.notes, *reviewed(chain, result, refit, options)),
+        notes=(*result.report.notes, *reviewed(chain, result, refit, options), *of_scene),
         untested=untested(chain),
     )
-    model = result.model if mount == "eye_to_hand" else restored(result.model)
     return CalibrationResult(msgspec.structs.replace(model, loads=trials.loads), report)
 
 

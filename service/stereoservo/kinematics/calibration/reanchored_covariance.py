@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +73,7 @@ def by_model(
 ) -> FloatArray:
     """Derivative (k, 2, p) of the raw pixels of ``views`` in cameras ``matrices`` (c, 3, 4), which inherit from the
     model's by ``motion``, by the parameters of its covariance. ``offsets`` (s, n): joints of the poses, less the zero.
+    Static points move with the cameras that triangulated them.
     """
     k, p = len(views.camera), parameters_of(model)
     found = np.zeros((k, 2, p))
@@ -91,10 +92,15 @@ def by_model(
             ideal = images[mine, :2] / images[mine, 2:]
             slope = lens_jacobian(lenses[i], ideal) @ basis[:, :3].T
             found[mine, :, starts[2][c] : starts[2][c] + len(basis)] += slope
+    static = {marker: i for i, marker in enumerate(model.scene_ids)}
+    for r in np.flatnonzero(views.pose < 0):
+        if int(views.ids[r]) in static:
+            by_point = _by_point(rows[r], matrices[views.camera[r]], views.points[r])
+            found[r] += by_point @ scene_by_model(model, static[int(views.ids[r])])
     arm = np.flatnonzero(views.pose >= 0)
     if len(arm):
         slope, columns = _by_arm(model, stated, matrices, lenses, views, arm, offsets)
-        found[np.ix_(arm, [0, 1], columns)] += slope
+        found[np.ix_(arm, np.arange(2), columns)] += slope
     return found
 
 
@@ -140,8 +146,44 @@ def _by_arm(
     return slope.reshape(len(arm), 2, charts.size), np.concatenate(columns)
 
 
+def _by_point(by_entries: FloatArray, matrix: FloatArray, point: FloatArray) -> FloatArray:
+    """Derivative (2, 4) of a pixel by its point, from that by the entries of its matrix (2, 12): ``∂u/∂m Mᵀ``."""
+    by_image = by_entries.reshape(2, 3, 4) @ point / float(point @ point)
+    return np.asarray(by_image @ matrix)
+
+
+def scene_by_model(model: CellModel, i: int) -> FloatArray:
+    """What the model's parameters do to static point ``i`` (4, p): it was triangulated by cameras that they move.
+
+    Taken with equal weights, by all cameras in whose image it lies.
+    """
+    point = model.scene_points[i]
+    every = Views(
+        np.arange(len(model.cameras)),
+        np.zeros(len(model.cameras), dtype=np.int64),
+        np.full(len(model.cameras), -1, dtype=np.int64),
+        np.tile(point, (len(model.cameras), 1)),
+        np.zeros((len(model.cameras), 2)),
+        np.tile(np.eye(2), (len(model.cameras), 1, 1)),
+    )
+    seen = [c for c in range(len(model.cameras)) if _inside(model, c, every.select(every.camera == c))[0]]
+    if len(seen) < 2:
+        return np.zeros((4, parameters_of(model)))
+    views = replace(every.select(np.isin(every.camera, seen)), camera=np.arange(len(seen)))
+    matrices = np.array([model.cameras[c].matrix for c in seen])
+    lenses = np.array([model.cameras[c].lens for c in seen])
+    # An id of no static point: the point itself is held here.
+    held = by_model(
+        model, tuple(seen), matrices, np.eye(4), replace(views, ids=np.full(len(seen), -1)), np.zeros((0, 0))
+    ).reshape(2 * len(seen), -1)
+    chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
+    rows = slopes(matrices, lenses, views)
+    J = np.concatenate([_by_point(row, P, point) @ chart for row, P in zip(rows, matrices, strict=True)])
+    return np.asarray(-chart @ np.linalg.lstsq(J, held, rcond=None)[0])
+
+
 def static_roots(model: CellModel, matrices: FloatArray, lenses: FloatArray, views: Views) -> FloatArray:
-    """Root (k, 2, 4 s) of what the covariances of the static points do to the pixels."""
+    """Root (k, 2, 4 s) of what the covariances of the static points, given the cameras, do to the pixels."""
     count = len(model.scene_ids)
     found = np.zeros((len(views.camera), 2, 4 * count))
     rows = slopes(matrices, lenses, views)
@@ -149,11 +191,9 @@ def static_roots(model: CellModel, matrices: FloatArray, lenses: FloatArray, vie
     for k in np.flatnonzero(views.pose < 0):
         i = static[int(views.ids[k])]
         values, vectors = np.linalg.eigh(model.scene_covariances[i])
-        # rows are products of ∂u/∂m and the point: back to ∂u/∂X = ∂u/∂m P.
-        point = views.points[k]
-        by_image = rows[k].reshape(2, 3, 4) @ point / float(point @ point)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        found[k, :, 4 * i : 4 * i + 4] = by_image @ matrices[views.camera[k]] @ root
+        slope = _by_point(rows[k], matrices[views.camera[k]], views.points[k])
+        found[k, :, 4 * i : 4 * i + 4] = slope @ root
     return found
 
 
@@ -181,20 +221,20 @@ def with_moved_cameras(
             maps[c] = rows
         at += size
     identity = np.eye(p, p + noise)
-    rows, bases = [identity[:first]], []
+    blocks, bases = [identity[:first]], []
     for c, basis in enumerate(stated.cameras):
         if c not in maps:
             bases.append(basis)
-            rows.append(identity[starts[c] : starts[c] + len(basis)])
+            blocks.append(identity[starts[c] : starts[c] + len(basis)])
             continue
         unit = matrices[c].ravel() / np.linalg.norm(matrices[c])
         own = maps[c] - np.outer(unit, unit @ maps[c])
         values, vectors = np.linalg.eigh(own @ source @ own.T)
         kept = vectors[:, values > NEGLIGIBLE * values[-1]].T
         bases.append(kept.reshape(-1, 3, 4))
-        rows.append(kept @ own)
-    rows.append(identity[last:])
-    change = np.concatenate(rows)
+        blocks.append(kept @ own)
+    blocks.append(identity[last:])
+    change = np.concatenate(blocks)
     covariance = change @ source @ change.T
     return ModelCovariance(
         stated.generators, tuple(bases), stated.lenses, stated.markers, 0.5 * (covariance + covariance.T)

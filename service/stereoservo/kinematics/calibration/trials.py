@@ -20,6 +20,7 @@ IntArray = npt.NDArray[np.int64]
 
 TRIALS_SCHEMA = 1
 LOADS = "loads_"
+STATIC = "static_"
 MAX_POSITION = 1e6
 """Largest joint position [rad or m] that is taken for one."""
 MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
@@ -38,7 +39,8 @@ class CalibrationError(Exception):
             ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``;
             of the diagnosis ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``, ``joint_order``,
             ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
-            ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``.
+            ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``;
+            of re-anchoring ``too_few_points``, ``points_coplanar``, ``not_explained``, ``too_uncertain``.
         data: the values the message speaks of.
     """
 
@@ -66,6 +68,16 @@ class TrialCamera(msgspec.Struct, frozen=True):
     mount: Mount = "eye_to_hand"
 
 
+class StaticSights(msgspec.Struct, frozen=True, eq=False):
+    """Markers that stand still for good, over all stops: ``ids`` (k,), raw ``pixels`` (c, k, 2) [px], NaN where a
+    camera does not see one, and ``sigmas`` (c, k) [px].
+    """
+
+    ids: tuple[int, ...]
+    pixels: FloatArray
+    sigmas: FloatArray
+
+
 class TrialData(msgspec.Struct, frozen=True, eq=False):
     """Stops of trial motions and what the cameras saw there.
 
@@ -73,7 +85,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
     seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
     one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: what the drives said
-    of their loads on the way, where they did; handed on to the model.
+    of their loads on the way, where they did; handed on to the model. ``static``: ids that stand still for good.
     """
 
     joint_names: tuple[str, ...]
@@ -86,6 +98,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     sigmas: FloatArray
     images: int = 0
     loads: JointLoads | None = None
+    static: StaticSights | None = None
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
@@ -146,6 +159,8 @@ def check_trials(trials: TrialData) -> None:
     for key, array, shape in expected:
         if array.shape != shape:
             raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
+    if trials.static is not None:
+        _check_static(trials, trials.static)
     if trials.loads is not None:
         try:
             check_loads(trials.loads, n)
@@ -173,6 +188,28 @@ def check_trials(trials: TrialData) -> None:
         )
     _check_sizes(trials)
     _check_pixels(trials)
+
+
+def _check_static(trials: TrialData, static: StaticSights) -> None:
+    c, k = len(trials.cameras), len(static.ids)
+    twice = sorted({i for i in static.ids if static.ids.count(i) > 1 or i in trials.marker_ids})
+    if twice:
+        raise CalibrationError(
+            "bad_data",
+            f"static ids {twice} stand twice, or are markers of the arm, too",
+            key="static",
+            ids=twice,
+        )
+    if static.pixels.shape != (c, k, 2) or static.sigmas.shape != (c, k):
+        raise CalibrationError(
+            "bad_data",
+            f"static pixels {static.pixels.shape} and sigmas {static.sigmas.shape}; {(c, k, 2)} and {(c, k)} are "
+            "needed",
+            key="static",
+        )
+    seen = finite_rows(static.pixels)
+    if not (np.isfinite(static.sigmas[seen]).all() and (static.sigmas[seen] > 0.0).all()):
+        raise CalibrationError("bad_data", "static sigmas are not all positive numbers", key="static")
 
 
 def _check_sizes(trials: TrialData) -> None:
@@ -256,6 +293,7 @@ def encode_trials(trials: TrialData) -> bytes:
         pixels=np.asarray(trials.pixels, dtype=np.float64),
         sigmas=np.asarray(trials.sigmas, dtype=np.float64),
         **_load_arrays(trials.loads),  # type: ignore[arg-type]
+        **_static_arrays(trials.static),  # type: ignore[arg-type]
     )
     return buffer.getvalue()
 
@@ -266,6 +304,26 @@ def _load_arrays(loads: JointLoads | None) -> dict[str, FloatArray]:
         return {}
     given = {field: getattr(loads, field) for field in JointLoads.__struct_fields__}
     return {LOADS + field: array for field, array in given.items() if array is not None}
+
+
+def _static_arrays(static: StaticSights | None) -> dict[str, npt.NDArray[Any]]:
+    if static is None:
+        return {}
+    return {
+        STATIC + "ids": np.array(static.ids, dtype=np.int64),
+        STATIC + "pixels": np.asarray(static.pixels, dtype=np.float64),
+        STATIC + "sigmas": np.asarray(static.sigmas, dtype=np.float64),
+    }
+
+
+def _static(arrays: dict[str, npt.NDArray[Any]]) -> StaticSights | None:
+    if STATIC + "ids" not in arrays:
+        return None
+    return StaticSights(
+        tuple(int(i) for i in arrays[STATIC + "ids"]),
+        arrays[STATIC + "pixels"].astype(np.float64, casting="same_kind"),
+        arrays[STATIC + "sigmas"].astype(np.float64, casting="same_kind"),
+    )
 
 
 def _loads(arrays: dict[str, npt.NDArray[Any]]) -> JointLoads | None:
@@ -300,6 +358,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             sigmas=arrays["sigmas"].astype(np.float64, casting="same_kind"),
             images=header.images,
             loads=_loads(arrays),
+            static=_static(arrays),
         )
     except KeyError as error:
         raise CalibrationError(
