@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import http.client
+import re
 import select
 import socket
 import ssl
@@ -20,7 +21,7 @@ import numpy as np
 
 from stereoservo.runtime.ports import Clock, DriverError
 from stereoservo_drivers.video.options import Place, VideoOptions
-from stereoservo_drivers.video.pictures import check_size, decoding_flag, jpeg_size
+from stereoservo_drivers.video.pictures import check_size, jpeg_flag, jpeg_size
 from stereoservo_drivers.video.sources import Picture, Settings
 
 LARGEST_PART = 50_000_000
@@ -29,6 +30,8 @@ CHUNK = 1 << 18
 MOST_READS = 64
 SPOILED_IN_A_ROW = 10
 REDIRECTIONS = 3
+_HEADERS_END = re.compile(rb"\A\r?\n|\r?\n\r?\n")
+"""An empty line; the first, where a part has no headers."""
 
 
 class MultipartError(Exception):
@@ -100,9 +103,8 @@ class MultipartParser:
         return True
 
     def _read_headers(self, part: Part) -> bool:
-        end, width = self._buffer.find(b"\r\n\r\n"), 4
-        if end < 0:
-            end, width = self._buffer.find(b"\n\n"), 2
+        found = _HEADERS_END.search(self._buffer, 0, LONGEST_HEADERS + 4)
+        end, width = (found.start(), len(found[0])) if found else (-1, 0)
         self._bound_headers(len(self._buffer) if end < 0 else end)
         if end < 0:
             return False
@@ -133,6 +135,7 @@ class MultipartParser:
                 return False
             return self._complete(part, length, cut=False)
         if boundary >= 0:
+            boundary -= self._buffer[:boundary].endswith(b"\r")
             return self._complete(part, boundary, cut=length is not None)
         if len(self._buffer) > self._largest:
             raise MultipartError("frame_too_large", f"a picture above {self._largest} bytes without an end")
@@ -284,7 +287,7 @@ class MjpegSource:
         image = None
         if size is not None:
             check_size(self._place, self._options, *size)
-            image = cv2.imdecode(np.frombuffer(part.body, np.uint8), decoding_flag(self._options.channel))
+            image = cv2.imdecode(np.frombuffer(part.body, np.uint8), jpeg_flag(self._options.channel))
         if image is None:
             self._spoiled += 1
             if self._spoiled >= SPOILED_IN_A_ROW:

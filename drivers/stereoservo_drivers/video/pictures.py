@@ -14,8 +14,12 @@ _SIZE_MARKERS = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
 
 
-def decoding_flag(channel: Channel) -> int:
-    """How `cv2.imread` and `cv2.imdecode` are to decode; turning by camera orientation tags is left out."""
+PICTURE_FLAG = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+"""How picture files are decoded: gray ones as they are, others in colour, which :func:`one_channel` rounds properly."""
+
+
+def jpeg_flag(channel: Channel) -> int:
+    """How JPEG data are decoded: their luma is coded by itself, and quicker to have alone."""
     wanted = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
     return wanted | cv2.IMREAD_IGNORE_ORIENTATION
 

@@ -16,7 +16,7 @@ import numpy as np
 from stereoservo.runtime.image_files import ImageFileError, ImageReader, sidecar_of
 from stereoservo.runtime.ports import DriverError, Frame, ImageArray
 from stereoservo_drivers.video.options import Place, VideoOptions
-from stereoservo_drivers.video.pictures import check_size, decoding_flag, jpeg_size
+from stereoservo_drivers.video.pictures import PICTURE_FLAG, check_size, jpeg_size
 
 LARGEST_PICTURE = 50_000_000
 
@@ -219,7 +219,7 @@ class NumberedPictures:
             )
         data = path.read_bytes()
         if path.suffix.lower() not in (".jpg", ".jpeg") or jpeg_size(data) is not None:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), decoding_flag(self._options.channel))
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), PICTURE_FLAG)
         if image is None:
             raise self._place.error(
                 "corrupt",

@@ -21,8 +21,8 @@ WIDTH, HEIGHT = 64, 48
 
 
 def picture(number: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """A smooth picture whose eight left cells tell ``number`` (mod 256) as black or white, JPEG or not."""
-    image = np.full((height, width), 128, np.uint8)
+    """Noise of its own below; above, eight cells tell ``number`` (mod 256) as black or white, JPEG or not."""
+    image = np.random.default_rng(number).integers(0, 256, (height, width), np.uint8)
     for bit in range(8):
         image[: height // 2, bit * 8 : bit * 8 + 8] = 255 if number >> bit & 1 else 0
     return image
