@@ -66,7 +66,7 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
         )
     gathered = ImageTrials(flight, settings, settings.trials)
     for camera in cameras:
-        gathered.add(_counted(camera, note, progress))
+        gathered.add(_observations(camera, gathered, note, progress))
     job = CalibrationJob(settings)
     events = gathered.events()
     for event in events:
@@ -75,9 +75,18 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
     return FoundTrials(trials, len(events), trials.images, gathered.left_out, job.standing)
 
 
-def _counted(camera: RecordedCamera, note: Note, progress: Progress) -> Iterator[CameraObservation]:
-    name = camera.description.name
-    return camera.observations(note, lambda frames: progress(name, frames))
+def _observations(
+    camera: RecordedCamera, gathered: ImageTrials, note: Note, progress: Progress
+) -> Iterator[CameraObservation]:
+    name, frames = camera.description.name, 0
+
+    def wanted(t_shutter_ns: int) -> bool:
+        nonlocal frames
+        frames += 1
+        progress(name, frames)
+        return gathered.wants(name, t_shutter_ns)
+
+    return camera.observations(note, wanted)
 
 
 def _settings(cell: CellFile, cell_path: Path, flight: Flight, cameras: list[RecordedCamera]) -> CoreSettings:

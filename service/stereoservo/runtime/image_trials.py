@@ -21,6 +21,7 @@ from stereoservo.runtime.visiting import too_few_seen
 
 SAME = 4.0 * ARRIVED
 """Joints nearer than this are in one place [rad or m]: each of two arrivals is within ``ARRIVED``, and settles."""
+BEFORE_NS = 500_000_000
 
 
 @dataclass
@@ -54,6 +55,17 @@ class ImageTrials:
         ]
         self._settled = [stop.rest.settled_ns for stop in self._stops]
         self.used = 0
+
+    def wants(self, camera: str, t_ns: int) -> bool:
+        """Whether a frame of this time may count, or comes so little before one that does that a detector which follows
+        its markers from frame to frame is to see it.
+        """
+        column = next(k for k, one in enumerate(self.settings.cameras) if one.name == camera)
+        newest = bisect_right(self._settled, t_ns + BEFORE_NS) - 1
+        return any(
+            t_ns <= stop.rest.end_ns and stop.sums.frames[column] < self.trial.frames
+            for stop in self._stops[max(newest - 1, 0) : newest + 1]
+        )
 
     def add(self, observations: Iterable[CameraObservation]) -> None:
         """Take one camera's observations in the order of time; what was seen in motion is passed over."""

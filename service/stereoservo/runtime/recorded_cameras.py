@@ -36,13 +36,13 @@ class RecordedCamera:
     detector: Detector
 
     def observations(
-        self, note: Callable[[str], None], progress: Callable[[int], None] = lambda frames: None
+        self, note: Callable[[str], None], wanted: Callable[[int], bool] = lambda t_shutter_ns: True
     ) -> Iterator[CameraObservation]:
         """What the detector finds in frame after frame, without priors; stamps are those of the recording.
 
-        ``note`` is told where a file is cut off. Raises DriverError: a damaged file, a picture of another size.
+        ``wanted`` is asked of each frame before it is given to the detector; ``note`` is told where a file is cut off.
+        Raises DriverError: a damaged file, a picture of another size.
         """
-        frames = 0
         try:
             self.driver.configure()
             self.driver.activate()
@@ -57,9 +57,8 @@ class RecordedCamera:
                     return
                 for frame in arrived:
                     assert isinstance(frame, Frame)
-                    frames += 1
-                    progress(frames)
-                    yield self.detector.detect(frame, None)
+                    if wanted(frame.t_shutter_ns):
+                        yield self.detector.detect(frame, None)
         finally:
             self.driver.deactivate()
             self.driver.close()
