@@ -190,7 +190,8 @@ class Bench:
     joints_on: bool = True
     frozen_joint: int = -1
     marker_mask: np.ndarray = field(default_factory=lambda: np.ones(8, bool))
-    bias_px: float = 0.0
+    bias_px: float | np.ndarray = 0.0
+    """Added to all pixels, or (8, 2) to each marker's."""
     events: list[Event] = field(default_factory=list)
     commands: list[np.ndarray] = field(default_factory=list)
     log: list[tuple[StepInputs, StepOutputs]] = field(default_factory=list)
@@ -233,9 +234,8 @@ class Bench:
             if not self.cameras_on[c]:
                 continue
             inside = self.marker_mask & np.all((exact[c] >= 0) & (exact[c] < (640, 480)), axis=1)
-            pixels = (
-                exact[c, inside] + self.noise_px * self.rng.standard_normal((inside.sum(), 2)) + self.bias_px
-            )
+            noise = self.noise_px * self.rng.standard_normal((inside.sum(), 2))
+            pixels = exact[c, inside] + noise + np.broadcast_to(self.bias_px, (8, 2))[inside]
             covariance = np.tile(np.eye(2) * max(self.noise_px, 0.01) ** 2, (inside.sum(), 1, 1))
             self.pending.append(
                 CameraObservation(

@@ -257,7 +257,7 @@ def test_model_waits_for_rest_and_unknown_models_are_refused(bench: Any) -> None
 
 def test_images_that_contradict_the_model_make_it_suspect_and_abort(bench: Any) -> None:
     moving(bench)
-    bench.bias_px = 60.0
+    bench.bias_px = bench.rng.normal(0.0, 60.0, (8, 2))  # of a shape that no one change explains
     event = bench.until(ended, 3.0)
     assert event.reasons[0].code == "MODEL_SUSPECT"
     refused = bench.reply(goal(bench, bench.q))

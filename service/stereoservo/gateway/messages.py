@@ -34,6 +34,7 @@ from stereoservo.runtime.commands import (
     Teach,
     UpdateGoal,
 )
+from stereoservo.runtime.cycle import Health
 from stereoservo.runtime.image_order import ImagesRecorded
 
 ENCODING = "application/json"
@@ -209,6 +210,8 @@ class StateMessage(msgspec.Struct, frozen=True):
     """How far efforts may go from their moving mean before the arm stops for a contact; absent where nobody knows."""
     following_limits: dict[str, float] = {}
     """How large following errors may become before the arm stops for a contact."""
+    health: Health = Health()
+    """Whether the images agree with the model, by camera; what explains it where they do not, and what is done."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):

@@ -43,6 +43,7 @@ from stereoservo.gateway.publisher import (
     features_message,
     state_message,
 )
+from stereoservo.gateway.reanchoring import Reanchoring
 from stereoservo.gateway.recordings import CannotRecordError, Recordings
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.session import (
@@ -58,6 +59,7 @@ from stereoservo.gateway.stop import StopThread
 from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.teaching import Teaching
 from stereoservo.gateway.validation import GoalContext
+from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.channel import ChannelServer
 from stereoservo.runtime.cycle import Event
 from stereoservo.runtime.daemon import DaemonInfo
@@ -105,6 +107,9 @@ class Gateway:
         self._link.records = bool(plan.record)
         self._replies = ReplyThread()
         self._calibration = Calibration(self.settings, self._models, self._link, self.log, directories.checks)
+        self._reanchoring = Reanchoring(
+            self._models, self._link, self.log, lambda: self._calibration.model, self._use_model
+        )
         self._sights = NewestSights({camera.name: camera.systematic_px for camera in self.settings.cameras})
         self._teaching = Teaching(
             TaughtStore(directories.taught, self._models.of_epoch),
@@ -154,6 +159,10 @@ class Gateway:
         self._journal.add(payload)
         self._publishers.event.put(payload)
 
+    def _use_model(self, model: CellModel) -> None:
+        """The core works with ``model``, which was made for moved cameras."""
+        self._calibration.model = model
+
     def _context(self) -> GoalContext:
         model = self._calibration.model
         markers = None if model is None else model.marker_ids
@@ -180,6 +189,7 @@ class Gateway:
             self._recordings.take(item)
         self._recordings.images.follow()
         self._calibration.follow()
+        self._reanchoring.follow()
         if not self._announced and self._greeted:
             self._announced = True
             self._announce()
@@ -293,7 +303,8 @@ class Gateway:
             self._teaching.taught(event)
         self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
-        if event.kind in ("taught", "calibration_finished", "check_finished"):
+        self._reanchoring.core_event(event, fresh=fresh)
+        if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor"):
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
             self._handled_path.write_text(str(self._handled))
@@ -374,6 +385,7 @@ class Gateway:
     def close(self) -> None:
         """Finish the recording, end the fit, close the sessions within a time limit."""
         self._calibration.cancel()
+        self._reanchoring.cancel()
         for item in self._link.steps(100_000):
             self._recordings.take(item)
         self._recordings.stop()

@@ -168,6 +168,7 @@ def state_message(
         following_errors=_finite(names, status.following_errors),
         effort_limits=_finite(names, status.effort_limits),
         following_limits=_finite(names, status.following_limits),
+        health=status.health,
     )
 
 

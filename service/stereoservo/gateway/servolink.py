@@ -78,10 +78,10 @@ class ServoLink:
             return None
         return number
 
-    def give_model(self, model: CellModel) -> bool:
+    def give_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
         """Hand a model to the core, without its covariance: the loop has no use for it, and a message has a limit."""
         bare = msgspec.structs.replace(model, covariance=None)
-        return self._control is not None and self._control.send(encode(NewModel(bare)))
+        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
 
     def events(self) -> list[Event]:
         """Core events since the last call, in order."""

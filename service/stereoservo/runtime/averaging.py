@@ -10,7 +10,7 @@ import numpy as np
 from stereoservo.runtime.cycle import Sample
 from stereoservo.runtime.ports import CameraObservation
 from stereoservo.runtime.settings import CoreSettings
-from stereoservo.runtime.state import Sums
+from stereoservo.runtime.sums import Sums
 
 
 def add_observation(

@@ -315,6 +315,20 @@ class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbi
     tool: tuple[MarkerId, ...] = ()
 
 
+class ReanchorRefused(
+    msgspec.Struct, frozen=True, tag="reanchor_refused", tag_field="command", forbid_unknown_fields=True
+):
+    """The fit's answer to the event ``reanchor`` where it cannot find the cameras: what is suspended stays so.
+
+    From the process that fits; no client may send it.
+    """
+
+    message: str
+    value: float | None = None
+    threshold: float | None = None
+    unit: str = ""
+
+
 Command = (
     RunGoal
     | RenewGoal
@@ -330,6 +344,7 @@ Command = (
     | Home
     | Calibrate
     | Teach
+    | ReanchorRefused
 )
 
 

@@ -9,9 +9,27 @@ import numpy as np
 from stereoservo.control.reasons import Level, Reason
 from stereoservo.control.safety import SafetyInputs, SafetyLimits, SafetyResult, safety_stage
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime import contact, ending, following, goals, going_on, intake, progress
+from stereoservo.runtime import (
+    contact,
+    ending,
+    following,
+    goals,
+    going_on,
+    health,
+    intake,
+    progress,
+    reanchoring,
+)
 from stereoservo.runtime.check import check_step
-from stereoservo.runtime.cycle import Event, Lifecycle, ModelReadiness, Status, StepInputs, StepOutputs
+from stereoservo.runtime.cycle import (
+    Event,
+    Lifecycle,
+    ModelReadiness,
+    ModelUpdate,
+    Status,
+    StepInputs,
+    StepOutputs,
+)
 from stereoservo.runtime.estimate import (
     SUSPECT_FRAMES,
     TRUSTED_FRAMES,
@@ -28,6 +46,7 @@ from stereoservo.runtime.estimate import (
     priors,
     remember_joints,
 )
+from stereoservo.runtime.health_state import Verdict
 from stereoservo.runtime.incidences import incidence_motion
 from stereoservo.runtime.motion import Motion, Present, joint_move
 from stereoservo.runtime.ports import CameraObservation, FloatArray
@@ -112,7 +131,9 @@ class ServoCore:
         self._watch_contact(present, inputs)
         self._watch_following(present)
         teach_step(present)
+        self._watch_health(present)
         self._watch_model(present)
+        reanchoring.step(present)
         going_on.go_on(present)
         intake.answer_waiting(present)
         motion = self._move(present)
@@ -186,18 +207,41 @@ class ServoCore:
             except ValueError as error:
                 emit("warning", message=f"model refused: {error}")
             else:
-                state.pending_model = inputs.model_update.model
-        if state.pending_model is None or isinstance(state.source, LawRun) or state.planning is not None:
+                self._await(inputs.model_update, emit)
+        if state.pending_model is None:
             return
-        if bool((np.abs(state.command) > AT_REST).any()):
+        run = state.reanchoring
+        if state.pending_reanchored:
+            if run is None or run.phase != "take":
+                return
+            self._use_model(state.pending_model, masked=health.masked_ids(state))
+            reanchoring.taken(run, state, inputs.now_ns)
+        elif isinstance(state.source, LawRun) or state.planning is not None or self._moving():
             return
-        self._use_model(state.pending_model)
-        state.pending_model = None
+        else:
+            self._use_model(state.pending_model)
+            state.reanchoring = None
+        state.pending_model, state.pending_reanchored = None, ()
         emit("model", message=f"model epoch {self._epoch()} is {state.readiness}", name=str(state.readiness))
 
-    def _use_model(self, model: CellModel) -> None:
+    def _moving(self) -> bool:
+        return bool((np.abs(self.state.command) > AT_REST).any())
+
+    def _await(self, update: ModelUpdate, emit: Any) -> None:
+        """Keep a model until it may be used; a re-anchored one must be the one that is waited for."""
+        state = self.state
+        if update.reanchored:
+            refusal = reanchoring.misfit(state, update)
+            if refusal:
+                emit("warning", message=f"re-anchored model refused: {refusal}")
+                return
+        state.pending_model, state.pending_reanchored = update.model, update.reanchored
+
+    def _use_model(self, model: CellModel, masked: tuple[int, ...] = ()) -> None:
+        """``masked``: markers that have slipped and stay unused."""
         state = self.state
         self._arrays = model_arrays(model, self.settings)
+        health.start(state, self._arrays, self.settings, masked)
         state.model = model
         self._contact_limits = self._contact_thresholds()
         state.readiness = self._fitted(model)
@@ -218,6 +262,10 @@ class ServoCore:
         """Fold the observations in, each at its own stamp, and predict the present."""
         state = self.state
         fresh: list[CameraObservation] = []
+        unknown = reanchoring.unknown_cameras(state)
+        usable = state.watching.masked == 0.0
+        for sighting in state.watching.sightings:
+            sighting.fresh = False
         for observation in inputs.observations:
             camera = next(
                 (i for i, c in enumerate(self.settings.cameras) if c.name == observation.camera), None
@@ -233,7 +281,9 @@ class ServoCore:
                 ideal = ideal_observation(self._arrays, camera, observation)
                 then = predict(self._arrays, at_shutter)
                 sights = frame_sights(self._arrays, camera, ideal, then, state.velocities)
-                accept_sights(estimate, sights, np.ones(sights.seen.size, bool), self.settings)
+                health.see(state.watching, camera, sights, at_shutter)
+                if observation.camera not in unknown:
+                    accept_sights(estimate, sights, usable, self.settings)
         common: dict[str, Any] = {
             "now_ns": inputs.now_ns, "dt_s": inputs.period_ns * 1e-9, "q": q, "state": state,
             "settings": self.settings, "observations": tuple(fresh), "emit": emit,
@@ -283,9 +333,46 @@ class ServoCore:
         self.state.driver_request = "deactivate"
         present.emit("fault", message=reason.hint, reasons=(reason,))
 
+    def _watch_health(self, present: Present) -> None:
+        """Say what explains the images, when that has changed, and do what follows."""
+        state = self.state
+        if state.reanchoring is not None and state.reanchoring.phase != "verify":
+            return  # at rest, what stands is watched by `reanchoring`
+        verdict = health.watch(present)
+        if state.reanchoring is None and state.watching.verdict.kind in health.MOVED:
+            self._camera_moved(state.watching.verdict, present, fresh=verdict is not None)
+        if verdict is None or (state.reanchoring is not None and state.reanchoring.phase == "verify"):
+            return
+        health.tell(verdict, present)
+        if verdict.kind == "marker_slipped" and health.mask(verdict, present):
+            subject = ", ".join(verdict.subjects)
+            present.emit("warning", message=f"marker {subject} is not used any more", name=subject)
+
+    def _camera_moved(self, verdict: Verdict, present: Present, *, fresh: bool) -> None:
+        """Find it anew, where that is allowed; else the model is suspect, and what relies on it ends."""
+        state = self.state
+        reason = health.verdict_reason(verdict)
+        assert reason is not None
+        if isinstance(state.source, Visiting):
+            if fresh:
+                ending.end_source(present, "goal_aborted", (reason,), verdict.text)
+            return
+        if verdict.moved_px <= self.settings.tolerance_px or state.readiness == ModelReadiness.SUSPECT:
+            return
+        if self.settings.reanchor:
+            reanchoring.begin(verdict, present)
+            return
+        state.readiness = ModelReadiness.SUSPECT
+        hint = f"{verdict.text}; it is not found anew by itself ([servo] reanchor): calibrate"
+        present.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
+        if isinstance(state.source, LawRun):
+            ending.end_source(present, "goal_aborted", (reason,), hint)
+
     def _watch_model(self, present: Present) -> None:
         """Images that contradict the model for many frames make it SUSPECT; ones that agree with it clear it."""
         state = self.state
+        if state.reanchoring is not None:
+            return
         if state.readiness == ModelReadiness.SUSPECT and state.model is not None:
             if min(estimate.agreeing_frames for estimate in state.cameras) >= TRUSTED_FRAMES:
                 state.readiness = self._fitted(state.model)
@@ -301,7 +388,8 @@ class ServoCore:
             state.readiness = ModelReadiness.SUSPECT
             reason = Reason(
                 "MODEL_SUSPECT", "hold", camera.name, float(estimate.rejected_frames), float(SUSPECT_FRAMES), "frames",
-                f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
+                state.watching.verdict.text
+                or f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
             )  # fmt: skip
             present.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
             if isinstance(state.source, LawRun):
@@ -326,7 +414,7 @@ class ServoCore:
             reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
             ending.end_source(present, "goal_aborted", (reason,), reason.hint)
             return rest
-        if state.held or state.stopped:
+        if state.held or state.stopped or reanchoring.suspended(state):
             return rest
         if isinstance(source, Jogging):
             if present.now_ns >= source.until_ns:
@@ -358,7 +446,7 @@ class ServoCore:
                 feature_age_s=(inputs.now_ns - newest) * 1e-9,
                 needs_features=motion.needs_features,
                 speed_scale=motion.speed_scale * self.settings.limits.speed_scale,
-                brake=state.held or state.stopped,
+                brake=state.held or state.stopped or reanchoring.suspended(state),
             ),
             self._limits,
         )
@@ -375,6 +463,7 @@ class ServoCore:
             self.state.cameras,
             self.state.velocities,
             present.now_ns,
+            reanchoring.unknown_cameras(self.state),
         )
 
     def _epoch(self) -> int:
@@ -383,7 +472,15 @@ class ServoCore:
     def _reasons(self, present: Present, motion: Motion, safety: SafetyResult) -> tuple[Reason, ...]:
         state = self.state
         found = [*state.fault, *safety.reasons, *motion.reasons]
-        if isinstance(state.source, LawRun) and not (state.held or state.stopped):
+        found.extend(reanchoring.reasons(state))
+        if (
+            state.reanchoring is None
+            and (reason := health.verdict_reason(state.watching.verdict)) is not None
+        ):
+            found.append(reason)
+        if isinstance(state.source, LawRun) and not (
+            state.held or state.stopped or reanchoring.suspended(state)
+        ):
             found.extend(progress.watch(state.source, present, tuple(found)))
         if state.planning is not None:
             found.append(progress.planning_reason(state.planning))
@@ -427,6 +524,9 @@ class ServoCore:
             },
             progress=done,
             seconds_left=left_s,
+            health=health.health_now(
+                state, self.settings, "" if state.reanchoring is None else state.reanchoring.phase
+            ),
             **contact.told(state.contact, self._contact_limits),
         )
 

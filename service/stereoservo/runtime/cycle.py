@@ -90,7 +90,10 @@ EventKind = Literal[
     "calibration_finished",
     "calibration_aborted",
     "check_finished",
+    "health",  # the watch over the model has come to another verdict
     "reanchor",  # cameras have moved, the arm rests, and these are the sights to re-anchor them by
+    "reanchored",  # the cameras are known again; a goal that was suspended goes on
+    "reanchor_failed",  # they are not: what is suspended stays so
     "taught",
     "warning",
 ]
@@ -133,6 +136,40 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     """Of a reply to a goal that was planned."""
     loads: JointLoads | None = None
     """Of finished trial motions, where the drives tell."""
+    cameras: tuple[str, ...] = ()
+    """Of ``reanchor`` and what follows it: cameras that have moved; ``rigid``: as one body."""
+    rigid: bool = False
+
+
+class CameraHealth(msgspec.Struct, frozen=True):
+    """How one camera's newest frame agrees with the model: chi-square a freedom, rms innovation [px], the ``worst``
+    marker (-1: none) and its innovation.
+    """
+
+    chi2: float = 0.0
+    rms_px: float = 0.0
+    worst: int = -1
+    worst_px: float = 0.0
+
+
+class Health(msgspec.Struct, frozen=True):
+    """What the watch over the model says.
+
+    ``verdict``: ``ok``, ``camera_moved``, ``cameras_moved_together``, ``marker_slipped``, ``joint_zero``, ``unclear``,
+    or ``unknown`` without a model; ``subjects`` names the cameras, the marker or the joint; ``size`` in ``unit`` with
+    its standard ``deviation``; ``text``: with what to do. ``masked``: markers that are not used. ``reanchoring``: what
+    is being done for cameras that have moved, in a word.
+    """
+
+    verdict: str = "unknown"
+    subjects: tuple[str, ...] = ()
+    size: float = 0.0
+    deviation: float = 0.0
+    unit: str = ""
+    text: str = ""
+    cameras: dict[str, CameraHealth] = {}
+    masked: tuple[int, ...] = ()
+    reanchoring: str = ""
 
 
 class Status(msgspec.Struct, frozen=True, eq=False):
@@ -167,6 +204,7 @@ class Status(msgspec.Struct, frozen=True, eq=False):
     """How far an effort may go from its moving mean (n,), infinite where nobody knows; None: no watch at all."""
     following_limits: FloatArray | None = None
     """Likewise of the following errors, from zero."""
+    health: Health = Health()
 
 
 class StepOutputs(msgspec.Struct, frozen=True, eq=False):

@@ -62,6 +62,12 @@ class ModelArrays:
     """Six twists (6, 4, 4) that span all displacements, where the model is metric."""
     marker_ids: tuple[int, ...]
     index: dict[int, int]
+    scene_ids: tuple[int, ...]
+    scene_points: FloatArray
+    scene_pixels: FloatArray
+    """Static points in the images (c, s, 2): they never move there."""
+    rows: dict[int, int]
+    """Rows of `FrameSights`: the markers, then the static points."""
 
 
 def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
@@ -92,6 +98,8 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         [by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64
     )
     centres = np.array([camera_centre(P) for P in matrices])
+    scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
+    scene_pixels, _ = project_points(matrices, scene)
     return ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
@@ -105,6 +113,10 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         metric_basis=_metric_basis(model),
         marker_ids=model.marker_ids,
         index={marker: i for i, marker in enumerate(model.marker_ids)},
+        scene_ids=model.scene_ids,
+        scene_points=scene,
+        scene_pixels=scene_pixels,
+        rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
     )
 
 
@@ -210,8 +222,10 @@ def ideal_observation(arrays: ModelArrays, camera: int, observation: CameraObser
 
 @dataclass(frozen=True)
 class FrameSights:
-    """One frame against the prediction at its shutter: ``innovation`` (m, 2) [px], its covariance ``spread`` (m, 2, 2)
-    by detector and timing, ``noise`` (m,) [px²] of a coordinate by the detector alone, and what was ``seen`` (m,).
+    """One frame against the prediction at its shutter, k rows: the model's markers, then its static points.
+
+    ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) by detector and timing, ``noise`` (k,) [px²] of a
+    coordinate by the detector alone, and what was ``seen`` (k,).
     """
 
     t_shutter_ns: int
@@ -232,10 +246,12 @@ def frame_sights(
 
     ``speed`` (n,): of the joints then.
     """
-    rows = np.array([arrays.index.get(int(i), -1) for i in observation.ids], dtype=np.int64)
+    rows = np.array([arrays.rows.get(int(i), -1) for i in observation.ids], dtype=np.int64)
+    standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
     innovation, spread, seen = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
-        prediction.pixels[camera], prediction.jacobian[camera], speed, TIMING_SIGMA_S,
+        np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
+        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
     )  # fmt: skip
     noise = np.ones(seen.size)
     for k, row in enumerate(rows):
@@ -252,8 +268,9 @@ def accept_sights(
     The gate is chi-square with two freedoms on the deviation from the filtered innovation, with the covariances of
     detector, timing and model. Near the gate a sight counts less: in the filter, and in triangulation by its sigma.
     """
+    m = used.size
     accepted, rejected, squares = fold_in(
-        sights.innovation, sights.spread, sights.seen & used, sights.noise, sights.t_shutter_ns,
+        sights.innovation[:m], sights.spread[:m], sights.seen[:m] & used, sights.noise[:m], sights.t_shutter_ns,
         estimate.innovation, estimate.sigma, estimate.seen_ns,
         settings.limits.coast_s + 1.0, settings.filter_s, gate_threshold(settings.gate_sigma), MODEL_SIGMA_PX,
         FIRST_SIGHT_SIGMA_PX,
@@ -323,12 +340,17 @@ def with_unit_height(points: FloatArray, plane_at_infinity: FloatArray) -> Float
 
 def priors(
     arrays: ModelArrays, settings: CoreSettings, prediction: Prediction, cameras: list[CameraEstimate],
-    velocities: FloatArray, now_ns: int,
+    velocities: FloatArray, now_ns: int, unknown: tuple[str, ...] = (),
 ) -> tuple[Prior, ...]:  # fmt: skip
-    """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back."""
+    """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back.
+
+    None for cameras of whose place nothing is known: their detectors look in the whole image.
+    """
     ids: IntArray = np.array(arrays.marker_ids, dtype=np.int64)
     found = []
     for camera, estimate in enumerate(cameras):
+        if settings.cameras[camera].name in unknown:
+            continue
         speed = (prediction.jacobian[camera] * velocities).sum(axis=-1)
         fresh = (now_ns - estimate.seen_ns <= 1_000_000_000) & (estimate.seen_ns > 0)
         sigma = np.where(fresh, 1.0, FIRST_SIGHT_SIGMA_PX) + TIMING_SIGMA_S * np.abs(speed).max(axis=-1)

@@ -113,3 +113,25 @@ def fold_in(
         squares += innovation[i, 0] * innovation[i, 0] + innovation[i, 1] * innovation[i, 1]
         accepted += 1
     return accepted, refused, squares
+
+
+@kernel
+def camera_chi2(
+    innovation: FloatArray, spread: FloatArray, used: FloatArray, model_px: float
+) -> tuple[float, float, int, float]:
+    """Chi-square of a frame's innovations (k, 2) where ``used`` (k,) > 0, sum of their squares [px²], the row of the
+    largest squared distance (-1: none) and this distance.
+    """
+    total, squares, largest = 0.0, 0.0, 0.0
+    worst = -1
+    for i in range(used.size):
+        if not used[i] > 0.0:
+            continue
+        x, y = innovation[i, 0], innovation[i, 1]
+        m = model_px * model_px
+        d2 = distance2(x, y, spread[i, 0, 0] + m, spread[i, 0, 1], spread[i, 1, 1] + m)
+        total += d2
+        squares += x * x + y * y
+        if worst < 0 or d2 > largest:
+            worst, largest = i, d2
+    return total, squares, worst, largest

@@ -28,6 +28,7 @@ from stereoservo.runtime.planned import (
     begin_plan,
     unplanned_report,
 )
+from stereoservo.runtime.reanchoring import refuse_while_moved
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.servoing import place_now, start_servoing
 from stereoservo.runtime.state import (
@@ -138,6 +139,7 @@ def prepare(
             "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
         )
     trusted_model(present)
+    refuse_while_moved(present.state)
     if place is None:
         place = place_now(present)
     if isinstance(target, IncidenceTarget):
@@ -197,6 +199,7 @@ def move_goal(command: UpdateGoal, present: Present) -> str:
             "only goals in set-points, points or displacements may be moved",
             subject=command.id,
         )
+    refuse_while_moved(present.state)
     return update(command, source, present, place_now(present), trusted_model(present))
 
 

@@ -136,6 +136,8 @@ def _next_plan(present: Present) -> None:
     """Plan what is to be planned without being asked: a way anew, the next goal, the one after this."""
     state = present.state
     source = state.source
+    if state.reanchoring is not None:
+        return
     if isinstance(source, Servoing) and source.law == "trajectory" and source.plan is None:
         if bool((np.abs(state.command) < AT_REST).all()) and bool(
             (np.abs(state.velocities) < 10 * AT_REST).all()
@@ -209,7 +211,12 @@ def _hand_over(present: Present) -> None:
     if not state.queue or state.queue[0].id != following.goal.id:
         state.ahead = None
         return
-    if state.held or source.error_px is None or source.error_px > source.goal.blend_px:
+    if (
+        state.held
+        or state.reanchoring is not None
+        or source.error_px is None
+        or source.error_px > source.goal.blend_px
+    ):
         return
     state.queue.pop(0)
     state.queued_until_ns.pop(following.goal.id, None)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereoservo.control.reasons import Reason
-from stereoservo.runtime import ending, goals
+from stereoservo.runtime import ending, goals, reanchoring
 from stereoservo.runtime.check import start_check
 from stereoservo.runtime.commands import (
     AcknowledgeGoal,
@@ -19,6 +19,7 @@ from stereoservo.runtime.commands import (
     Hold,
     Home,
     Jog,
+    ReanchorRefused,
     RenewGoal,
     Request,
     Reset,
@@ -140,6 +141,7 @@ def _do(request: Request, command: Command, present: Present) -> str:
         return "holding"
     if isinstance(command, Resume):
         state.held = state.stopped = False
+        reanchoring.try_again(present)
         present.emit("resumed", message=f"resumed by {request.operator}", id=ending.goal_of(state.source))
         return "resumed from the measured state"
     if isinstance(command, RenewGoal):
@@ -150,6 +152,8 @@ def _do(request: Request, command: Command, present: Present) -> str:
         return goals.acknowledge(command, present)
     if isinstance(command, CancelGoal):
         return goals.cancel(command, present)
+    if isinstance(command, ReanchorRefused):
+        return reanchoring.refused(command, present)
     if isinstance(command, Teach):
         return start_teaching(command, request, present)
     ending.may_move(present)

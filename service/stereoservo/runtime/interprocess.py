@@ -79,9 +79,10 @@ class Ask(msgspec.Struct, frozen=True, tag="ask"):
 
 
 class NewModel(msgspec.Struct, frozen=True, tag="model", eq=False):
-    """A model for the core."""
+    """A model for the core. ``reanchored``: see `cycle.ModelUpdate`."""
 
     model: CellModel
+    reanchored: tuple[str, ...] = ()
 
 
 ToServo = Hello | Heartbeat | Ask | NewModel

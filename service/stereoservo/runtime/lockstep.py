@@ -34,6 +34,7 @@ from stereoservo.runtime.record import encode_step, fingerprint
 from stereoservo.runtime.recorder import CHECKPOINT_EVERY_S, FlightRecorder
 from stereoservo.runtime.settings import CoreSettings, core_settings
 from stereoservo.runtime.state import encode_state
+from stereoservo.runtime.vision import PRIOR_MAX_AGE_S
 
 REPLY_TIMEOUT_S = 60.0
 """Of virtual time: a goal is planned before it is answered."""
@@ -85,6 +86,8 @@ class LockstepCell:
             FlightRecorder(recording, self.settings, fingerprint()) if recording is not None else None
         )
         self.on_step = on_step
+        self.on_event: list[Callable[[Event], None]] = []
+        """Called with every event, after its step."""
         self.period_ns = round(1e9 / self.settings.rate_hz)
         self._requests: list[Request] = []
         self._request_number = 0
@@ -132,6 +135,9 @@ class LockstepCell:
             self._priors[prior.camera] = prior
         if self.on_step is not None:
             self.on_step(inputs, outputs)
+        for event in outputs.events:
+            for listener in self.on_event:
+                listener(event)
         return outputs
 
     def _checkpoint(self, now_ns: int) -> bytes | None:
@@ -163,10 +169,17 @@ class LockstepCell:
                 if isinstance(item, Frame):
                     if detector is None:
                         raise ValueError(f"camera {description.name!r} delivers frames; it needs a detector")
-                    found.append(detector.detect(item, self._priors.get(description.name)))
+                    found.append(detector.detect(item, self._fresh_prior(description.name)))
                 else:
                     found.append(item)
         return found
+
+    def _fresh_prior(self, camera: str) -> Prior | None:
+        """As the vision process does: an old prior is none."""
+        prior = self._priors.get(camera)
+        if prior is None or (self.clock.now_ns() - prior.t_ns) * 1e-9 > PRIOR_MAX_AGE_S:
+            return None
+        return prior
 
     def _act(self, outputs: StepOutputs) -> None:
         try:
@@ -197,6 +210,11 @@ class LockstepCell:
         return self.wait_for(
             lambda event: event.kind == "reply" and event.request == number, REPLY_TIMEOUT_S, since
         )
+
+    def request(self, command: Command, operator: str = "lockstep") -> None:
+        """Send a command and do not wait for its reply."""
+        self._request_number += 1
+        self._requests.append(Request(self._request_number, operator, command))
 
     def raise_stop(self) -> None:
         """Raise the stop slot."""

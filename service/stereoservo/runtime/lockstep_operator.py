@@ -8,7 +8,7 @@ from collections.abc import Callable
 from stereoservo.kinematics.calibration.check import check_model_holds, examine, report_of
 from stereoservo.kinematics.calibration.check_report import CheckReport, ZeroReset
 from stereoservo.kinematics.calibration.fit import fit_model
-from stereoservo.kinematics.calibration.trials import TrialData
+from stereoservo.kinematics.calibration.trials import CalibrationError, TrialData
 from stereoservo.kinematics.calibration.zero_reset import reset_zeros
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.calibration_job import CalibrationJob
@@ -20,6 +20,7 @@ from stereoservo.runtime.commands import (
     Goal,
     Home,
     PlanReport,
+    ReanchorRefused,
     RunGoal,
     Target,
     TaughtTarget,
@@ -27,6 +28,7 @@ from stereoservo.runtime.commands import (
 )
 from stereoservo.runtime.cycle import Event, Lifecycle, ModelUpdate
 from stereoservo.runtime.lockstep import LockstepCell
+from stereoservo.runtime.reanchor_job import ReanchorJob, find_anew
 from stereoservo.runtime.taught import feature_target
 
 TERMINAL = frozenset({"goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted"})
@@ -50,7 +52,27 @@ class LockstepOperator:
         self.trials: TrialData | None = None
         self._epoch = 0
         self._body: tuple[int, ...] | None = None
+        self._reanchoring = ReanchorJob()
+        self.answers = True
+        """Whether cameras that have moved are found anew for the core."""
+        cell.on_event.append(self._answer)
         self._ids = (uuid.UUID(int=(seed << 32) + k) for k in range(1, 1 << 32))
+
+    def _answer(self, event: Event) -> None:
+        """As the gateway does: find moved cameras anew, from what the core saw."""
+        if event.kind != "reanchor":
+            return
+        self._reanchoring.add(event)
+        model = self.cell.core.state.model
+        if not self.answers or model is None:
+            return
+        try:
+            found = find_anew(self._reanchoring.events, model, max(self._epoch, model.epoch) + 1)
+        except CalibrationError as error:
+            self.cell.request(ReanchorRefused(str(error)))
+            return
+        self._epoch = found.model.epoch
+        self.cell.update_model(ModelUpdate(found.model, event.cameras))
 
     def _submit(self, command: Command) -> Event:
         reply = self.cell.submit(command)

@@ -195,7 +195,7 @@ class ServoProcess:
                 if isinstance(message, Ask):
                     requests.append(message.request)
                 elif isinstance(message, NewModel):
-                    model = ModelUpdate(message.model)
+                    model = ModelUpdate(message.model, message.reanchored)
                 elif isinstance(message, Hello):
                     self._outbox.rewind(message.last_event)
                 else:

@@ -13,12 +13,14 @@ from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.commands import Goal, Request
 from stereoservo.runtime.cycle import Lifecycle, ModelReadiness, decode_array, encode_array
+from stereoservo.runtime.health_state import Reanchoring, Watching, nothing_sighted
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.sums import Sums
 from stereoservo.trajectory.plan import Plan
 from stereoservo.trajectory.planning import Planning
 
-STATE_VERSION = 5
+STATE_VERSION = 6
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
 
 
@@ -231,25 +233,6 @@ class Incidence(LawRun, tag="incidence", eq=False, kw_only=True):
     wanted: FloatArray
 
 
-class Sums(msgspec.Struct, eq=False, kw_only=True):
-    """Sights of the markers, summed up while the arm rests; see ``averaging``."""
-
-    counts: FloatArray
-    """Sights of each marker in each camera, (c, m)."""
-    sums: FloatArray
-    """(c, m, 2)"""
-    first: FloatArray
-    """Pixels at the first sight (c, m, 2), against which the scatter is taken."""
-    deviation_sums: FloatArray
-    """(c, m, 2)"""
-    square_sums: FloatArray
-    """(c, m)"""
-    covariance_sums: FloatArray
-    """(c, m, 2, 2)"""
-    frames: IntArray
-    """Frames taken, by camera."""
-
-
 class Visiting(Leased, eq=False, kw_only=True):
     """Goes to configurations and looks from there at rest; see ``visiting``."""
 
@@ -383,6 +366,11 @@ class CoreState(msgspec.Struct, eq=False):
     correction: FloatArray
     """Joint-space correction that explains the innovations best (n,)."""
     contact: Contact
+    watching: Watching
+    reanchoring: Reanchoring | None
+    """While it is not None, no law runs: its goal waits."""
+    pending_reanchored: tuple[str, ...]
+    """Of ``pending_model``: see `cycle.ModelUpdate`."""
 
 
 def initial_state(settings: CoreSettings) -> CoreState:
@@ -420,6 +408,9 @@ def initial_state(settings: CoreSettings) -> CoreState:
         last_positions=None,
         correction=np.zeros(n),
         contact=no_contact(n, 1 if settings.contact is None else settings.contact.samples),
+        watching=nothing_sighted(len(settings.cameras), 0, n, 0),
+        reanchoring=None,
+        pending_reanchored=(),
     )
 
 

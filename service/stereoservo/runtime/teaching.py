@@ -7,6 +7,7 @@ import numpy as np
 from stereoservo.runtime.averaging import add_observation, averages
 from stereoservo.runtime.commands import Request, Teach
 from stereoservo.runtime.motion import Present, measurement_buffers
+from stereoservo.runtime.reanchoring import refuse_while_moved
 from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.state import Teaching
 
@@ -26,6 +27,7 @@ def start_teaching(command: Teach, request: Request, present: Present) -> str:
         raise RefusalError(
             "TEACHING", f"goal {state.teaching.name!r} is still being taught", subject=state.teaching.name
         )
+    refuse_while_moved(state)
     if bool((np.abs(state.command) > AT_REST).any()):
         raise RefusalError(
             "MOVING",
@@ -48,6 +50,9 @@ def teach_step(present: Present) -> None:
         return
     if bool((np.abs(state.command) > AT_REST).any()):
         _give_up(teaching, present, "the arm moved")
+        return
+    if state.reanchoring is not None:
+        _give_up(teaching, present, "a camera moved")
         return
     for observation in present.observations:
         add_observation(teaching, settings, observation, teaching.frames_wanted, teaching.started_ns)

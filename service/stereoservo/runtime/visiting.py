@@ -13,7 +13,8 @@ from stereoservo.runtime.estimate import joints_at
 from stereoservo.runtime.motion import ARRIVED, Motion, Present, arrived, measurement_buffers, towards
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.settings import CoreSettings, TrialSettings
-from stereoservo.runtime.state import Sums, Visiting
+from stereoservo.runtime.state import Visiting
+from stereoservo.runtime.sums import Sums
 
 FIRST_FRAME_S = 120.0  # a camera that has never delivered may still be starting
 LOST_S = 0.4  # markers missing for so long in motion: back off

@@ -1,0 +1,129 @@
+"""Moved cameras found anew for the core: its sights in, a process of its own, the model, or the refusal, back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from stereoservo.gateway.fitting import ChildJob, FitFailedError
+from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.servolink import ServoLink
+from stereoservo.gateway.stores import ModelStore
+from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
+from stereoservo.runtime.commands import ReanchorRefused
+from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.reanchor_job import ReanchorJob, save_events
+from stereoservo.runtime.reanchor_process import ReanchorReport
+
+OPERATOR = "the gateway"
+
+
+class ReanchorFit(ChildJob):
+    """One running process. ``cameras``: that it looks for."""
+
+    def __init__(self, job: ReanchorJob, model_path: Path, new_path: Path, epoch: int) -> None:
+        self.cameras = job.events[-1].cameras
+        self.goal = job.events[-1].id
+        sights = new_path.with_name("reanchor.msgpack")
+        save_events(sights, job.events)
+        super().__init__(
+            "stereoservo.runtime.reanchor_process",
+            str(sights),
+            str(model_path),
+            str(new_path),
+            "--epoch",
+            str(epoch),
+        )
+
+    def report(self) -> tuple[CellModel, ReanchorReport]:
+        """The new model and what is to be said of it. Raises FitFailedError, ModelFileError."""
+        report = msgspec.convert(self.require("reanchored"), ReanchorReport)
+        return load_model(Path(report.model)), report
+
+
+class Reanchoring:
+    """Answers the core's events ``reanchor``. ``model``: gives the model in use, ``take`` makes another the one."""
+
+    def __init__(
+        self,
+        models: ModelStore,
+        link: ServoLink,
+        log: EventLog,
+        model: Callable[[], CellModel | None],
+        take: Callable[[CellModel], None],
+    ) -> None:
+        self._models, self._link, self._log = models, link, log
+        self._model, self._take = model, take
+        self._job = ReanchorJob()
+        self._fit: ReanchorFit | None = None
+        self._handed: CellModel | None = None
+
+    def core_event(self, event: Event, *, fresh: bool) -> None:
+        """Take an event of the core; ``fresh``: it was not acted upon before a restart of the gateway."""
+        if event.kind == "reanchor":
+            self._job.add(event)
+            if fresh:
+                self._start()
+        elif event.kind == "model" and self._handed is not None:
+            self._take(self._handed)
+            self._handed = None
+
+    def _start(self) -> None:
+        self.cancel()
+        model = self._model()
+        if model is None:
+            self._refuse("the model that the cameras belong to is gone: calibrate")
+            return
+        try:
+            epoch = self._models.next_epoch()
+            self._fit = ReanchorFit(
+                self._job, self._models.path(model.epoch), self._models.path(epoch), epoch
+            )
+        except OSError as error:
+            self._refuse(str(error))
+
+    def follow(self) -> None:
+        """When the process has ended, hand its model over, or say why there is none."""
+        fit = self._fit
+        if fit is None:
+            return
+        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        for _ in fit.poll():
+            pass
+        if not ended:
+            return
+        self._fit = None
+        try:
+            model, report = fit.report()
+        except FitFailedError as error:
+            self._refuse(str(error), error.code)
+        except ModelFileError as error:
+            self._refuse(str(error))
+        else:
+            self._hand_over(model, report, fit)
+        fit.close()
+
+    def _hand_over(self, model: CellModel, report: ReanchorReport, fit: ReanchorFit) -> None:
+        if not self._link.give_model(model, fit.cameras):
+            self._refuse(f"the servo process does not take the model; it is saved as {report.model}")
+            return
+        self._handed = model
+        self._log.add(
+            "reanchor_model",
+            message=report.message,
+            id=fit.goal,
+            name=", ".join(fit.cameras),
+            origin="gateway",
+        )
+
+    def _refuse(self, message: str, code: str = "") -> None:
+        self._log.add("reanchor_model", message=message, name=code, accepted=False, origin="gateway")
+        self._link.ask(ReanchorRefused(message), OPERATOR)
+
+    def cancel(self) -> None:
+        """End what runs. Idempotent."""
+        if self._fit is not None:
+            self._fit.close()
+        self._fit = None

@@ -1,0 +1,113 @@
+"""What the core remembers of the model's health, and of cameras that are being found anew: parts of its state."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from stereoservo.control.reasons import Reason
+from stereoservo.runtime.ports import FloatArray, IntArray
+from stereoservo.runtime.sums import Sums
+
+VerdictKind = Literal[
+    "ok", "camera_moved", "cameras_moved_together", "marker_slipped", "joint_zero", "unclear"
+]
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What explains the innovations: ``subjects`` names cameras, the marker or the joint; ``size`` in ``unit``, its
+    standard ``deviation``; ``moved_px``: what it moves in the images, rms; ``text`` in words.
+    """
+
+    kind: VerdictKind = "ok"
+    subjects: tuple[str, ...] = ()
+    size: float = 0.0
+    deviation: float = 0.0
+    unit: str = ""
+    moved_px: float = 0.0
+    text: str = ""
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What two frames must agree in."""
+        return (self.kind, *self.subjects)
+
+
+class Sighting(msgspec.Struct, eq=False):
+    """The newest frame of one camera against the prediction at its shutter: markers of the model, then static points.
+
+    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0; joints ``q`` (n,).
+    ``fresh``: it came in this step; ``looked``: a round has looked at it. ``chi2`` a freedom, ``rms_px`` and the
+    ``worst`` row are its own.
+    """
+
+    innovation: FloatArray
+    spread: FloatArray
+    seen: FloatArray
+    q: FloatArray
+    t_ns: int = 0
+    fresh: bool = False
+    looked: bool = True
+    chi2: float = 0.0
+    rms_px: float = 0.0
+    worst: int = -1
+    worst_px: float = 0.0
+
+
+class Watching(msgspec.Struct, eq=False):
+    """The watch over the model. ``last``: verdicts of the last rounds of frames, newest last. ``masked`` (m,): 1 for
+    markers that have slipped and are not used; ``back`` (m,): rounds in a row in which such a one was in its place.
+    """
+
+    sightings: list[Sighting]
+    masked: FloatArray
+    back: IntArray
+    verdict: Verdict = msgspec.field(default_factory=Verdict)
+    last: list[Verdict] = []
+    rounds: int = 0
+    due: bool = False
+    """A camera has given two frames since the last round: the others are not waited for."""
+
+
+class Reanchoring(msgspec.Struct, eq=False, kw_only=True):
+    """Cameras that have moved and are being found anew; see `reanchoring`.
+
+    ``together``: they moved as one body. ``sums``, ``joint_sum`` (n,): sights at rest. ``reference`` (c, k, 2) [px]:
+    the innovations of the first frame at rest, and ``referred`` (c, k) 1 where there is one: what stands keeps them.
+    ``poses``: handed out so far, ``tried_at`` (n,) the joints of the last and ``tried_seen`` how much the moved cameras
+    saw there. ``reason``: why it has failed.
+    """
+
+    phase: Literal["brake", "collect", "wait", "take", "verify", "failed"]
+    cameras: tuple[str, ...]
+    together: bool
+    moved_px: float
+    since_ns: int
+    phase_ns: int
+    sums: Sums
+    joint_sum: FloatArray
+    reference: FloatArray
+    referred: FloatArray
+    tried_at: FloatArray
+    joint_frames: int = 0
+    rested_ns: int = 0
+    poses: int = 0
+    tried_seen: int = 0
+    tries: int = 0
+    contradicting: int = 0
+    """Frames in a row in which what stands has moved."""
+    reason: Reason | None = None
+
+
+def nothing_sighted(cameras: int, rows: int, joints: int, markers: int) -> Watching:
+    """A watch that has seen nothing: ``rows`` markers and static points, of them ``markers`` of the model."""
+    return Watching(
+        [
+            Sighting(np.zeros((rows, 2)), np.zeros((rows, 2, 2)), np.zeros(rows), np.zeros(joints))
+            for _ in range(cameras)
+        ],
+        np.zeros(markers),
+        np.zeros(markers, np.int64),
+    )

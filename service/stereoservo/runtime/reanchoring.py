@@ -1,0 +1,400 @@
+"""Cameras that have moved are found anew while the goal waits: brake, look at rest, ask for a model, verify, go on.
+
+The core only looks; `kinematics.calibration.reanchoring` makes the model, outside the servo process. What stands at
+rest keeps its innovation: where that changes, a camera was moved again, and all begins anew.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.control.reasons import Reason
+from stereoservo.runtime.averaging import add_observation, averages
+from stereoservo.runtime.carrying_over import carry_goal, carry_run
+from stereoservo.runtime.commands import Goal, ReanchorRefused
+from stereoservo.runtime.cycle import ModelUpdate, Sample
+from stereoservo.runtime.ending import end_followers, end_source, forget_ahead, goal_of
+from stereoservo.runtime.estimate import ModelArrays, joints_at, model_arrays
+from stereoservo.runtime.health_state import Reanchoring, Verdict
+from stereoservo.runtime.motion import Present, measurement_buffers
+from stereoservo.runtime.refusal import RefusalError
+from stereoservo.runtime.servoing import place_now
+from stereoservo.runtime.state import CoreState, LawRun, Visiting
+from stereoservo.runtime.sums import Sums
+
+AT_REST = 1e-3
+"""Command [rad/s or m/s]."""
+RESTING = 0.01
+"""Measured velocity [rad/s or m/s]."""
+SETTLE_S = 0.15
+FRAMES = 16
+"""That are averaged, of each camera that has moved."""
+COLLECT_S = 3.0
+ANSWER_S = 60.0
+"""How long a model may be waited for."""
+VERIFY_ROUNDS = 3
+VERIFY_S = 3.0
+MOST_TRIES = 4
+MOVED_AGAIN_PX = 3.0
+"""Median change of what stands, at rest, from which a camera has been moved again."""
+SAME_PLACE = 2e-3
+OTHER_PLACE = 0.05
+"""Joint motion [rad or m] after which what could not be found is looked for again."""
+AGAIN_S = 1.0
+FEWEST = 4
+"""Known points that a camera must see before a fit is worth trying."""
+
+
+def begin(verdict: Verdict, present: Present) -> None:
+    """Cameras have moved, by ``verdict``: no law runs until they are known again."""
+    state, settings = present.state, present.settings
+    names = list(verdict.subjects)
+    state.reanchoring = Reanchoring(
+        phase="brake",
+        cameras=tuple(names),
+        together=verdict.kind == "cameras_moved_together",
+        moved_px=verdict.moved_px,
+        since_ns=present.now_ns,
+        phase_ns=present.now_ns,
+        sums=Sums(**measurement_buffers(settings)),
+        joint_sum=np.zeros_like(present.q),
+        reference=np.zeros((len(settings.cameras), _rows(state), 2)),
+        referred=np.zeros((len(settings.cameras), _rows(state))),
+        tried_at=present.q.copy(),
+    )
+    _forget(names, present)
+
+
+def _rows(state: CoreState) -> int:
+    return len(state.watching.sightings[0].seen)
+
+
+def _forget(names: list[str], present: Present) -> None:
+    """What these cameras said last holds no more."""
+    for camera, estimate in zip(present.settings.cameras, present.state.cameras, strict=True):
+        if camera.name in names:
+            estimate.seen_ns[:] = 0
+            estimate.innovation[:] = 0.0
+
+
+def suspended(state: CoreState) -> bool:
+    """Whether the active law waits for cameras to be known again."""
+    return state.reanchoring is not None and isinstance(state.source, LawRun)
+
+
+def unknown_cameras(state: CoreState) -> tuple[str, ...]:
+    """Cameras whose pixels mean nothing now."""
+    run = state.reanchoring
+    return () if run is None or run.phase == "verify" else run.cameras
+
+
+def reasons(state: CoreState) -> tuple[Reason, ...]:
+    """Why laws wait."""
+    run = state.reanchoring
+    if run is None:
+        return ()
+    if run.reason is not None:
+        return (run.reason,)
+    doing = {
+        "brake": "the arm comes to rest", "collect": "looking at rest", "wait": "it is being found anew",
+        "take": "its new place is taken over", "verify": "its new place is verified",
+    }[run.phase]  # fmt: skip
+    return (
+        Reason(
+            "CAMERA_MOVED", "hold", ", ".join(run.cameras), run.moved_px, None, "px",
+            f"{_named(run.cameras)} moved: {doing}; laws go on by themselves. Leave it alone now",
+        ),
+    )  # fmt: skip
+
+
+def misfit(state: CoreState, update: ModelUpdate) -> str:
+    """Why a re-anchored model is not the one that is waited for; empty where it is."""
+    run, model = state.reanchoring, state.model
+    if run is None or model is None or run.phase != "wait":
+        return "no cameras are being found anew, or they have moved again since"
+    if set(update.reanchored) != set(run.cameras):
+        return f"it is re-anchored for {', '.join(update.reanchored)}; {', '.join(run.cameras)} moved"
+    same = np.array_equal(update.model.plane_at_infinity, model.plane_at_infinity) and np.array_equal(
+        update.model.generators, model.generators
+    )
+    return "" if same else "it is of another frame than the model in use"
+
+
+def refuse_while_moved(state: CoreState) -> None:
+    """Raises RefusalError while cameras are being found anew: pixels of then and now mean different things."""
+    run = state.reanchoring
+    if run is not None:
+        raise RefusalError(
+            "CAMERA_MOVED",
+            f"{_named(run.cameras)} moved and is not known again yet: wait for the event reanchored, or calibrate",
+            subject=", ".join(run.cameras),
+        )
+
+
+def step(present: Present) -> None:
+    """One step of it."""
+    state = present.state
+    run = state.reanchoring
+    if run is None:
+        return
+    if isinstance(state.source, Visiting):
+        state.reanchoring = None  # what calibrates, or checks, needs no model of before
+        return
+    resting = bool((np.abs(state.command) < AT_REST).all() and (np.abs(state.velocities) < RESTING).all())
+    if run.phase in ("collect", "wait", "failed") and _moved_again(run, present):
+        return
+    if run.phase == "brake":
+        if not resting:
+            run.phase_ns = present.now_ns
+        elif (present.now_ns - run.phase_ns) * 1e-9 >= SETTLE_S:
+            _begin_to_look(run, present)
+    elif run.phase == "collect":
+        if resting:
+            _look(run, present)
+        else:
+            _enter(run, "brake", present)
+    elif run.phase == "wait":
+        if (
+            state.pending_model is not None
+            and state.pending_reanchored
+            and resting
+            and state.planning is None
+        ):
+            _carry_over(run, present)
+        elif (present.now_ns - run.phase_ns) * 1e-9 > ANSWER_S:
+            _fail(run, present, "no model came: is the gateway alive? See the daemon's log", ANSWER_S, "s")
+    elif run.phase == "verify":
+        _verify(run, present)
+    elif run.phase == "failed" and resting and (present.now_ns - run.phase_ns) * 1e-9 > AGAIN_S:
+        elsewhere = bool((np.abs(present.q - run.tried_at) > OTHER_PLACE).any())
+        if elsewhere or _seen_now(run, present) > run.tried_seen:
+            try_again(present)
+
+
+def try_again(present: Present) -> None:
+    """Look again after a failure: more is seen, the arm stands elsewhere, or somebody asks for it."""
+    run = present.state.reanchoring
+    if run is not None and run.phase == "failed":
+        run.reason = None
+        run.tries = 0
+        _enter(run, "brake", present)
+
+
+def refused(command: ReanchorRefused, present: Present) -> str:
+    """The fit could not find the cameras. Raises RefusalError where nobody asked for it."""
+    run = present.state.reanchoring
+    if run is None or run.phase != "wait":
+        raise RefusalError("NOT_AWAITED", "no cameras are being found anew")
+    _fail(run, present, command.message, command.value, command.unit, command.threshold)
+    return "the cameras stay unknown"
+
+
+def _enter(run: Reanchoring, phase: str, present: Present) -> None:
+    run.phase = phase  # type: ignore[assignment]
+    run.phase_ns = present.now_ns
+
+
+def _begin_to_look(run: Reanchoring, present: Present) -> None:
+    _enter(run, "collect", present)
+    run.sums = Sums(**measurement_buffers(present.settings))
+    run.joint_sum = np.zeros_like(present.q)
+    run.joint_frames = 0
+    run.referred[:] = 0.0
+    run.contradicting = 0
+    run.tried_at = present.q.copy()
+
+
+def _moved_again(run: Reanchoring, present: Present) -> bool:
+    """Whether what stands has moved in some image since the arm rests; then everything begins anew."""
+    if bool((np.abs(present.q - run.tried_at) > SAME_PLACE).any()):
+        return False
+    moved: list[str] = []
+    for c, camera in enumerate(present.settings.cameras):
+        sighting = present.state.watching.sightings[c]
+        if sighting.t_ns <= run.phase_ns or not sighting.fresh:
+            continue
+        known = run.referred[c] > 0.0
+        both = known & (sighting.seen > 0.0)
+        if int(both.sum()) >= 3:
+            apart = np.sqrt(((sighting.innovation - run.reference[c])[both] ** 2).sum(axis=-1))
+            if float(np.median(apart)) > MOVED_AGAIN_PX:
+                moved.append(camera.name)
+        fresh = ~known & (sighting.seen > 0.0)
+        run.reference[c][fresh] = sighting.innovation[fresh]
+        run.referred[c][fresh] = 1.0
+    if not moved:
+        run.contradicting = 0
+        return False
+    run.contradicting += 1
+    if run.contradicting < 2:
+        return False
+    more = [name for name in moved if name not in run.cameras]
+    run.together = False
+    run.cameras = (*run.cameras, *more)
+    run.poses = 0
+    run.tries = 0
+    run.reason = None
+    present.state.pending_model = None if present.state.pending_reanchored else present.state.pending_model
+    present.state.pending_reanchored = ()
+    _forget(list(run.cameras), present)
+    message = f"{_named(tuple(moved))} moved again while cameras were being found anew: looking once more"
+    present.emit("health", message=message, name="camera_moved", cameras=run.cameras)
+    _enter(run, "brake", present)
+    return True
+
+
+def _look(run: Reanchoring, present: Present) -> None:
+    for observation in present.observations:
+        at_shutter = joints_at(present.state.history, observation.t_shutter_ns)
+        if at_shutter is not None and add_observation(
+            run.sums, present.settings, observation, FRAMES, run.phase_ns
+        ):
+            run.joint_sum += at_shutter
+            run.joint_frames += 1
+    wanted = [c for c, camera in enumerate(present.settings.cameras) if camera.name in run.cameras]
+    waited_s = (present.now_ns - run.phase_ns) * 1e-9
+    if not bool((run.sums.frames[wanted] >= FRAMES).all()) and waited_s <= COLLECT_S:
+        return
+    samples = averages(run.sums, present.settings)
+    run.tried_seen = sum(len(_known(sample, present)) for sample in samples if sample.camera in run.cameras)
+    for sample in samples:
+        if sample.camera in run.cameras and len(_known(sample, present)) < FEWEST:
+            few, frames = len(_known(sample, present)), sample.frames
+            _fail(
+                run, present,
+                f"camera {sample.camera} sees {few} known markers in {frames} frames, {FEWEST} are needed: turn it "
+                "back to the arm or to the static markers, or move the arm before it by joints",
+                float(few), "markers", float(FEWEST),
+            )  # fmt: skip
+            return
+    present.emit(
+        "reanchor", id=goal_of(present.state.source), joints=run.joint_sum / max(run.joint_frames, 1),
+        samples=samples, trial=run.poses, cameras=run.cameras, rigid=run.together,
+        message=f"{_named(run.cameras)} seen at rest: to be found anew",
+    )  # fmt: skip
+    run.poses += 1
+    _enter(run, "wait", present)
+
+
+def _known(sample: Sample, present: Present) -> list[int]:
+    model = present.state.model
+    assert model is not None
+    points = {*model.marker_ids, *model.scene_ids}
+    return [int(i) for i in sample.ids if int(i) in points]
+
+
+def _seen_now(run: Reanchoring, present: Present) -> int:
+    """Known points in the newest frames of the cameras that have moved."""
+    return sum(
+        int(sighting.seen.sum())
+        for camera, sighting in zip(present.settings.cameras, present.state.watching.sightings, strict=True)
+        if camera.name in run.cameras
+    )
+
+
+def _fail(
+    run: Reanchoring, present: Present, why: str, value: float | None, unit: str, limit: float | None = None
+) -> None:
+    run.reason = Reason(
+        "REANCHOR_FAILED", "hold", ", ".join(run.cameras), value, limit, unit,
+        f"{_named(run.cameras)} moved and could not be found anew: {why}. It is tried again when more is seen, when "
+        "the arm rests elsewhere, and on resume; or cancel the goal and calibrate",
+    )  # fmt: skip
+    _enter(run, "failed", present)
+    present.emit(
+        "reanchor_failed", id=goal_of(present.state.source), message=run.reason.hint, reasons=(run.reason,),
+        cameras=run.cameras,
+    )  # fmt: skip
+
+
+def _carry_over(run: Reanchoring, present: Present) -> None:
+    """Say the goals in the new cameras' pixels; the model is taken with the next step."""
+    state = present.state
+    old, model = state.model, state.pending_model
+    assert old is not None
+    assert model is not None
+    moved = tuple(
+        c for c, camera in enumerate(present.settings.cameras) if camera.name in state.pending_reanchored
+    )
+    new: ModelArrays = model_arrays(model, present.settings)
+    epochs = (old.epoch, model.epoch)
+    place = place_now(present)
+    forget_ahead(present)
+    kept: list[Goal] = []
+    queued, state.queue = state.queue, []
+    for k, goal in enumerate(queued):
+        carried = carry_goal(goal, place, new, moved, epochs)
+        if isinstance(carried, Reason):
+            state.queued_until_ns.pop(goal.id, None)
+            present.emit("goal_aborted", id=goal.id, message=carried.hint, reasons=(carried,))
+            if goal.acknowledge_s is not None:
+                state.queue = queued[k + 1 :]
+                end_followers(present, goal, (carried,))
+                break
+        else:
+            kept.append(carried)
+    state.queue = kept
+    if isinstance(state.source, LawRun):
+        reason = carry_run(state.source, place, new, moved)
+        if reason is not None:
+            end_source(present, "goal_aborted", (reason,), reason.hint)
+    _enter(run, "take", present)
+
+
+def taken(run: Reanchoring, state: CoreState, now_ns: int) -> None:
+    """The new model is in use: laws begin to count frames anew, and fresh frames must agree with it."""
+    run.phase, run.phase_ns = "verify", now_ns
+    if isinstance(state.source, LawRun):
+        state.source.last_frames = sum(estimate.frames for estimate in state.cameras)
+        state.source.held = 0
+
+
+def _verify(run: Reanchoring, present: Present) -> None:
+    state = present.state
+    watching = state.watching
+    last = watching.last[-VERIFY_ROUNDS:]
+    seen = [
+        sighting
+        for camera, sighting in zip(present.settings.cameras, watching.sightings, strict=True)
+        if camera.name in run.cameras
+    ]
+    looked = all(s.t_ns > run.phase_ns and int(s.seen.sum()) >= 3 for s in seen)
+    if len(last) == VERIFY_ROUNDS and looked and all(verdict.kind == "ok" for verdict in last):
+        _known_again(run, present)
+        return
+    contradicted = len(last) == VERIFY_ROUNDS and all(verdict.kind != "ok" for verdict in last)
+    late = (present.now_ns - run.phase_ns) * 1e-9 > VERIFY_S
+    if not (contradicted or late):
+        return
+    run.tries += 1
+    if run.tries < MOST_TRIES:
+        verdict = last[-1] if last else Verdict()
+        more = verdict.subjects if verdict.kind in ("camera_moved", "cameras_moved_together") else ()
+        run.cameras = (*run.cameras, *(name for name in more if name not in run.cameras))
+        run.poses = 0
+        _forget(list(run.cameras), present)
+        _enter(run, "brake", present)
+        return
+    worst = max(sighting.rms_px for sighting in seen)
+    _fail(run, present, "frames of now contradict each model that was made", worst, "px")
+
+
+def _known_again(run: Reanchoring, present: Present) -> None:
+    state = present.state
+    state.reanchoring = None
+    px = ", ".join(
+        f"{camera.name} {sighting.rms_px:.2g} px rms"
+        for camera, sighting in zip(present.settings.cameras, state.watching.sightings, strict=True)
+    )
+    seconds = (present.now_ns - run.since_ns) * 1e-9
+    goal = goal_of(state.source)
+    on = f"; goal {goal} goes on" if goal else ""
+    present.emit(
+        "reanchored", id=goal, cameras=run.cameras, rigid=run.together,
+        message=f"{_named(run.cameras)} moved by {run.moved_px:.3g} px and is known again after {seconds:.1f} s: now "
+        f"{px}{on}",
+    )  # fmt: skip
+
+
+def _named(cameras: tuple[str, ...]) -> str:
+    return f"camera{'s' if len(cameras) > 1 else ''} {', '.join(cameras)}"
