@@ -8,150 +8,26 @@ from __future__ import annotations
 
 import base64
 import http.client
-import re
 import select
 import socket
 import ssl
+import urllib.request
 from contextlib import suppress
-from dataclasses import dataclass, field
-from urllib.parse import SplitResult, unquote, urljoin, urlsplit
+from urllib.parse import SplitResult, unquote, urljoin, urlsplit, urlunsplit
 
 import cv2
 import numpy as np
 
 from stereoservo.runtime.ports import Clock, DriverError
+from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, Part, number_in
 from stereoservo_drivers.video.options import Place, VideoOptions
 from stereoservo_drivers.video.pictures import check_size, jpeg_flag, jpeg_size
 from stereoservo_drivers.video.sources import Picture, Settings
 
-LARGEST_PART = 50_000_000
-LONGEST_HEADERS = 16384
 CHUNK = 1 << 18
 MOST_READS = 64
 SPOILED_IN_A_ROW = 10
 REDIRECTIONS = 3
-_HEADERS_END = re.compile(rb"\A\r?\n|\r?\n\r?\n")
-"""An empty line; the first, where a part has no headers."""
-
-
-class MultipartError(Exception):
-    """The stream is not what it says: ``code`` as of DriverError."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
-
-
-@dataclass
-class Part:
-    """One part: when its first byte was there, its headers by name in lower case, its body; ``cut``: not all of it."""
-
-    t_ns: int
-    headers: dict[str, str] = field(default_factory=dict)
-    body: bytes = b""
-    cut: bool = False
-
-
-class MultipartParser:
-    """Bytes in as they come, whole parts out. Finds its way again after a part that is not as long as it says."""
-
-    def __init__(self, boundary: str, largest: int = LARGEST_PART) -> None:
-        # Half of the servers write the boundary's leading "--" into the header already: both end in this.
-        self._delimiter = b"--" + boundary.encode("latin-1").lstrip(b"-")
-        self._largest = largest
-        self._buffer = bytearray()
-        self._part: Part | None = None
-        self._length: int | None = None
-        self._in_body = False
-        self._scanned = 0
-
-    def feed(self, data: bytes, t_ns: int) -> list[Part]:
-        """Take ``data`` received at ``t_ns``; the parts that it completes.
-
-        Raises MultipartError: ``frame_too_large``, ``not_mjpeg``.
-        """
-        self._buffer += data
-        parts: list[Part] = []
-        while True:
-            if self._part is None:
-                if not self._find_part():
-                    return parts
-                self._part = Part(t_ns)
-            if not self._in_body and not self._read_headers(self._part):
-                return parts
-            if not self._read_body(self._part):
-                return parts
-            parts.append(self._part)
-            self._part = None
-
-    def _find_part(self) -> bool:
-        """Pass over everything to after the next boundary's line, and see that something follows."""
-        at = self._buffer.find(self._delimiter, self._scanned)
-        if at < 0:
-            keep = len(self._delimiter) - 1
-            if len(self._buffer) > self._largest:
-                raise MultipartError("not_mjpeg", "its boundary does not come")
-            self._scanned = max(0, len(self._buffer) - keep)
-            return False
-        end = self._buffer.find(b"\n", at)
-        if end < 0 or end + 1 == len(self._buffer):
-            self._scanned = at
-            self._bound_headers(len(self._buffer) - at)
-            return False
-        del self._buffer[: end + 1]
-        self._scanned = 0
-        return True
-
-    def _read_headers(self, part: Part) -> bool:
-        found = _HEADERS_END.search(self._buffer, 0, LONGEST_HEADERS + 4)
-        end, width = (found.start(), len(found[0])) if found else (-1, 0)
-        self._bound_headers(len(self._buffer) if end < 0 else end)
-        if end < 0:
-            return False
-        for line in bytes(self._buffer[:end]).splitlines():
-            name, colon, value = line.decode("latin-1").partition(":")
-            if colon:
-                part.headers[name.strip().lower()] = value.strip()
-        del self._buffer[: end + width]
-        self._length = _number(part.headers.get("content-length"))
-        if self._length is not None and self._length > self._largest:
-            raise MultipartError(
-                "frame_too_large", f"a picture of {self._length} bytes; at most {self._largest} are taken"
-            )
-        self._in_body = True
-        self._scanned = 0
-        return True
-
-    def _bound_headers(self, length: int) -> None:
-        if length > LONGEST_HEADERS:
-            raise MultipartError("not_mjpeg", f"headers of a part above {LONGEST_HEADERS} bytes")
-
-    def _read_body(self, part: Part) -> bool:
-        length = self._length
-        boundary = self._buffer.find(b"\n" + self._delimiter, self._scanned)
-        if length is not None and (boundary < 0 or boundary + 1 >= length):
-            if len(self._buffer) < length:
-                self._rescan_from_tail()
-                return False
-            return self._complete(part, length, cut=False)
-        if boundary >= 0:
-            boundary -= self._buffer[:boundary].endswith(b"\r")
-            return self._complete(part, boundary, cut=length is not None)
-        if len(self._buffer) > self._largest:
-            raise MultipartError("frame_too_large", f"a picture above {self._largest} bytes without an end")
-        self._rescan_from_tail()
-        return False
-
-    def _rescan_from_tail(self) -> None:
-        self._scanned = max(0, len(self._buffer) - len(self._delimiter) - 1)
-
-    def _complete(self, part: Part, length: int, *, cut: bool) -> bool:
-        part.body = bytes(self._buffer[:length])
-        part.cut = cut
-        del self._buffer[:length]
-        self._in_body = False
-        self._scanned = 0
-        return True
 
 
 class MjpegSource:
@@ -192,34 +68,36 @@ class MjpegSource:
         if self._socket is not None:
             self._socket.settimeout(self._options.read_timeout_s)
 
-    def _request(self, url: SplitResult) -> http.client.HTTPResponse:
+    def _request(self, url: SplitResult, challenge: str = "") -> http.client.HTTPResponse:
         secure = url.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         connection = kind(url.hostname or "", url.port, timeout=self._options.open_timeout_s)
         headers = {"Accept": "multipart/x-mixed-replace, */*", "Connection": "close"}
         if url.username:
-            pair = f"{unquote(url.username)}:{unquote(url.password or '')}"
-            headers["Authorization"] = "Basic " + base64.b64encode(pair.encode()).decode()
+            headers["Authorization"] = authorization(url, challenge)
         try:
             connection.connect()
             self._socket = connection.sock
             if self._interrupted:
                 raise self._place.error("closed", "the driver was closed while it connected", retry=True)
-            connection.request(
-                "GET", (url.path or "/") + (f"?{url.query}" if url.query else ""), headers=headers
-            )
-            return connection.getresponse()
+            connection.request("GET", _target(url), headers=headers)
+            response = connection.getresponse()
         except (OSError, http.client.HTTPException) as error:
             connection.close()
             raise _unreached(self._place, error, self._options.open_timeout_s) from error
         except DriverError:
             connection.close()
             raise
+        asked = response.getheader("WWW-Authenticate", "")
+        if response.status == 401 and url.username and not challenge and asked.lower().startswith("digest "):
+            response.close()
+            return self._request(url, asked)
+        return response
 
     def _boundary(self, response: http.client.HTTPResponse) -> str:
         if response.status != 200:
             cure = {
-                401: "Put user and password into the URL (http://user:password@host/...); Basic is supported",
+                401: "Put user and password into the URL: http://user:password@host/...",
                 403: "Look at the rights of the camera's user",
                 404: "Look up the path of its MJPEG stream",
             }.get(response.status, "Look at the camera's own page")
@@ -299,7 +177,7 @@ class MjpegSource:
                 )
             return None
         self._spoiled = 0
-        number = _number(part.headers.get("x-sequence"))
+        number = number_in(part.headers.get("x-sequence"))
         return Picture(image, part.t_ns, number, skipped)
 
     def interrupt(self) -> None:
@@ -318,8 +196,21 @@ class MjpegSource:
             self._socket.close()
 
 
-def _number(text: str | None) -> int | None:
-    return int(text) if text is not None and text.isascii() and text.isdigit() and len(text) < 19 else None
+def _target(url: SplitResult) -> str:
+    return (url.path or "/") + (f"?{url.query}" if url.query else "")
+
+
+def authorization(url: SplitResult, challenge: str = "") -> str:
+    """Header of the user in ``url``: Basic, or Digest where the server's ``challenge`` asks for it (RFC 7617, 7616)."""
+    user, password = unquote(url.username or ""), unquote(url.password or "")
+    if not challenge:
+        return "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
+    plain = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))
+    known = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+    known.add_password(None, plain, user, password)
+    told = urllib.request.parse_keqv_list(urllib.request.parse_http_list(challenge.partition(" ")[2]))
+    request = urllib.request.Request(plain)
+    return f"Digest {urllib.request.AbstractDigestAuthHandler(known).get_authorization(request, told)}"
 
 
 def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
@@ -334,7 +225,10 @@ def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
     if isinstance(error, socket.gaierror):
         return place.error("unknown_host", f"its host has no address ({error.strerror})", retry=True)
     if isinstance(error, ssl.SSLError):
-        return place.error("tls", f"no trusted TLS connection ({error.reason or error})")
+        return place.error(
+            "tls",
+            f"no trusted TLS connection ({error.reason or error}); http:// on a network of its own needs none",
+        )
     if isinstance(error, http.client.HTTPException):
         return place.error("http", f"does not speak HTTP ({type(error).__name__})")
     return place.error("unreachable", f"cannot be reached ({error})", retry=True)

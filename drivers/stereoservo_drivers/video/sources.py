@@ -64,6 +64,7 @@ class CaptureSource:
     def open(self) -> None:
         """Open and set what is asked. Raises DriverError."""
         device = self._place.kind == "device"
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # ours say more
         if device:
             self._check_device()
         self._capture = self._open_device() if device else self._open_stream()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 import socket
 import threading
 import time
@@ -52,6 +54,7 @@ class MjpegServer:
         self.content_type = "multipart/x-mixed-replace; boundary=frame"
         self.status = 200
         self.reply: dict[str, str] = {}
+        self.digest: tuple[str, str] | None = None
         self.ended = threading.Event()
         self._server: ThreadingHTTPServer | None = None
         self._thread: threading.Thread | None = None
@@ -66,6 +69,11 @@ class MjpegServer:
             def do_GET(self) -> None:
                 owner.requests.append(self.path)
                 owner.headers.append(dict(self.headers))
+                if owner.digest is not None and not owner.authorised(self.headers.get("Authorization", "")):
+                    self.send_response(401)
+                    self.send_header("WWW-Authenticate", 'Digest realm="cam", nonce="n1", qop="auth"')
+                    self.end_headers()
+                    return
                 self.send_response(owner.status)
                 for name, value in owner.reply.items():
                     self.send_header(name, value)
@@ -91,6 +99,20 @@ class MjpegServer:
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}/stream"
+
+    def authorised(self, header: str) -> bool:
+        """RFC 7616, 3.4.1, with MD5 and ``qop=auth``."""
+        told = dict(re.findall(r'(\w+)="?([^",]+)', header))
+
+        def md5(*texts: str) -> str:
+            return hashlib.md5(":".join(texts).encode()).hexdigest()
+
+        assert self.digest is not None
+        user, password = self.digest
+        if not header.startswith("Digest ") or told["username"] != user or told["nonce"] != "n1":
+            return False
+        secret, what = md5(user, "cam", password), md5("GET", "/stream")
+        return told["response"] == md5(secret, "n1", told["nc"], told["cnonce"], "auth", what)
 
     def part(self, handler: Any, data: bytes, headers: str = "", length: int | None = None) -> None:
         """Write one part."""

@@ -270,6 +270,13 @@ def test_user_and_password_are_sent_and_not_told(camera, server):
     assert "sec" not in str(failure(driver))
 
 
+def test_a_camera_that_asks_for_a_digest_gets_it(camera, server):
+    server.digest = ("me", "sec ret")
+    poll_until(start(camera(server.url.replace("//", "//me:sec%20ret@"))), 2)
+    error = refused(camera(server.url.replace("//", "//me:wrong@")))
+    assert (error.code, error.data["status"]) == ("http_status", 401)
+
+
 def test_a_password_stays_with_its_host(camera, server):
     server.status, server.reply = 302, {"Location": server.url.replace("127.0.0.1", "localhost")}
     refused(camera(server.url.replace("//", "//me:secret@")))
