@@ -38,10 +38,10 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: one stands
     beside the body; where, the file ``simulated-workpiece.json`` there tells for every frame
     (`stereoservo_sim.workpiece`).
-    Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later. ``drop_rate``: chance
-    that a frame is lost; ``dropouts``: spans [s, s] after activation without frames; ``freeze_after_s``:
-    from then on the picture stands still though frames keep coming. ``seed``: of noise and losses
-    (default: the context's).
+    Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
+    ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
+    after activation without frames; ``freeze_after_s``: from then on the picture stands still though frames keep
+    coming. ``seed``: of noise and losses (default: the context's).
     """
 
     view: str = ""
@@ -51,6 +51,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     workpiece: bool = False
     rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 30.0
     latency_s: NonNegative = 0.012
+    told_latency_s: NonNegative | None = None
     phase_s: NonNegative = 0.0
     drop_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
     dropouts: tuple[tuple[float, float], ...] = ()
@@ -97,6 +98,8 @@ class SimulatedCamera:
         self._history: JointHistory | None = None
         self._seed = context.seed if options.seed is None else options.seed
         self._period_ns = 1e9 / options.rate_hz
+        told_s = options.latency_s if options.told_latency_s is None else options.told_latency_s
+        self._stamped_late_ns = round((options.latency_s - told_s) * 1e9)
         self._next = 0
         self._activated_ns = 0
         self._frozen: FloatArray | None = None
@@ -180,7 +183,7 @@ class SimulatedCamera:
         rng = np.random.default_rng((self._seed & 0xFFFFFFFF, zlib.crc32(self.name.encode()), k))
         if self._lost(t_shutter_ns, rng):
             return []
-        return [self.deliver(k, t_shutter_ns, now_ns, q, rng)]  # type: ignore[return-value]
+        return [self.deliver(k, t_shutter_ns + self._stamped_late_ns, now_ns, q, rng)]  # type: ignore[return-value]
 
     def deactivate(self) -> None:
         """No more frames. Idempotent."""

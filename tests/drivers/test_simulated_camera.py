@@ -272,3 +272,13 @@ def test_camera_that_is_bumped_sees_from_elsewhere_until_the_file_puts_it_back(t
     MovedFile(tmp_path, "simulated-camera-left.json").path.write_text("{")
     with pytest.raises(DriverError, match=r"simulated-camera-left.json: .*such a file holds"):
         cell.run(0.2)
+
+
+def test_a_latency_told_wrongly_shifts_the_stamps_and_nothing_else(tmp_path):
+    cell = Cell(tmp_path, [fake(latency_s=0.04), fake(latency_s=0.04, told_latency_s=0.03)])
+    true, told = cell.run(0.5, [0.5, 0, 0, 0, 0, 0])
+    assert len(true) == len(told) > 5
+    for one, other in zip(true, told, strict=True):
+        assert other.t_shutter_ns - one.t_shutter_ns == 10 * MS
+        assert other.t_received_ns == one.t_received_ns
+        assert (other.pixels == one.pixels).all()

@@ -316,6 +316,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         "thesis 9.3: the same tasks with a projective model and with metric ones of growing errors",
         50,
     ),
+    "unsynchronised": simulated(
+        "unsynchronised",
+        "cameras without a trigger beside the same with one: 15 ms skew, 40 ms latency, and a latency told wrongly",
+        3,
+    ),
     "laws": Experiment(
         "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
         frozenset(),

@@ -22,15 +22,21 @@ JUDGED_S = 1.0
 
 
 @dataclass
-class Flight:
-    """What a recording shows when it is replayed: every status, every event, the calibration's stops."""
+class Course:
+    """What a cell did, step by step: times (k,), errors (k,), commands (k, n), goals' ids, and every event."""
 
-    result: ReplayResult
     t_ns: IntArray
     error_px: FloatArray
     commands: FloatArray
     goal_ids: list[str]
     events: list[Event]
+
+
+@dataclass
+class Flight(Course):
+    """A course out of a recording that was replayed, and the calibration's stops."""
+
+    result: ReplayResult
     trials: TrialData | None
 
 
@@ -78,12 +84,12 @@ def read_flight(recording: Path) -> Flight:
     for event in events:
         job.add(event)
     return Flight(
-        result,
         np.array(times),
         np.array(errors),
         np.array(commands),
         goals,
         events,
+        result,
         job.trials() if job.stops else None,
     )
 
@@ -92,7 +98,7 @@ def judge_goal(
     name: str,
     law: str,
     outcome: str,
-    flight: Flight,
+    flight: Course,
     truth_t: IntArray,
     truth_q: FloatArray,
     cell: SimulatedCell,
@@ -133,7 +139,7 @@ def judge_goal(
     )
 
 
-def _flown(name: str, flight: Flight) -> tuple[Event, Event]:
+def _flown(name: str, flight: Course) -> tuple[Event, Event]:
     """Start and end of the visual goal that came after all teaching: the n-th taught is the n-th flown."""
     taught = [e.name for e in flight.events if e.kind == "taught"]
     begun = [e for e in flight.events if e.kind == "goal_started" and e.name in LAWS]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -85,21 +85,22 @@ def perform(
     joint_names: tuple[str, ...],
     configurations: Mapping[str, FloatArray],
     tell: Callable[[str], None],
+    goals: Sequence[ShownGoal] = GOALS,
 ) -> tuple[Calibrated, dict[str, str]]:
-    """The whole demonstration, goals shown at ``configurations`` (n,); the calibration and each goal's outcome."""
+    """The whole demonstration, ``goals`` shown at ``configurations`` (n,); the calibration and each goal's outcome."""
     operator.enable()
     tell("calibrating: each joint moves alone in view of both cameras")
     calibrated = operator.calibrate()
     statistics = calibrated.model.statistics
     rms = "" if statistics is None else f", residual {statistics.rms_px:.4f} px"
     tell(f"calibrated in {calibrated.seconds:.0f} s{rms}")
-    for goal in GOALS:
+    for goal in goals:
         tell(f"showing goal {goal.name!r}")
         operator.move(dict(zip(joint_names, configurations[goal.name].tolist(), strict=True)))
         operator.rest(REST_S)
         operator.teach(goal.name, TEACH_FRAMES)
     outcomes = {}
-    for goal in GOALS:
+    for goal in goals:
         operator.home()
         operator.rest(REST_S)
         target: VisualTarget = TaughtTarget(goal.name)
