@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import msgspec
 import typer
 
 from stereoservo.cli import interruption
+from stereoservo.cli.goal_images import FRAMES, feature_tree, read_images, require_cameras
 from stereoservo.cli.goal_input import (
     adaptive,
     make_goal,
@@ -33,6 +34,9 @@ from stereoservo.cli.output import (
 from stereoservo.gateway.client import Client, ClientError, GoalHandle
 from stereoservo.gateway.messages import decode
 from stereoservo.runtime.commands import LAWS, Goal, StreamedTarget
+
+if TYPE_CHECKING:
+    from stereoservo.runtime.image_set_points import SetPoints
 
 WAITING_LEASE_S = 2.0
 """Who waits for a goal stands behind it: when that process dies, the arm stops."""
@@ -57,6 +61,20 @@ def goal(
         Path | None,
         typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
     ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            "--images",
+            metavar="DIR",
+            help="Set-points out of pictures recorded by `record --images`, at rest.",
+        ),
+    ] = None,
+    at: Annotated[
+        float, typer.Option("--at", help="With --images: seconds from their beginning.", min=0.0)
+    ] = 0.0,
+    frames: Annotated[
+        int, typer.Option("--frames", help="With --images: frames a camera to average.", min=1, max=1000)
+    ] = FRAMES,
     points: Annotated[
         Path | None,
         typer.Option(
@@ -136,10 +154,13 @@ def goal(
 ) -> None:
     """Send a goal and wait for its end. Ctrl-C cancels it."""
     stream: Iterator[tuple[float | None, StreamedTarget]] | None = None
+    found: tuple[SetPoints, ...] = ()
+    if images is None and (at or frames != FRAMES):
+        raise CommandError("usage", "--at and --frames go with --images DIR")
     if gain is not None and adaptive_gain is not None:
         raise CommandError("usage", "--gain and --adaptive-gain: one of them")
     if follow_file is not None:
-        if file or name or joint or set_points or points or displacement or incidence:
+        if file or name or joint or set_points or points or displacement or incidence or images:
             raise CommandError("usage", "--follow is a target of its own; its first line is where it begins")
         stream = stream_lines(follow_file)
         first = next(stream, None)
@@ -147,6 +168,11 @@ def goal(
             raise CommandError("stream", f"{follow_file}: holds no set-points; a line at least is needed")
         stream = chain([first], stream)
         target = cast("dict[str, Any]", msgspec.to_builtins(first[1], str_keys=True))
+    elif images is not None:
+        if file or name or joint or set_points or points or displacement or incidence:
+            raise CommandError("usage", "--images is a target of its own; leave the others out")
+        found = read_images(cell, endpoint, images, at, frames)
+        target = feature_tree(found)
     elif file is None:
         files = {"points": points, "displacement": displacement, "incidence": incidence}
         target = target_tree(name, joint, set_points, files, relative_to, common)
@@ -174,6 +200,7 @@ def goal(
     if wait and wanted.lease_s is None:
         wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
     with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
+        require_cameras(client, found)
         if check or wanted.check:
             reply = client.check(wanted)
             emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)

@@ -50,8 +50,8 @@ def target_tree(
     if sum(given) != 1:
         raise CommandError(
             "usage",
-            "one of NAME (a taught goal), --joint, --set-points, --points, --displacement, --incidence, --follow or "
-            "--file is needed",
+            "one of NAME (a taught goal), --joint, --set-points, --images, --points, --displacement, --incidence, "
+            "--follow or --file is needed",
         )
     if (relative_to or common) and not name:
         raise CommandError("usage", "--relative-to and --common go with NAME, a taught goal")

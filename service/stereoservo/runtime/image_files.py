@@ -510,3 +510,21 @@ def _open_header(path: Path, video: Path) -> tuple[IO[bytes], ImageHeader]:
         file.close()
         raise ImageFileError(path, "foreign_sidecar", f"{cause}; it belongs to something else, or is damaged")
     return file, header
+
+
+def image_lines(video: Path) -> Iterator[ImageLine]:
+    """The frames that the sidecar of a recording tells of, in order; the video is not looked at.
+
+    Ends at the first line that is none: what comes before it holds. Raises ImageFileError (``no_sidecar``,
+    ``foreign_sidecar``).
+    """
+    file, _ = _open_header(sidecar_of(video), video)
+    with file:
+        while data := file.readline(LONGEST_LINE):
+            try:
+                line = _decode(data)
+            except msgspec.MsgspecError:
+                return
+            if not isinstance(line, ImageLine):
+                return
+            yield line
