@@ -51,7 +51,8 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     withheld, from the first on; 0 looks for none (default: 10, and 0 for files).
 
     Of files and pictures: ``start``, number of the first picture used; ``loop``, begin again at the end;
-    ``pace``: ``recorded``, each at its time, or ``every``, the next one at each poll.
+    ``pace``: ``recorded``, each at its time since delivery began (of this camera: several are not aligned), or
+    ``every``, the next one at each poll, with the recording's own stamps.
     """
 
     source: int | str
