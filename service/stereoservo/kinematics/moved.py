@@ -1,4 +1,4 @@
-"""Which of a camera, a marker, a joint zero explains the innovations of now (live; the readable reference).
+"""Which of a camera, a marker, a joint zero explains the innovations of now.
 
 Innovations are observed less predicted pixels of one moment. Hypotheses, each a change of few parameters:
 
