@@ -1,0 +1,1 @@
+"""Commands of the drivers, found by entry point ``stereoservo.commands``."""
