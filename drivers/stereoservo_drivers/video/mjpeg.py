@@ -13,14 +13,15 @@ import socket
 import ssl
 import urllib.request
 from contextlib import suppress
-from urllib.parse import SplitResult, unquote, urljoin, urlsplit, urlunsplit
+from pathlib import Path
+from urllib.parse import SplitResult, unquote, urljoin, urlunsplit
 
 import cv2
 import numpy as np
 
 from stereoservo.runtime.ports import Clock, DriverError
 from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, Part, number_in
-from stereoservo_drivers.video.options import Place, VideoOptions
+from stereoservo_drivers.video.options import Place, VideoOptions, place_of
 from stereoservo_drivers.video.pictures import check_size, jpeg_flag, jpeg_size
 from stereoservo_drivers.video.sources import Picture, Settings
 
@@ -52,12 +53,8 @@ class MjpegSource:
             response = self._request(url)
             if response.status not in (301, 302, 303, 307, 308):
                 break
-            target = urlsplit(urljoin(url.geturl(), response.getheader("Location", "")))
+            target = self._sent_on(url, response.getheader("Location", ""))
             response.close()
-            if target.scheme not in ("http", "https") or not target.hostname:
-                raise self._place.error(
-                    "http", f"sent on to {target.geturl()!r}, which is no address of HTTP"
-                )
             if target.hostname == url.hostname and not target.username:  # the password is that host's
                 target = target._replace(netloc=url.netloc.rpartition("@")[0] + "@" + target.netloc)
             url = target
@@ -67,6 +64,15 @@ class MjpegSource:
         self._parser = MultipartParser(self._boundary(response))
         if self._socket is not None:
             self._socket.settimeout(self._options.read_timeout_s)
+
+    def _sent_on(self, url: SplitResult, location: str) -> SplitResult:
+        try:
+            target = place_of(urljoin(url.geturl(), location), Path())
+        except (DriverError, ValueError) as error:
+            raise self._place.error("http", f"sent on to {location!r}, which is no address") from error
+        if target.kind != "http":
+            raise self._place.error("http", f"sent on to {location!r}, which is no address of HTTP")
+        return target.url
 
     def _request(self, url: SplitResult, challenge: str = "") -> http.client.HTTPResponse:
         secure = url.scheme == "https"
@@ -82,7 +88,7 @@ class MjpegSource:
                 raise self._place.error("closed", "the driver was closed while it connected", retry=True)
             connection.request("GET", _target(url), headers=headers)
             response = connection.getresponse()
-        except (OSError, http.client.HTTPException) as error:
+        except (OSError, http.client.HTTPException, UnicodeError) as error:
             connection.close()
             raise _unreached(self._place, error, self._options.open_timeout_s) from error
         except DriverError:
@@ -222,8 +228,8 @@ def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
         return place.error(
             "refused", "nobody listens there. Start the camera's server, or mend the port", retry=True
         )
-    if isinstance(error, socket.gaierror):
-        return place.error("unknown_host", f"its host has no address ({error.strerror})", retry=True)
+    if isinstance(error, socket.gaierror | UnicodeError):
+        return place.error("unknown_host", f"its host has no address ({error})", retry=True)
     if isinstance(error, ssl.SSLError):
         return place.error(
             "tls",

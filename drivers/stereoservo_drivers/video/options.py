@@ -154,6 +154,8 @@ def _url(source: str) -> Place:
         host, _port = url.hostname, url.port
     except ValueError as error:
         raise _wrong("source", source, f"not a URL ({error})") from error
+    if not source.isascii() or not source.isprintable() or " " in source:
+        raise _wrong("source", source, "valid: a URL of ASCII characters, others written as %20 and the like")
     if not host:
         raise _wrong("source", source, "valid: a URL with a host, such as http://camera.local:8080/stream")
     shown = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))

@@ -54,11 +54,12 @@ def size_error(place: Place, options: VideoOptions, width: int, height: int) -> 
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of whole JPEG data, None where not whole: begin marker, frame header, end marker (then zeros).
+    """Width and height of JPEG data that are whole (begin marker, frame header, end marker after it), or None.
 
-    Decoders fill up what is missing without a word; ITU-T T.81 B.1.
+    Decoders fill up what is missing without a word. Cameras may pad behind the end; within coded data no end marker can
+    stand, and that of a thumbnail stands before the frame header. ITU-T T.81, B.1.
     """
-    if data[:2] != b"\xff\xd8" or data.rstrip(b"\x00\r\n")[-2:] != b"\xff\xd9":
+    if data[:2] != b"\xff\xd8":
         return None
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
@@ -68,6 +69,8 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
         elif marker in _BARE_MARKERS:
             at += 2
         elif marker in _SIZE_MARKERS:
+            if data.rfind(b"\xff\xd9", at) < 0:
+                return None
             return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
         else:
             at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

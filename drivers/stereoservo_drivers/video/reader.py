@@ -36,6 +36,7 @@ class Reader:
         self._changed = threading.Condition()
         self._ending = False
         self._heard_s: float | None = None
+        self._after_ns = 0
         self._newest: Frame | None = None
         self._error: DriverError | None = None
         self._thread = threading.Thread(target=self._run, name=f"video-{camera}", daemon=True)
@@ -124,7 +125,9 @@ class Reader:
                 image, picture.t_received_ns, picture.seq, picture.skipped, look=self._frozen_frames > 0
             )
             if fresh:
-                received_ns = picture.t_received_ns
+                # Two pictures that came with one read have one time; in order all the same.
+                received_ns = max(picture.t_received_ns, self._after_ns)
+                self._after_ns = received_ns + 1
                 shutter_ns = received_ns - self._latency_ns
                 self._newest = Frame(self._camera, self._watch.number, shutter_ns, received_ns, image)
             self._heard_s = time.monotonic()

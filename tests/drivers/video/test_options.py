@@ -57,6 +57,7 @@ def test_a_device_path_is_its_number():
         ({"source": "0"}, ('source = "0"', "source = 0")),
         ({"source": "left.txt"}, ('source = "left.txt"', ".avi, .mkv, .mp4")),
         ({"source": "ftp://cam/x"}, ("ftp://cam/x", "https://")),
+        ({"source": "http://cam/a b"}, ("http://cam/a b", "%20")),
         ({"source": "http:///x"}, ("http:///x", "with a host")),
         ({"source": "http://cam:port/x"}, ("http://cam:port/x", "not a URL")),
         ({"source": "p%04d%d.png"}, ("p%04d%d.png", "one %d")),
