@@ -1,7 +1,8 @@
-"""A cell on a CAN bus under test: emulated drives in a process of their own, or, by ``--hil``, real ones."""
+"""A cell under test: emulated drives and cameras in processes of their own, or, by ``--hil``, real ones."""
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from stereoservo.runtime.cellfile import load_cell_file
 from stereoservo.runtime.daemon import DaemonProcess
 from stereoservo.runtime.directories import CellDirectories, cell_directories
 from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
+from stereoservo_sim.demonstration.emulated import ANY_PORT, ANY_SERVER, move_to_channel, move_to_server
 from stereoservo_sim.emulation.process import EmulatorProcess
 from stereoservo_sim.history import FILE_NAME, JointHistory
 
@@ -26,42 +27,36 @@ STANDS = 2e-4
 """[rad] Rigid bodies that hold their place move less in ``RESTS_S``."""
 RANGE = 0.15
 
-CAMERAS = {
-    "features": """
-driver = "fake"
-mount = "eye_to_hand"
-options = { rate_hz = 30.0 }
-""",
-    "images": """
-driver = "pybullet"
-detector = "dots"
-mount = "eye_to_hand"
-options = { rate_hz = 15.0, latency_s = 0.012, noise = 2.0, background = "plain" }
-""",
-}
 
-
-def cell_text(name: str, cameras: str) -> str:
-    """The shipped CAN cell as ``name``, with ``cameras`` of CAMERAS and a quick calibration."""
-    text = shipped_cell_path("hil-can").read_text(encoding="utf-8")
-    head, _, tail = text.partition("# -- cameras")
-    servo = tail[tail.index("[servo]") : tail.index("# Trial motions")]
+def cell_text(name: str, *, joints: str = "") -> str:
+    """The shipped cell of CAN drives and MJPEG cameras as ``name``, before a plain background and with a quick
+    calibration. ``joints``: another ``[joints]`` section instead of the CAN bus.
+    """
+    text = shipped_cell_path("hil-video").read_text(encoding="utf-8")
+    head, _, tail = text.partition("# Trial motions")
     base = tail[tail.index("base = {") :].partition("\n")[0]
     ranges = ", ".join(f"j{k} = {RANGE}" for k in range(1, 7))
-    sections = "".join(f'\n[[camera]]\nname = "{side}"{CAMERAS[cameras]}' for side in ("left", "right"))
     speed = "stops = 4\nframes = 2\nsettle_s = 0.05\nspeed_scale = 0.8\n"
     calibration = f"[calibration]\n{base}\nrange = {{ {ranges} }}\n{speed}"
-    head = head.replace('name = "hil-can"', f'name = "{name}"', 1)
-    return f"{head}{sections}\n{servo}\n{calibration}"
+    head = head.replace('name = "hil-video"', f'name = "{name}"', 1)
+    head = re.sub(r'(?m)^background = "pybullet"', 'background = "plain"', head)
+    if joints:
+        front, cameras = head.index("[joints]"), head.index("[emulate.cameras]")
+        head = f"{head[:front]}{joints}\n{head[cameras:]}"
+    return f"{head}\n{calibration}"
 
 
 @dataclass
 class CanBench:
-    """Daemon and drives, and what a test does with them. ``emulator`` is None on hardware."""
+    """Daemon, drives and cameras, and what a test does with them.
+
+    ``emulator``, ``cameras``: those of drives and cameras; None on hardware, or where the cell needs none.
+    """
 
     cell: Path
     logs: Path
     emulator: EmulatorProcess | None
+    cameras: EmulatorProcess | None = None
     daemon: DaemonProcess | None = None
     starts: int = 0
     name: str = field(init=False)
@@ -70,15 +65,24 @@ class CanBench:
         self.name = load_cell_file(self.cell).cell.name
 
     @classmethod
-    def emulated(cls, folder: Path, cameras: str) -> CanBench:
-        """Emulated drives on a free port, no daemon yet; the cell has the folder's name."""
-        folder.mkdir()
-        (folder / "copy").mkdir()
+    def emulated(cls, folder: Path, *, joints: str = "") -> CanBench:
+        """Emulated drives and cameras on free ports, no daemon yet; the cell has the folder's name.
+
+        ``joints``: another ``[joints]`` section instead of the CAN bus.
+        """
+        for made in (folder, folder / "bus", folder / "streams"):
+            made.mkdir()
         path = folder / "cell.toml"
-        path.write_text(cell_text(folder.name, cameras), encoding="utf-8")
-        emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=folder / "drives-0.log")
-        channel = emulator.wait_ready()
-        return cls(move_to_channel(path, folder / "copy", channel), folder, emulator)
+        path.write_text(cell_text(folder.name, joints=joints), encoding="utf-8")
+        cameras = EmulatorProcess(
+            path, what="cameras", options=("--channel", ANY_SERVER), log=folder / "cameras.log"
+        )
+        emulator = None
+        if not joints:
+            emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=folder / "drives-0.log")
+            path = move_to_channel(path, folder / "bus", emulator.wait_ready())
+        path = move_to_server(path, folder / "streams", cameras.wait_ready())
+        return cls(path, folder, emulator, cameras)
 
     @property
     def directories(self) -> CellDirectories:
@@ -101,8 +105,9 @@ class CanBench:
         """End what was started."""
         if self.daemon is not None:
             self.daemon.stop()
-        if self.emulator is not None:
-            self.emulator.stop()
+        for process in (self.emulator, self.cameras):
+            if process is not None:
+                process.stop()
 
     def needs_emulated_drives(self, why: str) -> None:
         """Skip the test on hardware."""

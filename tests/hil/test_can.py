@@ -1,5 +1,5 @@
-"""An arm on a CAN bus: daemon, drives behind slcan in another process, cameras; calibrated and servoed through features
-and images alone, and every fault ends with the arm at rest, until a person has reset and enabled it.
+"""An arm on a CAN bus: daemon, drives behind slcan and cameras as MJPEG streams in other processes; calibrated and
+servoed through the images alone, and every fault ends with the arm at rest, until a person has reset and enabled it.
 
 ``pytest tests/hil/test_can.py --hil CELL.toml`` runs it on real drives: see docs/can.md.
 """
@@ -33,7 +33,7 @@ def hardware(request: pytest.FixtureRequest) -> Path | None:
 def bench(hardware: Path | None, roots: Path) -> Iterator[CanBench]:
     """Drives and a daemon for the whole module."""
     if hardware is None:
-        bench = CanBench.emulated(roots / "can", "features")
+        bench = CanBench.emulated(roots / "can")
     else:
         (roots / "can").mkdir()
         bench = CanBench(hardware, roots / "can", None)
@@ -209,23 +209,3 @@ def test_the_drives_stop_by_themselves_when_the_servo_process_is_killed_and_a_fa
         bench.order("sticky 2 off")
         recover(again)
         again.goal("park", tolerance_px=0.5, hold_frames=3).reached(60.0)
-
-
-# -- images -----------------------------------------------------------------------------------------------------
-
-
-def test_rendered_images_close_the_loop(hardware: Path | None, roots: Path) -> None:
-    """The same cell with cameras that render what they see: calibrated and servoed through images only."""
-    if hardware is not None:
-        pytest.skip("the cameras of --hil are real already")
-    bench = CanBench.emulated(roots / "can-images", "images")
-    try:
-        bench.start_daemon()
-        with Client(bench.name) as client:
-            client.enable()
-            assert client.calibrate(timeout_s=300.0).covariance_ok
-            client.teach("park", frames=5)
-            away_and_back(bench, client, "stereo")
-    finally:
-        bench.end()
-    eventually("no process is left", lambda: not processes(bench.directories))

@@ -24,7 +24,7 @@ def test_the_conditions_differ_in_shutters_and_stamps_alone() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_without_a_trigger_goals_are_reached_as_well(capsys: pytest.CaptureFixture[str]) -> None:
-    """The ratio is a median over six pairs whose noise is the same and whose ways differ; 1.25 is thrice its scatter."""
+    """A ratio is a median over six pairs of the same noise and different ways; 1.25 is thrice its scatter."""
     assert cli.invoke(["reproduce", "unsynchronised", "--seeds", "2", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [row["reached"] for row in rows] == ["6 of 6"] * 4

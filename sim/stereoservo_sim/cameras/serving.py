@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import time
@@ -18,6 +19,9 @@ from stereoservo_sim.cameras.server import CameraServer
 from stereoservo_sim.cameras.settings import CamerasSettings, cameras_of_cell, port_of
 from stereoservo_sim.cameras.studio import Studio
 from stereoservo_sim.emulation.console import Console, Printer
+
+PRIORITY = 3
+"""SCHED_FIFO where it is allowed: real cameras take no processor; below the servo process and emulated drives."""
 
 
 def make_studio(cell: CellFile, settings: CamerasSettings, runtime_dir: Path) -> Studio:
@@ -50,6 +54,8 @@ def serve_cameras(
     printer = Printer(as_json)
     console = Console(server, printer)
     console.attach()
+    with contextlib.suppress(OSError):  # not allowed: then without
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     gc.freeze()  # what was imported is not looked through again
     printer.say(
         "ready", f"listening on {server.url}: {', '.join(server.streams.values())}", channel=server.url,
@@ -59,5 +65,7 @@ def serve_cameras(
     try:
         server.run(ended)
     finally:
-        printer.say("end", server.words(), pictures=server.pictures, late_ns=server.late_ns)
+        printer.say(
+            "end", server.words(), pictures=server.pictures, withheld=server.withheld, late_ns=server.late_ns
+        )
         printer.end()
