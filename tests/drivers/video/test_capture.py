@@ -183,7 +183,8 @@ class Hanging:
 
 
 @pytest.mark.parametrize("hang_in_open", [False, True])
-def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered(hang_in_open):
+def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered(hang_in_open, monkeypatch):
+    monkeypatch.setattr("stereoservo_drivers.video.reader.JOIN_S", 0.05)
     source, watch = Hanging(hang_in_open), Watch(30.0)
     place = Place("device", "/dev/video0", device=0)
     reader = Reader(source, place, options(open_timeout_s=0.05), "left", watch)
