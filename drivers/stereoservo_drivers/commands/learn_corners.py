@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,6 @@ import cv2
 import numpy as np
 import typer
 
-from stereoservo.kinematics.model import write_atomically
 from stereoservo.runtime import plugins
 from stereoservo.runtime.cellfile import CellFile, load_cell_file
 from stereoservo.runtime.clock import MonotonicClock
@@ -24,7 +24,7 @@ from stereoservo.runtime.image_files import ImageReader
 from stereoservo.runtime.ports import CameraDriver, DriverContext, DriverError, Frame
 from stereoservo_drivers.detectors.landmark_learning import LearningSettings, learn_landmarks
 from stereoservo_drivers.detectors.landmark_pictures import draw_landmarks
-from stereoservo_drivers.detectors.landmarks import ImageArray, encode_landmarks, summary
+from stereoservo_drivers.detectors.landmarks import KINDS, ImageArray, encode_landmarks
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PATIENCE_S = 10.0
@@ -48,7 +48,9 @@ def learn_corners(
     ] = None,
     pair: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(metavar="LEFT RIGHT", help="Images of the first two cameras of the cell file, in its order."),
+        typer.Option(
+            metavar="LEFT RIGHT", help="Images of the first two cameras of the cell file, in its order."
+        ),
     ] = None,
     moved: Annotated[
         tuple[Path, Path] | None,
@@ -58,9 +60,12 @@ def learn_corners(
         Path | None, typer.Option(help="A folder as --images, after the last joint alone has moved.")
     ] = None,
     ask_to_move: Annotated[
-        bool, typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again.")
+        bool,
+        typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again."),
     ] = False,
-    frames: Annotated[int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")] = 8,
+    frames: Annotated[
+        int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")
+    ] = 8,
     most: Annotated[int, typer.Option(min=16, max=2000, help="Landmarks to keep.")] = 150,
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Draw what was matched, and of which kind it is.")
@@ -72,9 +77,13 @@ def learn_corners(
     if images is not None and pair is not None:
         raise LearnError("argument", "--images and --pair are two ways to give the images; give one of them")
     if moved is not None and moved_images is not None:
-        raise LearnError("argument", "--moved and --moved-images are two ways to say the same; give one of them")
+        raise LearnError(
+            "argument", "--moved and --moved-images are two ways to say the same; give one of them"
+        )
     if ask_to_move and (images is not None or pair is not None):
-        raise LearnError("argument", "--ask-to-move is for live cameras; files go with --moved or --moved-images")
+        raise LearnError(
+            "argument", "--ask-to-move is for live cameras; files go with --moved or --moved-images"
+        )
     if out.exists() and not force:
         raise LearnError("exists", f"{out} exists; --force writes over it")
     if picture is not None and picture.suffix.lower() not in SUFFIXES:
@@ -86,10 +95,10 @@ def learn_corners(
     elif moved_images is not None:
         after = _folder(section, moved_images, frames)
     landmarks, report = learn_landmarks(before, after, LearningSettings(most=most))
-    write_atomically(out, encode_landmarks(landmarks))
+    _write(out, encode_landmarks(landmarks))
     if picture is not None:
         _write_picture(picture, draw_landmarks(landmarks))
-    kinds = {kind: landmarks.of_kind(kind).tolist() for kind in summary(landmarks)}
+    kinds = {kind: landmarks.of_kind(kind).tolist() for kind in KINDS}
     answer: dict[str, Any] = {
         "file": str(out),
         "landmarks": len(landmarks.ids),
@@ -137,7 +146,8 @@ def _sights(
     running = daemon_info(cell_directories(cell.cell.name))
     if running is not None:
         raise LearnError(
-            "running", f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images"
+            "running",
+            f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images",
         )
     before = _look(cell, path, frames)
     if not ask:
@@ -199,7 +209,9 @@ def _look(cell: CellFile, path: Path, frames: int) -> Sights:
                 clock=MonotonicClock(), cell=cell.cell.name, runtime_dir=path.parent, cell_dir=path.parent,
                 camera=camera.name, mount=camera.mount,
             )  # fmt: skip
-            driver: CameraDriver = plugins.load(plugins.CAMERA_DRIVERS, camera.driver)(camera.options, context)
+            driver: CameraDriver = plugins.load(plugins.CAMERA_DRIVERS, camera.driver)(
+                camera.options, context
+            )
             opened[camera.name] = driver
             driver.configure()
             driver.activate()
@@ -222,7 +234,9 @@ def _look(cell: CellFile, path: Path, frames: int) -> Sights:
 def _take(name: str, arrived: Sequence[Any], seen: list[ImageArray], frames: int) -> None:
     for frame in arrived:
         if not isinstance(frame, Frame):
-            raise DriverError("no_images", f"camera {name!r} delivers observations; landmarks need its images")
+            raise DriverError(
+                "no_images", f"camera {name!r} delivers observations; landmarks need its images"
+            )
         if len(seen) < frames:
             seen.append(np.array(frame.image))
 
@@ -231,4 +245,14 @@ def _write_picture(path: Path, drawn: ImageArray) -> None:
     encoded, data = cv2.imencode(path.suffix, drawn)
     if not encoded:
         raise LearnError("picture", f"{path}: cannot be written as {path.suffix}")
-    write_atomically(path, data.tobytes())
+    _write(path, data.tobytes())
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Whole or not at all. Raises OSError."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_bytes(data)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)

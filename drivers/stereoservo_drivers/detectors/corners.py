@@ -53,8 +53,9 @@ PULL = 0.1
 OFF_PX = 5.0
 """How far a landmark that was not tracked may be found from where prior or neighbours have it, beside their sigmas."""
 OFF_SIGMAS = 4.0
-REFERENCE_TILTS = 2
-KEYPOINTS = 1200
+REFERENCE_TILTS = 1
+KEYPOINTS = 600
+"""Of the image, and of each view of the reference."""
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -78,7 +79,7 @@ class CornerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_prior_age_s: Positive = 0.25
     search_every: Annotated[int, Meta(ge=1)] = 10
     """Frames from one search of the whole image to the next, while only a part of the landmarks is lost."""
-    floor_px: Annotated[float, Meta(ge=0)] = 0.01
+    floor_px: Annotated[float, Meta(ge=0)] = 0.02
     """Systematic standard deviation [px], part of every covariance: interpolation, and surfaces that bend."""
 
 

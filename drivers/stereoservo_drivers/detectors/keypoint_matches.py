@@ -23,6 +23,9 @@ RATIO = 0.8
 CONTRAST = 0.01
 NEAR_PX = 3.0
 """Keypoints of one feature that tilted views give several times; a second best so near is the same."""
+TWINS = 4
+"""Second bests that are looked at for one elsewhere."""
+CHUNK = 512
 PLANE_PX = 3.0
 """How far a match may lie off the plane that it belongs to."""
 MAX_PLANES = 8
@@ -56,8 +59,7 @@ def match_keypoints(first: Keypoints, second: Keypoints, ratio: float = RATIO) -
     """Matches (n, 2) by index: nearest in descriptors, mutually, and well before the second best elsewhere."""
     if len(first.pixels) < 2 or len(second.pixels) < 2:
         return np.empty((0, 2), np.int64)
-    best, distance, other = _nearest_two(first.descriptors, second)
-    back, _, _ = _nearest_two(second.descriptors, first)
+    best, distance, other, back = _nearest(first.descriptors, second)
     rows = np.arange(len(best))
     # Where one feature has several keypoints, to come back to any of them is to come back.
     returned = np.linalg.norm(first.pixels[back[best]] - first.pixels, axis=1) <= NEAR_PX
@@ -65,28 +67,36 @@ def match_keypoints(first: Keypoints, second: Keypoints, ratio: float = RATIO) -
     return np.column_stack([rows[good], best[good]])
 
 
-def _nearest_two(
+def _nearest(
     descriptors: npt.NDArray[np.float32], among: Keypoints
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Index of the nearest, its distance, and of the nearest not within ``NEAR_PX`` of it, (n,) each."""
-    n, k = len(descriptors), min(6, len(among.pixels))
+) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
+    """Index of the nearest ``among``, its distance, that of the nearest not within ``NEAR_PX`` of it, (n,) each; and
+    which of ``descriptors`` is nearest to each ``among`` (k,).
+    """
+    n, k = len(descriptors), len(among.pixels)
     best, distance, other = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
-    squares = (among.descriptors.astype(np.float32) ** 2).sum(axis=1)
-    for start in range(0, n, 1024):
-        some = descriptors[start : start + 1024]
-        d2 = (some**2).sum(axis=1)[:, None] + squares[None] - 2.0 * (some @ among.descriptors.T)
-        nearest = np.argpartition(d2, k - 1, axis=1)[:, :k]
-        values = np.take_along_axis(d2, nearest, axis=1)
-        order = np.argsort(values, axis=1, kind="stable")
-        nearest, values = np.take_along_axis(nearest, order, 1), np.take_along_axis(values, order, 1)
-        root = np.sqrt(np.maximum(values, 0.0))
-        apart = np.linalg.norm(among.pixels[nearest] - among.pixels[nearest[:, :1]], axis=2) > NEAR_PX
-        apart[:, -1] = True
-        second = apart.argmax(axis=1)
-        stop = start + len(some)
-        best[start:stop], distance[start:stop] = nearest[:, 0], root[:, 0]
-        other[start:stop] = root[np.arange(len(some)), second]
-    return best, distance, other
+    back, back_distance = np.zeros(k, np.int64), np.full(k, np.inf, np.float32)
+    squares = np.einsum("ij,ij->i", among.descriptors, among.descriptors)
+    for start in range(0, n, CHUNK):
+        some = descriptors[start : start + CHUNK]
+        rows, at = np.arange(len(some)), slice(start, start + len(some))
+        d2 = some @ (-2.0 * among.descriptors.T)
+        d2 += squares
+        d2 += np.einsum("ij,ij->i", some, some)[:, None]
+        nearest_back = d2.argmin(axis=0)
+        closer = d2[nearest_back, np.arange(k)] < back_distance
+        back[closer] = start + nearest_back[closer]
+        back_distance[closer] = d2[nearest_back, np.arange(k)][closer]
+        nearest = d2.argmin(axis=1)
+        best[at], distance[at] = nearest, d2[rows, nearest]
+        rival, last = np.full(len(some), np.nan), nearest
+        for _ in range(TWINS):
+            d2[rows, last] = np.inf
+            last = d2.argmin(axis=1)
+            apart = np.linalg.norm(among.pixels[last] - among.pixels[nearest], axis=1) > NEAR_PX
+            rival = np.where(np.isnan(rival) & apart, d2[rows, last], rival)
+        other[at] = np.where(np.isnan(rival), d2[rows, last], rival)
+    return best, np.sqrt(np.maximum(distance, 0.0)), np.sqrt(np.maximum(other, 0.0)), back
 
 
 @dataclass(frozen=True, eq=False)

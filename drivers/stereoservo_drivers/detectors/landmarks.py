@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -214,8 +213,3 @@ def _typed(array: npt.NDArray[Any], dtype: Any) -> npt.NDArray[Any]:
 
 def _bad(path: Path | str, message: str, **data: Any) -> DriverError:
     return DriverError("landmarks", f"{path}: {message}", path=str(path), **data)
-
-
-def summary(landmarks: Landmarks) -> Mapping[str, int]:
-    """How many landmarks there are of each kind."""
-    return {kind: len(landmarks.of_kind(kind)) for kind in KINDS}
