@@ -57,6 +57,8 @@ RESECTION_POINTS, RIG_POINTS = 6, 5
 ROUNDS, GAUSS_NEWTON = 6, 12
 SETTLED = 1e-4
 """Length of a step [standard deviations] at which the least squares have converged."""
+FAR_PX = 1e6
+"""Error of a point that is predicted behind its camera."""
 RANK = 1e-9
 """Least pivot of the weighted equations, columns of length 1, below which a direction is open."""
 
@@ -193,7 +195,9 @@ def _attempt(
     starts = [start]
     if isinstance(family, Freely):
         starts += _resected(views, lenses)
-    matrices, _ = fit_with_outliers(family, starts, lenses, views)
+    matrices, loss = fit_with_outliers(family, starts, lenses, views)
+    if not np.isfinite(loss):
+        _refuse_outliers(model, views, group, np.zeros(len(views.camera), dtype=bool))
     keep = np.ones(len(views.camera), dtype=bool)
     for _ in range(ROUNDS):
         motion = _motion(model, start, matrices, family)
@@ -247,6 +251,7 @@ def _inliers(
         rows = by_model(model, group, matrices, motion, views, offsets)
         covariances += np.einsum("kip,pq,kjq->kij", rows, model.covariance.covariance, rows, optimize=True)
     error = predicted(matrices, lenses, views) - views.pixels
+    error = np.where(np.isfinite(error), error, FAR_PX)
     squares = np.einsum("ki,ki->k", error, np.linalg.solve(covariances, error[..., None])[..., 0])
     factor = max(1.0, float(np.median(squares)) / np.log(4.0))
     keep = squares <= OUTLIER_CHI2 * factor
@@ -291,6 +296,11 @@ def _least_squares(
         x = -gain @ error
         before, directions = matrices, family.directions(matrices)
         matrices = family.step(matrices, x)
+        if not np.isfinite(predicted(matrices, lenses, views)).all():
+            wrong = tuple(int(i) for i in np.unique(views.ids))
+            raise not_explained(
+                [model.cameras[c].name for c in group], np.inf, np.inf, 0, wrong, 1.0, MAX_OUTLIERS
+            )
         if float(np.linalg.norm(rows @ x)) < SETTLED:
             break
     gain = gain @ np.linalg.inv(triangle)
