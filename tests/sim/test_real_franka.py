@@ -17,8 +17,6 @@ from typer.testing import CliRunner
 from stereoservo_sim.commands.reproduce import EXPERIMENTS, reproduce
 from stereoservo_sim.experiments.aruco_tags import (
     find_tags,
-    homography_from_quad,
-    pattern_image,
     register_tag,
     tag_cells,
 )
@@ -161,20 +159,6 @@ def test_registration_is_exact_where_subpixel_corners_are_not(truth):
         opencv.append(start - exact)
     assert np.sqrt(np.mean(np.square(errors))) < 0.06
     assert np.sqrt(np.mean(np.square(errors))) < 0.4 * np.sqrt(np.mean(np.square(opencv)))
-
-
-def test_pattern_derivative_agrees_with_finite_differences():
-    rng = np.random.default_rng(3)
-    quad = np.array([[0.0, 0.0], [1.1, 0.1], [1.0, 1.0], [-0.1, 0.9]]) - 0.5
-    p = np.concatenate([homography_from_quad(quad).ravel()[:8], [np.log(0.05), 200.0, 10.0, -5.0, 20.0]])
-    points = rng.uniform(-0.6, 0.6, (60, 2))
-    J = pattern_image(p, points, tag_cells(9))[1]
-    steps = 1e-6 * np.eye(13)
-    by_difference = [
-        (pattern_image(p + e, points, tag_cells(9))[0] - pattern_image(p - e, points, tag_cells(9))[0]) / 2e-6
-        for e in steps
-    ]
-    np.testing.assert_allclose(J, np.stack(by_difference, axis=1), rtol=1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize("kappa", [0.03, -0.08])
