@@ -197,6 +197,8 @@ class Bench:
     log: list[tuple[StepInputs, StepOutputs]] = field(default_factory=list)
     pending: list[CameraObservation] = field(default_factory=list)
     encoder: np.ndarray | None = None
+    zero_offset: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    """What the encoders tell more than the joints stand at."""
     loads: Callable[[Bench], tuple[np.ndarray, np.ndarray]] | None = None
     """Efforts and following errors (6,), (6,) that the drives tell; None: they do not."""
 
@@ -204,7 +206,7 @@ class Bench:
         period_ns = round(1e9 / self.settings.rate_hz)
         self.now_ns += period_ns
         self.seq += 1
-        q_encoder = self.q.copy()
+        q_encoder = self.q + self.zero_offset
         if self.frozen_joint >= 0:
             self.encoder = self.q.copy() if self.encoder is None else self.encoder
             q_encoder[self.frozen_joint] = self.encoder[self.frozen_joint]

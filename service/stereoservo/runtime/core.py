@@ -344,6 +344,9 @@ class ServoCore:
         if verdict is None or (state.reanchoring is not None and state.reanchoring.phase == "verify"):
             return
         health.tell(verdict, present)
+        if verdict.kind == "joint_zero":
+            for estimate in state.cameras:  # images decide where the arm goes: they are believed from here on
+                estimate.seen_ns[:] = 0
         if verdict.kind == "marker_slipped" and health.mask(verdict, present):
             subject = ", ".join(verdict.subjects)
             present.emit("warning", message=f"marker {subject} is not used any more", name=subject)

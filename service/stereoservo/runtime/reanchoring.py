@@ -209,6 +209,7 @@ def _moved_again(run: Reanchoring, present: Present) -> bool:
     if bool((np.abs(present.q - run.tried_at) > SAME_PLACE).any()):
         return False
     moved: list[str] = []
+    looked = False
     for c, camera in enumerate(present.settings.cameras):
         sighting = present.state.watching.sightings[c]
         if sighting.t_ns <= run.phase_ns or not sighting.fresh:
@@ -216,6 +217,7 @@ def _moved_again(run: Reanchoring, present: Present) -> bool:
         known = run.referred[c] > 0.0
         both = known & (sighting.seen > 0.0)
         if int(both.sum()) >= 3:
+            looked = True
             apart = np.sqrt(((sighting.innovation - run.reference[c])[both] ** 2).sum(axis=-1))
             if float(np.median(apart)) > MOVED_AGAIN_PX:
                 moved.append(camera.name)
@@ -223,7 +225,7 @@ def _moved_again(run: Reanchoring, present: Present) -> bool:
         run.reference[c][fresh] = sighting.innovation[fresh]
         run.referred[c][fresh] = 1.0
     if not moved:
-        run.contradicting = 0
+        run.contradicting = 0 if looked else run.contradicting
         return False
     run.contradicting += 1
     if run.contradicting < 2:
