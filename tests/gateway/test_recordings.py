@@ -1,0 +1,113 @@
+"""Orders to record images, and what is told of them; no process is started."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from stereoservo.gateway import recordings
+from stereoservo.gateway.messages import EventMessage, decode
+from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.recordings import CannotRecordError, ImageOrders
+from stereoservo.runtime.directories import CellDirectories
+from stereoservo.runtime.image_order import RecordedImages, order_path, read_order
+
+
+class Bench:
+    """Orders of a cell with these cameras, on a clock of its own."""
+
+    def __init__(self, directory: Path, monkeypatch: pytest.MonkeyPatch, **cameras: str) -> None:
+        self.directories = CellDirectories("cell", directory, directory)
+        self.events: list[EventMessage] = []
+        self.now = 100.0
+        clock = SimpleNamespace(monotonic=lambda: self.now, monotonic_ns=lambda: int(self.now * 1e9))
+        monkeypatch.setattr(recordings, "time", clock)
+        plan: Any = SimpleNamespace(
+            directories=self.directories,
+            cameras=[SimpleNamespace(name=name, delivers=delivers) for name, delivers in cameras.items()],
+        )
+        log = EventLog("boot", lambda payload: self.events.append(decode(payload, EventMessage)))
+        self.orders = ImageOrders(plan, log)
+        self.flight = directory / "flight.mcap"
+
+    def tell(self, camera: str, frames: int, left_out: int = 0, why: str = "ended") -> None:
+        file = str(self.flight.with_suffix(".images") / f"{camera}.avi")
+        self.orders.told(RecordedImages(camera, file, frames, left_out, 1000, why))
+
+    def ordered(self) -> str | None:
+        order = read_order(order_path(self.directories))
+        return None if order is None else order.directory
+
+
+def test_a_recording_is_summed_up_once_all_cameras_have_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path, monkeypatch, left="frames", right="frames", third="observations")
+    bench.orders.check()
+    bench.orders.begin(bench.flight)
+    assert bench.ordered() == str(tmp_path / "flight.images")
+    assert "third deliver observations" in bench.events[-1].message
+    bench.tell("right", 40, 2, "the disk is full")
+    bench.orders.follow()
+    assert bench.orders.running
+    bench.orders.end()
+    assert bench.ordered() is None
+    bench.orders.follow()
+    assert [event.kind for event in bench.events] == ["images"]
+    bench.tell("left", 50)
+    bench.orders.follow()
+    bench.orders.follow()
+    assert [event.kind for event in bench.events] == ["images", "images_recorded"]
+    found = bench.events[-1].images
+    assert found is not None
+    assert [(one.camera, one.frames, one.left_out) for one in found.cameras] == [
+        ("left", 50, 0),
+        ("right", 40, 2),
+    ]
+    assert bench.events[-1].message.endswith(
+        "left: 50 frames; right: 40 frames, 2 left out, the disk is full"
+    )
+
+
+def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(tmp_path, monkeypatch, left="frames", right="frames")
+    bench.orders.begin(bench.flight)
+    bench.orders.told(RecordedImages("right", "/elsewhere/right.avi", 9, 0, 9))
+    bench.orders.end()
+    bench.tell("left", 5)
+    bench.now += recordings.LAST_WORD_S + 0.1
+    bench.orders.follow()
+    found = bench.events[-1].images
+    assert found is not None
+    assert "has not said" in found.cameras[1].why
+    assert not bench.orders.running
+
+
+def test_a_new_recording_does_not_wait_for_the_last_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path, monkeypatch, left="frames")
+    bench.orders.begin(bench.flight)
+    first = read_order(order_path(bench.directories))
+    bench.orders.end()
+    bench.now += 0.1
+    bench.flight = tmp_path / "second.mcap"
+    bench.orders.begin(bench.flight)
+    second = read_order(order_path(bench.directories))
+    assert first is not None
+    assert second is not None
+    assert first.number != second.number
+    assert [event.kind for event in bench.events] == ["images", "images_recorded", "images"]
+
+
+def test_cameras_without_pictures_are_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path, monkeypatch, left="observations", right="observations")
+    with pytest.raises(CannotRecordError, match="left, right deliver observations"):
+        bench.orders.check()
+    order_path(bench.directories).write_text('{"number": 1, "directory": "/old"}')
+    assert Bench(tmp_path, monkeypatch, left="frames").ordered() is None, "of a gateway that has died"
