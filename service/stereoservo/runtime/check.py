@@ -79,9 +79,9 @@ def check_step(checking: Checking, present: Present) -> Motion:
         samples = look(checking, present, trial)
         if samples is None:
             return rest
-        poorest = too_few_seen(samples, trial)
+        poorest = too_few_seen(samples, trial, present.settings.scene_ids)
         if poorest is not None and checking.index == 0:
-            return _abort(checking, present, unseen_at_base(poorest, trial))
+            return _abort(checking, present, unseen_at_base(poorest, trial, present.settings.scene_ids))
         if poorest is None:
             checking.seen += 1
         present.emit(

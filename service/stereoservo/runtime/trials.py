@@ -101,10 +101,10 @@ def _move(trials: Trials, present: Present, settings: TrialSettings) -> Motion:
 def _stop_done(
     trials: Trials, present: Present, settings: TrialSettings, samples: tuple[Sample, ...]
 ) -> Motion:
-    poorest = too_few_seen(samples, settings)
+    poorest = too_few_seen(samples, settings, present.settings.scene_ids)
     if poorest is not None:
         if trials.joint < 0 and trials.turn < 0:
-            return _abort(trials, present, unseen_at_base(poorest, settings))
+            return _abort(trials, present, unseen_at_base(poorest, settings, present.settings.scene_ids))
         return _turn_done(trials, present, settings, "at the stop")
     mean = mean_joints(trials)
     # The base with the spread joint turned is a stop of that joint's own.

@@ -11,7 +11,7 @@ from stereoservo.runtime.averaging import add_observation, averages
 from stereoservo.runtime.cycle import Sample
 from stereoservo.runtime.estimate import joints_at
 from stereoservo.runtime.motion import ARRIVED, Motion, Present, arrived, measurement_buffers, towards
-from stereoservo.runtime.ports import FloatArray
+from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.settings import CoreSettings, TrialSettings
 from stereoservo.runtime.state import Visiting
 from stereoservo.runtime.sums import Sums
@@ -81,10 +81,15 @@ def too_slow(visit: Visiting, present: Present, trial: TrialSettings) -> Reason 
     )  # fmt: skip
 
 
+def _of_body(ids: IntArray, static: tuple[int, ...]) -> int:
+    """How many of ``ids`` are not ``static``, of the scene."""
+    return sum(int(marker) not in static for marker in ids)
+
+
 def markers_lost(visit: Visiting, present: Present, trial: TrialSettings) -> bool:
     """Some camera has seen too few markers for ``LOST_S``."""
     for observation in present.observations:
-        if int(observation.ids.size) < trial.min_markers:
+        if _of_body(observation.ids, present.settings.scene_ids) < trial.min_markers:
             visit.lost_ns = visit.lost_ns or present.now_ns
             return (present.now_ns - visit.lost_ns) * 1e-9 > LOST_S
     if present.observations:
@@ -123,30 +128,33 @@ def mean_joints(visit: Visiting) -> FloatArray:
     return mean
 
 
-def too_few_seen(samples: tuple[Sample, ...], trial: TrialSettings) -> Sample | None:
-    """The camera that saw too few markers, or too few frames, at a stop."""
-    for sample in sorted(samples, key=lambda sample: sample.ids.size):
-        if sample.ids.size < trial.min_markers or sample.frames < max(1, trial.frames // 2):
+def too_few_seen(
+    samples: tuple[Sample, ...], trial: TrialSettings, static: tuple[int, ...] = ()
+) -> Sample | None:
+    """The camera that saw too few markers, or too few frames, at a stop; ``static`` points do not count."""
+    for sample in sorted(samples, key=lambda sample: _of_body(sample.ids, static)):
+        if _of_body(sample.ids, static) < trial.min_markers or sample.frames < max(1, trial.frames // 2):
             return sample
     return None
 
 
-def unseen_at_base(poorest: Sample, trial: TrialSettings) -> Reason:
-    """Why nothing can begin: the base shows too little."""
+def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...] = ()) -> Reason:
+    """Why nothing can begin: the base shows too little; ``static`` points do not count."""
+    seen = _of_body(poorest.ids, static)
     if poorest.frames == 0:
         return Reason(
             "CAMERA_SILENT", "hold", poorest.camera, 0.0, float(trial.frames), "frames",
             f"camera {poorest.camera} delivers no frames: is it connected? See the daemon's log",
         )  # fmt: skip
-    if poorest.ids.size >= trial.min_markers:
+    if seen >= trial.min_markers:
         return Reason(
             "CAMERA_SILENT", "hold", poorest.camera, float(poorest.frames), float(trial.frames), "frames",
             f"camera {poorest.camera} delivered {poorest.frames} of {trial.frames} frames at the base in "
             f"{trial.wait_s:g} s: a slow or interrupted camera; see the daemon's log, or raise calibration.wait_s",
         )  # fmt: skip
     return Reason(
-        "MARKERS_NOT_SEEN", "hold", poorest.camera, float(poorest.ids.size), float(trial.min_markers), "markers",
-        f"camera {poorest.camera} shows {poorest.ids.size} markers in {poorest.frames} frames at the base: "
+        "MARKERS_NOT_SEEN", "hold", poorest.camera, float(seen), float(trial.min_markers), "markers",
+        f"camera {poorest.camera} shows {seen} markers in {poorest.frames} frames at the base: "
         "check light, focus, and that the base configuration shows the marker body to every camera",
     )  # fmt: skip
 

@@ -86,6 +86,27 @@ def warm_up() -> None:
                     driver_active=True,
                 )
             )
+    _rehearse_health(model, pixels)
+
+
+def _rehearse_health(model: CellModel, pixels: FloatArray) -> None:
+    """Frames of a camera that was moved: what explains them is asked for at no other time."""
+    core = ServoCore(_settings())
+    moved = pixels + np.array([30.0, 0.0]) * np.array([1.0, 0.0])[:, None, None]
+    for step in range(1, 12):
+        now_ns = 1_000_000_000 + step * PERIOD_NS
+        seen = moved if step > 6 else pixels
+        core.step(
+            StepInputs(
+                now_ns=now_ns,
+                period_ns=PERIOD_NS,
+                joints=JointState(step, now_ns, np.zeros(6), np.zeros(6)),
+                observations=tuple(_sight(name, seen[c], step, now_ns) for c, name in enumerate(CAMERAS)),
+                model_update=ModelUpdate(model) if step == 2 else None,
+            )
+        )
+    if core.state.reanchoring is None:
+        raise AssertionError("the rehearsal's camera was moved, and nothing was said of it")
 
 
 def _sight(camera: str, pixels: FloatArray, step: int, now_ns: int) -> CameraObservation:
