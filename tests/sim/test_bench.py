@@ -76,6 +76,10 @@ def test_features_find_the_dots():
     result = run_features(1, 0, quiet)
     assert result["dots_found"]["least"] >= 7
     assert set(result["ms"]) == {"cold", "tracking", "cv2_threshold_and_connected_components"}
+    for row in result["robustness"]:
+        low, high = row["tracked"]["all_faces_wilson_95"]
+        assert low <= row["tracked"]["all_faces"] / row["tracked"]["frames"] <= high
+        assert row["tracked"]["wrong_ids"] == row["acquired"]["wrong_ids"] == 0
 
 
 def test_command_prints_one_object_with_the_machine(capfd):

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo_drivers.detectors.centroids import FIELDS, LOPSIDED, MAX_WINDOW, OK, measure_windows
+from stereoservo_drivers.detectors.centroids import measure_windows
+from stereoservo_drivers.detectors.components import MAX_WINDOW
+from stereoservo_drivers.detectors.measurements import FIELDS, LOPSIDED, OK
 from stereoservo_drivers.detectors.tracking import whole
 
 SHRINK_FROM = 240

@@ -21,7 +21,6 @@ is not noise).
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo_drivers.detectors.compilation import (
     BOOL,
@@ -34,141 +33,54 @@ from stereoservo_drivers.detectors.compilation import (
     kernel,
     written,
 )
+from stereoservo_drivers.detectors.components import MAX_WINDOW, nearest_component, ring_level
+from stereoservo_drivers.detectors.levels import inside, surroundings
+from stereoservo_drivers.detectors.measurements import (
+    AREA,
+    BACKGROUND,
+    BORDER,
+    BXX,
+    BXY,
+    BYY,
+    CONTRAST,
+    CXX,
+    CXY,
+    CYY,
+    DARK,
+    DIVERGED,
+    EXX,
+    EXY,
+    EYY,
+    FLUX,
+    FLUX_NOISE,
+    LIT,
+    LOPSIDED,
+    LOPSIDED_NOISE,
+    NO_COMPONENT,
+    NO_CONTRAST,
+    NOISE,
+    OK,
+    PULL,
+    QXX,
+    QXY,
+    QYY,
+    SHAPE,
+    U,
+    V,
+)
 
 SKIRT = 2.2
 """Distance to the ellipse, to first order, up to which a pixel outside counts [px] (in truth up to 2.8 at 4
 px radius).
 """
-RING = 2
-"""Width of the surroundings outside the skirt [px] that give background and noise."""
+NARROW = 1.3
+"""The same where another dot stands near."""
+NARROWEST = 0.8
+"""The same where one all but touches: enough to tell a face by, hardly to measure with."""
+CROWDED, PRESSED = 0.02, 0.1
+"""Standard deviations [px] that the light of a neighbour adds then."""
 MARGIN = 4
 """Pixels needed between a dot's half-contrast outline and the border of the image."""
-
-U, V, CXX, CXY, CYY, AREA, QXX, QXY, QYY, CONTRAST, NOISE, LOPSIDED, LOPSIDED_NOISE = range(13)
-FIELDS = 13
-"""Columns of a measurement: centre [px]; covariance for unit noise [px²]; area [px²]; ellipse matrix (dᵀQd
-= 1 on the edge); contrast and noise variance [grey levels, squared]; amplitude of the odd harmonics (first
-and third) of the edge's level around the dot, 0 for whole dots whatever their blur, and its rms under unit
-noise."""
-
-OK, NO_CONTRAST, NO_COMPONENT, BORDER, SHAPE, DIVERGED = range(6)
-
-MAX_WINDOW = 160
-"""Largest side of a window [px]."""
-
-
-def scratch() -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Label image and stack for :func:`measure`, to be reused between calls of one thread."""
-    return np.zeros((MAX_WINDOW, MAX_WINDOW), np.int32), np.zeros(MAX_WINDOW * MAX_WINDOW, np.int32)
-
-
-@kernel
-def _median(histogram, count):
-    half = (count + 1) // 2
-    total = 0
-    for level in range(256):
-        total += histogram[level]
-        if total >= half:
-            return float(level)
-    return 255.0
-
-
-@kernel
-def _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found):
-    """Label the bright components of a window; the label of the one nearest to (pu, pv), 0 if there is none.
-
-    ``found``: count, sum u, sum v, u_min, u_max, v_min, v_max, level sum of its inner pixels, their count.
-    Components that touch the window's rim are something larger than a dot and do not count.
-    """
-    u0, v0, u1, v1 = box
-    labels[: v1 - v0, : u1 - u0] = 0
-    best = 0
-    best_distance = 1e30
-    label = 0
-    for sv in range(v0, v1):
-        for su in range(u0, u1):
-            level = int(image[sv, su])
-            if dark:
-                level = 255 - level
-            if level < threshold or labels[sv - v0, su - u0] != 0:
-                continue
-            label += 1
-            labels[sv - v0, su - u0] = label
-            stack[0] = (sv - v0) * MAX_WINDOW + (su - u0)
-            top = 1
-            count = 0
-            sum_u = 0
-            sum_v = 0
-            u_min, u_max, v_min, v_max = su, su, sv, sv
-            inner_sum = 0
-            inner = 0
-            while top > 0:
-                top -= 1
-                v = stack[top] // MAX_WINDOW + v0
-                u = stack[top] % MAX_WINDOW + u0
-                count += 1
-                sum_u += u
-                sum_v += v
-                u_min = min(u_min, u)
-                u_max = max(u_max, u)
-                v_min = min(v_min, v)
-                v_max = max(v_max, v)
-                neighbours = 0
-                for k in range(4):
-                    nu = u + (1 if k == 0 else -1 if k == 1 else 0)
-                    nv = v + (1 if k == 2 else -1 if k == 3 else 0)
-                    if nu < u0 or nu >= u1 or nv < v0 or nv >= v1:
-                        continue
-                    other = int(image[nv, nu])
-                    if dark:
-                        other = 255 - other
-                    if other < threshold:
-                        continue
-                    neighbours += 1
-                    if labels[nv - v0, nu - u0] == 0:
-                        labels[nv - v0, nu - u0] = label
-                        stack[top] = (nv - v0) * MAX_WINDOW + (nu - u0)
-                        top += 1
-                if neighbours == 4:
-                    here = int(image[v, u])
-                    inner_sum += 255 - here if dark else here
-                    inner += 1
-            if count < min_area or u_min == u0 or v_min == v0 or u_max == u1 - 1 or v_max == v1 - 1:
-                continue
-            du = sum_u / count - pu
-            dv = sum_v / count - pv
-            if du * du + dv * dv < best_distance:
-                best_distance = du * du + dv * dv
-                best = label
-                found[0] = count
-                found[1] = sum_u
-                found[2] = sum_v
-                found[3] = u_min
-                found[4] = u_max
-                found[5] = v_min
-                found[6] = v_max
-                found[7] = inner_sum
-                found[8] = inner
-    return best
-
-
-@kernel
-def _ring_level(image, dark, u_min, u_max, v_min, v_max):
-    """Median level of the rectangular ring 3 to 4 px outside a bounding box (all inside the image)."""
-    histogram = np.zeros(256, np.int32)
-    count = 0
-    for grow in (3, 4):
-        for u in range(u_min - grow, u_max + grow + 1):
-            for v in (v_min - grow, v_max + grow):
-                level = int(image[v, u])
-                histogram[255 - level if dark else level] += 1
-                count += 1
-        for v in range(v_min - grow + 1, v_max + grow):
-            for u in (u_min - grow, u_max + grow):
-                level = int(image[v, u])
-                histogram[255 - level if dark else level] += 1
-                count += 1
-    return _median(histogram, count)
 
 
 @kernel
@@ -234,23 +146,23 @@ def smaller_half_axis(q11, q12, q22):
 
 
 @kernel
-def _reach(q11, q12, q22):
-    """How far the window extends outside the ellipse [px], where the distance to first order is SKIRT."""
+def _reach(q11, q12, q22, skirt):
+    """How far the window extends outside the ellipse [px], where the distance to first order is ``skirt``."""
     thin = smaller_half_axis(q11, q12, q22)
-    return SKIRT + np.sqrt(SKIRT * SKIRT + thin * thin) - thin
+    return skirt + np.sqrt(skirt * skirt + thin * thin) - thin
 
 
 @kernel
-def _window_sums(image, dark, background, out, sums, edge):
+def _window_sums(image, dark, background, skirt, out, sums, edge):
     """S (2), J (4), sum T Tᵀ (3) at the centre in ``out``; where ``edge``, the odd harmonics of the edge's
-    level.
+    level, and what light, its slopes and its noise take.
 
     False where the window leaves the image.
     """
     q11, q12, q22 = out[QXX], out[QXY], out[QYY]
     det = q11 * q22 - q12 * q12
     cu, cv = out[U], out[V]
-    reach = _reach(q11, q12, q22)
+    reach = _reach(q11, q12, q22, skirt)
     half_u = np.sqrt(q22 / det) + reach
     half_v = np.sqrt(q11 / det) + reach
     lo_u, hi_u = int(np.ceil(cu - half_u)), int(np.floor(cu + half_u))
@@ -267,7 +179,7 @@ def _window_sums(image, dark, background, out, sums, edge):
             gx = q11 * x + q12 * y
             gy = q12 * x + q22 * y
             e = x * gx + y * gy - 1.0
-            band = 4.0 * SKIRT * SKIRT * (gx * gx + gy * gy)
+            band = 4.0 * skirt * skirt * (gx * gx + gy * gy)
             if e > 0.0 and e * e >= band:
                 continue
             level = float(image[v, u])
@@ -276,13 +188,13 @@ def _window_sums(image, dark, background, out, sums, edge):
             level -= background
             weight = 1.0
             if e * e < band:
-                # W = (1 - (delta / SKIRT)²)², delta = e / 2|Qd|
+                # W = (1 - (delta / skirt)²)², delta = e / 2|Qd|
                 t = e * e / band
                 bump = (1.0 - t) * (1.0 - t)
                 if e > 0.0:
                     weight = bump
                     f = 8.0 * e * (1.0 - t) / band
-                    g = 2.0 * SKIRT * SKIRT * f * e / band
+                    g = 2.0 * skirt * skirt * f * e / band
                     dx = f * gx - g * (q11 * gx + q12 * gy)
                     dy = f * gy - g * (q12 * gx + q22 * gy)
                     j00 += x * dx * level
@@ -290,7 +202,7 @@ def _window_sums(image, dark, background, out, sums, edge):
                     j10 += y * dx * level
                     j11 += y * dy * level
                 if edge:
-                    r = 2.0 * SKIRT / np.sqrt(band)
+                    r = 2.0 * skirt / np.sqrt(band)
                     nx = gx * r
                     ny = gy * r
                     sums[9] += bump
@@ -299,6 +211,21 @@ def _window_sums(image, dark, background, out, sums, edge):
                     sums[12] += bump * level * (4.0 * nx * nx - 3.0) * nx
                     sums[13] += bump * level * (3.0 - 4.0 * ny * ny) * ny
                     sums[14] += bump * bump
+            if edge:
+                light = weight * level
+                bright = weight * light
+                sums[15] += light
+                sums[16] += weight
+                sums[17] += weight * weight
+                sums[18] += x * x * light
+                sums[19] += x * y * light
+                sums[20] += y * y * light
+                sums[21] += x * x * bright
+                sums[22] += x * y * bright
+                sums[23] += y * y * bright
+                sums[24] += x * x * weight
+                sums[25] += x * y * weight
+                sums[26] += y * y * weight
             s0 += x * weight * level
             s1 += y * weight * level
             j00 -= weight * level
@@ -314,12 +241,12 @@ def _window_sums(image, dark, background, out, sums, edge):
 
 
 @kernel
-def _crowded(labels, box, label, out):
-    """Whether more than specks (noise on the dot's own edge) of other components come within a pixel of its skirt."""
+def _crowded(labels, box, label, near, out):
+    """Whether more than specks (noise on the dot's own edge) of other components come within ``near`` [px] of it."""
     specks = 3
     u0, v0, u1, v1 = box
     q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    far = 4.0 * (SKIRT + 1.0) * (SKIRT + 1.0)
+    far = 4.0 * near * near
     for v in range(v0, v1):
         for u in range(u0, u1):
             other = labels[v - v0, u - u0]
@@ -333,83 +260,6 @@ def _crowded(labels, box, label, out):
                     if specks < 0:
                         return True
     return False
-
-
-@kernel
-def _noise(image, dark, background, out):
-    """Variance of the dot's surroundings about a plane [grey levels squared]; -1 where there is too little
-    to see.
-
-    Pixels off by more than four robust standard deviations (a neighbour's skirt, the plate's edge) do not
-    count.
-    """
-    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    det = q11 * q22 - q12 * q12
-    cu, cv = out[U], out[V]
-    reach = _reach(q11, q12, q22) + RING
-    half_u = np.sqrt(q22 / det) + reach
-    half_v = np.sqrt(q11 / det) + reach
-    rows, columns = image.shape
-    lo_u, hi_u = max(int(cu - half_u), 0), min(int(cu + half_u) + 1, columns - 1)
-    lo_v, hi_v = max(int(cv - half_v), 0), min(int(cv + half_v) + 1, rows - 1)
-    histogram = np.zeros(256, np.int32)
-    ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 3))
-    count = 0
-    for v in range(lo_v, hi_v + 1):
-        y = v - cv
-        for u in range(lo_u, hi_u + 1):
-            x = u - cu
-            gx = q11 * x + q12 * y
-            gy = q12 * x + q22 * y
-            e = x * gx + y * gy - 1.0
-            if e >= 0.0 and e * e >= 4.0 * SKIRT * SKIRT * (gx * gx + gy * gy):
-                level = float(image[v, u])
-                if dark:
-                    level = 255.0 - level
-                level -= background
-                histogram[int(abs(level))] += 1
-                ring[count, 0] = x
-                ring[count, 1] = y
-                ring[count, 2] = level
-                count += 1
-    if count < 24:
-        return -1.0
-    limit = 4.0 * 1.4826 * _median(histogram, count) + 2.0
-    level0 = slope_x = slope_y = variance = 0.0
-    for _ in range(2):
-        n = si = sx = sy = sxx = sxy = syy = sxi = syi = sii = 0.0
-        for k in range(count):
-            x, y, level = ring[k, 0], ring[k, 1], ring[k, 2]
-            if abs(level - level0 - slope_x * x - slope_y * y) > limit:
-                continue
-            n += 1.0
-            si += level
-            sx += x
-            sy += y
-            sxx += x * x
-            sxy += x * y
-            syy += y * y
-            sxi += x * level
-            syi += y * level
-            sii += level * level
-        if n < 12.0:
-            return -1.0
-        sxx -= sx * sx / n
-        sxy -= sx * sy / n
-        syy -= sy * sy / n
-        sxi -= sx * si / n
-        syi -= sy * si / n
-        sii -= si * si / n
-        d = sxx * syy - sxy * sxy
-        if d <= 0.0:
-            return -1.0
-        slope_x = (syy * sxi - sxy * syi) / d
-        slope_y = (sxx * syi - sxy * sxi) / d
-        level0 = (si - slope_x * sx - slope_y * sy) / n
-        variance = max(sii - slope_x * sxi - slope_y * syi, 0.0) / (n - 3.0)
-        limit = 3.0 * np.sqrt(variance) + 0.5
-    # what lies within three standard deviations of a Gaussian has 0.973 of its variance
-    return variance / 0.973 if variance > 1.0 else variance
 
 
 @kernel
@@ -437,13 +287,13 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
         threshold = 255 - (low + high) // 2
     found = np.zeros(9)
     box = (u0, v0, u1, v1)
-    label = _nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found)
+    label = nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found)
     if label == 0:
         return NO_COMPONENT
     u_min, u_max, v_min, v_max = int(found[3]), int(found[4]), int(found[5]), int(found[6])
     if u_min < MARGIN or v_min < MARGIN or u_max >= columns - MARGIN or v_max >= rows - MARGIN:
         return BORDER
-    background = _ring_level(image, dark, u_min, u_max, v_min, v_max)
+    background = ring_level(image, dark, u_min, u_max, v_min, v_max)
     top = float(255 - low) if dark else float(high)
     contrast = top - background
     if found[8] >= 4:
@@ -452,14 +302,19 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
         return NO_CONTRAST
     if not _ellipse(image, dark, box, labels, label, found, background, contrast, out):
         return SHAPE
-    if _crowded(labels, box, label, out):
-        return SHAPE
+    skirt, beside = SKIRT, 0.0
+    if _crowded(labels, box, label, SKIRT + 1.0, out):
+        skirt, beside = NARROW, CROWDED * CROWDED
+        if _crowded(labels, box, label, NARROW + 1.0, out):
+            skirt, beside = NARROWEST, PRESSED * PRESSED
+            if _crowded(labels, box, label, NARROWEST + 0.5, out):
+                return SHAPE
     start_u, start_v = out[U], out[V]
-    sums = np.zeros(15)
+    sums = np.zeros(27)
     # Newton's method from a start within some hundredths of a pixel: the second step is of the order of
     # 1e-4 px
     for step in range(4):
-        if not _window_sums(image, dark, background, out, sums, step > 0):
+        if not _window_sums(image, dark, background, skirt, out, sums, step > 0):
             return BORDER
         det = sums[2] * sums[5] - sums[3] * sums[4]
         if det <= 0.0 or sums[2] + sums[5] >= 0.0:
@@ -479,7 +334,30 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     out[CXY] = a * c * n11 + (a * d + b * c) * n12 + b * d * n22
     out[CYY] = c * c * n11 + 2.0 * c * d * n12 + d * d * n22
     out[CONTRAST] = contrast
-    out[NOISE] = _noise(image, dark, background, out)
+    f = 1.0 / contrast
+    n11, n12, n22 = f * sums[21], f * sums[22], f * sums[23]
+    out[BXX] = a * a * n11 + 2.0 * a * b * n12 + b * b * n22
+    out[BXY] = a * c * n11 + (a * d + b * c) * n12 + b * d * n22
+    out[BYY] = c * c * n11 + 2.0 * c * d * n12 + d * d * n22
+    for k in range(2):
+        # the shift is -J⁻¹ sum T dI, and T = d W
+        p, r = (a, b) if k == 0 else (c, d)
+        out[LIT + 2 * k] = -(p * sums[18] + r * sums[19])
+        out[LIT + 2 * k + 1] = -(p * sums[19] + r * sums[20])
+        out[DARK + 2 * k] = -(p * sums[24] + r * sums[25])
+        out[DARK + 2 * k + 1] = -(p * sums[25] + r * sums[26])
+        # inside the dot T = d is one of the terms that the slope is fitted with
+        out[PULL + 2 * k] = -f * p
+        out[PULL + 2 * k + 1] = -f * r
+    plane = np.zeros(2)
+    out[NOISE] = surroundings(
+        image, dark, background, skirt, _reach(out[QXX], out[QXY], out[QYY], skirt), out, plane
+    )
+    inside(image, dark, background, contrast, out)
+    out[BACKGROUND] = background + plane[0]
+    out[FLUX] = sums[15] - plane[0] * sums[16]
+    out[FLUX_NOISE] = np.sqrt(sums[17] + sums[16] ** 2 / max(plane[1], 1.0))
+    out[EXX], out[EXY], out[EYY] = beside, 0.0, beside
     if sums[9] <= 0.0:
         return SHAPE
     odd = sums[10] ** 2 + sums[11] ** 2 + sums[12] ** 2 + sums[13] ** 2

@@ -4,9 +4,7 @@ priors.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import permutations
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -24,39 +22,19 @@ from stereoservo.runtime.ports import (
     ImageArray,
     Prior,
 )
-from stereoservo_drivers.detectors import centroids, patterns, tracking
+from stereoservo_drivers.detectors import acquisition, centroids, patterns, tracking
+from stereoservo_drivers.detectors.acquisition import Expectation
 from stereoservo_drivers.detectors.blobs import find_spots
-from stereoservo_drivers.detectors.centroids import (
-    AREA,
-    CXX,
-    CXY,
-    CYY,
-    FIELDS,
-    NOISE,
-    measure_windows,
-    scratch,
-)
-from stereoservo_drivers.detectors.patterns import basis_inverse, find_face
-from stereoservo_drivers.detectors.plates import CORNERS, DEFAULT_BODY, FACES, DotFace
+from stereoservo_drivers.detectors.centroids import measure_windows
+from stereoservo_drivers.detectors.components import scratch
+from stereoservo_drivers.detectors.covariances import covariances_of
+from stereoservo_drivers.detectors.faces import FaceOptions, Positive, patterns_of
+from stereoservo_drivers.detectors.measurements import FIELDS
 from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, settle_face
 
-QUANTISATION = 1.0 / 12.0
-"""Least noise variance [grey levels squared]: rounding to whole levels."""
 SMALLEST_IMAGE = 32
 SAME_SPOT_PX = 2.0
 """A spot this near to a dot that was tracked is that dot."""
-Positive = Annotated[float, Meta(gt=0)]
-
-
-class FaceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A face of one's own: ids and positions of its dots [any unit], four corners clockwise first; radius
-    in that unit.
-    """
-
-    name: str
-    ids: tuple[int, ...]
-    positions: tuple[tuple[float, float], ...]
-    radius: Positive
 
 
 class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -81,8 +59,10 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Dots of a face that acquisition must find."""
     consistency_px: Positive = 0.3
     """How far a dot may lie from its face's homography [px]: print and lens errors, not noise."""
-    gate_sigma: Annotated[float, Meta(ge=0)] = 0.0
-    """Refuse dots so many standard deviations off their prior; 0: leave it to the core."""
+    gate_probability: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+    """Refuse tracked dots so far off their prior that only 1 - this of good ones are (chi-square of two degrees of
+    freedom; covariance of prior and measurement); 0: leave it to the core, which can tell what moved.
+    """
     lopsided: Positive = 0.02
     """Largest odd harmonic of a whole dot's edge; a cut of 0.5 px makes 0.02, of 1 px 0.04."""
     floor_px: Annotated[float, Meta(ge=0)] = 0.001
@@ -93,17 +73,6 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
     max_spots: Annotated[int, Meta(ge=7, le=100)] = 48
     """Dot-like spots that acquisition looks at, the roundest first."""
-
-
-@dataclass(frozen=True)
-class _Pattern:
-    """A face as the kernels want it, in units of half the distance of its corners."""
-
-    ids: npt.NDArray[np.int64]
-    positions: FloatArray
-    radius: float
-    bases: npt.NDArray[np.int64]
-    inverses: FloatArray
 
 
 _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
@@ -134,7 +103,7 @@ class DotDetector:
                 options=dict(options),
             ) from error
         self.camera = context.camera
-        self._patterns = _patterns(self.options)
+        self._patterns = patterns_of(self.options.faces, self.options.beside)
         self._dark = self.options.polarity == "dark"
         self._labels, self._stack = scratch()
         centroids.compile_kernels()
@@ -158,7 +127,21 @@ class DotDetector:
             found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9)
             if found[1].sum() >= self.options.min_dots:
                 return self._observation(frame, self._with_others(image, found, prior))
-        return self._observation(frame, self._acquire(image, range(len(self._patterns))))
+        return self._observation(frame, self._search(frame, image, prior))
+
+    def _search(self, frame: Frame, image: ImageArray, prior: Prior | None) -> _Found:
+        """All faces: where the prior, of whatever age, expects them; in the whole image if that is not enough."""
+        every = range(len(self._patterns))
+        if prior is None or not len(prior.ids):
+            return self._acquire(image, every, [None] * len(every))
+        limit_s = self.options.max_prior_age_s
+        expected = acquisition.expectations(prior, frame.t_shutter_ns, limit_s, self._every_id)
+        region = acquisition.region_of(expected, image.shape)
+        if region is not None:
+            dots, used = self._acquire(acquisition.crop(image, region), every, expected, np.array(region[:2]))
+            if used.any(axis=1).all():
+                return dots, used
+        return self._acquire(image, every, expected)
 
     def _fresh(self, frame: Frame, prior: Prior) -> bool:
         age_s = abs(frame.t_shutter_ns - prior.t_ns) * 1e-9
@@ -207,13 +190,14 @@ class DotDetector:
             image, self._dark, windows, predicted, options.min_contrast, least, self._labels, self._stack,
             dots, status
         )  # fmt: skip
-        gates = np.zeros((m, 3))
-        if options.gate_sigma:
+        spread, limit = np.zeros((m, 3)), np.inf
+        if options.gate_probability:
+            limit = -2.0 * np.log1p(-options.gate_probability)
             for k, marker in enumerate(ids.tolist()):
                 if marker in self._place:
-                    gates[self._place[marker]] = _gate(covariances[k], options.gate_sigma)
+                    spread[self._place[marker]] = covariances[k].ravel()[[0, 1, 3]]
         judge(
-            self._positions, self._radii, predicted, present, shapes, status, gates, options.lopsided,
+            self._positions, self._radii, predicted, present, shapes, status, spread, limit, options.lopsided,
             options.consistency_px, dots, used,
         )  # fmt: skip
         return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
@@ -225,12 +209,24 @@ class DotDetector:
         if not unknown.any():
             return tracked
         dots, used = tracked
-        found, seen = self._acquire(image, np.flatnonzero(unknown).tolist(), dots[used, :2])
+        wanted = np.flatnonzero(unknown).tolist()
+        found, seen = self._acquire(image, wanted, [None] * len(unknown), taken=dots[used, :2])
         return np.where(unknown[:, None, None], found, dots), np.where(unknown[:, None], seen, used)
 
-    def _acquire(self, image: ImageArray, faces: Iterable[int], taken: FloatArray | None = None) -> _Found:
-        """The ``faces`` by index, among all spots but those ``taken`` (k, 2) [px]."""
+    def _acquire(
+        self,
+        image: ImageArray,
+        faces: Sequence[int],
+        expected: Sequence[Expectation | None],
+        origin: npt.NDArray[np.int64] | None = None,
+        taken: FloatArray | None = None,
+    ) -> _Found:
+        """The ``faces`` by index, among all spots of an image but those ``taken`` (k, 2) [px].
+
+        ``expected`` of all faces chooses among copies. ``origin`` (2,): where the image stands in a larger one.
+        """
         options = self.options
+        least, tolerance = options.acquire_dots, options.consistency_px
         spots = find_spots(
             image,
             self._dark,
@@ -240,34 +236,24 @@ class DotDetector:
             self._labels,
             self._stack,
         )
+        if origin is not None:
+            spots[:, :2] += origin
         if taken is not None and len(taken) and len(spots):
             away = np.hypot(*(spots[:, None, :2] - taken[None]).transpose(2, 0, 1)).min(axis=1)
             spots = spots[away > SAME_SPOT_PX]
-        centres, areas = np.ascontiguousarray(spots[:, :2]), np.ascontiguousarray(spots[:, AREA])
         owners = np.full(self._every_id.shape, -1, np.int64)
         for f in faces:
-            pattern, owner, count = self._patterns[f], owners[f], 0
-            for bases in (slice(0, 1), slice(1, None)):
-                # the first basis is the corners, the others stand in where one is hidden
-                if count == 0 and len(spots) >= options.acquire_dots:
-                    count = find_face(
-                        pattern.positions, pattern.radius, centres, areas, pattern.bases[bases],
-                        pattern.inverses[bases], options.acquire_dots, 1.5, options.consistency_px, owner,
-                    )  # fmt: skip
-        owners = _without_conflicts(owners)
+            copies = acquisition.copies_of(self._patterns[f], spots, least, tolerance)
+            owner = acquisition.choose(copies, spots, expected[f])
+            if owner is not None:
+                owners[f] = owner
+        owners = acquisition.without_conflicts(owners)
         used = owners >= 0
         dots = np.zeros((*used.shape, FIELDS))
         dots[used] = spots[owners[used]]
         for f, pattern in enumerate(self._patterns):
             if used[f].any():
-                settle_face(
-                    pattern.positions,
-                    pattern.radius,
-                    dots[f],
-                    used[f],
-                    options.consistency_px,
-                    options.acquire_dots,
-                )
+                settle_face(pattern.positions, pattern.radius, dots[f], used[f], tolerance, least)
         return dots, used
 
     def _observation(self, frame: Frame, found: _Found) -> CameraObservation:
@@ -275,8 +261,7 @@ class DotDetector:
         ids, chosen = self._every_id[used], dots[used]
         order = np.argsort(ids)
         ids, chosen = ids[order], chosen[order]
-        variance = noise_variances(chosen[:, NOISE])
-        covariances = variance[:, None, None] * chosen[:, [CXX, CXY, CXY, CYY]].reshape(-1, 2, 2)
+        covariances = covariances_of(chosen)
         covariances += self.options.floor_px**2 * np.eye(2)
         return CameraObservation(
             camera=frame.camera,
@@ -287,104 +272,3 @@ class DotDetector:
             pixels=np.ascontiguousarray(chosen[:, :2]),
             covariances=covariances,
         )
-
-
-def noise_variances(measured: FloatArray) -> FloatArray:
-    """Noise variance of each dot's surroundings (k,) from the measured ones (k,), -1 where there is none
-    [levels²].
-
-    One picture has one noise: each gets the median over all dots, which is steadier (a dot's own: 15 %),
-    unless its own surroundings are more than twice as restless.
-    """
-    known = measured[measured >= 0.0]
-    if not len(known):
-        return np.full(len(measured), 1.0 + QUANTISATION)
-    common = max(float(np.median(known)), QUANTISATION)
-    return np.where(measured > 2.0 * common, measured, common)
-
-
-def _gate(covariance: FloatArray, sigma: float) -> tuple[float, float, float]:
-    """Inverse of a covariance (2, 2), (xx, xy, yy), over ``sigma`` squared; all 0, no gate, where it is
-    singular.
-    """
-    xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
-    scale = (xx * yy - xy * xy) * sigma**2
-    return (yy / scale, -xy / scale, xx / scale) if scale > 0.0 else (0.0, 0.0, 0.0)
-
-
-def _without_conflicts(owners: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Faces (f, 7) that share a spot: the one with more dots stays; of equals, none."""
-    kept = owners.copy()
-    for f, owner in enumerate(owners):
-        mine = owner[owner >= 0]
-        for g, other in enumerate(owners):
-            if f != g and np.isin(mine, other).any() and (other >= 0).sum() >= len(mine):
-                kept[f] = -1
-    return kept
-
-
-def _patterns(options: DotOptions) -> tuple[_Pattern, ...]:
-    if options.faces is not None and not options.faces:
-        raise DriverError("option", "faces: is empty; give at least one face, or leave it out", faces=[])
-    known = [_printed(face) if isinstance(face, str) else face for face in options.beside]
-    patterns = tuple(
-        _pattern(face.name, face.ids, np.array(face.positions, dtype=float), face.radius)
-        for face in (*(DEFAULT_BODY if options.faces is None else options.faces), *known)
-    )
-    ids = [int(i) for pattern in patterns for i in pattern.ids]
-    twice = sorted({i for i in ids if ids.count(i) > 1})
-    if twice:
-        raise DriverError("option", f"faces: marker ids {twice} are used twice; ids must differ", ids=twice)
-    return patterns
-
-
-def _printed(name: str) -> DotFace:
-    if name not in FACES:
-        raise DriverError(
-            "option", f"beside: no face {name!r} is printed; there are {', '.join(FACES)}", face=name
-        )
-    return FACES[name]
-
-
-def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float) -> _Pattern:
-    if len(ids) != 7 or positions.shape != (7, 2) or not np.isfinite(positions).all():
-        raise DriverError(
-            "option",
-            f"face {name!r}: {len(ids)} ids and positions {positions.shape}; a face has 7 ids and 7 finite (x, y)",
-            face=name,
-        )
-    corners = positions[list(CORNERS)]
-    edges = np.roll(corners, -1, axis=0) - corners
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
-    if not (turns > 0).all():
-        raise DriverError(
-            "option",
-            f"face {name!r}: its first four dots are not convex and clockwise (x right, y down)",
-            face=name,
-        )
-    unit = 0.5 * float(np.linalg.norm(edges, axis=1).mean())
-    scaled = np.ascontiguousarray((positions - corners.mean(axis=0)) / unit)
-    bases = np.array([CORNERS, *(_spare_basis(scaled, corner) for corner in CORNERS)], np.int64)
-    return _Pattern(
-        ids=np.array(ids, np.int64),
-        positions=scaled,
-        radius=radius / unit,
-        bases=bases,
-        inverses=np.array([basis_inverse(scaled[basis]) for basis in bases]),
-    )
-
-
-def _spare_basis(positions: FloatArray, missing: int) -> tuple[int, int, int, int]:
-    """Four dots without ``missing``, convex and clockwise where possible, whose smallest triangle is
-    largest.
-    """
-    points = [complex(x, y) for x, y in positions]
-
-    def quality(rows: tuple[int, ...]) -> float:
-        p = [points[i] for i in rows]
-        triangles = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
-        return min(((p[b] - p[a]).conjugate() * (p[c] - p[a])).imag for a, b, c in triangles)
-
-    others = [i for i in range(len(positions)) if i != missing]
-    best = max(permutations(others, 4), key=quality)
-    return best[0], best[1], best[2], best[3]

@@ -9,20 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo_drivers.detectors.centroids import (
-    AREA,
-    CONTRAST,
-    CXX,
-    CYY,
-    LOPSIDED,
-    LOPSIDED_NOISE,
-    NOISE,
-    OK,
-    QXX,
-    QXY,
-    QYY,
-    smaller_half_axis,
-)
+from stereoservo_drivers.detectors.centroids import smaller_half_axis
 from stereoservo_drivers.detectors.compilation import (
     BOOL,
     FLOAT,
@@ -32,7 +19,33 @@ from stereoservo_drivers.detectors.compilation import (
     kernel,
     written,
 )
-from stereoservo_drivers.detectors.patterns import drop_strangers, fit_homography, image_of_circle
+from stereoservo_drivers.detectors.homographies import (
+    drop_strangers,
+    fit_homography,
+    image_of_circle,
+    odd_dot,
+)
+from stereoservo_drivers.detectors.levels import UNEVEN_INSIDE
+from stereoservo_drivers.detectors.lighting import take_light_back
+from stereoservo_drivers.detectors.measurements import (
+    AREA,
+    BRIGHT,
+    BXX,
+    BYY,
+    CONTRAST,
+    CXX,
+    CXY,
+    CYY,
+    EXX,
+    EYY,
+    LOPSIDED,
+    LOPSIDED_NOISE,
+    NOISE,
+    OK,
+    QXX,
+    QXY,
+    QYY,
+)
 
 MIN_HALF_WINDOW = 14
 MAX_HALF_WINDOW = 64
@@ -43,7 +56,7 @@ THINNEST = 1.0
 FEW_TOLERANCE = 0.7
 """How far four or five dots of a face may lie from their predictions, up to a similarity [px]."""
 SHAPE = 7
-"""Columns of an expected dot, as :func:`~stereoservo_drivers.detectors.patterns.image_of_circle` writes
+"""Columns of an expected dot, as :func:`~stereoservo_drivers.detectors.homographies.image_of_circle` writes
 them.
 """
 
@@ -133,7 +146,7 @@ def expect(
 
 
 @kernel
-def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):
+def _gates(predicted, present, shapes, status, spread, limit, lopsided, dots, used):
     """What each dot of a face must keep by itself and beside its neighbours, into ``used`` (n,)."""
     n = used.size
     contrasts = np.zeros(n)
@@ -142,14 +155,18 @@ def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):
         used[i] = False
         if not present[i] or status[i] != OK:
             continue
-        area, shape, gate = dots[i, AREA], shapes[i], gates[i]
+        area, shape, dot = dots[i, AREA], shapes[i], dots[i]
         # blur inflates the area of thin dots
         most = np.pi * (shape[5] + 1.0) * (shape[6] + 1.0) * 1.4
         du, dv = dots[i, 0] - predicted[i, 0], dots[i, 1] - predicted[i, 1]
-        off = gate[0] * du * du + 2.0 * gate[1] * du * dv + gate[2] * dv * dv
+        noise = max(dot[NOISE], 0.08)
+        xx, xy = spread[i, 0] + noise * dot[CXX], spread[i, 1] + noise * dot[CXY]
+        yy = spread[i, 2] + noise * dot[CYY]
+        off = yy * du * du - 2.0 * xy * du * dv + xx * dv * dv
+        near = off <= limit * (xx * yy - xy * xy) or limit == np.inf
         contrasts[i] = dots[i, CONTRAST]
         scales[i] = area / shape[4]
-        used[i] = area > 0.6 * shape[4] and area < most and off <= 1.0 and whole(dots[i], lopsided)
+        used[i] = area > 0.6 * shape[4] and area < most and near and whole(dot, lopsided)
     contrast = _median(contrasts, used)
     scale = _median(scales, used)
     for i in range(n):
@@ -159,11 +176,14 @@ def _gates(predicted, present, shapes, status, gates, lopsided, dots, used):
 
 
 @kernel
-def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, tolerance, dots, used):
+def judge(
+    patterns, radii, predicted, present, shapes, status, spread, limit, lopsided, tolerance, dots, used
+):
     """Accept what was measured: whole, of the expected size, alike, nearest to its own prediction, fitting
     its face.
 
-    ``gates`` (m, 3): inverse covariances (xx, xy, yy) of the prior over the squared gate, 0 for none;
+    ``spread`` (m, 3): covariances (xx, xy, yy) of the prior [px²], and ``limit`` the largest squared distance from it
+    with the measurement's covariance added, infinite for none;
     ``lopsided``, ``tolerance`` [px] as in the options. Moves ``dots`` (m, FIELDS) to the dots' centres,
     writes ``used`` (m,). Returns their number.
     """
@@ -172,7 +192,17 @@ def judge(patterns, radii, predicted, present, shapes, status, gates, lopsided, 
     for f in range(faces):
         a, b = f * n, (f + 1) * n
         mine = used[a:b]
-        _gates(predicted[a:b], present[a:b], shapes[a:b], status[a:b], gates[a:b], lopsided, dots[a:b], mine)
+        _gates(
+            predicted[a:b],
+            present[a:b],
+            shapes[a:b],
+            status[a:b],
+            spread[a:b],
+            limit,
+            lopsided,
+            dots[a:b],
+            mine,
+        )
         count = 0
         for i in range(a, b):
             if not used[i]:
@@ -248,23 +278,44 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
     """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to
     the dots' own.
 
-    Rows of ``used`` that do not fit the others are cleared (of five or more; four are taken as they are);
-    all are, where fewer than ``least`` remain. The picture of a circle's centre is not the centre of its
-    picture; the face's homography tells the difference, no camera needed. Returns the number that remains.
+    Uneven light is taken back. Rows of ``used`` that do not fit the others are cleared (of five or more; four are
+    taken as they are); all are, where fewer than ``least`` remain. The picture of a circle's centre is not the centre
+    of its picture; the face's homography tells the difference, no camera needed. Returns the number that remains.
     """
     n = pattern.shape[0]
     H = np.zeros((3, 3))
     raw = dots[:, :2].copy()
     count = 0
-    unit = 0.0
     for i in range(n):
-        if used[i]:
-            count += 1
-            unit += 0.5 * (dots[i, CXX] + dots[i, CYY])
-    if count < least:
+        count += 1 if used[i] else 0
+    if count < least or not fit_homography(pattern, dots, used, H):
         used[:] = False
         return 0
-    sigma = np.sqrt(unit / count * max(_median(dots[:, NOISE], used), 0.08))
+    clear = np.zeros(n, np.bool_)
+    for i in range(n):
+        clear[i] = used[i] and dots[i, EXX] == 0.0
+    areas = np.ones(n)
+    circle = np.zeros(SHAPE)
+    for i in range(n):
+        if used[i]:
+            if not image_of_circle(H, pattern[i, 0], pattern[i, 1], radius, circle):
+                used[:] = False
+                return 0
+            areas[i] = circle[4]
+    dark = max(_median(dots[:, NOISE], used), 0.08)
+    misfit = UNEVEN_INSIDE * _median(dots[:, CONTRAST], used)
+    inside = max(_median(dots[:, BRIGHT], used), dark)
+    bright = max(inside - misfit * misfit, dark)
+    # slopes inside have that misfit, too
+    take_light_back(areas, used, dark, inside, dots, raw)
+    variance = 0.0
+    for i in range(n):
+        if used[i]:
+            own, light = dots[i, CXX] + dots[i, CYY], dots[i, BXX] + dots[i, BYY]
+            variance += 0.5 * (dark * (own - light) + bright * light + dots[i, EXX] + dots[i, EYY])
+            dots[i, 0] = raw[i, 0]
+            dots[i, 1] = raw[i, 1]
+    sigma = np.sqrt(max(variance, 0.0) / count)
     # twice: a first shift under the homography of the ellipses' centres, which hardly differs, then the
     # checked one
     for step in range(2):
@@ -276,6 +327,20 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
             used[:] = False
             return 0
         _remove_shift(pattern, radius, raw, used, H, dots)
+    away = np.zeros((n, 3))
+    odd = odd_dot(pattern, dots, used, sigma, away)
+    if odd >= 0:
+        # it may be the others' print: it stays, as uncertain as it is odd
+        dots[odd, EXX] += away[odd, 0] ** 2
+        dots[odd, EYY] += away[odd, 0] ** 2
+    # dots that touch others helped to find the face; they are worth reporting only where they are needed
+    count = 0
+    for i in range(n):
+        count += 1 if used[i] and clear[i] else 0
+    if count >= 4:
+        for i in range(n):
+            used[i] = used[i] and clear[i]
+        return count
     count = 0
     for i in range(n):
         count += 1 if used[i] else 0
@@ -291,7 +356,7 @@ def compile_kernels() -> None:
     )  # fmt: skip
     compile_for(
         judge, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(BOOL, 1), given(FLOAT, 2), given(INT, 1),
-        given(FLOAT, 2), FLOAT, FLOAT, written(FLOAT, 2), written(BOOL, 1),
+        given(FLOAT, 2), FLOAT, FLOAT, FLOAT, written(FLOAT, 2), written(BOOL, 1),
     )  # fmt: skip
     compile_for(
         settle_face, given(FLOAT, 2), FLOAT, written(FLOAT, 2), written(BOOL, 1), FLOAT, INT

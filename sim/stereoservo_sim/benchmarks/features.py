@@ -12,6 +12,7 @@ import numpy as np
 from stereoservo.runtime.clock import MonotonicClock
 from stereoservo.runtime.ports import DriverContext, Frame, Prior
 from stereoservo_drivers.detectors.dots import DotDetector
+from stereoservo_sim.benchmarks.features_robustness import robustness
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.rendering import Renderer, RenderSettings
 from stereoservo_sim.world import demo_cell
@@ -23,7 +24,10 @@ IMAGES = 8
 
 
 def run_features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Milliseconds an image of 640x480: search with nothing known, windows about a prior, one labelling pass."""
+    """Milliseconds an image of 640x480: search with nothing known, windows about a prior, one labelling pass.
+
+    And what is found how well, in four pictures a repetition of each of the conditions of ``robustness``.
+    """
     rng = np.random.default_rng(seed)
     cell = demo_cell()
     camera = cell.rig.cameras[0]
@@ -70,4 +74,5 @@ def run_features(repetitions: int, seed: int, progress: ProgressCall) -> dict[st
         "ms": {name: summary(samples, 1e3) for name, samples in times.items()},
         "cold_over_baseline": medians["cold"] / baseline,
         "tracking_over_baseline": medians["tracking"] / baseline,
+        "robustness": robustness(detector, 4 * repetitions, seed, progress),
     }

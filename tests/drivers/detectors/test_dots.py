@@ -285,15 +285,20 @@ def test_four_dots_of_a_face_go_with_the_prior_three_do_not(detector):
         assert wrong(shot, observation) == 0
 
 
-def test_the_prior_gate_is_optional(detector):
+def test_the_prior_gate_is_a_probability(detector):
+    """2 px off at 0.2 px has a chi-square of 100; the same at 1 px of 4, of which 0.86 of good dots stay below."""
     shot = random_shot(np.random.default_rng(22), noise=2.0)
-    prior = shot.prior((2.0, 0.0), sigma=0.2)
-    gated = make_detector(gate_sigma=3.0, min_dots=1)
-    near = shot.prior((0.3, 0.0), sigma=0.2)
-    assert len(detector.detect(shot.frame, prior).ids) == 14
-    assert len(gated.detect(shot.frame, near).ids) == 14
-    with_gate = gated._track(shot.frame.image, prior, 0.0)
-    assert with_gate[1].sum() == 0
+    tight, loose = (
+        make_detector(gate_probability=0.8, min_dots=1),
+        make_detector(gate_probability=0.9, min_dots=1),
+    )
+    prior = shot.prior((2.0, 0.0), sigma=1.0)
+    assert detector._track(shot.frame.image, shot.prior((2.0, 0.0), sigma=0.2), 0.0)[1].all()
+    assert not loose._track(shot.frame.image, shot.prior((2.0, 0.0), sigma=0.2), 0.0)[1].any()
+    assert loose._track(shot.frame.image, prior, 0.0)[1].all()
+    assert not tight._track(shot.frame.image, prior, 0.0)[1].any()
+    # what is refused is looked for anew, in the picture
+    assert tight.detect(shot.frame, prior).ids.tolist() == IDS.tolist()
 
 
 def test_read_only_and_strided_images(detector):

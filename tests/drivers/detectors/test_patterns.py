@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereoservo_drivers.detectors.patterns import drop_strangers, fit_homography, image_of_circle
+from stereoservo_drivers.detectors.homographies import drop_strangers, fit_homography, image_of_circle
 from stereoservo_drivers.detectors.plates import DEFAULT_BODY
 
 from .rendering import conic_of_circle, look, project

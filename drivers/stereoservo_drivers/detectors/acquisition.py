@@ -1,0 +1,139 @@
+"""Acquisition: faces among the spots of a picture, with or without an idea of where they were."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.runtime.ports import FloatArray, ImageArray, Prior
+from stereoservo_drivers.detectors.faces import Pattern
+from stereoservo_drivers.detectors.measurements import AREA
+from stereoservo_drivers.detectors.patterns import find_face
+
+IntArray = npt.NDArray[np.int64]
+Region = tuple[int, int, int, int]
+"""Left, top, right, bottom [px]; right and bottom are the first beyond."""
+
+REACH_PX = 1.5
+"""How far a dot may lie from the homography of four others."""
+MOST_COPIES = 3
+LOST_SPEED_PX_S = 200.0
+"""Standard deviation of a speed that a prior did not know of."""
+NEAR = 9.0
+"""Mean squared distance [prior variances] within which a copy of a face may be the one expected (chi-square of two
+degrees of freedom: 0.99)."""
+FARTHER = 20.0
+"""How much farther [prior variances] the other copies must be."""
+MARGIN_PX = 48.0
+"""Room about where dots are expected: their size, and background to judge them by."""
+WORTH = 0.5
+"""Part of a picture from which a region is not searched on its own first."""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Where the dots of a face may be: ``rows`` (k,) of its pattern, ``pixels`` (k, 2), ``covariances`` (k, 2, 2)."""
+
+    rows: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
+
+    def squared_distance(self, places: FloatArray, found: npt.NDArray[np.bool_]) -> float:
+        """Mean squared Mahalanobis distance of the dots ``found`` (7,) at ``places`` (7, 2); infinite without any."""
+        common = found[self.rows]
+        if not common.any():
+            return np.inf
+        off = places[self.rows[common]] - self.pixels[common]
+        return float(
+            np.mean(np.sum(off * np.linalg.solve(self.covariances[common], off[..., None])[..., 0], 1))
+        )
+
+
+def expectations(prior: Prior, t_ns: int, max_age_s: float, every_id: IntArray) -> list[Expectation | None]:
+    """What a prior of any age says of each face of ``every_id`` (f, 7) at ``t_ns``; None where it says nothing usable.
+
+    It is moved by its velocities for no longer than ``max_age_s``, and loosened by its whole age.
+    """
+    age_s = (t_ns - prior.t_ns) * 1e-9
+    pixels = prior.pixels + prior.velocities * float(np.clip(age_s, -max_age_s, max_age_s))
+    covariances = prior.covariances + ((LOST_SPEED_PX_S * age_s) ** 2 + 1.0) * np.eye(2)
+    usable = np.isfinite(pixels).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    usable &= (np.abs(pixels) < 1e6).all(axis=1) & (covariances.trace(axis1=1, axis2=2) < 1e12)
+    usable[usable] &= np.linalg.det(covariances[usable]) > 0.0
+    found: list[Expectation | None] = []
+    for ids in every_id:
+        rows, places = np.nonzero((ids[:, None] == prior.ids[None]) & usable[None])
+        found.append(Expectation(rows, pixels[places], covariances[places]) if len(rows) else None)
+    return found
+
+
+def region_of(expected: Sequence[Expectation | None], shape: tuple[int, ...]) -> Region | None:
+    """The part of a picture (height, width) where all of these must be; None where that is no smaller, or unknown."""
+    known = [one for one in expected if one is not None]
+    if len(known) < len(expected) or not known:
+        return None
+    pixels = np.concatenate([one.pixels for one in known])
+    sigma = np.sqrt(np.concatenate([one.covariances for one in known])[:, [0, 1], [0, 1]])
+    low = np.floor((pixels - 3.0 * sigma).min(axis=0) - MARGIN_PX).astype(int)
+    high = np.ceil((pixels + 3.0 * sigma).max(axis=0) + MARGIN_PX).astype(int)
+    u0, v0, u1, v1 = max(low[0], 0), max(low[1], 0), min(high[0], shape[1]), min(high[1], shape[0])
+    if u1 - u0 < 64 or v1 - v0 < 64 or (u1 - u0) * (v1 - v0) > WORTH * shape[0] * shape[1]:
+        return None
+    return int(u0), int(v0), int(u1), int(v1)
+
+
+def crop(image: ImageArray, region: Region) -> ImageArray:
+    """The part of an image, C order."""
+    u0, v0, u1, v1 = region
+    return np.ascontiguousarray(image[v0:v1, u0:u1])
+
+
+def copies_of(pattern: Pattern, spots: FloatArray, least: int, tolerance: float) -> list[IntArray]:
+    """Every place of a face among ``spots`` (m, FIELDS): rows of the spots (7,), -1 for missing dots."""
+    left = np.arange(len(spots))
+    found: list[IntArray] = []
+    while len(left) >= least and len(found) < MOST_COPIES:
+        centres = np.ascontiguousarray(spots[left, :2])
+        areas = np.ascontiguousarray(spots[left, AREA])
+        owner = np.full(len(pattern.ids), -1, np.int64)
+        for bases in (slice(0, 1), slice(1, None)):
+            # the first basis is the corners, the others stand in where one is hidden
+            if find_face(
+                pattern.positions, pattern.radius, centres, areas, pattern.bases[bases],
+                pattern.inverses[bases], least, REACH_PX, tolerance, owner,
+            ):  # fmt: skip
+                break
+        if (owner < 0).all():
+            break
+        found.append(np.where(owner >= 0, left[owner], -1))
+        left = np.setdiff1d(left, found[-1])
+    return found
+
+
+def choose(copies: Sequence[IntArray], spots: FloatArray, expected: Expectation | None) -> IntArray | None:
+    """Of several copies of a face the one that was expected; None where nothing or nothing clear was.
+
+    A single one is taken wherever it is: a prior does not decide against the picture.
+    """
+    if len(copies) < 2:
+        return copies[0] if copies else None
+    if expected is None:
+        return None
+    distances = np.array([expected.squared_distance(spots[owner, :2], owner >= 0) for owner in copies])
+    first, second = np.argsort(distances)[:2]
+    clear = distances[first] <= NEAR and distances[second] > distances[first] + FARTHER
+    return copies[first] if clear else None
+
+
+def without_conflicts(owners: IntArray) -> IntArray:
+    """Faces (f, 7) that share a spot: the one with more dots stays; of equals, none."""
+    kept = owners.copy()
+    for f, owner in enumerate(owners):
+        mine = owner[owner >= 0]
+        for g, other in enumerate(owners):
+            if f != g and np.isin(mine, other).any() and (other >= 0).sum() >= len(mine):
+                kept[f] = -1
+    return kept

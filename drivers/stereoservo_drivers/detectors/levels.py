@@ -1,0 +1,181 @@
+"""Grey levels of a dot and of what surrounds it: noise, slopes, background. Numba kernels; no state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo_drivers.detectors.compilation import kernel
+from stereoservo_drivers.detectors.components import median_level
+from stereoservo_drivers.detectors.measurements import (
+    BRIGHT,
+    QXX,
+    QXY,
+    QYY,
+    SLOPE,
+    SLOPE_XX,
+    SLOPE_XY,
+    SLOPE_YY,
+    U,
+    V,
+)
+
+RING = 2
+"""Width of the surroundings outside the skirt [px] that give background and noise."""
+INNER = 0.6
+"""Part of the ellipse's area whose level is looked at for slope and noise."""
+MIN_INNER = 18
+"""Pixels of it without which nothing is said."""
+TERMS = 7
+"""Of the levels inside, as :func:`inside` lists them."""
+UNEVEN_INSIDE = 0.005
+"""What these terms leave of a dot's own shape, as a part of its contrast: not noise."""
+EVEN = 1e6
+"""Variance [1/px²] of a slope of which nothing is known."""
+
+
+@kernel
+def surroundings(image, dark, background, skirt, reach, out, plane):
+    """Variance of the dot's surroundings about a plane [grey levels squared]; -1 where there is too little
+    to see. ``plane`` (2,) gets its level under the centre above ``background``, and the number of pixels.
+
+    Pixels off by more than four robust standard deviations (a neighbour's skirt, the plate's edge) do not
+    count.
+    """
+    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
+    det = q11 * q22 - q12 * q12
+    cu, cv = out[U], out[V]
+    reach += RING
+    half_u = np.sqrt(q22 / det) + reach
+    half_v = np.sqrt(q11 / det) + reach
+    rows, columns = image.shape
+    lo_u, hi_u = max(int(cu - half_u), 0), min(int(cu + half_u) + 1, columns - 1)
+    lo_v, hi_v = max(int(cv - half_v), 0), min(int(cv + half_v) + 1, rows - 1)
+    histogram = np.zeros(256, np.int32)
+    ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 3))
+    count = 0
+    plane[:] = 0.0
+    for v in range(lo_v, hi_v + 1):
+        y = v - cv
+        for u in range(lo_u, hi_u + 1):
+            x = u - cu
+            gx = q11 * x + q12 * y
+            gy = q12 * x + q22 * y
+            e = x * gx + y * gy - 1.0
+            if e >= 0.0 and e * e >= 4.0 * skirt * skirt * (gx * gx + gy * gy):
+                level = float(image[v, u])
+                if dark:
+                    level = 255.0 - level
+                level -= background
+                histogram[int(abs(level))] += 1
+                ring[count, 0] = x
+                ring[count, 1] = y
+                ring[count, 2] = level
+                count += 1
+    if count < 24:
+        return -1.0
+    limit = 4.0 * 1.4826 * median_level(histogram, count) + 2.0
+    level0 = slope_x = slope_y = variance = 0.0
+    for _ in range(2):
+        n = si = sx = sy = sxx = sxy = syy = sxi = syi = sii = 0.0
+        for k in range(count):
+            x, y, level = ring[k, 0], ring[k, 1], ring[k, 2]
+            if abs(level - level0 - slope_x * x - slope_y * y) > limit:
+                continue
+            n += 1.0
+            si += level
+            sx += x
+            sy += y
+            sxx += x * x
+            sxy += x * y
+            syy += y * y
+            sxi += x * level
+            syi += y * level
+            sii += level * level
+        if n < 12.0:
+            return -1.0
+        sxx -= sx * sx / n
+        sxy -= sx * sy / n
+        syy -= sy * sy / n
+        sxi -= sx * si / n
+        syi -= sy * si / n
+        sii -= si * si / n
+        d = sxx * syy - sxy * sxy
+        if d <= 0.0:
+            return -1.0
+        slope_x = (syy * sxi - sxy * syi) / d
+        slope_y = (sxx * syi - sxy * sxi) / d
+        level0 = (si - slope_x * sx - slope_y * sy) / n
+        variance = max(sii - slope_x * sxi - slope_y * syi, 0.0) / (n - 3.0)
+        limit = 3.0 * np.sqrt(variance) + 0.5
+    plane[0], plane[1] = level0, n
+    # what lies within three standard deviations of a Gaussian has 0.973 of its variance
+    return variance / 0.973 if variance > 1.0 else variance
+
+
+@kernel
+def inside(image, dark, background, contrast, out):
+    """Relative slope of the level inside a dot with its covariance under unit noise, and the noise there, into ``out``.
+
+    Least squares of the levels on 1, x, y, x², xy, y², q² with q = dᵀQd < INNER: the even terms take up what blur and
+    motion do to a small dot.
+    """
+    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
+    det = q11 * q22 - q12 * q12
+    cu, cv = out[U], out[V]
+    half_u, half_v = np.sqrt(INNER * q22 / det), np.sqrt(INNER * q11 / det)
+    A = np.zeros((TERMS, TERMS + 3))
+    row = np.empty(TERMS)
+    row[0] = 1.0
+    count = 0
+    square = 0.0
+    for v in range(int(np.ceil(cv - half_v)), int(np.floor(cv + half_v)) + 1):
+        y = v - cv
+        for u in range(int(np.ceil(cu - half_u)), int(np.floor(cu + half_u)) + 1):
+            x = u - cu
+            q = x * (q11 * x + 2.0 * q12 * y) + q22 * y * y
+            if q > INNER:
+                continue
+            level = float(image[v, u])
+            if dark:
+                level = 255.0 - level
+            level -= background + contrast
+            row[1], row[2], row[3], row[4], row[5], row[6] = x, y, x * x, x * y, y * y, q * q
+            for i in range(TERMS):
+                for j in range(i, TERMS):
+                    A[i, j] += row[i] * row[j]
+                A[i, TERMS] += row[i] * level
+            square += level * level
+            count += 1
+    out[BRIGHT] = -1.0
+    out[SLOPE], out[SLOPE + 1] = 0.0, 0.0
+    out[SLOPE_XX], out[SLOPE_XY], out[SLOPE_YY] = EVEN, 0.0, EVEN
+    if count < MIN_INNER:
+        return
+    A[1, TERMS + 1] = A[2, TERMS + 2] = 1.0
+    right = A[:, TERMS].copy()
+    for i in range(TERMS):
+        for j in range(i):
+            A[i, j] = A[j, i]
+    for i in range(TERMS):
+        # positive definite: no pivoting
+        if A[i, i] < 1e-9:
+            return
+        f = 1.0 / A[i, i]
+        for j in range(TERMS + 3):
+            A[i, j] *= f
+        for k in range(TERMS):
+            if k != i and A[k, i] != 0.0:
+                g = A[k, i]
+                for j in range(TERMS + 3):
+                    A[k, j] -= g * A[i, j]
+    for i in range(TERMS):
+        square -= A[i, TERMS] * right[i]
+    out[BRIGHT] = max(square, 0.0) / (count - TERMS)
+    level = contrast + A[0, TERMS]
+    out[SLOPE], out[SLOPE + 1] = A[1, TERMS] / level, A[2, TERMS] / level
+    f = 1.0 / (level * level)
+    out[SLOPE_XX], out[SLOPE_XY], out[SLOPE_YY] = (
+        f * A[1, TERMS + 1],
+        f * A[1, TERMS + 2],
+        f * A[2, TERMS + 2],
+    )
