@@ -45,12 +45,13 @@ class JointsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One ``[[camera]]``."""
+    """One ``[[camera]]``. ``mobile``: it may be moved at any time, and is adjusted to the arm while it moves."""
 
     name: Name
     driver: str
     detector: str = ""
     mount: Mount = "eye_to_hand"
+    mobile: bool = False
     options: dict[str, Any] = {}
     detector_options: dict[str, Any] = {}
 
@@ -236,6 +237,14 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
     for name in names:
         if names.count(name) > 1:
             raise CellFileError(path, "camera.name", f"{name!r} is used twice; camera names must differ")
+    for camera in cell.camera:
+        if camera.mobile and camera.mount != "eye_to_hand":
+            raise CellFileError(
+                path,
+                "camera.mobile",
+                f"{camera.name!r} rides on the arm (mount {camera.mount!r}), where the arm itself says how it moves; "
+                "mobile is for cameras that something else moves (mount 'eye_to_hand')",
+            )
     mounts = {camera.mount for camera in cell.camera}
     if len(mounts) > 1:
         raise CellFileError(

@@ -93,6 +93,7 @@ EventKind = Literal[
     "health",  # the watch over the model has come to another verdict
     "reanchor",  # cameras have moved, the arm rests, and these are the sights to re-anchor them by
     "reanchored",  # the cameras are known again; a goal that was suspended goes on
+    "camera_adjusted",  # a mobile camera stands again, and its matrix is the one found while it moved
     "reanchor_failed",  # they are not: what is suspended stays so
     "taught",
     "warning",
@@ -143,13 +144,14 @@ class Event(msgspec.Struct, frozen=True, eq=False):
 
 class CameraHealth(msgspec.Struct, frozen=True):
     """How one camera's newest frame agrees with the model: chi-square a freedom, rms innovation [px], the ``worst``
-    marker (-1: none) and its innovation.
+    marker (-1: none) and its innovation. ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``.
     """
 
     chi2: float = 0.0
     rms_px: float = 0.0
     worst: int = -1
     worst_px: float = 0.0
+    place: str = ""
 
 
 class Health(msgspec.Struct, frozen=True):

@@ -71,6 +71,31 @@ class Watching(msgspec.Struct, eq=False):
     """A camera has given two frames since the last round: the others are not waited for."""
 
 
+class MobileCamera(msgspec.Struct, eq=False):
+    """A camera that moves for good; see `mobile`. While it is ``moving``, the model has it where it stood last.
+
+    ``way`` (4, 4): from there to where its newest frame has it, ``P way``. ``reference`` (4, 4): likewise of the first
+    of the ``still`` frames that agree with each other; ``twists`` (6,): sum of theirs from there, in the metric basis.
+    ``lost``: frames in a row that nothing explained; ``moved_px``: from where it stood last, rms.
+    """
+
+    way: FloatArray
+    reference: FloatArray
+    twists: FloatArray
+    moving: bool = False
+    still: int = 0
+    lost: int = 0
+    moved_px: float = 0.0
+    since_ns: int = 0
+    found_ns: int = 0
+    """Of the newest frame that was explained."""
+
+
+def standing_camera() -> MobileCamera:
+    """A mobile camera where the model has it."""
+    return MobileCamera(np.eye(4), np.eye(4), np.zeros(6))
+
+
 class Reanchoring(msgspec.Struct, eq=False, kw_only=True):
     """Cameras that have moved and are being found anew; see `reanchoring`.
 

@@ -30,6 +30,7 @@ class CameraSettings(msgspec.Struct, frozen=True):
     mount: Mount
     marker_ids: tuple[int, ...]
     systematic_px: float = 0.0
+    mobile: bool = False
 
 
 class LimitSettings(msgspec.Struct, frozen=True, eq=False):
@@ -143,7 +144,7 @@ def core_settings(
     camera_settings = tuple(
         CameraSettings(
             description.name, description.width, description.height, description.rate_hz, section.mount,
-            tuple(sorted(description.marker_ids)), description.systematic_px,
+            tuple(sorted(description.marker_ids)), description.systematic_px, section.mobile,
         )
         for section, description in zip(cell.camera, cameras, strict=True)
     )  # fmt: skip

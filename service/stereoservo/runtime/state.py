@@ -13,7 +13,7 @@ from stereoservo.control.reasons import Reason
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.commands import Goal, Request
 from stereoservo.runtime.cycle import Lifecycle, ModelReadiness, decode_array, encode_array
-from stereoservo.runtime.health_state import Reanchoring, Watching, nothing_sighted
+from stereoservo.runtime.health_state import MobileCamera, Reanchoring, Watching, nothing_sighted
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.sums import Sums
@@ -371,6 +371,10 @@ class CoreState(msgspec.Struct, eq=False):
     """While it is not None, no law runs: its goal waits."""
     pending_reanchored: tuple[str, ...]
     """Of ``pending_model``: see `cycle.ModelUpdate`."""
+    mobile: list[MobileCamera | None]
+    """By camera; None for those that stand for good."""
+    adjusted: tuple[str, ...]
+    """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
 
 
 def initial_state(settings: CoreSettings) -> CoreState:
@@ -411,6 +415,8 @@ def initial_state(settings: CoreSettings) -> CoreState:
         watching=nothing_sighted(len(settings.cameras), 0, n, 0),
         reanchoring=None,
         pending_reanchored=(),
+        mobile=[None for _ in settings.cameras],
+        adjusted=(),
     )
 
 
