@@ -132,7 +132,7 @@ class CornerDetector:
         self._keypoints = self._reference_keypoints(reference.picture)
         self._least = 1.0 / np.sqrt(1.0 + self.options.max_residual**2)
         self._track: _Track | None = None
-        self._since_search = 0
+        self._since_search = self.options.search_every
 
     def describe(self) -> DetectorDescription:
         """The ids of the landmarks that this camera's reference shows."""
@@ -144,7 +144,9 @@ class CornerDetector:
         pyramid = build_pyramid(image, self.options.levels)
         found = nothing(len(self._ids))
         track = self._usable_track(frame)
-        if track is not None:
+        if track is None:
+            self._since_search = self.options.search_every
+        else:
             self._follow(image, pyramid, track, found, prior, frame)
         if prior is not None:
             self._by_prior(pyramid, frame, prior, found)
@@ -232,9 +234,19 @@ class CornerDetector:
         there, back = there.reshape(-1, 2), back.reshape(-1, 2)
         ok = (ok_there.ravel() == 1) & (ok_back.ravel() == 1)
         ok &= np.linalg.norm(back - before.reshape(-1, 2), axis=1) <= FLOW_BACK_PX
+        tracked, expectations = rows, guess.reshape(-1, 2).astype(np.float64)
         rows, where = rows[ok], there[ok].astype(np.float64)
-        if not len(rows):
-            return
+        if len(rows):
+            self._anchor(pyramid, track, rows, where, found)
+        # Flow takes a lamp that is switched on for motion; patches do not.
+        lost = ~found.found[tracked]
+        none = np.zeros(int(lost.sum()))
+        self._seek_near(pyramid, tracked[lost], track.found.A[tracked[lost]], expectations[lost], none, found)
+
+    def _anchor(
+        self, pyramid: list[ImageArray], track: _Track, rows: IntArray, where: FloatArray, found: Alignment
+    ) -> None:
+        """The reference patches of ``rows`` (k,) from where flow has them (k, 2) [px]."""
         flowed, used = np.zeros((len(self._ids), 2)), np.zeros(len(self._ids), np.bool_)
         flowed[rows], used[rows] = where, True
         around, _, known = self._around.local_maps(flowed, used)
