@@ -34,7 +34,7 @@ from stereoservo_drivers.detectors.measurements import (
 
 BEND = 0.24
 """Length over which light bends as much as it lies off its plane, in rms distances of a face's dots."""
-PRINT_CONTRAST = 0.002
+PRINT_CONTRAST = 0.001
 """Relative standard deviation of the light of alike dots, before anything is seen of it; also of predicted areas."""
 PRINT_BACKGROUND = 0.03
 """The same of backgrounds [grey levels]."""
