@@ -10,6 +10,8 @@ from stereoservo.gateway.drawings import synthesise
 from stereoservo.gateway.matching import TransferError
 from stereoservo.gateway.messages import Synthesise
 from stereoservo.gateway.transfer import resolve
+from stereoservo.gateway.views import taught_views
+from stereoservo.geometry.distortion import distort
 from stereoservo.runtime.commands import TaughtTarget
 
 from .scene import BODY, TOOL, WORK, Cameras, arm, make_model, placed, pose, some_pose, teach
@@ -184,6 +186,29 @@ def test_as_taught_the_pixels_stay_what_they_were():
     found = resolve(TaughtTarget("pick"), goal, model, sights)
     assert (found.target, found.note) == (goal.target, "")
     assert not set(WORK) & {m for seen in found.target.set_points.values() for m in seen}
+
+
+@pytest.mark.parametrize("stratum", STRATA)
+def test_as_taught_in_a_camera_that_was_moved_and_found_anew_since(stratum):
+    goal, model, sights, _ = moved_workpiece(np.random.default_rng(2), stratum)
+    D = np.eye(4) + 0.02 * np.random.default_rng(3).normal(size=(4, 4))  # of the frame of that camera alone
+    left, right = model.cameras
+    moved = msgspec.structs.replace(left, matrix=left.matrix @ D)
+    anew = msgspec.structs.replace(model, epoch=9, cameras=(moved, right))
+    found = resolve(TaughtTarget("pick"), goal, anew, sights)
+    assert found.target.model_epoch == 9
+    assert "camera left was moved" in found.note
+    assert found.target.set_points["right"] == goal.target.set_points["right"]
+    taught = taught_views(goal)
+    names = [m for m in taught.ids if m in found.target.set_points["left"]]
+    points, _ = taught.of(names).points()
+    image = points @ moved.matrix.T
+    expected = distort(moved.lens, image[:, :2] / image[:, 2:])
+    assert np.abs(np.array([found.target.set_points["left"][m] for m in names]) - expected).max() < 1e-6
+    other = msgspec.structs.replace(anew, plane_at_infinity=1.01 * anew.plane_at_infinity)
+    assert (
+        resolve(TaughtTarget("pick"), goal, other, sights).target == goal.target
+    )  # the core refuses its epoch
 
 
 # -- refusals -------------------------------------------------------------------------------------------------

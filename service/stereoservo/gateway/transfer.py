@@ -31,7 +31,7 @@ from stereoservo.geometry.moved_cameras import FrameChange, carried_point_covari
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.runtime.commands import FeatureTarget, TaughtTarget
-from stereoservo.runtime.taught import TaughtGoal
+from stereoservo.runtime.taught import TaughtGoal, TaughtModel
 
 MOUNTED_PX = 5.0
 """Where cameras alone have changed, goal and kinematics agree within this, or the body was mounted anew."""
@@ -48,7 +48,7 @@ class Resolved:
 def resolve(wanted: TaughtTarget, goal: TaughtGoal, model: CellModel | None, sights: Sights) -> Resolved:
     """A taught goal as set-points of the body for the model and the cameras of now. Raises TransferError."""
     if wanted.relative_to is None and not goal.tool:
-        return Resolved(goal.target, "")
+        return _as_taught(goal, model)
     if model is None:
         raise TransferError("the cell has no model yet: calibrate first")
     if goal.model is None:
@@ -82,6 +82,56 @@ def resolve(wanted: TaughtTarget, goal: TaughtGoal, model: CellModel | None, sig
             f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
         )
     return Resolved(FeatureTarget(set_points, model.epoch), f"{said}; {note}")
+
+
+def _as_taught(goal: TaughtGoal, model: CellModel | None) -> Resolved:
+    """The pixels as they were taught; of cameras that were moved and found anew since, in their pixels of now.
+
+    Re-anchoring keeps the frame, to the bit: the goal's points are still what the cameras of teaching make of it.
+    """
+    taught = goal.model
+    if model is None or taught is None or taught.epoch == model.epoch or not _same_frame(taught, model):
+        return Resolved(goal.target, "")
+    then = {camera.name: (camera.matrix, camera.lens) for camera in taught.cameras}
+    moved = [
+        camera.name for camera in model.cameras
+        if then.get(camera.name) != (tuple(camera.matrix.ravel().tolist()), tuple(camera.lens.tolist()))
+    ]  # fmt: skip
+    said = {name: pixels for name, pixels in goal.target.set_points.items() if name not in moved}
+    if not moved:  # other joint zeros, say: whether the goal holds is the core's to judge
+        return Resolved(goal.target, "")
+    if not set(moved) & set(goal.target.set_points):
+        return Resolved(FeatureTarget(said, model.epoch), "")
+    views = taught_views(goal)
+    names = [marker for marker in views.ids if marker in model.marker_ids]
+    points, spread = views.of(names).points()
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(known) < MIN_MARKERS:
+        raise TransferError(
+            f"camera {listed(moved)} was moved since it was taught, and {len(known)} of its markers "
+            f"({listed(names[k] for k in known)}) are known from two cameras; 3 or more are needed: teach it again"
+        )
+    anew, _, note = set_points_of(
+        model,
+        [names[k] for k in known],
+        points[known],
+        spread[known],
+        "in the pixels of the camera as it stands now",
+    )
+    said |= {name: anew[name] for name in moved if name in goal.target.set_points and name in anew}
+    return Resolved(
+        FeatureTarget(said, model.epoch), f"camera {listed(moved)} was moved since it was taught; {note}"
+    )
+
+
+def _same_frame(taught: TaughtModel, model: CellModel) -> bool:
+    """Whether one model comes from the other by re-anchoring: what fixes the frame is the same to the bit."""
+    upgrade = model.projective_to_euclidean
+    return (
+        taught.stratum == model.stratum
+        and taught.plane_at_infinity == tuple(model.plane_at_infinity.tolist())
+        and taught.projective_to_euclidean == (None if upgrade is None else tuple(upgrade.ravel().tolist()))
+    )
 
 
 def _nothing_moved() -> FrameChange:
