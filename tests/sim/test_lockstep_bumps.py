@@ -1,0 +1,181 @@
+"""Cameras of the whole simulated cell bumped in mid-goal, in lockstep: the truth of the arm at the goal; replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stereoservo.kinematics.model import CellModel
+from stereoservo.runtime.cellfile import CellFile, check_cell
+from stereoservo.runtime.commands import Goal, JointTarget, RunGoal
+from stereoservo.runtime.cycle import ModelUpdate
+from stereoservo.runtime.lockstep import LockstepCell
+from stereoservo.runtime.lockstep_operator import LockstepOperator
+from stereoservo.runtime.replay import replay
+from stereoservo_sim.history import JointHistory
+from stereoservo_sim.workpiece import Moved
+from stereoservo_sim.world import demo_cell
+
+NAMES = tuple(f"j{k}" for k in range(1, 7))
+GOAL = np.radians([4.0, -83.0, -29.0, -24.0, 53.0, -90.0])
+BUMP = Moved((0.03, 0.0, 0.0), (0.0, 5.0, 0.0))
+
+
+def fake_cell(**camera: Any) -> CellFile:
+    base = demo_cell().base
+    return check_cell(
+        {
+            "schema": 1,
+            "cell": {"name": "bumps"},
+            "joints": {"driver": "fake"},
+            "camera": [{"name": name, "driver": "fake", "options": camera} for name in ("left", "right")],
+            "servo": {"tolerance_px": 0.2, "hold_frames": 5},
+            "safety": {
+                "limit": [
+                    {"joint": n, "min": -m, "max": m, "velocity": 1.0, "acceleration": 4.0}
+                    for n, m in zip(NAMES, (2.7, 2.3, 2.4, 4.7, 1.8, 4.7), strict=True)
+                ]
+            },
+            "calibration": {
+                "base": dict(zip(NAMES, base.tolist(), strict=True)),
+                "range": dict(zip(NAMES, [0.3, 0.3, 0.3, 0.7, 0.6, 0.7], strict=True)),
+                "stops": 7,
+                "frames": 2,
+                "settle_s": 0.05,
+                "speed_scale": 1.0,
+            },
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellModel, Any]:
+    """A model of the fake cell and a goal that was shown to it."""
+    directory = tmp_path_factory.mktemp("calibrated")
+    with LockstepCell(fake_cell(), cell_dir=directory, runtime_dir=directory) as cell:
+        cell.run_for(0.5)
+        operator = LockstepOperator(cell)
+        operator.enable()
+        model = operator.calibrate()
+        operator.goal(JointTarget(dict(zip(NAMES, GOAL.tolist(), strict=True))))
+        cell.run_for(0.3)
+        operator.teach("shown")
+        return model, operator.taught["shown"]
+
+
+@dataclass
+class Outcome:
+    """``frames`` that showed the bump before it was named; ``error_px``: noise-free reprojection at the end, rms."""
+
+    kind: str
+    frames: int
+    error_px: float
+    kinds: list[str]
+
+
+def fly(
+    calibrated: tuple[CellModel, Any], directory: Path, seed: int, bumps: dict[int, Moved], after_s: float,
+    recording: Path | None = None,
+) -> Outcome:  # fmt: skip
+    """To the goal, cameras (by number) bumped on the way."""
+    model, target = calibrated
+    history = JointHistory.in_memory(6, capacity=1 << 14)
+    log = []
+    cell = LockstepCell(
+        fake_cell(), cell_dir=directory, runtime_dir=directory, seed=seed, services={"world": history},
+        on_step=lambda inputs, outputs: log.append(inputs), recording=recording,
+    )  # fmt: skip
+    with cell:
+        cell.run_for(0.5)
+        LockstepOperator(cell).enable()
+        cell.update_model(ModelUpdate(model))
+        cell.run_for(0.3)
+        goal = Goal("0000abcd", target)
+        assert cell.submit(RunGoal(goal)).accepted
+        cell.run_for(after_s)
+        bumped_ns, first = cell.clock.now_ns(), len(cell.events)
+        for camera, moved in bumps.items():
+            cell.cameras[camera].bump(moved)  # type: ignore[attr-defined]
+        ended = cell.wait_for(lambda e: e.id == goal.id and e.kind in ("goal_reached", "goal_aborted"), 60.0)
+        told = next((e for e in cell.events[first:] if e.kind == "health"), None)
+        names = [("left", "right")[camera] for camera in bumps]
+        frames = [
+            sum(o.camera == name for i in log if bumped_ns < i.now_ns <= told.t_ns for o in i.observations)
+            for name in names if told is not None
+        ]  # fmt: skip
+        errors = []
+        world = demo_cell()
+        for _ in range(10):
+            cell.run_for(0.1)
+            newest = history.newest()
+            assert newest is not None
+            for camera in cell.cameras:
+                view = camera.camera  # type: ignore[attr-defined]
+                there, wanted = (view.image_of(world.marker_positions(q))[0] for q in (newest[1], GOAL))
+                errors.append(there - wanted)
+        kinds = [e.kind for e in cell.events[first:]]
+        return Outcome(ended.kind, max(frames, default=0), float(np.sqrt(np.mean(np.square(errors)))), kinds)
+
+
+def test_recording_of_a_goal_through_a_bump_replays_bit_for_bit(
+    calibrated: tuple[CellModel, Any], tmp_path: Path
+) -> None:
+    recording = tmp_path / "bump.mcap"
+    outcome = fly(calibrated, tmp_path, 0, {0: BUMP}, 0.8, recording)
+    assert outcome.kind == "goal_reached"
+    assert outcome.frames <= 3
+    assert [k for k in outcome.kinds if k in ("health", "reanchor", "reanchored")] == [
+        "health", "reanchor", "reanchored",
+    ]  # fmt: skip
+    result = replay(recording)
+    assert result.identical is True
+    assert result.steps > 1000
+
+
+@pytest.mark.slow
+def test_bumps_at_any_moment_cost_at_most_the_usual_error_again(
+    calibrated: tuple[CellModel, Any], tmp_path: Path
+) -> None:
+    """5 degrees and 3 cm in random directions, of one camera or both, at eight moments: 16 goals of 16 are reached.
+
+    By Wilson that is 0.81 or more of all, at 95 %.
+    """
+    rng = np.random.default_rng(27)
+    usual, bumped = [], []
+    for seed in range(16):
+        axes, ways = rng.standard_normal((2, 2, 3))
+        moved = [
+            Moved(tuple(0.03 * way / np.linalg.norm(way)), tuple(5.0 * axis / np.linalg.norm(axis)))
+            for axis, way in zip(axes, ways, strict=True)
+        ]
+        which = ({0: moved[0]}, {1: moved[1]}, {0: moved[0], 1: moved[1]})[seed % 3]
+        outcome = fly(calibrated, tmp_path, seed, which, (0.05, 0.3, 0.6, 1.0, 1.5, 2.0, 2.6, 3.3)[seed % 8])
+        assert outcome.kind == "goal_reached"
+        assert outcome.frames <= 3
+        bumped.append(outcome.error_px)
+        usual.append(fly(calibrated, tmp_path, 100 + seed, {}, 0.5).error_px)
+    assert np.sqrt(np.mean(np.square(bumped))) <= 2.0 * np.sqrt(np.mean(np.square(usual)))
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_goals_with_lost_frames_and_markers_raise_no_alarm(
+    calibrated: tuple[CellModel, Any], tmp_path: Path
+) -> None:
+    model, target = calibrated
+    lossy = fake_cell(drop_rate=0.05, marker_drop_rate=0.1)
+    with LockstepCell(lossy, cell_dir=tmp_path, runtime_dir=tmp_path, seed=5) as cell:
+        cell.run_for(0.5)
+        operator = LockstepOperator(cell)
+        operator.enable()
+        cell.update_model(ModelUpdate(model))
+        cell.run_for(0.3)
+        began_ns = cell.clock.now_ns()
+        while (cell.clock.now_ns() - began_ns) * 1e-9 < 600.0:
+            assert operator.goal(target).kind == "goal_reached"
+            cell.run_for(10.0)
+            operator.home()
+        assert [e.message for e in cell.events if e.kind in ("health", "reanchor")] == []
