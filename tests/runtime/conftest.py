@@ -28,6 +28,7 @@ from stereoservo.runtime.cycle import Event, ModelUpdate, StepInputs, StepOutput
 from stereoservo.runtime.ports import CameraObservation, JointState
 from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings, TrialSettings
 
+CAMERA_NAMES = ("left", "right", "high", "wide")
 TERMINAL = {"goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted"}
 NAMES = ("j1", "j2", "j3", "j4", "j5", "j6")
 ROWS = ((0, -90, 0.42), (0.40, 0, 0), (0, 90, 0), (0, -90, 0.80), (0, 90, 0), (0, 0, 0.085))
@@ -105,7 +106,7 @@ def flange_at(q: np.ndarray) -> np.ndarray:
     return pose
 
 
-def make_truth(seed: int, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Truth:
+def make_truth(seed: int, k1: float = 0.0, mount: Mount = "eye_to_hand", count: int = 2) -> Truth:
     rng = np.random.default_rng(seed)
     frames = [np.eye(4)]
     for (a, alpha, d), theta in zip(ROWS, BASE, strict=True):
@@ -126,6 +127,10 @@ def make_truth(seed: int, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Trut
             (K @ np.linalg.inv(look_at(middle + 1.2 * outward + s * 0.15 * side + [0, 0, 0.1], middle))[:3])
             for s in (-1, 1)
         ]
+        + [  # further ones, from above and from the side
+            (K @ np.linalg.inv(look_at(middle + 1.2 * outward + s * side + [0, 0, z], middle))[:3])
+            for s, z in ((0.1, 0.45), (0.5, 0.15))
+        ][: count - 2]
     )
     if (
         mount == "eye_in_hand"
@@ -151,7 +156,7 @@ def make_truth(seed: int, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Trut
         schema=MODEL_SCHEMA, epoch=7, joint_names=NAMES, joint_kinds=("revolute",) * 6, zero=BASE.copy(),
         generators=np.array([inverse @ G @ H for G in generators]),
         cameras=tuple(
-            CameraModel(n, P @ H, 640, 480, lens) for n, P in zip(("left", "right"), cameras, strict=True)
+            CameraModel(n, P @ H, 640, 480, lens) for n, P in zip(CAMERA_NAMES[:count], cameras, strict=True)
         ),
         marker_ids=tuple(range(len(body))), marker_points=points, plane_at_infinity=plane, stratum="metric",
         projective_to_euclidean=H, statistics=statistics, mount=mount,
@@ -159,10 +164,13 @@ def make_truth(seed: int, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Trut
     return Truth(model, cameras, generators, markers, lens, mount)
 
 
-def make_settings(mount: Mount = "eye_to_hand") -> CoreSettings:
+def make_settings(mount: Mount = "eye_to_hand", count: int = 2, mobile: tuple[str, ...] = ()) -> CoreSettings:
     return CoreSettings(
         cell="test", joint_names=NAMES, joint_kinds=("revolute",) * 6,
-        cameras=tuple(CameraSettings(n, 640, 480, 25.0, mount, tuple(range(8))) for n in ("left", "right")),
+        cameras=tuple(
+            CameraSettings(n, 640, 480, 25.0, mount, tuple(range(8)), mobile=n in mobile)
+            for n in CAMERA_NAMES[:count]
+        ),
         limits=LimitSettings(
             np.full(6, -3.0), np.full(6, 3.0), np.full(6, 1.0), np.full(6, 4.0), 0.01, np.zeros((0, 6, 2)), (),
             0.5, 0.1, 1.0,
@@ -186,7 +194,7 @@ class Bench:
     active: bool = False
     now_ns: int = 1_000_000_000
     seq: int = 0
-    cameras_on: list[bool] = field(default_factory=lambda: [True, True])
+    cameras_on: list[bool] = field(default_factory=lambda: [True] * len(CAMERA_NAMES))
     joints_on: bool = True
     frozen_joint: int = -1
     marker_mask: np.ndarray = field(default_factory=lambda: np.ones(8, bool))
@@ -201,6 +209,10 @@ class Bench:
     """What the encoders tell more than the joints stand at."""
     loads: Callable[[Bench], tuple[np.ndarray, np.ndarray]] | None = None
     """Efforts and following errors (6,), (6,) that the drives tell; None: they do not."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(camera.name for camera in self.settings.cameras)
 
     def step(self, *commands: Command, **inputs: object) -> StepOutputs:
         period_ns = round(1e9 / self.settings.rate_hz)
@@ -232,7 +244,7 @@ class Bench:
 
     def _shutter(self) -> None:
         exact = self.truth.pixels(self.q)
-        for c, name in enumerate(("left", "right")):
+        for c, name in enumerate(self.names):
             if not self.cameras_on[c]:
                 continue
             inside = self.marker_mask & np.all((exact[c] >= 0) & (exact[c] < (640, 480)), axis=1)
@@ -292,7 +304,7 @@ class Bench:
         exact = self.truth.pixels(q)
         return {
             name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])}
-            for c, name in enumerate(("left", "right"))
+            for c, name in enumerate(self.names)
         }
 
     def goal(self, target: Target, **options: Any) -> RunGoal:
@@ -364,7 +376,10 @@ def benches() -> Callable[..., Bench]:
     return make_bench
 
 
-def make_bench(seed: int, noise_px: float = 0.0, k1: float = 0.0, mount: Mount = "eye_to_hand") -> Bench:
-    settings = make_settings(mount)
-    truth = make_truth(seed, k1, mount)
+def make_bench(
+    seed: int, noise_px: float = 0.0, k1: float = 0.0, mount: Mount = "eye_to_hand", count: int = 2,
+    mobile: tuple[str, ...] = (),
+) -> Bench:  # fmt: skip
+    settings = make_settings(mount, count, mobile)
+    truth = make_truth(seed, k1, mount, count)
     return Bench(truth, settings, ServoCore(settings), np.random.default_rng(seed), BASE.copy(), noise_px)

@@ -17,6 +17,7 @@ from stereoservo.runtime import (
     going_on,
     health,
     intake,
+    mobile,
     progress,
     reanchoring,
 )
@@ -124,7 +125,8 @@ class ServoCore:
         q = self._take_joints(inputs)
         self._follow_driver(inputs, emit)
         self._take_model(inputs, emit)
-        present = self._present(inputs, q, emit)
+        present = mobile.step(self._present(inputs, q, emit))
+        self._arrays = present.arrays if present.arrays is not None else self._arrays
         if inputs.stop:
             self._stop(present)
         intake.answer_all(inputs.requests, present)
@@ -221,6 +223,8 @@ class ServoCore:
         else:
             self._use_model(state.pending_model)
             state.reanchoring = None
+        assert self._arrays is not None
+        mobile.start(state, self.settings, self._arrays, state.pending_reanchored, emit)
         state.pending_model, state.pending_reanchored = None, ()
         emit("model", message=f"model epoch {self._epoch()} is {state.readiness}", name=str(state.readiness))
 
@@ -235,7 +239,8 @@ class ServoCore:
             if refusal:
                 emit("warning", message=f"re-anchored model refused: {refusal}")
                 return
-        state.pending_model, state.pending_reanchored = update.model, update.reanchored
+        state.pending_model = mobile.with_adjusted(state, update.model, update.reanchored)
+        state.pending_reanchored = update.reanchored
 
     def _use_model(self, model: CellModel, masked: tuple[int, ...] = ()) -> None:
         """``masked``: markers that have slipped and stay unused."""
@@ -281,8 +286,11 @@ class ServoCore:
                 ideal = ideal_observation(self._arrays, camera, observation)
                 then = predict(self._arrays, at_shutter)
                 sights = frame_sights(self._arrays, camera, ideal, then, state.velocities)
+                sights = mobile.see(
+                    state, self.settings, self._arrays, camera, sights, then, at_shutter, emit
+                )
                 health.see(state.watching, camera, sights, at_shutter)
-                if observation.camera not in unknown:
+                if observation.camera not in (*unknown, *mobile.moving_cameras(state, self.settings)):
                     accept_sights(estimate, sights, usable, self.settings)
         common: dict[str, Any] = {
             "now_ns": inputs.now_ns, "dt_s": inputs.period_ns * 1e-9, "q": q, "state": state,
@@ -339,6 +347,8 @@ class ServoCore:
         if state.reanchoring is not None and state.reanchoring.phase != "verify":
             return  # at rest, what stands is watched by `reanchoring`
         verdict = health.watch(present)
+        if mobile.takes(present):
+            return
         if state.reanchoring is None and state.watching.verdict.kind in health.MOVED:
             self._camera_moved(state.watching.verdict, present, fresh=verdict is not None)
         if verdict is None or (state.reanchoring is not None and state.reanchoring.phase == "verify"):
@@ -459,14 +469,9 @@ class ServoCore:
     def _priors(self, present: Present) -> tuple[Any, ...]:
         if present.prediction is None or self._arrays is None or self.state.step % self._prior_every:
             return ()
+        arrays, prediction, cameras, unknown = mobile.to_look_from(self._arrays, present)
         return priors(
-            self._arrays,
-            self.settings,
-            present.prediction,
-            self.state.cameras,
-            self.state.velocities,
-            present.now_ns,
-            reanchoring.unknown_cameras(self.state),
+            arrays, self.settings, prediction, cameras, self.state.velocities, present.now_ns, unknown
         )
 
     def _epoch(self) -> int:
@@ -476,6 +481,7 @@ class ServoCore:
         state = self.state
         found = [*state.fault, *safety.reasons, *motion.reasons]
         found.extend(reanchoring.reasons(state))
+        found.extend(mobile.reasons(state, self.settings))
         if (
             state.reanchoring is None
             and (reason := health.verdict_reason(state.watching.verdict)) is not None

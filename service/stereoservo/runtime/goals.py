@@ -23,6 +23,7 @@ from stereoservo.runtime.cycle import ModelReadiness
 from stereoservo.runtime.ending import drop_plan, end_source, forget_ahead, goal_of, may_move
 from stereoservo.runtime.incidences import start_incidence
 from stereoservo.runtime.joint_goals import joint_goal, joint_report
+from stereoservo.runtime.mobile import refuse_pixels
 from stereoservo.runtime.motion import Present
 from stereoservo.runtime.planned import (
     begin_plan,
@@ -56,6 +57,7 @@ def run_goal(goal: Goal, request: Request, present: Present) -> Accepted | None:
         may_move(present)
         if _known(goal.id, present):
             return "already accepted", None  # a client's retry
+        refuse_pixels(goal.target, state, present.settings)
         busy = goal_of(state.source) or isinstance(state.source, Awaiting) or state.queue
         if goal.mode == "queue" and busy:
             return _enqueue(goal, present), None
@@ -200,6 +202,7 @@ def move_goal(command: UpdateGoal, present: Present) -> str:
             subject=command.id,
         )
     refuse_while_moved(present.state)
+    refuse_pixels(command.target, present.state, present.settings)
     return update(command, source, present, place_now(present), trusted_model(present))
 
 

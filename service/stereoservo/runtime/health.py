@@ -91,7 +91,8 @@ def watch(present: Present) -> Verdict | None:
     for c, (camera, sighting) in enumerate(zip(present.settings.cameras, watching.sightings, strict=True)):
         age_s = (present.now_ns - sighting.t_ns) * 1e-9
         recent = not sighting.looked or age_s * camera.rate_hz <= STALE_PERIODS
-        if recent and sighting.t_ns > 0:
+        mobile = present.state.mobile[c]
+        if recent and sighting.t_ns > 0 and not (mobile is not None and mobile.moving):
             known.append(c)
         sighting.looked = True
     if not known:
@@ -238,8 +239,11 @@ def health_now(state: CoreState, settings: CoreSettings, reanchoring: str) -> He
                 sighting.rms_px,
                 ids[sighting.worst] if sighting.worst >= 0 else -1,
                 sighting.worst_px,
+                "" if moves is None else moves.place,
             )
-            for camera, sighting in zip(settings.cameras, watching.sightings, strict=True)
+            for camera, sighting, moves in zip(
+                settings.cameras, watching.sightings, state.mobile, strict=True
+            )
         },
         masked=masked,
         reanchoring=reanchoring,

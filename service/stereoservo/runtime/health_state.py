@@ -11,6 +11,9 @@ from stereoservo.control.reasons import Reason
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.sums import Sums
 
+LOST_FRAMES = 3
+"""Frames in a row that nothing explains, after which nobody knows where a moving camera is."""
+
 VerdictKind = Literal[
     "ok", "camera_moved", "cameras_moved_together", "marker_slipped", "joint_zero", "unclear"
 ]
@@ -86,9 +89,18 @@ class MobileCamera(msgspec.Struct, eq=False):
     still: int = 0
     lost: int = 0
     moved_px: float = 0.0
+    seen: int = 0
+    """Known points in its newest frame."""
     since_ns: int = 0
     found_ns: int = 0
     """Of the newest frame that was explained."""
+
+    @property
+    def place(self) -> Literal["stands", "moving", "lost"]:
+        """What is known of where it is, in a word."""
+        if not self.moving:
+            return "stands"
+        return "lost" if self.lost >= LOST_FRAMES else "moving"
 
 
 def standing_camera() -> MobileCamera:

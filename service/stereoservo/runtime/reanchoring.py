@@ -257,7 +257,12 @@ def _look(run: Reanchoring, present: Present) -> None:
     waited_s = (present.now_ns - run.phase_ns) * 1e-9
     if not bool((run.sums.frames[wanted] >= FRAMES).all()) and waited_s <= COLLECT_S:
         return
-    samples = averages(run.sums, present.settings)
+    state = present.state
+    samples = tuple(  # the model that is handed in has the adjusted ones where they were
+        sample
+        for sample in averages(run.sums, present.settings)
+        if sample.camera in run.cameras or sample.camera not in state.adjusted
+    )
     run.tried_seen = sum(len(_known(sample, present)) for sample in samples if sample.camera in run.cameras)
     for sample in samples:
         if sample.camera in run.cameras and len(_known(sample, present)) < FEWEST:
@@ -320,6 +325,16 @@ def _carry_over(run: Reanchoring, present: Present) -> None:
     )
     new: ModelArrays = model_arrays(model, present.settings)
     epochs = (old.epoch, model.epoch)
+    carry_all(new, moved, epochs, present)
+    _enter(run, "take", present)
+
+
+def carry_all(new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int], present: Present) -> None:
+    """Say the running and the queued goals in the pixels of the cameras ``moved``, as ``new`` has them.
+
+    ``epochs``: of the model before and of the new one. Goals that cannot be said end.
+    """
+    state = present.state
     place = place_now(present)
     forget_ahead(present)
     kept: list[Goal] = []
@@ -340,7 +355,6 @@ def _carry_over(run: Reanchoring, present: Present) -> None:
         reason = carry_run(state.source, place, new, moved)
         if reason is not None:
             end_source(present, "goal_aborted", (reason,), reason.hint)
-    _enter(run, "take", present)
 
 
 def taken(run: Reanchoring, state: CoreState, now_ns: int) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from stereoservo.runtime.averaging import add_observation, averages
 from stereoservo.runtime.commands import Request, Teach
+from stereoservo.runtime.mobile import moving_cameras, refuse_moving
 from stereoservo.runtime.motion import Present, measurement_buffers
 from stereoservo.runtime.reanchoring import refuse_while_moved
 from stereoservo.runtime.refusal import RefusalError
@@ -28,6 +29,7 @@ def start_teaching(command: Teach, request: Request, present: Present) -> str:
             "TEACHING", f"goal {state.teaching.name!r} is still being taught", subject=state.teaching.name
         )
     refuse_while_moved(state)
+    refuse_moving(moving_cameras(state, present.settings))
     if bool((np.abs(state.command) > AT_REST).any()):
         raise RefusalError(
             "MOVING",
@@ -51,7 +53,7 @@ def teach_step(present: Present) -> None:
     if bool((np.abs(state.command) > AT_REST).any()):
         _give_up(teaching, present, "the arm moved")
         return
-    if state.reanchoring is not None:
+    if state.reanchoring is not None or moving_cameras(state, settings):
         _give_up(teaching, present, "a camera moved")
         return
     for observation in present.observations:

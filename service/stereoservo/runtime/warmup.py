@@ -28,6 +28,7 @@ from stereoservo.runtime.commands import (
 )
 from stereoservo.runtime.core import ServoCore
 from stereoservo.runtime.cycle import ModelUpdate, StepInputs
+from stereoservo.runtime.mobile import rehearse as rehearse_mobile
 from stereoservo.runtime.ports import CameraObservation, FloatArray, JointState
 from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.trajectory.rehearsal import rehearse_planning
@@ -46,6 +47,7 @@ def warm_up() -> None:
     rehearse_incidences()
     rehearse_laws()
     rehearse_planning()
+    rehearse_mobile()
     model = _model()
     pixels = np.stack(
         [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
@@ -170,7 +172,9 @@ def _settings() -> CoreSettings:
         cell="warmup",
         joint_names=JOINTS,
         joint_kinds=("revolute",) * 6,
-        cameras=tuple(CameraSettings(name, WIDTH, HEIGHT, 30.0, "eye_to_hand", MARKERS) for name in CAMERAS),
+        cameras=tuple(
+            CameraSettings(name, WIDTH, HEIGHT, 30.0, "eye_to_hand", MARKERS, mobile=True) for name in CAMERAS
+        ),
         limits=LimitSettings(
             -2 * ones, 2 * ones, ones, 4 * ones, 0.01, np.zeros((0, 6, 2)), (), 0.5, 0.1, 1.0
         ),

@@ -1,0 +1,452 @@
+"""Cameras that move for good, adjusted on-line against the tool that the others see (thesis 9, fig. 9.1).
+
+One that stands is a camera like any other. While it moves, laws go on without it: the model keeps it where it stood
+last, as after a drop-out, and in every frame a displacement of it is fitted to the markers where the joints, corrected
+by the cameras that stand, have them. Once some frames agree, it stands: the model has it at their mean, and what goals
+say in its pixels is said anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from stereoservo.control.reasons import Reason
+from stereoservo.geometry.cameras import camera_centre
+from stereoservo.kinematics.kernels import BoolArray, exp_twist, multiply4_into, project_points, transform_points
+from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.moved_fits_kernel import fit_displacement
+from stereoservo.kinematics.moved_kernel import ROUNDS
+from stereoservo.kinematics.moved_thresholds import chi2_quantile
+from stereoservo.runtime.commands import FeatureTarget, IncidenceTarget, Target
+from stereoservo.runtime.diagnosis import thresholds_of
+from stereoservo.runtime.ending import goal_of
+from stereoservo.runtime.estimate import (
+    MODEL_SIGMA_PX,
+    FrameSights,
+    ModelArrays,
+    Prediction,
+    chain_at,
+    pixels_now,
+    predict,
+    with_unit_height,
+)
+from stereoservo.runtime.gate_kernel import gate_threshold
+from stereoservo.runtime.health_state import MobileCamera, Verdict, standing_camera
+from stereoservo.runtime.motion import Emit, Present
+from stereoservo.runtime.ports import FloatArray
+from stereoservo.runtime.reanchoring import AT_REST, begin, carry_all, unknown_cameras
+from stereoservo.runtime.refusal import RefusalError
+from stereoservo.runtime.settings import CoreSettings
+from stereoservo.runtime.state import CameraEstimate, CoreState, Holding, camera_estimate
+
+FREEDOMS = 6
+FEWEST = 4
+"""Known points that a frame must show."""
+LEFT_OUT = 2
+"""Sights of a frame that may be wrong."""
+STILL_FRAMES = 10
+STILL_PX = 0.1
+"""Besides its own noise, what a camera that stands may seem to move in that time, rms: models are not exact."""
+STILL_CHANCE = 1e-4
+"""Of noise alone looking like motion, of one frame."""
+UNEXPLAINED_CHANCE = 1e-6
+HAND_OVER_S = 2.0
+"""A camera at rest that nothing explains for so long is found anew like one that was bumped, where no goal runs."""
+
+_STILL_CHI2 = chi2_quantile(STILL_CHANCE, FREEDOMS)
+
+
+def start(
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, reanchored: tuple[str, ...], emit: Emit
+) -> None:
+    """A model is in use from here on: of the cameras ``reanchored`` alone, or (empty) of all."""
+    state.adjusted = tuple(name for name in state.adjusted if reanchored and name not in reanchored)
+    metric = arrays.metric_basis is not None
+    for c, camera in enumerate(settings.cameras):
+        if not camera.mobile or not metric:
+            state.mobile[c] = None
+        elif state.mobile[c] is None or not reanchored or camera.name in reanchored:
+            state.mobile[c] = standing_camera()
+    names = ", ".join(camera.name for camera in settings.cameras if camera.mobile)
+    if names and not metric:
+        emit(
+            "warning", name=names,
+            message=f"mobile: {names} cannot be adjusted while it moves, for the model is not metric: it is treated "
+            "like a camera that stands, and found anew at rest",
+        )  # fmt: skip
+
+
+def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...]) -> CellModel:
+    """A re-anchored model, with mobile cameras that are not among the ``reanchored`` where they stand now."""
+    if state.model is None or not reanchored:
+        return model
+    here = {camera.name: camera for camera in state.model.cameras}
+    cameras = tuple(
+        here[camera.name] if camera.name in state.adjusted and camera.name not in reanchored else camera
+        for camera in model.cameras
+    )
+    return msgspec.structs.replace(model, cameras=cameras)
+
+
+# -- every frame ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Adjusted:
+    """A displacement ``D`` (4, 4) of a camera, its ``twist`` (6,), and what it explains: ``weights`` (k,) [1/px] of
+    the sights that agree, chi-square ``before`` it and with it.
+    """
+
+    D: FloatArray
+    twist: FloatArray
+    weights: FloatArray
+    before: float
+    chi2: float
+
+
+def see(
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, sights: FrameSights,
+    prediction: Prediction, q: FloatArray, emit: Emit,
+) -> FrameSights:  # fmt: skip
+    """One frame of a camera, with the arm at ``q`` (n,) at its shutter; what of it may be compared with the model."""
+    mobile = state.mobile[camera]
+    if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
+        return sights
+    points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
+    P = arrays.matrices[camera]
+    found = _adjust(moved_matrix(P, mobile.reference), points, observed, weights, arrays, settings)
+    if not mobile.moving:
+        ratio = thresholds_of(settings, len(arrays.marker_ids), len(settings.cameras)).ratios[FREEDOMS]
+        if found is None or found.before - found.chi2 <= ratio or _others_contradict(state, settings):
+            return sights
+        _set_out(mobile, camera, settings, sights.t_shutter_ns, emit)
+    mobile.seen = int((weights > 0.0).sum())
+    if found is None:
+        mobile.lost += 1
+        mobile.still = 0
+    else:
+        _follow(mobile, P, points, sights, found)
+        mobile.lost, mobile.found_ns = 0, sights.t_shutter_ns
+    return dataclasses.replace(sights, seen=np.zeros_like(sights.seen))
+
+
+def _known(
+    state: CoreState, arrays: ModelArrays, camera: int, sights: FrameSights, prediction: Prediction,
+    q: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Points (k, 4) where the joints ``q``, corrected, have them, with the static ones; what the camera saw of them
+    (k, 2) and its weights (k,) [1/px].
+    """
+    H = chain_at(arrays, q + state.correction)[0]
+    points = np.concatenate((transform_points(H, arrays.marker_points), arrays.scene_points))
+    observed = np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])) + sights.innovation
+    variance = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
+    weights = np.where(sights.seen, 1.0 / np.sqrt(variance), 0.0)
+    weights[: len(state.watching.masked)] *= 1.0 - state.watching.masked
+    return points, observed, weights
+
+
+def _adjust(
+    P: FloatArray, points: FloatArray, observed: FloatArray, weights: FloatArray, arrays: ModelArrays,
+    settings: CoreSettings,
+) -> _Adjusted | None:  # fmt: skip
+    """The displacement of camera ``P`` (3, 4) that explains what it sees; None where none does.
+
+    One sight after the other, the worst first, may be left out where it is beyond the gate.
+    """
+    basis = arrays.metric_basis
+    assert basis is not None
+    gate = gate_threshold(settings.gate_sigma)
+    weights = weights.copy()
+    matrices, targets = P[None].copy(), observed[None].copy()
+    D, twist = np.empty((4, 4)), np.empty(FREEDOMS)
+    side = _side(P, points, weights)
+    for _ in range(LEFT_OUT + 1):
+        count = int((weights > 0.0).sum())
+        if count < FEWEST:
+            return None
+        chi2, _ = fit_displacement(
+            matrices, 0, basis, 0, FREEDOMS, points, len(points), targets, weights[None], ROUNDS, D, twist
+        )
+        moved = moved_matrix(P, D)
+        if not math.isfinite(chi2) or _side(moved, points, weights) != side:
+            return None
+        squares = weights**2 * ((observed - _pixels(moved, points)) ** 2).sum(axis=-1)
+        worst = int(squares.argmax())
+        if squares[worst] <= gate and chi2 <= chi2_quantile(UNEXPLAINED_CHANCE, 2 * count - FREEDOMS):
+            before = weights**2 * ((observed - _pixels(P, points)) ** 2).sum(axis=-1)
+            return _Adjusted(D.copy(), twist.copy(), weights, float(before.sum()), float(chi2))
+        weights[worst] = 0.0
+    return None
+
+
+def _follow(
+    mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameSights, found: _Adjusted
+) -> None:
+    """Where the camera is by a frame that was explained, and whether it has moved since the frames before."""
+    then = moved_matrix(P, mobile.reference)
+    way = np.empty((4, 4))
+    multiply4_into(mobile.reference, found.D, way)
+    used = found.weights > 0.0
+    apart = _apart(then, moved_matrix(P, way), points, used)
+    noise = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1])
+    # The pixels of an estimate of six parameters deviate by chi-square of six freedoms in all; of two, by twice that.
+    random = math.sqrt(2.0 * _STILL_CHI2 * float(noise[used].sum())) / float(used.sum())
+    if mobile.still == 0 or apart > STILL_PX + random:
+        mobile.reference = way
+        mobile.twists = np.zeros(FREEDOMS)
+        mobile.still = 1
+    else:
+        mobile.twists = mobile.twists + found.twist
+        mobile.still += 1
+    mobile.way = way
+    mobile.moved_px = _apart(P, moved_matrix(P, way), points, used)
+
+
+def _set_out(mobile: MobileCamera, camera: int, settings: CoreSettings, now_ns: int, emit: Emit) -> None:
+    mobile.moving, mobile.since_ns, mobile.found_ns = True, now_ns, now_ns
+    name = settings.cameras[camera].name
+    message = f"camera {name} moves: it is adjusted in every frame, and used again once it stands"
+    emit("health", message=message, name="camera_moving", cameras=(name,))
+
+
+def _others_contradict(state: CoreState, settings: CoreSettings) -> bool:
+    """Whether cameras that stand for good refuse what they see, too: then it is not this camera."""
+    return any(
+        estimate.rejected_frames > 0
+        for camera, estimate in zip(settings.cameras, state.cameras, strict=True)
+        if not camera.mobile
+    )
+
+
+# -- every step -----------------------------------------------------------------------------------------------
+
+
+def takes(present: Present) -> bool:
+    """Whether the watch says that cameras have moved, and all of them are mobile: then they are adjusted."""
+    state = present.state
+    verdict = state.watching.verdict
+    if verdict.kind not in ("camera_moved", "cameras_moved_together"):
+        return False
+    named = [c for c, camera in enumerate(present.settings.cameras) if camera.name in verdict.subjects]
+    if any(state.mobile[c] is None for c in named) or unknown_cameras(state):
+        return False
+    for c in named:
+        mobile = state.mobile[c]
+        assert mobile is not None
+        if not mobile.moving:
+            _set_out(mobile, c, present.settings, present.now_ns, present.emit)
+    state.watching.verdict, state.watching.last = Verdict(), []
+    return True
+
+
+def step(present: Present) -> Present:
+    """Use cameras that stand again; the present with what is known now."""
+    state, settings = present.state, present.settings
+    if present.arrays is None:
+        return present
+    for c, mobile in enumerate(state.mobile):
+        if mobile is None or not mobile.moving:
+            continue
+        if settings.cameras[c].name in unknown_cameras(state):
+            state.mobile[c] = standing_camera()  # it is found anew at rest
+        elif mobile.still >= STILL_FRAMES and state.planning is None and not state.pending_reanchored:
+            present = _stand(c, mobile, present)
+        elif mobile.lost:
+            _hand_over(c, mobile, present)
+    return present
+
+
+def _stand(c: int, mobile: MobileCamera, present: Present) -> Present:
+    """The camera is where the mean of the frames that agree has it."""
+    state, arrays, model = present.state, present.arrays, present.state.model
+    assert arrays is not None
+    assert model is not None
+    assert present.weights is not None
+    name = present.settings.cameras[c].name
+    way = mean_way(mobile, arrays)
+    matrices = arrays.matrices.copy()
+    matrices[c] = moved_matrix(arrays.matrices[c], way)
+    new = _arrays_with(arrays, matrices)
+    carry_all(new, (c,), (model.epoch, model.epoch), present)
+    state.model = msgspec.structs.replace(
+        model,
+        cameras=tuple(
+            msgspec.structs.replace(camera, matrix=matrices[c].copy()) if camera.name == name else camera
+            for camera in model.cameras
+        ),
+    )
+    state.adjusted = (*state.adjusted, *(() if name in state.adjusted else (name,)))
+    state.mobile[c] = standing_camera()
+    estimate = state.cameras[c]
+    estimate.seen_ns[:] = 0
+    estimate.innovation[:] = 0.0
+    present.emit(
+        "camera_adjusted", id=goal_of(state.source), name=name, cameras=(name,),
+        message=f"camera {name} stands again, {(present.now_ns - mobile.since_ns) * 1e-9:.1f} s after it set out: "
+        f"turned by {math.degrees(angle(way)):.3g} degrees, its picture moved by {mobile.moved_px:.3g} px",
+    )  # fmt: skip
+    prediction = predict(new, present.q)
+    weights = present.weights.copy()
+    weights[c] = 0.0
+    return dataclasses.replace(
+        present, arrays=new, prediction=prediction, weights=weights, pixels=pixels_now(prediction, state.cameras)
+    )  # fmt: skip
+
+
+def mean_way(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:
+    """Displacement (4, 4) from where the camera stood to the mean of the frames that agree."""
+    assert arrays.metric_basis is not None
+    twist = mobile.twists / max(float(mobile.still), 1.0)
+    way = np.empty((4, 4))
+    multiply4_into(mobile.reference, exp_twist((twist[:, None, None] * arrays.metric_basis).sum(axis=0)), way)
+    return way
+
+
+def _hand_over(c: int, mobile: MobileCamera, present: Present) -> None:
+    """A camera that rests, sees enough and is lost all the same is found anew like one that was bumped."""
+    state, settings = present.state, present.settings
+    waited_s = (present.now_ns - mobile.found_ns) * 1e-9
+    resting = bool((np.abs(state.command) < AT_REST).all())
+    if (
+        waited_s < HAND_OVER_S
+        or mobile.seen < FEWEST
+        or not settings.reanchor
+        or state.reanchoring is not None
+    ):
+        return
+    if resting and isinstance(state.source, Holding) and not state.queue and state.planning is None:
+        name = settings.cameras[c].name
+        text = f"camera {name} moved, and no frame of it was explained for {waited_s:.1f} s"
+        begin(Verdict("camera_moved", (name,), moved_px=mobile.moved_px, text=text), present)
+
+
+# -- what others ask ------------------------------------------------------------------------------------------
+
+
+def to_look_from(
+    arrays: ModelArrays, present: Present
+) -> tuple[ModelArrays, Prediction, list[CameraEstimate], tuple[str, ...]]:
+    """For the priors: the model and its prediction with moving cameras where they are now, what cameras said, and
+    those of whose place nothing is known.
+    """
+    state, settings = present.state, present.settings
+    assert present.prediction is not None
+    unknown = unknown_cameras(state)
+    moving = [c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving]
+    if not moving:
+        return arrays, present.prediction, state.cameras, unknown
+    matrices, cameras = arrays.matrices.copy(), list(state.cameras)
+    for c in moving:
+        mobile = state.mobile[c]
+        assert mobile is not None
+        matrices[c] = moved_matrix(arrays.matrices[c], mobile.way)
+        cameras[c] = camera_estimate(len(arrays.marker_ids))
+        if mobile.place == "lost":
+            unknown = (*unknown, settings.cameras[c].name)
+    here = _arrays_with(arrays, matrices)
+    corrected = predict(here, present.q + state.correction)
+    pixels, jacobian = present.prediction.pixels.copy(), present.prediction.jacobian.copy()
+    pixels[moving], jacobian[moving] = corrected.pixels[moving], corrected.jacobian[moving]
+    return here, dataclasses.replace(present.prediction, pixels=pixels, jacobian=jacobian), cameras, unknown
+
+
+def moving_cameras(state: CoreState, settings: CoreSettings) -> tuple[str, ...]:
+    """Names of the cameras that move now."""
+    return tuple(
+        camera.name
+        for camera, mobile in zip(settings.cameras, state.mobile, strict=True)
+        if mobile is not None and mobile.moving
+    )
+
+
+def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
+    """What the status says of moving cameras."""
+    names = moving_cameras(state, settings)
+    if not names:
+        return ()
+    lost = ", ".join(
+        camera.name
+        for camera, mobile in zip(settings.cameras, state.mobile, strict=True)
+        if mobile is not None and mobile.place == "lost"
+    )
+    hint = "laws go on without it until it stands"
+    if lost:
+        hint += f"; {lost}: no displacement explains what it sees, turn it back to the markers"
+    return (Reason("CAMERA_MOVING", "info", ", ".join(names), hint=hint),)
+
+
+def refuse_pixels(target: Target, state: CoreState, settings: CoreSettings) -> None:
+    """Raises RefusalError for a goal in pixels of a camera that moves: they would be those of no one place."""
+    named: set[str] = set()
+    if isinstance(target, IncidenceTarget):
+        for spec in target.incidences:
+            named |= {*spec.moving.pixels, *spec.fixed.pixels}
+        if isinstance(target.secondary, FeatureTarget):
+            named |= set(target.secondary.set_points)
+    elif isinstance(target, FeatureTarget):
+        named |= set(target.set_points)
+    refuse_moving(tuple(name for name in moving_cameras(state, settings) if name in named))
+
+
+def refuse_moving(names: tuple[str, ...]) -> None:
+    """Raises RefusalError where cameras ``names``, whose pixels are wanted, move."""
+    if names:
+        raise RefusalError(
+            "CAMERA_MOVING",
+            f"camera {', '.join(names)} moves: wait for the event camera_adjusted, or leave its pixels out",
+            subject=", ".join(names),
+        )
+
+
+def rehearse() -> None:
+    """Compile the kernels that no frame of a camera that stands needs."""
+    exp_twist(np.zeros((4, 4)))
+
+
+# -- algebra --------------------------------------------------------------------------------------------------
+
+
+def moved_matrix(P: FloatArray, way: FloatArray) -> FloatArray:
+    """``P way`` (3, 4), without BLAS."""
+    product: FloatArray = (P[:, :, None] * way[None]).sum(axis=1)
+    return product
+
+
+def angle(displacement: FloatArray) -> float:
+    """Angle [rad] of a displacement (4, 4) in any frame, by its trace 2 + 2 cos."""
+    trace = float(np.trace(displacement))
+    return math.acos(min(max(0.5 * trace - 1.0, -1.0), 1.0))
+
+
+def _arrays_with(arrays: ModelArrays, matrices: FloatArray) -> ModelArrays:
+    centres = np.array([camera_centre(P) for P in matrices])
+    return dataclasses.replace(
+        arrays,
+        matrices=matrices,
+        camera_centres=with_unit_height(centres, arrays.plane_at_infinity),
+        scene_pixels=project_points(matrices, arrays.scene_points)[0],
+    )
+
+
+def _pixels(P: FloatArray, points: FloatArray) -> FloatArray:
+    pixels: FloatArray = project_points(P[None].copy(), points)[0][0]
+    return pixels
+
+
+def _side(P: FloatArray, points: FloatArray, weights: FloatArray) -> float:
+    """Sign of the depths of what is seen: +1, -1, or between where they differ."""
+    depths = project_points(P[None].copy(), points)[1][0]
+    seen = weights > 0.0
+    return float(np.sign(depths[seen]).sum()) / max(float(seen.sum()), 1.0)
+
+
+def _apart(P: FloatArray, Q: FloatArray, points: FloatArray, used: BoolArray) -> float:
+    """Rms distance [px] between the images of the points ``used`` in two cameras."""
+    squares = ((_pixels(P, points) - _pixels(Q, points)) ** 2).sum(axis=-1)
+    return math.sqrt(float(squares[used].sum()) / max(float(used.sum()), 1.0))
