@@ -320,6 +320,10 @@ def test_held_out_poses_of_the_real_arm_are_predicted_better_than_the_reference(
     assert answer["not_predicted"] == 0
     assert answer["median_px"] <= 0.33  # half the reference
     assert answer["rms_px"] <= 0.43
+    *pairs, every = answer["triangulation"]
+    assert len(pairs) == 3
+    assert len(every["cameras"]) == 3
+    assert all(every["rms_mm"] < pair["rms_mm"] for pair in pairs)
     assert answer["tag_side_mm"] == pytest.approx(40.0, abs=0.3)
     assert answer["table_flatness_mm"] <= 0.48
     without = answer["variants"]["cv2 subpixel corners, no radial term"]

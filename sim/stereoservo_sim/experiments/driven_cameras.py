@@ -82,7 +82,7 @@ class DrivenCameras:
 
 def predict(model: DrivenCameras, displacements: FloatArray, camera: IntArray, pose: IntArray) -> FloatArray:
     """Pixels ``(v, k, 2)`` [px] of the tag's corners in views (camera, pose); ``displacements`` (n, 4, 4)."""
-    points = _carried(displacements[pose], model.corners)
+    points = carried(displacements[pose], model.corners)
     m = np.einsum("vij,vkj->vki", model.Ps[camera], to_homogeneous(points))
     pixels = m[..., :2] / m[..., 2:]
     return distort(pixels, model.radial[camera][:, None], model.sizes[camera][:, None])
@@ -168,7 +168,7 @@ def _offsets(rng: np.random.Generator) -> FloatArray:
     return np.concatenate([radius * sphere for radius in RADII])
 
 
-def _carried(displacements: FloatArray, corners: FloatArray) -> FloatArray:
+def carried(displacements: FloatArray, corners: FloatArray) -> FloatArray:
     """Corners (k, 3) carried by displacements (v, 4, 4): (v, k, 3)."""
     points: FloatArray = (
         np.einsum("vij,kj->vki", displacements[:, :3, :3], corners) + displacements[:, None, :3, 3]
@@ -232,7 +232,7 @@ class _Problem:
         return (float(np.median(error)), Ps, corners) if np.isfinite(error).all() else None
 
     def _resect(self, corners: FloatArray, pixels: FloatArray) -> FloatArray:
-        points = to_homogeneous(_carried(self.turned, corners))
+        points = to_homogeneous(carried(self.turned, corners))
         cameras = [self.views.camera == c for c in range(len(self.sizes))]
         return np.stack(
             [resection(points[v].reshape(-1, 4), pixels[v].reshape(-1, 2), refine=False) for v in cameras]
@@ -259,7 +259,7 @@ class _Problem:
     def _residuals(self, z: FloatArray) -> FloatArray:
         """Predicted less measured (v, k, 2) [px]."""
         Ps, radial, corners = self._unpack(z)
-        m = np.einsum("vij,vkj->vki", Ps[self.views.camera], to_homogeneous(_carried(self.turned, corners)))
+        m = np.einsum("vij,vkj->vki", Ps[self.views.camera], to_homogeneous(carried(self.turned, corners)))
         u = m[..., :2] / m[..., 2:]
         square = (u**2).sum(axis=2, keepdims=True)
         residuals: FloatArray = (
@@ -272,7 +272,7 @@ class _Problem:
         Ps, radial, corners = self._unpack(z)
         v, k, c = len(self.turned), len(corners), len(Ps)
         P = Ps[self.views.camera]
-        points = to_homogeneous(_carried(self.turned, corners))
+        points = to_homogeneous(carried(self.turned, corners))
         m = np.einsum("vij,vkj->vki", P, points)
         u, depth = m[..., :2] / m[..., 2:], m[..., 2]
         square = (u**2).sum(axis=2)

@@ -33,6 +33,7 @@ from stereoservo_sim.experiments.driven_cameras import (
 )
 from stereoservo_sim.experiments.errors import ExperimentError
 from stereoservo_sim.experiments.hand_poses import HandEyeSet, load_hand_eye_set, read_image
+from stereoservo_sim.experiments.held_out_triangulation import Triangulated, triangulation_errors
 from stereoservo_sim.experiments.standing_tags import Flatness, find_standing_tags, flatness, median_image
 
 FloatArray = npt.NDArray[np.float64]
@@ -97,12 +98,13 @@ class Fits:
 class HeldOut:
     """Held-out errors ``(v, 4, 2)`` [px] by model, NaN where no fold could predict. ``chosen``: by each
     fold's own criterion, on its training poses alone; ``radial_folds``: the folds that took the radial
-    terms."""
+    terms; ``fits``: of each fold that could be predicted, number, cameras and the model that it chose."""
 
     chosen: FloatArray
     pinhole: FloatArray
     radial: FloatArray
     radial_folds: tuple[int, ...]
+    fits: tuple[tuple[int, IntArray, DrivenCameras], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,7 @@ class RealFrankaResult:
     held_out: HeldOut
     held_out_opencv: HeldOut
     table: Flatness
+    triangulated: list[Triangulated]
 
 
 def run_real_franka(
@@ -160,9 +163,11 @@ def run_real_franka(
     held_out_opencv = cross_validate(displacements, opencv_views, seen.sizes, fold, seed)
     tell("fit", 3, 3)
     table = flatness(fits.better, [seen.standing[i] for i in fits.kept], table_tags)
+    triangulated = triangulation_errors(held_out.fits, displacements, views, fold)
     return RealFrankaResult(
-        directory, hand_tag, seed, displacements, views, seen, fits, held_out, held_out_opencv, table
-    )
+        directory, hand_tag, seed, displacements, views, seen, fits, held_out, held_out_opencv, table,
+        triangulated,
+    )  # fmt: skip
 
 
 def observe(data: HandEyeSet, hand_tag: int, table_tags: tuple[int, ...], progress: Progress) -> Observations:
@@ -270,7 +275,8 @@ def cross_validate(
     Raises ExperimentError ``too_few_poses`` where nothing could be predicted.
     """
     chosen, pinhole, radial = (np.full(views.pixels.shape, np.nan) for _ in range(3))
-    radial_folds = []
+    radial_folds: list[int] = []
+    fold_fits: list[tuple[int, IntArray, DrivenCameras]] = []
     for number in np.unique(fold):
         out = fold == number
         training, held = views.take(~out), views.take(out)
@@ -280,6 +286,7 @@ def cross_validate(
         pinhole[out] = fits.errors(fits.pinhole, displacements, held)
         radial[out] = fits.errors(fits.radial, displacements, held)
         chosen[out] = radial[out] if fits.radial_better else pinhole[out]
+        fold_fits.append((int(number), fits.kept, fits.better))
         if fits.radial_better:
             radial_folds.append(int(number))
     if not np.isfinite(chosen).any():
@@ -291,4 +298,4 @@ def cross_validate(
             views=count.tolist(),
             needed=LEAST_VIEWS,
         )
-    return HeldOut(chosen, pinhole, radial, tuple(radial_folds))
+    return HeldOut(chosen, pinhole, radial, tuple(radial_folds), tuple(fold_fits))

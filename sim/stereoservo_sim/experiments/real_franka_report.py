@@ -76,6 +76,16 @@ def report(result: RealFrankaResult) -> dict[str, Any]:
             "tag_offset_m": model.corners.mean(axis=0).tolist(),
             "robust_costs_of_starts": list(model.costs),
         },
+        "triangulation": [
+            {
+                "cameras": _names(result, list(found.cameras)),
+                "rms_mm": found.rms_mm,
+                "median_mm": float(1e3 * np.median(found.errors)),
+                "corners": len(found.errors),
+            }
+            for found in result.triangulated
+        ],
+        "triangulation_is": "distance of triangulated corners of held-out poses from where the arm says that they are",
         "hand_tag": result.hand_tag,
         "dictionary": DICTIONARY_NAME,
         "seed": result.seed,
