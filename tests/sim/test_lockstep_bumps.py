@@ -74,7 +74,7 @@ class Outcome:
     kind: str
     frames: int
     error_px: float
-    kinds: list[str]
+    kinds: list[Any]
 
 
 def fly(
@@ -84,7 +84,7 @@ def fly(
     """To the goal, cameras (by number) bumped on the way."""
     model, target = calibrated
     history = JointHistory.in_memory(6, capacity=1 << 14)
-    log = []
+    log: list[Any] = []
     cell = LockstepCell(
         fake_cell(), cell_dir=directory, runtime_dir=directory, seed=seed, services={"world": history},
         on_step=lambda inputs, outputs: log.append(inputs), recording=recording,
@@ -107,14 +107,14 @@ def fly(
             sum(o.camera == name for i in log if bumped_ns < i.now_ns <= told.t_ns for o in i.observations)
             for name in names if told is not None
         ]  # fmt: skip
-        errors = []
+        errors: list[Any] = []
         world = demo_cell()
         for _ in range(10):
             cell.run_for(0.1)
             newest = history.newest()
             assert newest is not None
-            for camera in cell.cameras:
-                view = camera.camera  # type: ignore[attr-defined]
+            for driver in cell.cameras:
+                view = driver.camera  # type: ignore[attr-defined]
                 there, wanted = (view.image_of(world.marker_positions(q))[0] for q in (newest[1], GOAL))
                 errors.append(there - wanted)
         kinds = [e.kind for e in cell.events[first:]]
@@ -145,7 +145,8 @@ def test_bumps_at_any_moment_cost_at_most_the_usual_error_again(
     By Wilson that is 0.81 or more of all, at 95 %.
     """
     rng = np.random.default_rng(27)
-    usual, bumped = [], []
+    usual: list[float] = []
+    bumped: list[float] = []
     for seed in range(16):
         axes, ways = rng.standard_normal((2, 2, 3))
         moved = [

@@ -32,8 +32,6 @@ from stereoservo.runtime.cycle import (
     StepOutputs,
 )
 from stereoservo.runtime.estimate import (
-    SUSPECT_FRAMES,
-    TRUSTED_FRAMES,
     ModelArrays,
     accept_sights,
     frame_sights,
@@ -47,8 +45,8 @@ from stereoservo.runtime.estimate import (
     priors,
     remember_joints,
 )
-from stereoservo.runtime.health_state import Verdict
 from stereoservo.runtime.incidences import incidence_motion
+from stereoservo.runtime.model_watch import fitted, watch_health, watch_model
 from stereoservo.runtime.motion import Motion, Present, joint_move
 from stereoservo.runtime.ports import CameraObservation, FloatArray
 from stereoservo.runtime.servoing import servo_step
@@ -133,8 +131,8 @@ class ServoCore:
         self._watch_contact(present, inputs)
         self._watch_following(present)
         teach_step(present)
-        self._watch_health(present)
-        self._watch_model(present)
+        watch_health(present)
+        watch_model(present)
         reanchoring.step(present)
         going_on.go_on(present)
         intake.answer_waiting(present)
@@ -249,7 +247,7 @@ class ServoCore:
         health.start(state, self._arrays, self.settings, masked)
         state.model = model
         self._contact_limits = self._contact_thresholds()
-        state.readiness = self._fitted(model)
+        state.readiness = fitted(model)
         state.cameras = [camera_estimate(len(model.marker_ids)) for _ in self.settings.cameras]
 
     def _contact_thresholds(self) -> tuple[FloatArray, FloatArray] | None:
@@ -257,11 +255,6 @@ class ServoCore:
             return None
         model = self.state.model
         return contact.thresholds(self.settings, None if model is None else model.loads)
-
-    @staticmethod
-    def _fitted(model: CellModel) -> ModelReadiness:
-        good = model.statistics is not None and model.statistics.chi2_ok
-        return ModelReadiness.VALID if good else ModelReadiness.CANDIDATE
 
     def _present(self, inputs: StepInputs, q: FloatArray, emit: Any) -> Present:
         """Fold the observations in, each at its own stamp, and predict the present."""
@@ -341,74 +334,6 @@ class ServoCore:
         self.state.driver_request = "deactivate"
         present.emit("fault", message=reason.hint, reasons=(reason,))
 
-    def _watch_health(self, present: Present) -> None:
-        """Say what explains the images, when that has changed, and do what follows."""
-        state = self.state
-        if state.reanchoring is not None and state.reanchoring.phase != "verify":
-            return  # at rest, what stands is watched by `reanchoring`
-        verdict = health.watch(present)
-        if mobile.takes(present):
-            return
-        if state.reanchoring is None and state.watching.verdict.kind in health.MOVED:
-            self._camera_moved(state.watching.verdict, present, fresh=verdict is not None)
-        if verdict is None or (state.reanchoring is not None and state.reanchoring.phase == "verify"):
-            return
-        health.tell(verdict, present)
-        if verdict.kind == "joint_zero":
-            for estimate in state.cameras:  # images decide where the arm goes: they are believed from here on
-                estimate.seen_ns[:] = 0
-        if verdict.kind == "marker_slipped" and health.mask(verdict, present):
-            subject = ", ".join(verdict.subjects)
-            present.emit("warning", message=f"marker {subject} is not used any more", name=subject)
-
-    def _camera_moved(self, verdict: Verdict, present: Present, *, fresh: bool) -> None:
-        """Find it anew, where that is allowed; else the model is suspect, and what relies on it ends."""
-        state = self.state
-        reason = health.verdict_reason(verdict)
-        assert reason is not None
-        if isinstance(state.source, Visiting):
-            if fresh:
-                ending.end_source(present, "goal_aborted", (reason,), verdict.text)
-            return
-        if verdict.moved_px <= self.settings.tolerance_px or state.readiness == ModelReadiness.SUSPECT:
-            return
-        if self.settings.reanchor:
-            reanchoring.begin(verdict, present)
-            return
-        state.readiness = ModelReadiness.SUSPECT
-        hint = f"{verdict.text}; it is not found anew by itself ([servo] reanchor): calibrate"
-        present.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
-        if isinstance(state.source, LawRun):
-            ending.end_source(present, "goal_aborted", (reason,), hint)
-
-    def _watch_model(self, present: Present) -> None:
-        """Images that contradict the model for many frames make it SUSPECT; ones that agree with it clear it."""
-        state = self.state
-        if state.reanchoring is not None:
-            return
-        if state.readiness == ModelReadiness.SUSPECT and state.model is not None:
-            if min(estimate.agreeing_frames for estimate in state.cameras) >= TRUSTED_FRAMES:
-                state.readiness = self._fitted(state.model)
-                present.emit(
-                    "model", message="the images agree with the model again", name=str(state.readiness)
-                )
-            return
-        if state.readiness not in (ModelReadiness.VALID, ModelReadiness.CANDIDATE):
-            return
-        for camera, estimate in zip(self.settings.cameras, state.cameras, strict=True):
-            if estimate.rejected_frames < SUSPECT_FRAMES:
-                continue
-            state.readiness = ModelReadiness.SUSPECT
-            reason = Reason(
-                "MODEL_SUSPECT", "hold", camera.name, float(estimate.rejected_frames), float(SUSPECT_FRAMES), "frames",
-                state.watching.verdict.text
-                or f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
-            )  # fmt: skip
-            present.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
-            if isinstance(state.source, LawRun):
-                ending.end_source(present, "goal_aborted", (reason,), reason.hint)
-            return
-
     def _move(self, present: Present) -> Motion:
         """The active source's joint velocity; nothing in hold, stop or outside ACTIVE."""
         state = self.state
@@ -482,10 +407,7 @@ class ServoCore:
         found = [*state.fault, *safety.reasons, *motion.reasons]
         found.extend(reanchoring.reasons(state))
         found.extend(mobile.reasons(state, self.settings))
-        if (
-            state.reanchoring is None
-            and (reason := health.verdict_reason(state.watching.verdict)) is not None
-        ):
+        if state.reanchoring is None and (reason := health.verdict_reason(health.shown(state))) is not None:
             found.append(reason)
         if isinstance(state.source, LawRun) and not (
             state.held or state.stopped or reanchoring.suspended(state)

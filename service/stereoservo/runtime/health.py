@@ -215,16 +215,21 @@ def _look_for_masked(watching: Watching, known: list[int], present: Present) -> 
             present.emit("health", message=message, name="ok")
 
 
+def shown(state: CoreState) -> Verdict:
+    """The verdict as it is shown: a marker that is left out remains one that has slipped."""
+    verdict, masked = state.watching.verdict, masked_ids(state)
+    if verdict.kind != "ok" or not masked:
+        return verdict
+    listed = tuple(str(marker) for marker in masked)
+    text = f"marker {', '.join(listed)} has slipped and is not used; fix it where it was, or calibrate"
+    return Verdict("marker_slipped", listed, text=text)
+
+
 def health_now(state: CoreState, settings: CoreSettings, reanchoring: str) -> Health:
     """What the status says of the model's health."""
     if state.model is None or state.readiness == ModelReadiness.NONE:
         return Health()
-    watching = state.watching
-    verdict, masked = watching.verdict, masked_ids(state)
-    if verdict.kind == "ok" and masked:
-        listed = ", ".join(str(marker) for marker in masked)
-        text = f"marker {listed} has slipped and is not used; fix it where it was, or calibrate"
-        verdict = Verdict("marker_slipped", tuple(str(marker) for marker in masked), text=text)
+    watching, verdict = state.watching, shown(state)
     ids = (*state.model.marker_ids, *state.model.scene_ids)
     return Health(
         verdict=verdict.kind,
@@ -245,6 +250,6 @@ def health_now(state: CoreState, settings: CoreSettings, reanchoring: str) -> He
                 settings.cameras, watching.sightings, state.mobile, strict=True
             )
         },
-        masked=masked,
+        masked=masked_ids(state),
         reanchoring=reanchoring,
     )
