@@ -11,13 +11,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import msgspec
 import numpy as np
 
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.cameras import camera_centre
-from stereoservo.kinematics.kernels import BoolArray, exp_twist, multiply4_into, project_points, transform_points
+from stereoservo.kinematics.kernels import (
+    BoolArray,
+    exp_twist,
+    multiply4_into,
+    project_points,
+    transform_points,
+)
 from stereoservo.kinematics.model import CellModel
 from stereoservo.kinematics.moved_fits_kernel import fit_displacement
 from stereoservo.kinematics.moved_kernel import ROUNDS
@@ -94,6 +101,12 @@ def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...
 
 
 # -- every frame ----------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=256)
+def _unexplained(freedoms: int) -> float:
+    """Chi-square from which a frame is not explained."""
+    return chi2_quantile(UNEXPLAINED_CHANCE, freedoms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +191,7 @@ def _adjust(
             return None
         squares = weights**2 * ((observed - _pixels(moved, points)) ** 2).sum(axis=-1)
         worst = int(squares.argmax())
-        if squares[worst] <= gate and chi2 <= chi2_quantile(UNEXPLAINED_CHANCE, 2 * count - FREEDOMS):
+        if squares[worst] <= gate and chi2 <= _unexplained(2 * count - FREEDOMS):
             before = weights**2 * ((observed - _pixels(P, points)) ** 2).sum(axis=-1)
             return _Adjusted(D.copy(), twist.copy(), weights, float(before.sum()), float(chi2))
         weights[worst] = 0.0
