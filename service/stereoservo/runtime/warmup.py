@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import get_args
 
+import msgspec
 import numpy as np
 
 from stereoservo.control.incidence_rehearsal import rehearse_incidences
@@ -93,7 +94,9 @@ def warm_up() -> None:
 
 def _rehearse_health(model: CellModel, pixels: FloatArray) -> None:
     """Frames of a camera that was moved: what explains them is asked for at no other time."""
-    core = ServoCore(_settings())
+    settings = _settings()
+    standing = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
+    core = ServoCore(msgspec.structs.replace(settings, cameras=standing))
     moved = pixels + np.array([30.0, 0.0]) * np.array([1.0, 0.0])[:, None, None]
     for step in range(1, 12):
         now_ns = 1_000_000_000 + step * PERIOD_NS
