@@ -321,6 +321,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         "cameras without a trigger beside the same with one: 15 ms skew, 40 ms latency, and a latency told wrongly",
         3,
     ),
+    "mobile-cameras": simulated(
+        "mobile_cameras",
+        "fig. 9.1: four cameras before one tool, two of them carried about: every pair, all, and all on the move",
+        3,
+    ),
     "laws": Experiment(
         "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
         frozenset(),
