@@ -205,6 +205,10 @@ def test_as_taught_in_a_camera_that_was_moved_and_found_anew_since(stratum):
     image = points @ moved.matrix.T
     expected = distort(moved.lens, image[:, :2] / image[:, 2:])
     assert np.abs(np.array([found.target.set_points["left"][m] for m in names]) - expected).max() < 1e-6
+    adjusted = msgspec.structs.replace(anew, epoch=model.epoch)  # a mobile camera's: the epoch stays
+    again = resolve(TaughtTarget("pick"), goal, adjusted, sights)
+    assert again.target.set_points == found.target.set_points
+    assert again.target.model_epoch == model.epoch
     other = msgspec.structs.replace(anew, plane_at_infinity=1.01 * anew.plane_at_infinity)
     assert (
         resolve(TaughtTarget("pick"), goal, other, sights).target == goal.target

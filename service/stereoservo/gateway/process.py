@@ -304,7 +304,7 @@ class Gateway:
         self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
         self._reanchoring.core_event(event, fresh=fresh)
-        if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor"):
+        if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"):
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
             self._handled_path.write_text(str(self._handled))

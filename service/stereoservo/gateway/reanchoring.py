@@ -11,9 +11,10 @@ from stereoservo.gateway.fitting import ChildJob, FitFailedError
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servolink import ServoLink
 from stereoservo.gateway.stores import ModelStore
-from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
+from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model
 from stereoservo.runtime.commands import ReanchorRefused
 from stereoservo.runtime.cycle import Event
+from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.reanchor_job import ReanchorJob, save_events
 from stereoservo.runtime.reanchor_process import ReanchorReport
 
@@ -69,6 +70,23 @@ class Reanchoring:
         elif event.kind == "model" and self._handed is not None:
             self._take(self._handed)
             self._handed = None
+        elif event.kind == "camera_adjusted" and fresh:
+            self._keep_adjusted(event)
+
+    def _keep_adjusted(self, event: Event) -> None:
+        """A mobile camera stands elsewhere: so it does in the model, and in its file."""
+        model = self._model()
+        if model is None or event.matrix is None or model.epoch != event.epoch:
+            return
+        adjusted = with_matrix(model, event.name, event.matrix)
+        self._take(adjusted)
+        try:
+            save_model(adjusted, self._models.path(adjusted.epoch))
+        except (OSError, ModelFileError) as error:
+            self._log.add(
+                "warning", origin="gateway", name=event.name,
+                message=f"where camera {event.name} stands now is not kept for the next start: {error}",
+            )  # fmt: skip
 
     def _start(self) -> None:
         self.cancel()
@@ -127,3 +145,12 @@ class Reanchoring:
         if self._fit is not None:
             self._fit.close()
         self._fit = None
+
+
+def with_matrix(model: CellModel, camera: str, matrix: FloatArray) -> CellModel:
+    """The model with one camera's matrix (3, 4) another."""
+    cameras = tuple(
+        msgspec.structs.replace(known, matrix=matrix.copy()) if known.name == camera else known
+        for known in model.cameras
+    )
+    return msgspec.structs.replace(model, cameras=cameras)

@@ -88,9 +88,10 @@ def _as_taught(goal: TaughtGoal, model: CellModel | None) -> Resolved:
     """The pixels as they were taught; of cameras that were moved and found anew since, in their pixels of now.
 
     Re-anchoring keeps the frame, to the bit: the goal's points are still what the cameras of teaching make of it.
+    Mobile cameras are found anew within one epoch.
     """
     taught = goal.model
-    if model is None or taught is None or taught.epoch == model.epoch or not _same_frame(taught, model):
+    if model is None or taught is None or not _same_frame(taught, model):
         return Resolved(goal.target, "")
     then = {camera.name: (camera.matrix, camera.lens) for camera in taught.cameras}
     moved = [

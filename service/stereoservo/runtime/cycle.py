@@ -140,6 +140,9 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     cameras: tuple[str, ...] = ()
     """Of ``reanchor`` and what follows it: cameras that have moved; ``rigid``: as one body."""
     rigid: bool = False
+    matrix: FloatArray | None = None
+    """Of ``camera_adjusted``: where the camera ``name`` stands now (3, 4), in the frame of model ``epoch``."""
+    epoch: int = 0
 
 
 class CameraHealth(msgspec.Struct, frozen=True):

@@ -300,7 +300,8 @@ def _stand(c: int, mobile: MobileCamera, present: Present) -> Present:
     estimate.seen_ns[:] = 0
     estimate.innovation[:] = 0.0
     present.emit(
-        "camera_adjusted", id=goal_of(state.source), name=name, cameras=(name,),
+        "camera_adjusted", id=goal_of(state.source), name=name, cameras=(name,), matrix=matrices[c].copy(),
+        epoch=model.epoch,
         message=f"camera {name} stands again, {(present.now_ns - mobile.since_ns) * 1e-9:.1f} s after it set out: "
         f"turned by {math.degrees(angle(way)):.3g} degrees, its picture moved by {mobile.moved_px:.3g} px",
     )  # fmt: skip
