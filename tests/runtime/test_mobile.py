@@ -287,6 +287,23 @@ def test_hidden_camera_is_lost_and_found_where_it_comes_to_stand(cells: Any) -> 
     assert reprojection(bench, 2) < 3.0 * NOISE_PX * np.sqrt(6.0 / 16.0 / FRAMES)
 
 
+def test_camera_that_nothing_explains_does_not_stop_the_others_and_is_found_anew_at_rest(cells: Any) -> None:
+    """Rolled by 170 degrees between two frames: too far to follow."""
+    bench = cells(0)
+    target = bench.q + DISPLACED
+    goal = send(bench, target)
+    K_inverse = np.linalg.inv(K)
+    roll = displacement(np.array([0.0, 0.0, 170.0]), np.zeros(3))[:3, :3]
+    bench.truth.cameras[2] = K @ roll @ K_inverse @ bench.truth.cameras[2]
+    bench.run(0.5)
+    assert bench.log[-1][1].status.health.cameras["high"].place == "lost"
+    assert bench.until(ended(goal), 20.0).kind == "goal_reached"
+    assert not [e for e in bench.events if e.kind in ("reanchor", "camera_adjusted")]
+    event = bench.until(lambda e: e.kind == "reanchor", 5.0)
+    assert event.cameras == ("high",)
+    assert bench.core.state.mobile[2].place == "stands"  # no longer adjusted: it is found anew
+
+
 def test_priors_of_a_moving_camera_follow_it(cells: Any) -> None:
     """By a frame and its latency it lags: at 2 s of the way that is 5 px."""
     bench = cells(6)

@@ -54,6 +54,8 @@ from stereoservo.runtime.state import CameraEstimate, CoreState, Holding, camera
 FREEDOMS = 6
 FEWEST = 4
 """Known points that a frame must show."""
+REFUSED_FRAMES = 2
+"""In a row, after which a camera that nothing explains is said to move."""
 LEFT_OUT = 2
 """Sights of a frame that may be wrong."""
 STILL_FRAMES = 10
@@ -134,10 +136,10 @@ def see(
     P = arrays.matrices[camera]
     found = _adjust(moved_matrix(P, mobile.reference), points, observed, weights, arrays, settings)
     if not mobile.moving:
-        ratio = thresholds_of(settings, len(arrays.marker_ids), len(settings.cameras)).ratios[FREEDOMS]
-        if found is None or found.before - found.chi2 <= ratio or _others_contradict(state, settings):
+        if not _sets_out(state, settings, arrays, camera, found, int((weights > 0.0).sum())):
             return sights
         _set_out(mobile, camera, settings, sights.t_shutter_ns, emit)
+        state.cameras[camera].rejected_frames = 0
     mobile.seen = int((weights > 0.0).sum())
     if found is None:
         mobile.lost += 1
@@ -219,6 +221,20 @@ def _follow(
         mobile.still += 1
     mobile.way = way
     mobile.moved_px = _apart(P, moved_matrix(P, way), points, used)
+
+
+def _sets_out(
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, found: _Adjusted | None, seen: int
+) -> bool:  # fmt: skip
+    """Whether a frame says that a camera that stood moves: a displacement explains it that is no noise, or nothing
+    does, and the frames before it were refused, too.
+    """
+    if _others_contradict(state, settings):
+        return False
+    if found is None:
+        return seen >= FEWEST and state.cameras[camera].rejected_frames >= REFUSED_FRAMES
+    ratio = thresholds_of(settings, len(arrays.marker_ids), len(settings.cameras)).ratios[FREEDOMS]
+    return bool(found.before - found.chi2 > ratio)
 
 
 def _set_out(mobile: MobileCamera, camera: int, settings: CoreSettings, now_ns: int, emit: Emit) -> None:
