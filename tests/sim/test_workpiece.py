@@ -156,8 +156,8 @@ def test_the_detector_finds_it_where_it_is_with_and_without_a_prior_of_the_body(
             assert found.ids.tolist() == [*BODY, *STANDING]
             assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.03
         assert DotDetector({}, context(tmp_path)).detect(frame, prior).ids.tolist() == list(BODY)
-    with pytest.raises(DriverError, match="no face 'e' is printed; there are a, b, c, d"):
-        DotDetector({"beside": ["e"]}, context(tmp_path))
+    with pytest.raises(DriverError, match="no face 'z' is printed; there are a, b, c, d"):
+        DotDetector({"beside": ["z"]}, context(tmp_path))
     with pytest.raises(DriverError, match="used twice"):
         DotDetector({"beside": ["a"]}, context(tmp_path))
 

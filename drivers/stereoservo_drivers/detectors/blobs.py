@@ -63,7 +63,9 @@ def find_spots(
     offset = max(0.4 * min_contrast, 4.0 * noise_level(bright))
     mean = cv2.blur(bright, (side, side), borderType=cv2.BORDER_REPLICATE)
     mask = cv2.compare(bright, cv2.add(mean, offset), cv2.CMP_GT)
-    _, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
+    # labels of 16 bits take less than half the time; no more components than a quarter of the pixels
+    labelled = cv2.CV_16U if mask.size <= 4 * 65535 else cv2.CV_32S
+    _, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=labelled)
     left, top, width, height, area = stats[1:].T
     longer, shorter = np.maximum(width, height), np.minimum(width, height)
     keep = (

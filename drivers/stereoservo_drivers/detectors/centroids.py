@@ -33,7 +33,13 @@ from stereoservo_drivers.detectors.compilation import (
     kernel,
     written,
 )
-from stereoservo_drivers.detectors.components import MAX_WINDOW, nearest_component, ring_level
+from stereoservo_drivers.detectors.components import (
+    MAX_WINDOW,
+    crowded,
+    extremes,
+    nearest_component,
+    ring_level,
+)
 from stereoservo_drivers.detectors.levels import inside, surroundings
 from stereoservo_drivers.detectors.measurements import (
     AREA,
@@ -93,12 +99,14 @@ def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
     ov = found[2] / found[0]
     s = su = sv = suu = suv = svv = 0.0
     for v in range(lo_v, hi_v + 1):
-        for u in range(lo_u, hi_u + 1):
+        row = image[v, lo_u : hi_u + 1]
+        for k in range(row.size):
+            u = lo_u + k
             if u0 <= u < u1 and v0 <= v < v1:
                 other = labels[v - v0, u - u0]
                 if other not in (0, label):
                     continue
-            level = int(image[v, u])
+            level = int(row[k])
             if dark:
                 level = 255 - level
             w = (level - background) / (0.5 * contrast) - 0.5
@@ -154,8 +162,8 @@ def _reach(q11, q12, q22, skirt):
 
 @kernel
 def _window_sums(image, dark, background, skirt, out, sums, edge):
-    """S (2), J (4), sum T Tᵀ (3) at the centre in ``out``; where ``edge``, the odd harmonics of the edge's
-    level, and what light, its slopes and its noise take.
+    """S (2), J (4) at the centre in ``out``; where ``edge``, sum T Tᵀ (3), the odd harmonics of the edge's level, and
+    what light, its slopes and its noise take.
 
     False where the window leaves the image.
     """
@@ -171,95 +179,97 @@ def _window_sums(image, dark, background, skirt, out, sums, edge):
     if lo_u < 0 or lo_v < 0 or hi_u >= columns or hi_v >= rows:
         return False
     sums[:] = 0.0
-    s0 = s1 = j00 = j01 = j10 = j11 = n00 = n01 = n11 = 0.0
+    sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
+    width = 4.0 * skirt * skirt
+    first = lo_u - cu
+    j00 = j01 = j10 = j11 = 0.0
+    bumps = odd_x = odd_y = odd_3x = odd_3y = bumps2 = 0.0
     for v in range(lo_v, hi_v + 1):
         y = v - cv
-        for u in range(lo_u, hi_u + 1):
-            x = u - cu
+        # sums along the row: their powers of y follow
+        light = light_x = light_xx = bright = bright_x = bright_xx = 0.0
+        all_w = all_wx = all_wxx = all_w2 = all_w2x = all_w2xx = 0.0
+        row = image[v, lo_u : hi_u + 1]
+        for k in range(row.size):
+            x = k + first
             gx = q11 * x + q12 * y
             gy = q12 * x + q22 * y
             e = x * gx + y * gy - 1.0
-            band = 4.0 * skirt * skirt * (gx * gx + gy * gy)
-            if e > 0.0 and e * e >= band:
+            g2 = gx * gx + gy * gy
+            band = width * g2
+            square = e * e
+            if e > 0.0 and square >= band:
                 continue
-            level = float(image[v, u])
-            if dark:
-                level = 255.0 - level
-            level -= background
+            level = sign * row[k] + zero
             weight = 1.0
-            if e * e < band:
+            if square < band:
                 # W = (1 - (delta / skirt)²)², delta = e / 2|Qd|
-                t = e * e / band
-                bump = (1.0 - t) * (1.0 - t)
+                over = 1.0 / band
+                rest = 1.0 - square * over
+                bump = rest * rest
                 if e > 0.0:
                     weight = bump
-                    f = 8.0 * e * (1.0 - t) / band
-                    g = 2.0 * skirt * skirt * f * e / band
-                    dx = f * gx - g * (q11 * gx + q12 * gy)
-                    dy = f * gy - g * (q12 * gx + q22 * gy)
-                    j00 += x * dx * level
-                    j01 += x * dy * level
-                    j10 += y * dx * level
-                    j11 += y * dy * level
+                    f = 8.0 * e * rest * over
+                    g = 2.0 * skirt * skirt * f * e * over
+                    dx = (f * gx - g * (q11 * gx + q12 * gy)) * level
+                    dy = (f * gy - g * (q12 * gx + q22 * gy)) * level
+                    j00 += x * dx
+                    j01 += x * dy
+                    j10 += y * dx
+                    j11 += y * dy
                 if edge:
-                    r = 2.0 * skirt / np.sqrt(band)
+                    r = 1.0 / np.sqrt(g2)
                     nx = gx * r
                     ny = gy * r
-                    sums[9] += bump
-                    sums[10] += bump * level * nx
-                    sums[11] += bump * level * ny
-                    sums[12] += bump * level * (4.0 * nx * nx - 3.0) * nx
-                    sums[13] += bump * level * (3.0 - 4.0 * ny * ny) * ny
-                    sums[14] += bump * bump
+                    part = bump * level
+                    bumps += bump
+                    bumps2 += bump * bump
+                    odd_x += part * nx
+                    odd_y += part * ny
+                    odd_3x += part * (4.0 * nx * nx - 3.0) * nx
+                    odd_3y += part * (3.0 - 4.0 * ny * ny) * ny
+            lit = weight * level
+            light += lit
+            light_x += x * lit
             if edge:
-                light = weight * level
-                bright = weight * light
-                sums[15] += light
-                sums[16] += weight
-                sums[17] += weight * weight
-                sums[18] += x * x * light
-                sums[19] += x * y * light
-                sums[20] += y * y * light
-                sums[21] += x * x * bright
-                sums[22] += x * y * bright
-                sums[23] += y * y * bright
-                sums[24] += x * x * weight
-                sums[25] += x * y * weight
-                sums[26] += y * y * weight
-            s0 += x * weight * level
-            s1 += y * weight * level
-            j00 -= weight * level
-            j11 -= weight * level
-            w2 = weight * weight
-            n00 += x * x * w2
-            n01 += x * y * w2
-            n11 += y * y * w2
-    sums[0], sums[1] = s0, s1
-    sums[2], sums[3], sums[4], sums[5] = j00, j01, j10, j11
-    sums[6], sums[7], sums[8] = n00, n01, n11
+                light_xx += x * x * lit
+                here = weight * lit
+                bright += here
+                bright_x += x * here
+                bright_xx += x * x * here
+                all_w += weight
+                all_wx += x * weight
+                all_wxx += x * x * weight
+                here = weight * weight
+                all_w2 += here
+                all_w2x += x * here
+                all_w2xx += x * x * here
+        sums[0] += light_x
+        sums[1] += y * light
+        sums[15] += light
+        if edge:
+            sums[6] += all_w2xx
+            sums[7] += y * all_w2x
+            sums[8] += y * y * all_w2
+            sums[16] += all_w
+            sums[17] += all_w2
+            sums[18] += light_xx
+            sums[19] += y * light_x
+            sums[20] += y * y * light
+            sums[21] += bright_xx
+            sums[22] += y * bright_x
+            sums[23] += y * y * bright
+            sums[24] += all_wxx
+            sums[25] += y * all_wx
+            sums[26] += y * y * all_w
+    sums[2], sums[3], sums[4], sums[5] = j00 - sums[15], j01, j10, j11 - sums[15]
+    sums[9], sums[10], sums[11], sums[12], sums[13], sums[14] = bumps, odd_x, odd_y, odd_3x, odd_3y, bumps2
     return True
 
 
 @kernel
-def _crowded(labels, box, label, near, out):
-    """Whether more than specks (noise on the dot's own edge) of other components come within ``near`` [px] of it."""
-    specks = 3
-    u0, v0, u1, v1 = box
-    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    far = 4.0 * near * near
-    for v in range(v0, v1):
-        for u in range(u0, u1):
-            other = labels[v - v0, u - u0]
-            if other not in (0, label):
-                x, y = u - out[U], v - out[V]
-                gx = q11 * x + q12 * y
-                gy = q12 * x + q22 * y
-                e = x * gx + y * gy - 1.0
-                if e <= 0.0 or e * e < far * (gx * gx + gy * gy):
-                    specks -= 1
-                    if specks < 0:
-                        return True
-    return False
+def _beset(labels, box, label, near, out):
+    return crowded(labels, box, label, near, _reach(out[QXX], out[QXY], out[QYY], near), out)
 
 
 @kernel
@@ -274,20 +284,16 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     u1, v1 = min(u1, columns), min(v1, rows)
     if u1 - u0 < 7 or v1 - v0 < 7 or u1 - u0 > MAX_WINDOW or v1 - v0 > MAX_WINDOW:
         return BORDER
-    low, high = 255, 0
-    for v in range(v0, v1):
-        for u in range(u0, u1):
-            level = int(image[v, u])
-            low = min(low, level)
-            high = max(high, level)
+    box = (u0, v0, u1, v1)
+    brightest = np.empty(v1 - v0, np.int64)
+    low, high = extremes(image, dark, box, brightest)
     if high - low < min_contrast:
         return NO_CONTRAST
     threshold = (low + high + 1) // 2
     if dark:
         threshold = 255 - (low + high) // 2
-    found = np.zeros(9)
-    box = (u0, v0, u1, v1)
-    label = nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found)
+    found = np.zeros(10)
+    label = nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, labels, stack, found)
     if label == 0:
         return NO_COMPONENT
     u_min, u_max, v_min, v_max = int(found[3]), int(found[4]), int(found[5]), int(found[6])
@@ -303,11 +309,11 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     if not _ellipse(image, dark, box, labels, label, found, background, contrast, out):
         return SHAPE
     skirt, beside = SKIRT, 0.0
-    if _crowded(labels, box, label, SKIRT + 1.0, out):
+    if found[9] > 1.0 and _beset(labels, box, label, SKIRT + 1.0, out):
         skirt, beside = NARROW, CROWDED * CROWDED
-        if _crowded(labels, box, label, NARROW + 1.0, out):
+        if _beset(labels, box, label, NARROW + 1.0, out):
             skirt, beside = NARROWEST, PRESSED * PRESSED
-            if _crowded(labels, box, label, NARROWEST + 0.5, out):
+            if _beset(labels, box, label, NARROWEST + 0.5, out):
                 return SHAPE
     start_u, start_v = out[U], out[V]
     sums = np.zeros(27)

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo_drivers.detectors.compilation import kernel
+from stereoservo_drivers.detectors.measurements import QXX, QXY, QYY, U, V
 
 MAX_WINDOW = 160
 """Largest side of a window [px]."""
@@ -28,11 +29,32 @@ def median_level(histogram, count):
 
 
 @kernel
-def nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, stack, found):
+def extremes(image, dark, box, brightest):
+    """Lowest and highest level of a window; ``brightest`` (rows,) gets that of each row, of inverted levels where
+    ``dark``.
+    """
+    u0, v0, u1, v1 = box
+    low, high = 255, 0
+    for v in range(v0, v1):
+        row = image[v, u0:u1]
+        lowest, highest = np.uint8(255), np.uint8(0)
+        for u in range(row.size):
+            level = row[u]
+            lowest = min(lowest, level)
+            highest = max(highest, level)
+        brightest[v - v0] = 255 - int(lowest) if dark else int(highest)
+        low = min(low, int(lowest))
+        high = max(high, int(highest))
+    return low, high
+
+
+@kernel
+def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, labels, stack, found):
     """Label the bright components of a window; the label of the one nearest to (pu, pv), 0 if there is none.
 
-    ``found``: count, sum u, sum v, u_min, u_max, v_min, v_max, level sum of its inner pixels, their count.
-    Components that touch the window's rim are something larger than a dot and do not count.
+    ``brightest`` level of each row (rows,). ``found``: count, sum u, sum v, u_min, u_max, v_min, v_max, level sum of
+    its inner pixels, their count; last, the number of all components. Those that touch the window's rim are something
+    larger than a dot and are not looked for.
     """
     u0, v0, u1, v1 = box
     labels[: v1 - v0, : u1 - u0] = 0
@@ -40,20 +62,23 @@ def nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, sta
     best_distance = 1e30
     label = 0
     for sv in range(v0, v1):
-        for su in range(u0, u1):
-            level = int(image[sv, su])
+        if brightest[sv - v0] < threshold:
+            continue
+        row, marks = image[sv, u0:u1], labels[sv - v0]
+        for su in range(row.size):
+            level = int(row[su])
             if dark:
                 level = 255 - level
-            if level < threshold or labels[sv - v0, su - u0] != 0:
+            if level < threshold or marks[su] != 0:
                 continue
             label += 1
-            labels[sv - v0, su - u0] = label
-            stack[0] = (sv - v0) * MAX_WINDOW + (su - u0)
+            marks[su] = label
+            stack[0] = (sv - v0) * MAX_WINDOW + su
             top = 1
             count = 0
             sum_u = 0
             sum_v = 0
-            u_min, u_max, v_min, v_max = su, su, sv, sv
+            u_min, u_max, v_min, v_max = su + u0, su + u0, sv, sv
             inner_sum = 0
             inner = 0
             while top > 0:
@@ -103,6 +128,7 @@ def nearest_component(image, dark, box, threshold, pu, pv, min_area, labels, sta
                 found[6] = v_max
                 found[7] = inner_sum
                 found[8] = inner
+    found[9] = label
     return best
 
 
@@ -123,3 +149,29 @@ def ring_level(image, dark, u_min, u_max, v_min, v_max):
                 histogram[255 - level if dark else level] += 1
                 count += 1
     return median_level(histogram, count)
+
+
+@kernel
+def crowded(labels, box, label, near, reach, out):
+    """Whether more than specks (noise on the dot's own edge) of other components come within ``near`` [px], to first
+    order, of the ellipse of ``out``; ``reach`` [px] how far that is at most."""
+    specks = 3
+    u0, v0, u1, v1 = box
+    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
+    det = q11 * q22 - q12 * q12
+    half_u, half_v = int(np.sqrt(q22 / det) + reach), int(np.sqrt(q11 / det) + reach)
+    u0, u1 = max(u0, int(out[U]) - half_u) - u0, min(u1, int(out[U]) + half_u + 2) - u0
+    far = 4.0 * near * near
+    for v in range(max(v0, int(out[V]) - half_v), min(v1, int(out[V]) + half_v + 2)):
+        row = labels[v - v0, u0:u1]
+        for k in range(row.size):
+            if row[k] not in (0, label):
+                x, y = k + u0 + box[0] - out[U], v - out[V]
+                gx = q11 * x + q12 * y
+                gy = q12 * x + q22 * y
+                e = x * gx + y * gy - 1.0
+                if e <= 0.0 or e * e < far * (gx * gx + gy * gy):
+                    specks -= 1
+                    if specks < 0:
+                        return True
+    return False

@@ -1,10 +1,10 @@
-"""Covariances of measured dots from the noise of a whole picture."""
+"""Covariances of measured dots from the noise of a whole picture. Numba kernels; no state."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.runtime.ports import FloatArray
+from stereoservo_drivers.detectors.compilation import FLOAT, compile_for, given, kernel, written
 from stereoservo_drivers.detectors.levels import UNEVEN_INSIDE
 from stereoservo_drivers.detectors.measurements import (
     BACKGROUND,
@@ -28,41 +28,62 @@ SATURATED_PX = 0.005
 """Standard deviation [px] that sampling adds to a dot whose edge is cut off at white (measured: 0.0045)."""
 
 
-def covariances_of(dots: FloatArray) -> FloatArray:
-    """Covariances (k, 2, 2) [px²] of measured ``dots`` (k, FIELDS)."""
-    odd = dots[:, [EXX, EXY, EXY, EYY]].reshape(-1, 2, 2)
-    return noise_covariances(dots) + odd
+@kernel
+def variances(dots, column, unevenness, out):
+    """Noise variance of each dot (k,) [levels²] from what its ``column`` of ``dots`` says, -1 where that is nothing.
+
+    ``unevenness``: part of the contrast that is no noise. One picture has one noise: each dot gets the median over all
+    of them, which is steadier (a dot's own: 15 %), unless its own is more than twice that.
+    """
+    n = dots.shape[0]
+    known = np.empty(n)
+    count = 0
+    for i in range(n):
+        out[i] = dots[i, column]
+        if out[i] >= 0.0:
+            out[i] = max(out[i] - (unevenness * dots[i, CONTRAST]) ** 2, 0.0)
+            known[count] = out[i]
+            count += 1
+    if count == 0:
+        out[:] = 1.0 + QUANTISATION
+        return
+    known = np.sort(known[:count])
+    common = max(0.5 * (known[(count - 1) // 2] + known[count // 2]), QUANTISATION)
+    for i in range(n):
+        if out[i] <= 2.0 * common:
+            out[i] = common
 
 
-def noise_covariances(dots: FloatArray) -> FloatArray:
-    """Covariances (k, 2, 2) [px²] that noise gives the centres of measured ``dots`` (k, FIELDS).
+@kernel
+def covariances(dots, floor, out):
+    """Covariances (k, 2, 2) [px²] of measured ``dots`` (k, FIELDS), with a standard deviation of ``floor`` [px] added.
 
     Noise may be more in the light than in the dark (shot noise). Where levels are cut off at black that of the light
     counts; less noise in the light than in the dark is none seen, for being cut off at white.
     """
-    dark = noise_variances(dots[:, NOISE])
-    own = np.maximum(dots[:, BRIGHT] - (UNEVEN_INSIDE * dots[:, CONTRAST]) ** 2, 0.0)
-    own = noise_variances(np.where(dots[:, BRIGHT] >= 0.0, own, -1.0))
-    bright = np.maximum(own, dark) if (dots[:, BRIGHT] >= 0.0).any() else dark
-    black = dots[:, BACKGROUND] < 3.0 * np.sqrt(bright)
-    white = dots[:, BACKGROUND] + dots[:, CONTRAST] > 255.0 - 3.0 * np.sqrt(bright)
-    dark = np.where(black, bright, dark)
-    light = dots[:, [BXX, BXY, BXY, BYY]]
-    both = dark[:, None] * (dots[:, [CXX, CXY, CXY, CYY]] - light) + bright[:, None] * light
-    return np.ascontiguousarray(both.reshape(-1, 2, 2)) + np.where(white, SATURATED_PX**2, 0.0)[
-        :, None, None
-    ] * np.eye(2)
+    n = dots.shape[0]
+    darks, brights = np.empty(n), np.empty(n)
+    variances(dots, NOISE, 0.0, darks)
+    variances(dots, BRIGHT, UNEVEN_INSIDE, brights)
+    seen = False
+    for i in range(n):
+        seen = seen or dots[i, BRIGHT] >= 0.0
+    for i in range(n):
+        dot, dark = dots[i], darks[i]
+        bright = max(brights[i], dark) if seen else dark
+        clip = 3.0 * np.sqrt(bright)
+        if dot[BACKGROUND] < clip:
+            dark = bright
+        even = floor * floor
+        if dot[BACKGROUND] + dot[CONTRAST] > 255.0 - clip:
+            even += SATURATED_PX * SATURATED_PX
+        light = bright - dark
+        out[i, 0, 0] = dark * dot[CXX] + light * dot[BXX] + dot[EXX] + even
+        out[i, 0, 1] = dark * dot[CXY] + light * dot[BXY] + dot[EXY]
+        out[i, 1, 0] = out[i, 0, 1]
+        out[i, 1, 1] = dark * dot[CYY] + light * dot[BYY] + dot[EYY] + even
 
 
-def noise_variances(measured: FloatArray) -> FloatArray:
-    """Noise variance of each dot's surroundings (k,) from the measured ones (k,), -1 where there is none
-    [levels²].
-
-    One picture has one noise: each gets the median over all dots, which is steadier (a dot's own: 15 %),
-    unless its own surroundings are more than twice as restless.
-    """
-    known = measured[measured >= 0.0]
-    if not len(known):
-        return np.full(len(measured), 1.0 + QUANTISATION)
-    common = max(float(np.median(known)), QUANTISATION)
-    return np.where(measured > 2.0 * common, measured, common)
+def compile_kernels() -> None:
+    """Compile what the detector calls, or load it from the cache."""
+    compile_for(covariances, given(FLOAT, 2), FLOAT, written(FLOAT, 3))

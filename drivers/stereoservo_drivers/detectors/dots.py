@@ -22,12 +22,11 @@ from stereoservo.runtime.ports import (
     ImageArray,
     Prior,
 )
-from stereoservo_drivers.detectors import acquisition, centroids, patterns, tracking
+from stereoservo_drivers.detectors import acquisition, centroids, covariances, patterns, tracking
 from stereoservo_drivers.detectors.acquisition import Expectation
 from stereoservo_drivers.detectors.blobs import find_spots
 from stereoservo_drivers.detectors.centroids import measure_windows
 from stereoservo_drivers.detectors.components import scratch
-from stereoservo_drivers.detectors.covariances import covariances_of
 from stereoservo_drivers.detectors.faces import FaceOptions, Positive, patterns_of
 from stereoservo_drivers.detectors.measurements import FIELDS
 from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, settle_face
@@ -109,8 +108,10 @@ class DotDetector:
         centroids.compile_kernels()
         patterns.compile_kernels()
         tracking.compile_kernels()
+        covariances.compile_kernels()
         self._size = self.options.image_size
         self._every_id = np.array([pattern.ids for pattern in self._patterns])
+        self._order = np.argsort(self._every_id.ravel())
         self._positions = np.array([pattern.positions for pattern in self._patterns])
         self._radii = np.array([pattern.radius for pattern in self._patterns])
         self._ids = tuple(sorted(self._every_id.ravel().tolist()))
@@ -179,11 +180,11 @@ class DotDetector:
         predicted, present = np.zeros((m, 2)), np.zeros(m, np.bool_)
         shapes, windows, least = np.zeros((m, SHAPE)), np.zeros((m, 4), np.int64), np.zeros(m, np.int64)
         dots, used, status = np.zeros((m, FIELDS)), np.zeros(m, np.bool_), np.zeros(m, np.int64)
-        covariances = np.ascontiguousarray(prior.covariances, np.float64)
+        uncertain = np.ascontiguousarray(prior.covariances, np.float64)
         ids = np.ascontiguousarray(prior.ids, np.int64)
         expect(
             self._every_id, self._positions, self._radii, ids, np.ascontiguousarray(prior.pixels, np.float64),
-            np.ascontiguousarray(prior.velocities, np.float64), covariances, dt_s, predicted, present, shapes,
+            np.ascontiguousarray(prior.velocities, np.float64), uncertain, dt_s, predicted, present, shapes,
             windows, least,
         )  # fmt: skip
         measure_windows(
@@ -195,7 +196,7 @@ class DotDetector:
             limit = -2.0 * np.log1p(-options.gate_probability)
             for k, marker in enumerate(ids.tolist()):
                 if marker in self._place:
-                    spread[self._place[marker]] = covariances[k].ravel()[[0, 1, 3]]
+                    spread[self._place[marker]] = uncertain[k].ravel()[[0, 1, 3]]
         judge(
             self._positions, self._radii, predicted, present, shapes, status, spread, limit, options.lopsided,
             options.consistency_px, dots, used,
@@ -204,6 +205,8 @@ class DotDetector:
 
     def _with_others(self, image: ImageArray, tracked: _Found, prior: Prior) -> _Found:
         """What was tracked, and the faces beside the body that the prior does not know, wherever they are."""
+        if not self.options.beside:
+            return tracked
         unknown = ~np.isin(self._every_id, prior.ids).any(axis=1)
         unknown[: len(self._patterns) - len(self.options.beside)] = False
         if not unknown.any():
@@ -258,11 +261,10 @@ class DotDetector:
 
     def _observation(self, frame: Frame, found: _Found) -> CameraObservation:
         dots, used = found
-        ids, chosen = self._every_id[used], dots[used]
-        order = np.argsort(ids)
-        ids, chosen = ids[order], chosen[order]
-        covariances = covariances_of(chosen)
-        covariances += self.options.floor_px**2 * np.eye(2)
+        rows = self._order[used.ravel()[self._order]]
+        ids, chosen = self._every_id.ravel()[rows], dots.reshape(-1, FIELDS)[rows]
+        spread = np.empty((len(ids), 2, 2))
+        covariances.covariances(chosen, self.options.floor_px, spread)
         return CameraObservation(
             camera=frame.camera,
             seq=frame.seq,
@@ -270,5 +272,5 @@ class DotDetector:
             t_received_ns=frame.t_received_ns,
             ids=ids,
             pixels=np.ascontiguousarray(chosen[:, :2]),
-            covariances=covariances,
+            covariances=spread,
         )

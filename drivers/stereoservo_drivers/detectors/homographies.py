@@ -43,6 +43,24 @@ def _solve(A, b):
 
 
 @kernel
+def _lower_root(A):
+    """Cholesky factor L of a symmetric A = L Lᵀ, in place in its lower triangle. False if A is singular."""
+    n = A.shape[0]
+    for j in range(n):
+        for i in range(j, n):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            if i == j:
+                if total < 1e-11:
+                    return False
+                A[j, j] = np.sqrt(total)
+            else:
+                A[i, j] = total / A[j, j]
+    return True
+
+
+@kernel
 def _normal_matrix(pattern, pixels, used, frame, h, A, b):
     """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = middle and scale
     of the pixels.
@@ -206,9 +224,9 @@ def _left_out(pattern, pixels, used, frame, h, A, b, out):
     if not _normal_matrix(pattern, pixels, used, frame, h, A, b):
         return False
     out[:] = 0.0
+    if not _lower_root(A):
+        return False
     rows = np.zeros((2, 8))
-    solved = np.zeros((2, 8))
-    work = np.zeros((8, 8))
     e = np.zeros(2)
     for i in range(used.size):
         if not used[i]:
@@ -220,17 +238,16 @@ def _left_out(pattern, pixels, used, frame, h, A, b, out):
             e[axis] = target / depth
             for j in range(8):
                 e[axis] -= rows[axis, j] * h[j]
+            # L⁻¹ row, the square of which is the leverage
             for j in range(8):
-                solved[axis, j] = rows[axis, j]
-                for k in range(8):
-                    work[j, k] = A[j, k]
-            if not _solve(work, solved[axis]):
-                return False
+                for k in range(j):
+                    rows[axis, j] -= A[j, k] * rows[axis, k]
+                rows[axis, j] /= A[j, j]
         m11, m12, m22 = 1.0, 0.0, 1.0
         for j in range(8):
-            m11 -= rows[0, j] * solved[0, j]
-            m12 -= rows[0, j] * solved[1, j]
-            m22 -= rows[1, j] * solved[1, j]
+            m11 -= rows[0, j] * rows[0, j]
+            m12 -= rows[0, j] * rows[1, j]
+            m22 -= rows[1, j] * rows[1, j]
         det = m11 * m22 - m12 * m12
         least = 0.5 * (m11 + m22) - np.sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12)
         if least < 1e-6 or det <= 0.0:

@@ -34,6 +34,21 @@ EVEN = 1e6
 
 
 @kernel
+def _add(sums, x, y, level, times):
+    """Moments of one pixel's place and level into ``sums`` (10,)."""
+    sums[0] += times
+    sums[1] += times * level
+    sums[2] += times * x
+    sums[3] += times * y
+    sums[4] += times * x * x
+    sums[5] += times * x * y
+    sums[6] += times * y * y
+    sums[7] += times * x * level
+    sums[8] += times * y * level
+    sums[9] += times * level * level
+
+
+@kernel
 def surroundings(image, dark, background, skirt, reach, out, plane):
     """Variance of the dot's surroundings about a plane [grey levels squared]; -1 where there is too little
     to see. ``plane`` (2,) gets its level under the centre above ``background``, and the number of pixels.
@@ -54,51 +69,67 @@ def surroundings(image, dark, background, skirt, reach, out, plane):
     ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 3))
     count = 0
     plane[:] = 0.0
+    sums = np.zeros(10)
+    sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
+    width = 4.0 * skirt * skirt
+    first = lo_u - cu
     for v in range(lo_v, hi_v + 1):
         y = v - cv
-        for u in range(lo_u, hi_u + 1):
-            x = u - cu
+        # sums along the row: their powers of y follow
+        si = sx = sxx = sxi = sii = 0.0
+        before = count
+        row = image[v, lo_u : hi_u + 1]
+        for k in range(row.size):
+            x = k + first
             gx = q11 * x + q12 * y
             gy = q12 * x + q22 * y
             e = x * gx + y * gy - 1.0
-            if e >= 0.0 and e * e >= 4.0 * skirt * skirt * (gx * gx + gy * gy):
-                level = float(image[v, u])
-                if dark:
-                    level = 255.0 - level
-                level -= background
+            if e >= 0.0 and e * e >= width * (gx * gx + gy * gy):
+                level = sign * row[k] + zero
                 histogram[int(abs(level))] += 1
                 ring[count, 0] = x
                 ring[count, 1] = y
                 ring[count, 2] = level
                 count += 1
+                si += level
+                sx += x
+                sxx += x * x
+                sxi += x * level
+                sii += level * level
+        n = float(count - before)
+        sums[0] += n
+        sums[1] += si
+        sums[2] += sx
+        sums[3] += n * y
+        sums[4] += sxx
+        sums[5] += sx * y
+        sums[6] += n * y * y
+        sums[7] += sxi
+        sums[8] += si * y
+        sums[9] += sii
     if count < 24:
         return -1.0
     limit = 4.0 * 1.4826 * median_level(histogram, count) + 2.0
+    counted = np.ones(count, np.bool_)
     level0 = slope_x = slope_y = variance = 0.0
     for _ in range(2):
-        n = si = sx = sy = sxx = sxy = syy = sxi = syi = sii = 0.0
         for k in range(count):
             x, y, level = ring[k, 0], ring[k, 1], ring[k, 2]
-            if abs(level - level0 - slope_x * x - slope_y * y) > limit:
-                continue
-            n += 1.0
-            si += level
-            sx += x
-            sy += y
-            sxx += x * x
-            sxy += x * y
-            syy += y * y
-            sxi += x * level
-            syi += y * level
-            sii += level * level
+            near = abs(level - level0 - slope_x * x - slope_y * y) <= limit
+            if near != counted[k]:
+                # few change sides
+                counted[k] = near
+                _add(sums, x, y, level, 1.0 if near else -1.0)
+        n = sums[0]
         if n < 12.0:
             return -1.0
-        sxx -= sx * sx / n
-        sxy -= sx * sy / n
-        syy -= sy * sy / n
-        sxi -= sx * si / n
-        syi -= sy * si / n
-        sii -= si * si / n
+        si, sx, sy = sums[1], sums[2], sums[3]
+        sxx = sums[4] - sx * sx / n
+        sxy = sums[5] - sx * sy / n
+        syy = sums[6] - sy * sy / n
+        sxi = sums[7] - sx * si / n
+        syi = sums[8] - sy * si / n
+        sii = sums[9] - si * si / n
         d = sxx * syy - sxy * sxy
         if d <= 0.0:
             return -1.0

@@ -141,26 +141,29 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
         t013 = _turn(pattern[basis[0]], pattern[basis[1]], pattern[basis[3]])
         t023 = _turn(pattern[basis[0]], pattern[basis[2]], pattern[basis[3]])
         t123 = _turn(pattern[basis[1]], pattern[basis[2]], pattern[basis[3]])
+        s012, s013, s023, s123 = 1.0 / t012, 1.0 / t013, 1.0 / t023, 1.0 / t123
         inverse = inverses[row]
         for i in range(m):
             for j in range(m):
                 if j == i or areas[j] > 3.0 * areas[i] or areas[i] > 3.0 * areas[j]:
                     continue
+                ju, jv = pixels[j, 0] - pixels[i, 0], pixels[j, 1] - pixels[i, 1]
                 for k in range(m):
-                    if k in (i, j):
-                        continue
-                    ratio = _turn(pixels[i], pixels[j], pixels[k]) / t012
+                    ku, kv = pixels[k, 0] - pixels[i, 0], pixels[k, 1] - pixels[i, 1]
+                    # twice the triangle's signed area; 0 for k in (i, j)
+                    turn = ju * kv - jv * ku
                     foretold = (areas[i] + areas[j] + areas[k]) / (3.0 * unit)
-                    if ratio < 0.4 * foretold or ratio > 2.0 * foretold:
+                    if turn * s012 < 0.4 * foretold or turn * s012 > 2.0 * foretold:
                         continue
                     for l in range(m):  # noqa: E741
-                        if l in (i, j, k):
-                            continue
-                        if _turn(pixels[i], pixels[j], pixels[l]) / t013 < 0.3 * foretold:
-                            continue
-                        if _turn(pixels[i], pixels[k], pixels[l]) / t023 < 0.3 * foretold:
-                            continue
-                        if _turn(pixels[j], pixels[k], pixels[l]) / t123 < 0.3 * foretold:
+                        lu, lv = pixels[l, 0] - pixels[i, 0], pixels[l, 1] - pixels[i, 1]
+                        ijl, ikl = ju * lv - jv * lu, ku * lv - kv * lu
+                        # that of j, k, l is what is left of the whole
+                        if (
+                            ijl * s013 < 0.3 * foretold
+                            or ikl * s023 < 0.3 * foretold
+                            or (turn - ijl + ikl) * s123 < 0.3 * foretold
+                        ):
                             continue
                         if not _hypothesis(pixels[i], pixels[j], pixels[k], pixels[l], inverse, H):
                             continue
