@@ -40,6 +40,7 @@ from stereoservo.runtime.estimate import (
     joints_at,
     marker_weights,
     model_arrays,
+    motion_at,
     pixels_now,
     predict,
     priors,
@@ -278,11 +279,14 @@ class ServoCore:
             if self._arrays is not None and at_shutter is not None:
                 ideal = ideal_observation(self._arrays, camera, observation)
                 then = predict(self._arrays, at_shutter)
-                sights = frame_sights(self._arrays, camera, ideal, then, state.velocities)
+                motion = motion_at(state.history, observation.t_shutter_ns)
+                speed = state.velocities if motion is None else motion
+                sights = frame_sights(self._arrays, camera, ideal, then, speed)
                 sights = mobile.see(
                     state, self.settings, self._arrays, camera, sights, then, at_shutter, emit
                 )
-                health.see(state.watching, camera, sights, at_shutter)
+                if motion is not None:  # where the arm was is known, and not only expected
+                    health.see(state.watching, camera, sights, at_shutter)
                 if observation.camera not in (*unknown, *mobile.moving_cameras(state, self.settings)):
                     accept_sights(estimate, sights, usable, self.settings)
         common: dict[str, Any] = {

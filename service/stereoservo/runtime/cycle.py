@@ -147,7 +147,8 @@ class Event(msgspec.Struct, frozen=True, eq=False):
 
 class CameraHealth(msgspec.Struct, frozen=True):
     """How one camera's newest frame agrees with the model: chi-square a freedom, rms innovation [px], the ``worst``
-    marker (-1: none) and its innovation. ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``.
+    marker (-1: none) and its innovation. ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``. ``timing``:
+    in words, where the stamps are seen to be wrong.
     """
 
     chi2: float = 0.0
@@ -155,6 +156,7 @@ class CameraHealth(msgspec.Struct, frozen=True):
     worst: int = -1
     worst_px: float = 0.0
     place: str = ""
+    timing: str = ""
 
 
 class Health(msgspec.Struct, frozen=True):

@@ -205,6 +205,25 @@ def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
     return None
 
 
+def motion_at(history: JointHistory, t_ns: int) -> FloatArray | None:
+    """Joint velocities (n,) at ``t_ns``, of the samples around it; None where only samples of before tell of it.
+
+    What the arm did since its last sample is known for one interval; a driver that is silent says nothing of now.
+    """
+    filled = min(history.count, HISTORY)
+    newest = history.count - 1
+    for back in range(filled - 1):
+        later, earlier = (newest - back) % HISTORY, (newest - back - 1) % HISTORY
+        t1, t0 = int(history.t_ns[later]), int(history.t_ns[earlier])
+        if t_ns < t0 or t1 == t0:
+            continue
+        if t_ns > 2 * t1 - t0:
+            return None
+        found: FloatArray = (history.positions[later] - history.positions[earlier]) / ((t1 - t0) * 1e-9)
+        return found
+    return None
+
+
 def ideal_observation(arrays: ModelArrays, camera: int, observation: CameraObservation) -> CameraObservation:
     """An observation in ideal pixels; sights that the camera's lens cannot have made are left out."""
     lens = arrays.lenses[camera]
@@ -225,7 +244,7 @@ class FrameSights:
     """One frame against the prediction at its shutter, k rows: the model's markers, then its static points.
 
     ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) by detector and timing, ``noise`` (k,) [px²] of a
-    coordinate by the detector alone, and what was ``seen`` (k,).
+    coordinate by the detector alone, what was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s] by the joints.
     """
 
     t_shutter_ns: int
@@ -233,6 +252,7 @@ class FrameSights:
     spread: FloatArray
     noise: FloatArray
     seen: BoolArray
+    velocity: FloatArray
 
 
 def frame_sights(
@@ -248,7 +268,7 @@ def frame_sights(
     """
     rows = np.array([arrays.rows.get(int(i), -1) for i in observation.ids], dtype=np.int64)
     standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
-    innovation, spread, seen = innovations(
+    innovation, spread, seen, velocity = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
         np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
         np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
@@ -257,7 +277,7 @@ def frame_sights(
     for k, row in enumerate(rows):
         if row >= 0:
             noise[row] = 0.5 * (observation.covariances[k, 0, 0] + observation.covariances[k, 1, 1])
-    return FrameSights(observation.t_shutter_ns, innovation, spread, noise, seen)
+    return FrameSights(observation.t_shutter_ns, innovation, spread, noise, seen, velocity)
 
 
 def accept_sights(

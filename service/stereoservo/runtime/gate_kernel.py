@@ -41,15 +41,15 @@ def distance2(x: float, y: float, a: float, b: float, c: float) -> float:
 def innovations(
     rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, jacobian: FloatArray,
     speed: FloatArray, timing_s: float,
-) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:  # fmt: skip
     """Of each marker of the model: observed less ``predicted`` (m, 2) [px], its covariance (m, 2, 2) by detector and
-    timing, and whether it was seen (m,).
+    timing, whether it was seen (m,), and its velocity (m, 2) [px/s].
 
     ``rows`` (k,): the model's marker of each sight, or -1. ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter
     stamp that is off by ``timing_s`` [s] moves.
     """
     m, n = jacobian.shape[0], jacobian.shape[2]
-    innovation, spread = np.zeros((m, 2)), np.zeros((m, 2, 2))
+    innovation, spread, velocity = np.zeros((m, 2)), np.zeros((m, 2, 2)), np.zeros((m, 2))
     seen = np.zeros(m, dtype=np.bool_)
     for k in range(rows.size):
         i = rows[k]
@@ -62,12 +62,13 @@ def innovations(
         for j in range(n):
             u += jacobian[i, 0, j] * speed[j]
             v += jacobian[i, 1, j] * speed[j]
+        velocity[i, 0], velocity[i, 1] = u, v
         t = timing_s * timing_s
         spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
         spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
         spread[i, 1, 0] = spread[i, 0, 1]
         spread[i, 1, 1] = covariances[k, 1, 1] + t * v * v
-    return innovation, spread, seen
+    return innovation, spread, seen, velocity
 
 
 @kernel

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from stereoservo.control.reasons import Reason
-from stereoservo.runtime.cycle import CameraHealth, Health, ModelReadiness
+from stereoservo.runtime.cycle import CameraHealth, Health, Lifecycle, ModelReadiness
 from stereoservo.runtime.diagnosis import diagnosed
 from stereoservo.runtime.estimate import MODEL_SIGMA_PX, FrameSights, ModelArrays
 from stereoservo.runtime.gate_kernel import camera_chi2, gate_threshold
@@ -21,6 +21,7 @@ from stereoservo.runtime.motion import Present
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import CoreState
+from stereoservo.runtime.timing import advice, fold_timing
 
 AGREE, OF = 2, 3
 """Rounds of the last ones that must say the same."""
@@ -28,6 +29,8 @@ BACK_ROUNDS = 30
 """Rounds in which a masked marker must stand where it should, to be used again."""
 STALE_PERIODS = 2.5
 """Frames that are older than so many periods of their camera are left out of a round."""
+LATEST_S = 0.02
+"""By which a busy computer may get a stamp wrong; what looks later than that is something else."""
 FEWEST_LEFT = 4
 """Markers of a camera that must remain where others are masked."""
 
@@ -62,6 +65,7 @@ def see(watching: Watching, camera: int, sights: FrameSights, q: FloatArray) -> 
     sighting.innovation = sights.innovation
     sighting.spread = sights.spread
     sighting.seen = sights.seen.astype(np.float64)
+    sighting.velocity = sights.velocity
     sighting.q = q
     sighting.t_ns = sights.t_shutter_ns
     sighting.fresh, sighting.looked = True, False
@@ -72,6 +76,14 @@ def see(watching: Watching, camera: int, sights: FrameSights, q: FloatArray) -> 
     sighting.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
     sighting.worst = int(worst)
     sighting.worst_px = 0.0 if worst < 0 else float(np.sqrt((sighting.innovation[worst] ** 2).sum()))
+    rows = used > 0.0
+    fold_timing(
+        sighting.timing,
+        sighting.innovation[rows],
+        sights.velocity[rows],
+        sights.noise[rows],
+        sights.t_shutter_ns,
+    )
 
 
 def _used(watching: Watching, sighting: Sighting) -> FloatArray:
@@ -86,6 +98,8 @@ def watch(present: Present) -> Verdict | None:
     watching, arrays = present.state.watching, present.arrays
     if arrays is None or not (watching.due or all(not s.looked for s in watching.sightings)):
         return None
+    if present.state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+        return None  # joints that a faulty drive tells are no measure of cameras
     watching.due = False
     known = []
     for c, (camera, sighting) in enumerate(zip(present.settings.cameras, watching.sightings, strict=True)):
@@ -109,9 +123,8 @@ def _judged(watching: Watching, known: list[int], arrays: ModelArrays, settings:
     for c in known:
         sighting = watching.sightings[c]
         used = _used(watching, sighting)
-        chi2, _, _, largest = camera_chi2(sighting.innovation, sighting.spread, used, MODEL_SIGMA_PX)
-        freedoms = 2.0 * float(used.sum())
-        suspicious |= chi2 > _improbable(freedoms) or largest > gate_threshold(settings.gate_sigma)
+        likely = _likely(sighting.innovation, sighting.spread, used, settings)
+        suspicious |= not (likely or _late(sighting, used, settings))
     if not suspicious:
         return Verdict()
     weights = np.zeros((len(known), len(arrays.rows)))
@@ -123,6 +136,28 @@ def _judged(watching: Watching, known: list[int], arrays: ModelArrays, settings:
         innovation[row] = sighting.innovation
     newest = max(known, key=lambda c: watching.sightings[c].t_ns)
     return diagnosed(arrays, settings, known, watching.sightings[newest].q, innovation, weights)
+
+
+def _likely(innovation: FloatArray, spread: FloatArray, used: FloatArray, settings: CoreSettings) -> bool:
+    """Whether innovations (k, 2) look like noise, all together and each of them."""
+    chi2, _, _, largest = camera_chi2(innovation, spread, used, MODEL_SIGMA_PX)
+    return chi2 <= _improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
+
+
+def _late(sighting: Sighting, used: FloatArray, settings: CoreSettings) -> bool:
+    """Whether a frame that was taken a little earlier or later than stated explains its innovations.
+
+    Pictures are late where a computer is busy; a camera that was moved shows it at rest, too.
+    """
+    moved = sighting.velocity * used[:, None]
+    square = float((moved * moved).sum())
+    if square <= 0.0:
+        return False
+    late_s = float((moved * sighting.innovation).sum()) / square
+    if abs(late_s) > LATEST_S:
+        return False
+    rest = sighting.innovation - late_s * sighting.velocity
+    return _likely(rest, sighting.spread, used, settings)
 
 
 def _improbable(freedoms: float) -> float:
@@ -245,6 +280,7 @@ def health_now(state: CoreState, settings: CoreSettings, reanchoring: str) -> He
                 ids[sighting.worst] if sighting.worst >= 0 else -1,
                 sighting.worst_px,
                 "" if moves is None else moves.place,
+                advice(sighting.timing),
             )
             for camera, sighting, moves in zip(
                 settings.cameras, watching.sightings, state.mobile, strict=True

@@ -10,6 +10,7 @@ import numpy as np
 from stereoservo.control.reasons import Reason
 from stereoservo.runtime.ports import FloatArray, IntArray
 from stereoservo.runtime.sums import Sums
+from stereoservo.runtime.timing import CameraTiming
 
 LOST_FRAMES = 3
 """Frames in a row that nothing explains, after which nobody knows where a moving camera is."""
@@ -41,7 +42,8 @@ class Verdict(msgspec.Struct, frozen=True):
 class Sighting(msgspec.Struct, eq=False):
     """The newest frame of one camera against the prediction at its shutter: markers of the model, then static points.
 
-    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0; joints ``q`` (n,).
+    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0, ``velocity`` (k, 2)
+    [px/s]; joints ``q`` (n,); ``timing``: what moving markers have said of the stamps.
     ``fresh``: it came in this step; ``looked``: a round has looked at it. ``chi2`` a freedom, ``rms_px`` and the
     ``worst`` row are its own.
     """
@@ -49,7 +51,9 @@ class Sighting(msgspec.Struct, eq=False):
     innovation: FloatArray
     spread: FloatArray
     seen: FloatArray
+    velocity: FloatArray
     q: FloatArray
+    timing: CameraTiming = msgspec.field(default_factory=CameraTiming)
     t_ns: int = 0
     fresh: bool = False
     looked: bool = True
@@ -142,7 +146,13 @@ def nothing_sighted(cameras: int, rows: int, joints: int, markers: int) -> Watch
     """A watch that has seen nothing: ``rows`` markers and static points, of them ``markers`` of the model."""
     return Watching(
         [
-            Sighting(np.zeros((rows, 2)), np.zeros((rows, 2, 2)), np.zeros(rows), np.zeros(joints))
+            Sighting(
+                np.zeros((rows, 2)),
+                np.zeros((rows, 2, 2)),
+                np.zeros(rows),
+                np.zeros((rows, 2)),
+                np.zeros(joints),
+            )
             for _ in range(cameras)
         ],
         np.zeros(markers),

@@ -21,7 +21,10 @@ def fitted(model: CellModel) -> ModelReadiness:
 def watch_health(present: Present) -> None:
     """Say what explains the images, when that has changed, and do what follows."""
     state = present.state
-    if state.reanchoring is not None and state.reanchoring.phase != "verify":
+    run = state.reanchoring
+    if run is not None and run.phase != "verify":
+        if run.phase == "collect":
+            health.watch(present)  # for `reanchoring`, which looks whether they have moved at all
         return  # at rest, what stands is watched by `reanchoring`
     verdict = health.watch(present)
     if mobile.takes(present):
