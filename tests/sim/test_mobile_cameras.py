@@ -69,4 +69,5 @@ def test_goals_are_reached_by_any_of_them_and_on_the_move(capsys: pytest.Capture
     assert len(rows) == len(CONDITIONS)
     assert all(row["reached"] == "2 of 2" for row in rows)
     assert all(row["error_mm"]["median"] < 0.5 for row in rows)
-    assert rows[-2]["ratio"] < 2.0
+    # Carried cameras are adjusted to what the standing pair says: the errors are those of this pair.
+    assert rows[-2]["ratio"] < 2.0 * rows[0]["ratio"]

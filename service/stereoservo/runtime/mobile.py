@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
-from functools import lru_cache
 
 import msgspec
 import numpy as np
@@ -19,15 +17,12 @@ import numpy as np
 from stereoservo.control.reasons import Reason
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import (
-    BoolArray,
     exp_twist,
     multiply4_into,
     project_points,
     transform_points,
 )
 from stereoservo.kinematics.model import CellModel
-from stereoservo.kinematics.moved_fits_kernel import fit_displacement
-from stereoservo.kinematics.moved_kernel import ROUNDS
 from stereoservo.kinematics.moved_thresholds import chi2_quantile
 from stereoservo.runtime.commands import FeatureTarget, IncidenceTarget, Target
 from stereoservo.runtime.diagnosis import thresholds_of
@@ -44,6 +39,7 @@ from stereoservo.runtime.estimate import (
 )
 from stereoservo.runtime.gate_kernel import gate_threshold
 from stereoservo.runtime.health_state import MobileCamera, Verdict, standing_camera
+from stereoservo.runtime.mobile_fit import FEWEST, FREEDOMS, Adjusted, adjust, angle, apart, moved_matrix
 from stereoservo.runtime.motion import Emit, Present
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.reanchoring import AT_REST, begin, carry_all, unknown_cameras
@@ -51,19 +47,13 @@ from stereoservo.runtime.refusal import RefusalError
 from stereoservo.runtime.settings import CoreSettings
 from stereoservo.runtime.state import CameraEstimate, CoreState, Holding, camera_estimate
 
-FREEDOMS = 6
-FEWEST = 4
-"""Known points that a frame must show."""
 REFUSED_FRAMES = 2
 """In a row, after which a camera that nothing explains is said to move."""
-LEFT_OUT = 2
-"""Sights of a frame that may be wrong."""
 STILL_FRAMES = 10
 STILL_PX = 0.1
 """Besides its own noise, what a camera that stands may seem to move in that time, rms: models are not exact."""
 STILL_CHANCE = 1e-4
 """Of noise alone looking like motion, of one frame."""
-UNEXPLAINED_CHANCE = 1e-6
 HAND_OVER_S = 2.0
 """A camera at rest that nothing explains for so long is found anew like one that was bumped, where no goal runs."""
 
@@ -105,25 +95,6 @@ def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...
 # -- every frame ----------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=256)
-def _unexplained(freedoms: int) -> float:
-    """Chi-square from which a frame is not explained."""
-    return chi2_quantile(UNEXPLAINED_CHANCE, freedoms)
-
-
-@dataclass(frozen=True, eq=False)
-class _Adjusted:
-    """A displacement ``D`` (4, 4) of a camera, its ``twist`` (6,), and what it explains: ``weights`` (k,) [1/px] of
-    the sights that agree, chi-square ``before`` it and with it.
-    """
-
-    D: FloatArray
-    twist: FloatArray
-    weights: FloatArray
-    before: float
-    chi2: float
-
-
 def see(
     state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, sights: FrameSights,
     prediction: Prediction, q: FloatArray, emit: Emit,
@@ -133,8 +104,10 @@ def see(
     if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
         return sights
     points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
+    basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
+    assert basis is not None
     P = arrays.matrices[camera]
-    found = _adjust(moved_matrix(P, mobile.reference), points, observed, weights, arrays, settings)
+    found = adjust(moved_matrix(P, mobile.reference), points, observed, weights, basis, gate)
     if not mobile.moving:
         if not _sets_out(state, settings, arrays, camera, found, int((weights > 0.0).sum())):
             return sights
@@ -166,53 +139,19 @@ def _known(
     return points, observed, weights
 
 
-def _adjust(
-    P: FloatArray, points: FloatArray, observed: FloatArray, weights: FloatArray, arrays: ModelArrays,
-    settings: CoreSettings,
-) -> _Adjusted | None:  # fmt: skip
-    """The displacement of camera ``P`` (3, 4) that explains what it sees; None where none does.
-
-    One sight after the other, the worst first, may be left out where it is beyond the gate.
-    """
-    basis = arrays.metric_basis
-    assert basis is not None
-    gate = gate_threshold(settings.gate_sigma)
-    weights = weights.copy()
-    matrices, targets = P[None].copy(), observed[None].copy()
-    D, twist = np.empty((4, 4)), np.empty(FREEDOMS)
-    side = _side(P, points, weights)
-    for _ in range(LEFT_OUT + 1):
-        count = int((weights > 0.0).sum())
-        if count < FEWEST:
-            return None
-        chi2, _ = fit_displacement(
-            matrices, 0, basis, 0, FREEDOMS, points, len(points), targets, weights[None], ROUNDS, D, twist
-        )
-        moved = moved_matrix(P, D)
-        if not math.isfinite(chi2) or _side(moved, points, weights) != side:
-            return None
-        squares = weights**2 * ((observed - _pixels(moved, points)) ** 2).sum(axis=-1)
-        worst = int(squares.argmax())
-        if squares[worst] <= gate and chi2 <= _unexplained(2 * count - FREEDOMS):
-            before = weights**2 * ((observed - _pixels(P, points)) ** 2).sum(axis=-1)
-            return _Adjusted(D.copy(), twist.copy(), weights, float(before.sum()), float(chi2))
-        weights[worst] = 0.0
-    return None
-
-
 def _follow(
-    mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameSights, found: _Adjusted
+    mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameSights, found: Adjusted
 ) -> None:
     """Where the camera is by a frame that was explained, and whether it has moved since the frames before."""
     then = moved_matrix(P, mobile.reference)
     way = np.empty((4, 4))
     multiply4_into(mobile.reference, found.D, way)
     used = found.weights > 0.0
-    apart = _apart(then, moved_matrix(P, way), points, used)
+    distance = apart(then, moved_matrix(P, way), points, used)
     noise = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1])
     # The pixels of an estimate of six parameters deviate by chi-square of six freedoms in all; of two, by twice that.
     random = math.sqrt(2.0 * _STILL_CHI2 * float(noise[used].sum())) / float(used.sum())
-    if mobile.still == 0 or apart > STILL_PX + random:
+    if mobile.still == 0 or distance > STILL_PX + random:
         mobile.reference = way
         mobile.twists = np.zeros(FREEDOMS)
         mobile.still = 1
@@ -220,11 +159,11 @@ def _follow(
         mobile.twists = mobile.twists + found.twist
         mobile.still += 1
     mobile.way = way
-    mobile.moved_px = _apart(P, moved_matrix(P, way), points, used)
+    mobile.moved_px = apart(P, moved_matrix(P, way), points, used)
 
 
 def _sets_out(
-    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, found: _Adjusted | None, seen: int
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, found: Adjusted | None, seen: int
 ) -> bool:  # fmt: skip
     """Whether a frame says that a camera that stood moves: a displacement explains it that is no noise, or nothing
     does, and the frames before it were refused, too.
@@ -442,18 +381,6 @@ def rehearse() -> None:
 # -- algebra --------------------------------------------------------------------------------------------------
 
 
-def moved_matrix(P: FloatArray, way: FloatArray) -> FloatArray:
-    """``P way`` (3, 4), without BLAS."""
-    product: FloatArray = (P[:, :, None] * way[None]).sum(axis=1)
-    return product
-
-
-def angle(displacement: FloatArray) -> float:
-    """Angle [rad] of a displacement (4, 4) in any frame, by its trace 2 + 2 cos."""
-    trace = float(np.trace(displacement))
-    return math.acos(min(max(0.5 * trace - 1.0, -1.0), 1.0))
-
-
 def _arrays_with(arrays: ModelArrays, matrices: FloatArray) -> ModelArrays:
     centres = np.array([camera_centre(P) for P in matrices])
     return dataclasses.replace(
@@ -462,21 +389,3 @@ def _arrays_with(arrays: ModelArrays, matrices: FloatArray) -> ModelArrays:
         camera_centres=with_unit_height(centres, arrays.plane_at_infinity),
         scene_pixels=project_points(matrices, arrays.scene_points)[0],
     )
-
-
-def _pixels(P: FloatArray, points: FloatArray) -> FloatArray:
-    pixels: FloatArray = project_points(P[None].copy(), points)[0][0]
-    return pixels
-
-
-def _side(P: FloatArray, points: FloatArray, weights: FloatArray) -> float:
-    """Sign of the depths of what is seen: +1, -1, or between where they differ."""
-    depths = project_points(P[None].copy(), points)[1][0]
-    seen = weights > 0.0
-    return float(np.sign(depths[seen]).sum()) / max(float(seen.sum()), 1.0)
-
-
-def _apart(P: FloatArray, Q: FloatArray, points: FloatArray, used: BoolArray) -> float:
-    """Rms distance [px] between the images of the points ``used`` in two cameras."""
-    squares = ((_pixels(P, points) - _pixels(Q, points)) ** 2).sum(axis=-1)
-    return math.sqrt(float(squares[used].sum()) / max(float(used.sum()), 1.0))

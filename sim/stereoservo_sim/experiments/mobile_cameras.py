@@ -283,7 +283,9 @@ def draw_mobile_cameras(answer: dict[str, Any], folder: Path) -> list[Path]:
         values = [goal["error_mm"] for goal in answer["goals"] if goal["condition"] == name]
         axis.plot(np.full(len(values), k), values, "o", markersize=3, alpha=0.6)
     axis.set_xticks(
-        range(len(names)), [name.replace(", ", "\n").replace(" + ", "\n") for name in names], fontsize=6
+        range(len(names)),
+        [name.replace(", ", "\n").replace(" + ", "\n").replace(" on the", "\non the") for name in names],
+        fontsize=6,
     )
     axis.set_ylim(bottom=0.0)
     labelled(axis, "error at the goal", "", "[mm]")

@@ -1,0 +1,101 @@
+"""The displacement of one camera that explains one of its frames, though some of its sights may be wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from stereoservo.kinematics.kernels import BoolArray, project_points
+from stereoservo.kinematics.moved_fits_kernel import fit_displacement
+from stereoservo.kinematics.moved_kernel import ROUNDS
+from stereoservo.kinematics.moved_thresholds import chi2_quantile
+from stereoservo.runtime.ports import FloatArray
+
+FREEDOMS = 6
+FEWEST = 4
+"""Known points that a frame must show."""
+LEFT_OUT = 2
+"""Sights of a frame that may be wrong."""
+UNEXPLAINED_CHANCE = 1e-6
+
+
+@lru_cache(maxsize=256)
+def _unexplained(freedoms: int) -> float:
+    """Chi-square from which a frame is not explained."""
+    return chi2_quantile(UNEXPLAINED_CHANCE, freedoms)
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """A displacement ``D`` (4, 4) of a camera, its ``twist`` (6,), and what it explains: ``weights`` (k,) [1/px] of
+    the sights that agree, chi-square ``before`` it and with it.
+    """
+
+    D: FloatArray
+    twist: FloatArray
+    weights: FloatArray
+    before: float
+    chi2: float
+
+
+def adjust(
+    P: FloatArray, points: FloatArray, observed: FloatArray, weights: FloatArray, basis: FloatArray, gate: float
+) -> Adjusted | None:  # fmt: skip
+    """The displacement of camera ``P`` (3, 4) that explains what it sees; None where none does.
+
+    One sight after the other, the worst first, may be left out where it is beyond the gate.
+    """
+    weights = weights.copy()
+    matrices, targets = P[None].copy(), observed[None].copy()
+    D, twist = np.empty((4, 4)), np.empty(FREEDOMS)
+    side = _side(P, points, weights)
+    for _ in range(LEFT_OUT + 1):
+        count = int((weights > 0.0).sum())
+        if count < FEWEST:
+            return None
+        chi2, _ = fit_displacement(
+            matrices, 0, basis, 0, FREEDOMS, points, len(points), targets, weights[None], ROUNDS, D, twist
+        )
+        moved = moved_matrix(P, D)
+        if not math.isfinite(chi2) or _side(moved, points, weights) != side:
+            return None
+        squares = weights**2 * ((observed - _pixels(moved, points)) ** 2).sum(axis=-1)
+        worst = int(squares.argmax())
+        if squares[worst] <= gate and chi2 <= _unexplained(2 * count - FREEDOMS):
+            before = weights**2 * ((observed - _pixels(P, points)) ** 2).sum(axis=-1)
+            return Adjusted(D.copy(), twist.copy(), weights, float(before.sum()), float(chi2))
+        weights[worst] = 0.0
+    return None
+
+
+def moved_matrix(P: FloatArray, way: FloatArray) -> FloatArray:
+    """``P way`` (3, 4), without BLAS."""
+    product: FloatArray = (P[:, :, None] * way[None]).sum(axis=1)
+    return product
+
+
+def angle(displacement: FloatArray) -> float:
+    """Angle [rad] of a displacement (4, 4) in any frame, by its trace 2 + 2 cos."""
+    trace = float(np.trace(displacement))
+    return math.acos(min(max(0.5 * trace - 1.0, -1.0), 1.0))
+
+
+def _pixels(P: FloatArray, points: FloatArray) -> FloatArray:
+    pixels: FloatArray = project_points(P[None].copy(), points)[0][0]
+    return pixels
+
+
+def _side(P: FloatArray, points: FloatArray, weights: FloatArray) -> float:
+    """Sign of the depths of what is seen: +1, -1, or between where they differ."""
+    depths = project_points(P[None].copy(), points)[1][0]
+    seen = weights > 0.0
+    return float(np.sign(depths[seen]).sum()) / max(float(seen.sum()), 1.0)
+
+
+def apart(P: FloatArray, Q: FloatArray, points: FloatArray, used: BoolArray) -> float:
+    """Rms distance [px] between the images of the points ``used`` in two cameras."""
+    squares = ((_pixels(P, points) - _pixels(Q, points)) ** 2).sum(axis=-1)
+    return math.sqrt(float(squares[used].sum()) / max(float(used.sum()), 1.0))
