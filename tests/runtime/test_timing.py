@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereoservo.runtime.estimate import motion_at, remember_joints
+from stereoservo.runtime.ports import JointState
+from stereoservo.runtime.state import HISTORY, JointHistory
 from stereoservo.runtime.timing import MODEL_PX, CameraTiming, advice, fold_timing, offset_s
 
 
@@ -65,3 +68,16 @@ def test_old_frames_are_forgotten() -> None:
         late.append(offset_s(timing)[0])
         assert timing.seen_ns == t_ns, k
     assert abs(late[-1]) < 0.001
+
+
+def test_motion_is_known_between_samples_and_for_one_interval_after_them() -> None:
+    history = JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, 1)))
+    ms = 1_000_000
+    for t_ms, q in ((100, 0.0), (104, 0.004), (108, 0.016), (400, 0.3), (404, 0.304)):
+        remember_joints(history, JointState(t_ms, t_ms * ms, np.array([q]), np.zeros(1)))
+    for t_ms, speed in ((102, 1.0), (106, 3.0), (402, 1.0), (407, 1.0)):
+        found = motion_at(history, t_ms * ms)
+        assert found is not None
+        assert found[0] == pytest.approx(speed)
+    for t_ms in (99, 200, 399, 409):
+        assert motion_at(history, t_ms * ms) is None, t_ms

@@ -208,7 +208,7 @@ def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
 def motion_at(history: JointHistory, t_ns: int) -> FloatArray | None:
     """Joint velocities (n,) at ``t_ns``, of the samples around it; None where only samples of before tell of it.
 
-    What the arm did since its last sample is known for one interval; a driver that is silent says nothing of now.
+    What the arm did since its last sample is known for one interval; of a driver's silence nothing is known.
     """
     filled = min(history.count, HISTORY)
     newest = history.count - 1
@@ -217,7 +217,7 @@ def motion_at(history: JointHistory, t_ns: int) -> FloatArray | None:
         t1, t0 = int(history.t_ns[later]), int(history.t_ns[earlier])
         if t_ns < t0 or t1 == t0:
             continue
-        if t_ns > 2 * t1 - t0:
+        if t_ns > 2 * t1 - t0 or t1 - t0 > UNKNOWN_NS:
             return None
         found: FloatArray = (history.positions[later] - history.positions[earlier]) / ((t1 - t0) * 1e-9)
         return found
