@@ -13,7 +13,7 @@ import pytest
 from stereoservo.runtime.cellfile import CellFileError, check_cell
 from stereoservo.runtime.commands import FeatureTarget, Goal, LawName, RunGoal, Teach
 from stereoservo.runtime.core import ServoCore
-from stereoservo.runtime.cycle import ModelUpdate
+from stereoservo.runtime.cycle import DriverFault, ModelUpdate
 from stereoservo.runtime.state import decode_state, encode_state
 
 DISPLACED = np.array([0.12, -0.1, 0.08, 0.2, -0.15, 0.25])
@@ -302,6 +302,38 @@ def test_camera_that_nothing_explains_does_not_stop_the_others_and_is_found_anew
     event = bench.until(lambda e: e.kind == "reanchor", 5.0)
     assert event.cameras == ("high",)
     assert bench.core.state.mobile[2].place == "stands"  # no longer adjusted: it is found anew
+
+
+def test_late_stamps_and_faulty_drives_move_no_camera(cells: Any) -> None:
+    """15 ms late, pixels of every marker along its motion; then encoders that jump while the cell is faulty."""
+    bench = cells(0, NAMES)
+    send(bench, bench.q + DISPLACED, gain=4.0)
+    bench.run(0.1)
+    honest = bench._shutter
+
+    def late() -> None:
+        begun = len(bench.pending)
+        honest()
+        bench.pending[begun:] = [
+            msgspec.structs.replace(
+                o, t_shutter_ns=o.t_shutter_ns - (15_000_000 if o.camera == "high" else 0)
+            )
+            for o in bench.pending[begun:]
+        ]
+
+    bench._shutter = late
+    seen_px = []
+    for _ in range(5):
+        bench.run(0.1)
+        seen_px.append(bench.core.state.watching.sightings[2].rms_px)
+    assert max(seen_px) > 1.0
+    bench._shutter = honest
+    bench.run(0.3)
+    for _ in range(30):
+        bench.zero_offset[1] = 0.02
+        bench.step(driver_fault=DriverFault("encoder", "it jumps"))
+    assert bench.log[-1][1].status.lifecycle == "fault"
+    assert not [e for e in bench.events if e.name == "camera_moving"]
 
 
 def test_priors_of_a_moving_camera_follow_it(cells: Any) -> None:

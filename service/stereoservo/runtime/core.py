@@ -282,10 +282,10 @@ class ServoCore:
                 motion = motion_at(state.history, observation.t_shutter_ns)
                 speed = state.velocities if motion is None else motion
                 sights = frame_sights(self._arrays, camera, ideal, then, speed)
-                sights = mobile.see(
-                    state, self.settings, self._arrays, camera, sights, then, at_shutter, emit
-                )
                 if motion is not None:  # where the arm was is known, and not only expected
+                    sights = mobile.see(
+                        state, self.settings, self._arrays, camera, sights, then, at_shutter, emit
+                    )
                     health.see(state.watching, camera, sights, at_shutter)
                 if observation.camera not in (*unknown, *mobile.moving_cameras(state, self.settings)):
                     accept_sights(estimate, sights, usable, self.settings)

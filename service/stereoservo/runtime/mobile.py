@@ -25,6 +25,7 @@ from stereoservo.kinematics.kernels import (
 from stereoservo.kinematics.model import CellModel
 from stereoservo.kinematics.moved_thresholds import chi2_quantile
 from stereoservo.runtime.commands import FeatureTarget, IncidenceTarget, Target
+from stereoservo.runtime.cycle import Lifecycle
 from stereoservo.runtime.diagnosis import thresholds_of
 from stereoservo.runtime.ending import goal_of
 from stereoservo.runtime.estimate import (
@@ -39,7 +40,17 @@ from stereoservo.runtime.estimate import (
 )
 from stereoservo.runtime.gate_kernel import gate_threshold
 from stereoservo.runtime.health_state import MobileCamera, Verdict, standing_camera
-from stereoservo.runtime.mobile_fit import FEWEST, FREEDOMS, Adjusted, adjust, angle, apart, moved_matrix
+from stereoservo.runtime.mobile_fit import (
+    FEWEST,
+    FREEDOMS,
+    Adjusted,
+    adjust,
+    angle,
+    apart,
+    late_alone,
+    moved_matrix,
+    pixels_of,
+)
 from stereoservo.runtime.motion import Emit, Present
 from stereoservo.runtime.ports import FloatArray
 from stereoservo.runtime.reanchoring import AT_REST, begin, carry_all, unknown_cameras
@@ -103,13 +114,19 @@ def see(
     mobile = state.mobile[camera]
     if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
         return sights
+    hidden = dataclasses.replace(sights, seen=np.zeros_like(sights.seen))
+    if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+        return (
+            hidden if mobile.moving else sights
+        )  # joints that a faulty drive tells are no measure of cameras
     points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
     basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
     assert basis is not None
     P = arrays.matrices[camera]
     found = adjust(moved_matrix(P, mobile.reference), points, observed, weights, basis, gate)
     if not mobile.moving:
-        if not _sets_out(state, settings, arrays, camera, found, int((weights > 0.0).sum())):
+        late = late_alone(observed - pixels_of(P, points), sights.velocity, weights)
+        if late or not _sets_out(state, settings, arrays, camera, found, int((weights > 0.0).sum())):
             return sights
         _set_out(mobile, camera, settings, sights.t_shutter_ns, emit)
         state.cameras[camera].rejected_frames = 0
@@ -120,7 +137,7 @@ def see(
     else:
         _follow(mobile, P, points, sights, found)
         mobile.lost, mobile.found_ns = 0, sights.t_shutter_ns
-    return dataclasses.replace(sights, seen=np.zeros_like(sights.seen))
+    return hidden
 
 
 def _known(

@@ -12,6 +12,7 @@ from stereoservo.kinematics.kernels import BoolArray, project_points
 from stereoservo.kinematics.moved_fits_kernel import fit_displacement
 from stereoservo.kinematics.moved_kernel import ROUNDS
 from stereoservo.kinematics.moved_thresholds import chi2_quantile
+from stereoservo.runtime.health import LATEST_S
 from stereoservo.runtime.ports import FloatArray
 
 FREEDOMS = 6
@@ -62,13 +63,26 @@ def adjust(
         moved = moved_matrix(P, D)
         if not math.isfinite(chi2) or _side(moved, points, weights) != side:
             return None
-        squares = weights**2 * ((observed - _pixels(moved, points)) ** 2).sum(axis=-1)
+        squares = weights**2 * ((observed - pixels_of(moved, points)) ** 2).sum(axis=-1)
         worst = int(squares.argmax())
         if squares[worst] <= gate and chi2 <= _unexplained(2 * count - FREEDOMS):
-            before = weights**2 * ((observed - _pixels(P, points)) ** 2).sum(axis=-1)
+            before = weights**2 * ((observed - pixels_of(P, points)) ** 2).sum(axis=-1)
             return Adjusted(D.copy(), twist.copy(), weights, float(before.sum()), float(chi2))
         weights[worst] = 0.0
     return None
+
+
+def late_alone(innovation: FloatArray, velocity: FloatArray, weights: FloatArray) -> bool:
+    """Whether innovations (k, 2) of markers with ``velocity`` (k, 2) [px/s] are those of a frame that was taken a
+    little earlier or later than stated.
+    """
+    square = float((weights[:, None] ** 2 * velocity**2).sum())
+    if square <= 0.0:
+        return False
+    late_s = float((weights[:, None] ** 2 * velocity * innovation).sum()) / square
+    rest = weights[:, None] * (innovation - late_s * velocity)
+    freedoms = 2 * int((weights > 0.0).sum()) - 1
+    return abs(late_s) <= LATEST_S and float((rest**2).sum()) <= _unexplained(freedoms)
 
 
 def moved_matrix(P: FloatArray, way: FloatArray) -> FloatArray:
@@ -83,7 +97,8 @@ def angle(displacement: FloatArray) -> float:
     return math.acos(min(max(0.5 * trace - 1.0, -1.0), 1.0))
 
 
-def _pixels(P: FloatArray, points: FloatArray) -> FloatArray:
+def pixels_of(P: FloatArray, points: FloatArray) -> FloatArray:
+    """Ideal pixels (k, 2) of points (k, 4)."""
     pixels: FloatArray = project_points(P[None].copy(), points)[0][0]
     return pixels
 
@@ -97,5 +112,5 @@ def _side(P: FloatArray, points: FloatArray, weights: FloatArray) -> float:
 
 def apart(P: FloatArray, Q: FloatArray, points: FloatArray, used: BoolArray) -> float:
     """Rms distance [px] between the images of the points ``used`` in two cameras."""
-    squares = ((_pixels(P, points) - _pixels(Q, points)) ** 2).sum(axis=-1)
+    squares = ((pixels_of(P, points) - pixels_of(Q, points)) ** 2).sum(axis=-1)
     return math.sqrt(float(squares[used].sum()) / max(float(used.sum()), 1.0))
