@@ -207,6 +207,8 @@ class Bench:
     encoder: np.ndarray | None = None
     zero_offset: np.ndarray = field(default_factory=lambda: np.zeros(6))
     """What the encoders tell more than the joints stand at."""
+    stamped_late_ns: int = 0
+    """By which the stamps of pictures are later than their shutters."""
     loads: Callable[[Bench], tuple[np.ndarray, np.ndarray]] | None = None
     """Efforts and following errors (6,), (6,) that the drives tell; None: they do not."""
 
@@ -255,7 +257,7 @@ class Bench:
                 CameraObservation(
                     name,
                     self.seq,
-                    self.now_ns,
+                    self.now_ns + self.stamped_late_ns,
                     self.now_ns + 20_000_000,
                     np.flatnonzero(inside),
                     pixels,
