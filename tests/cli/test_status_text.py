@@ -1,4 +1,4 @@
-"""What ``stereoservo status`` says of the joints' loads."""
+"""What ``stereoservo status`` says of the joints' loads and the model's health."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import msgspec
 
 from stereoservo.cli.status import describe
 from stereoservo.gateway.messages import LoopInfo, StateMessage, decode, encode
+from stereoservo.runtime.cycle import CameraHealth, Health
 
 STATE = StateMessage(
     cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
@@ -16,9 +17,12 @@ STATE = StateMessage(
 )  # fmt: skip
 
 
+def said(**fields: Any) -> list[str]:
+    return describe(msgspec.structs.replace(STATE, **fields)).splitlines()
+
+
 def loads(**fields: Any) -> list[str]:
-    lines = describe(msgspec.structs.replace(STATE, **fields)).splitlines()
-    return [line for line in lines if line.startswith("  loads")]
+    return [line for line in said(**fields) if line.startswith("  loads")]
 
 
 def test_drives_that_tell_nothing_are_not_spoken_of() -> None:
@@ -45,3 +49,15 @@ def test_a_state_of_an_older_daemon_is_read() -> None:
     for field in ("efforts", "following_errors", "effort_limits", "following_limits"):
         del tree[field]
     assert decode(msgspec.json.encode(tree), StateMessage) == STATE
+
+
+def test_the_models_health_is_told_camera_by_camera() -> None:
+    assert not [line for line in said() if line.startswith("  model ")]
+    health = Health(
+        "camera_moved", ("left",), text="camera left moved by 42 px rms",
+        cameras={"left": CameraHealth(rms_px=42.0), "up": CameraHealth(rms_px=0.02, place="moving", timing="is late")},
+    )  # fmt: skip
+    told = said(health=health)
+    assert "  model   camera moved: left 42.00 px  up 0.02 px (moving)" in told
+    assert "          camera left moved by 42 px rms" in told
+    assert "          camera up: is late" in told

@@ -30,6 +30,7 @@ def describe(state: StateMessage) -> str:
         f"{state.loop.lateness_us['p99']:.0f} us, max {state.loop.lateness_us['max']:.0f} us",
         "  markers " + "  ".join(f"{camera} {count}" for camera, count in state.visible.items()),
     ]
+    lines += _health(state)
     if state.efforts or state.following_errors:
         lines.append("  loads   " + _loads(state))
     if state.goal:
@@ -43,6 +44,21 @@ def describe(state: StateMessage) -> str:
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)
+
+
+def _health(state: StateMessage) -> list[str]:
+    """How far each camera agrees with the model, what is wrong where it does not, and stamps that are off."""
+    health = state.health
+    if health.verdict == "unknown":
+        return []
+    agreement = "  ".join(
+        f"{name} {camera.rms_px:.2f} px" + (f" ({camera.place})" if camera.place else "")
+        for name, camera in health.cameras.items()
+    )
+    lines = [f"  model   {health.verdict.replace('_', ' ')}: {agreement}"]
+    lines += [f"          {health.text}"] if health.text else []
+    lines += [f"          camera {name}: {c.timing}" for name, c in health.cameras.items() if c.timing]
+    return lines
 
 
 def _loads(state: StateMessage) -> str:
