@@ -29,8 +29,10 @@ BACK_ROUNDS = 30
 """Rounds in which a masked marker must stand where it should, to be used again."""
 STALE_PERIODS = 2.5
 """Frames that are older than so many periods of their camera are left out of a round."""
-LATEST_S = 0.02
-"""By which a busy computer may get a stamp wrong; what looks later than that is something else."""
+LATE_S, LATEST_S = 0.02, 0.15
+"""By which a busy computer may get a stamp wrong; by which at most, where nothing but noise is left then."""
+LATEST_MODEL_PX = 0.1
+"""What the model may be off by besides, at the latest."""
 FEWEST_LEFT = 4
 """Markers of a camera that must remain where others are masked."""
 
@@ -138,9 +140,12 @@ def _judged(watching: Watching, known: list[int], arrays: ModelArrays, settings:
     return diagnosed(arrays, settings, known, watching.sightings[newest].q, innovation, weights)
 
 
-def _likely(innovation: FloatArray, spread: FloatArray, used: FloatArray, settings: CoreSettings) -> bool:
+def _likely(
+    innovation: FloatArray, spread: FloatArray, used: FloatArray, settings: CoreSettings,
+    model_px: float = MODEL_SIGMA_PX,
+) -> bool:  # fmt: skip
     """Whether innovations (k, 2) look like noise, all together and each of them."""
-    chi2, _, _, largest = camera_chi2(innovation, spread, used, MODEL_SIGMA_PX)
+    chi2, _, _, largest = camera_chi2(innovation, spread, used, model_px)
     return chi2 <= _improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
 
 
@@ -157,7 +162,8 @@ def _late(sighting: Sighting, used: FloatArray, settings: CoreSettings) -> bool:
     if abs(late_s) > LATEST_S:
         return False
     rest = sighting.innovation - late_s * sighting.velocity
-    return _likely(rest, sighting.spread, used, settings)
+    model_px = MODEL_SIGMA_PX if abs(late_s) <= LATE_S else LATEST_MODEL_PX
+    return _likely(rest, sighting.spread, used, settings, model_px)
 
 
 def _improbable(freedoms: float) -> float:

@@ -12,7 +12,7 @@ from stereoservo.kinematics.kernels import BoolArray, project_points
 from stereoservo.kinematics.moved_fits_kernel import fit_displacement
 from stereoservo.kinematics.moved_kernel import ROUNDS
 from stereoservo.kinematics.moved_thresholds import chi2_quantile
-from stereoservo.runtime.health import LATEST_S
+from stereoservo.runtime.health import LATE_S
 from stereoservo.runtime.ports import FloatArray
 
 FREEDOMS = 6
@@ -82,7 +82,7 @@ def late_alone(innovation: FloatArray, velocity: FloatArray, weights: FloatArray
     late_s = float((weights[:, None] ** 2 * velocity * innovation).sum()) / square
     rest = weights[:, None] * (innovation - late_s * velocity)
     freedoms = 2 * int((weights > 0.0).sum()) - 1
-    return abs(late_s) <= LATEST_S and float((rest**2).sum()) <= _unexplained(freedoms)
+    return abs(late_s) <= LATE_S and float((rest**2).sum()) <= _unexplained(freedoms)
 
 
 def moved_matrix(P: FloatArray, way: FloatArray) -> FloatArray:
