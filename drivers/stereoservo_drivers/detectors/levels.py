@@ -29,13 +29,15 @@ TERMS = 7
 """Of the levels inside, as :func:`inside` lists them."""
 UNEVEN_INSIDE = 0.005
 """What these terms leave of a dot's own shape, as a part of its contrast: not noise."""
+UNLIKE_EVEN = 0.09
+"""And as a part of what the even terms explain: blur and motion that reach far into the dot (measured: 0.03 to 0.1)."""
 EVEN = 1e6
 """Variance [1/px²] of a slope of which nothing is known."""
 
 
 @kernel
-def _add(sums, x, y, level, times):
-    """Moments of one pixel's place and level into ``sums`` (10,)."""
+def _add(sums, x, y, level, tail, times):
+    """Moments of one pixel's place, level and tail into ``sums`` (15,)."""
     sums[0] += times
     sums[1] += times * level
     sums[2] += times * x
@@ -46,12 +48,18 @@ def _add(sums, x, y, level, times):
     sums[7] += times * x * level
     sums[8] += times * y * level
     sums[9] += times * level * level
+    sums[10] += times * tail
+    sums[11] += times * tail * x
+    sums[12] += times * tail * y
+    sums[13] += times * tail * tail
+    sums[14] += times * tail * level
 
 
 @kernel
 def surroundings(image, dark, background, skirt, reach, out, plane):
-    """Variance of the dot's surroundings about a plane [grey levels squared]; -1 where there is too little
-    to see. ``plane`` (2,) gets its level under the centre above ``background``, and the number of pixels.
+    """Variance of the dot's surroundings about a plane and the tail of the dot's blur [grey levels squared]; -1 where
+    there is too little to see. ``plane`` (2,) gets the plane's level under the centre above ``background``, and the
+    number of pixels.
 
     Pixels off by more than four robust standard deviations (a neighbour's skirt, the plate's edge) do not
     count.
@@ -66,17 +74,19 @@ def surroundings(image, dark, background, skirt, reach, out, plane):
     lo_u, hi_u = max(int(cu - half_u), 0), min(int(cu + half_u) + 1, columns - 1)
     lo_v, hi_v = max(int(cv - half_v), 0), min(int(cv + half_v) + 1, rows - 1)
     histogram = np.zeros(256, np.int32)
-    ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 3))
+    ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 4))
     count = 0
     plane[:] = 0.0
-    sums = np.zeros(10)
+    sums = np.zeros(15)
     sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
     width = 4.0 * skirt * skirt
+    # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
+    fall = 1.0 / ((skirt + RING) ** 2 - skirt * skirt)
     first = lo_u - cu
     for v in range(lo_v, hi_v + 1):
         y = v - cv
         # sums along the row: their powers of y follow
-        si = sx = sxx = sxi = sii = 0.0
+        si = sx = sxx = sxi = sii = st = stx = stt = sti = 0.0
         before = count
         row = image[v, lo_u : hi_u + 1]
         for k in range(row.size):
@@ -84,18 +94,26 @@ def surroundings(image, dark, background, skirt, reach, out, plane):
             gx = q11 * x + q12 * y
             gy = q12 * x + q22 * y
             e = x * gx + y * gy - 1.0
-            if e >= 0.0 and e * e >= width * (gx * gx + gy * gy):
+            g2 = gx * gx + gy * gy
+            if e >= 0.0 and e * e >= width * g2:
                 level = sign * row[k] + zero
+                near = max(1.0 - (0.25 * e * e / g2 - skirt * skirt) * fall, 0.0)
+                tail = near * near * near
                 histogram[int(abs(level))] += 1
                 ring[count, 0] = x
                 ring[count, 1] = y
                 ring[count, 2] = level
+                ring[count, 3] = tail
                 count += 1
                 si += level
                 sx += x
                 sxx += x * x
                 sxi += x * level
                 sii += level * level
+                st += tail
+                stx += tail * x
+                stt += tail * tail
+                sti += tail * level
         n = float(count - before)
         sums[0] += n
         sums[1] += si
@@ -107,23 +125,28 @@ def surroundings(image, dark, background, skirt, reach, out, plane):
         sums[7] += sxi
         sums[8] += si * y
         sums[9] += sii
+        sums[10] += st
+        sums[11] += stx
+        sums[12] += st * y
+        sums[13] += stt
+        sums[14] += sti
     if count < 24:
         return -1.0
     limit = 4.0 * 1.4826 * median_level(histogram, count) + 2.0
     counted = np.ones(count, np.bool_)
-    level0 = slope_x = slope_y = variance = 0.0
+    level0 = slope_x = slope_y = slope_t = variance = 0.0
     for _ in range(2):
         for k in range(count):
-            x, y, level = ring[k, 0], ring[k, 1], ring[k, 2]
-            near = abs(level - level0 - slope_x * x - slope_y * y) <= limit
+            x, y, level, tail = ring[k, 0], ring[k, 1], ring[k, 2], ring[k, 3]
+            near = abs(level - level0 - slope_x * x - slope_y * y - slope_t * tail) <= limit
             if near != counted[k]:
                 # few change sides
                 counted[k] = near
-                _add(sums, x, y, level, 1.0 if near else -1.0)
+                _add(sums, x, y, level, tail, 1.0 if near else -1.0)
         n = sums[0]
         if n < 12.0:
             return -1.0
-        si, sx, sy = sums[1], sums[2], sums[3]
+        si, sx, sy, st = sums[1], sums[2], sums[3], sums[10]
         sxx = sums[4] - sx * sx / n
         sxy = sums[5] - sx * sy / n
         syy = sums[6] - sy * sy / n
@@ -136,9 +159,22 @@ def surroundings(image, dark, background, skirt, reach, out, plane):
         slope_x = (syy * sxi - sxy * syi) / d
         slope_y = (sxx * syi - sxy * sxi) / d
         level0 = (si - slope_x * sx - slope_y * sy) / n
-        variance = max(sii - slope_x * sxi - slope_y * syi, 0.0) / (n - 3.0)
+        plane[0], plane[1] = level0, n
+        left = sii - slope_x * sxi - slope_y * syi
+        # the tail in what the plane leaves
+        stx, sty = sums[11] - st * sx / n, sums[12] - st * sy / n
+        tail_x = (syy * stx - sxy * sty) / d
+        tail_y = (sxx * sty - sxy * stx) / d
+        own = sums[13] - st * st / n - tail_x * stx - tail_y * sty
+        slope_t = 0.0
+        if own > 1e-3:
+            slope_t = (sums[14] - st * si / n - tail_x * sxi - tail_y * syi) / own
+            left -= slope_t * slope_t * own
+            level0 -= slope_t * (st - tail_x * sx - tail_y * sy) / n
+            slope_x -= slope_t * tail_x
+            slope_y -= slope_t * tail_y
+        variance = max(left, 0.0) / (n - 4.0)
         limit = 3.0 * np.sqrt(variance) + 0.5
-    plane[0], plane[1] = level0, n
     # what lies within three standard deviations of a Gaussian has 0.973 of its variance
     return variance / 0.973 if variance > 1.0 else variance
 
@@ -199,8 +235,12 @@ def inside(image, dark, background, contrast, out):
                 g = A[k, i]
                 for j in range(TERMS + 3):
                     A[k, j] -= g * A[i, j]
+    even = -right[0] * right[0] / count
     for i in range(TERMS):
         square -= A[i, TERMS] * right[i]
+        if i not in (1, 2):
+            even += A[i, TERMS] * right[i]
+    square -= UNLIKE_EVEN * UNLIKE_EVEN * max(even, 0.0)
     out[BRIGHT] = max(square, 0.0) / (count - TERMS)
     level = contrast + A[0, TERMS]
     out[SLOPE], out[SLOPE + 1] = A[1, TERMS] / level, A[2, TERMS] / level
