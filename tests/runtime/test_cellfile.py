@@ -118,7 +118,17 @@ CASES = {
         '[[safety.keep_out]]\nname = "a"\nranges = { j1 = [0.5, -0.5] }\n[calibration]',
         ["0.5", "below"],
     ),
-    "unknown law": ("schema = 1", 'schema = 1\n[servo]\nlaw = "magic"', ["magic"]),
+    "unknown law": ("schema = 1", 'schema = 1\n[servo]\nlaw = "magic"', ["magic", "valid: ", "cartesian3"]),
+    "unknown reanchor": (
+        "schema = 1",
+        'schema = 1\n[servo]\nreanchor = "maybe"',
+        ["reanchor", "'maybe'", "valid: auto, off"],
+    ),
+    "unknown mount": (
+        'name = "left"',
+        'name = "left"\nmount = "wall"',
+        ["camera[0].mount", "'wall'", "eye_in_hand, eye_to_hand"],
+    ),
     "spread of nothing": (
         "range = { j1 = 0.3 }",
         'spread = { joint = "j7" }',

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import msgspec.inspect
 from msgspec import Meta
 
 from stereoservo.runtime.commands import LAWS, LawName, Name, PointSource
@@ -372,27 +373,44 @@ def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str 
 
 def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
     """What would have been valid, where msgspec's text does not say it."""
-    if "unknown field" not in text:
-        value: Any = tree
-        for part in key.replace("[", ".[").split("."):
-            if not part:
-                continue
-            try:
-                value = value[int(part.strip("[]"))] if part.startswith("[") else value[part]
-            except (KeyError, IndexError, TypeError, ValueError):
-                return ""
-        return f", got {value!r}" if not isinstance(value, dict | list) else ""
-    sections: dict[str, type[msgspec.Struct]] = {
-        "": CellFile, "cell": CellSection, "joints": JointsSection, "camera": CameraSection, "servo": ServoSection,
-        "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
-        "safety.contact": ContactSection,
-        "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
-        "zenoh.tls": TlsSection, "scene": SceneSection,
-    }  # fmt: skip
-    section = sections.get(".".join(part.split("[")[0] for part in key.split(".")))
+    path = ".".join(part.split("[")[0] for part in key.split("."))
+    if "unknown field" in text:
+        section = _SECTIONS.get(path)
+        if section is None:
+            return ""
+        return f"; known keys: {', '.join(field.encode_name for field in msgspec.structs.fields(section))}"
+    if "Invalid enum value" in text:
+        place, _, name = path.rpartition(".")
+        words = _words_of(_SECTIONS.get(place), name)
+        return f"; valid: {', '.join(words)}" if words else ""
+    value: Any = tree
+    for part in key.replace("[", ".[").split("."):
+        if not part:
+            continue
+        try:
+            value = value[int(part.strip("[]"))] if part.startswith("[") else value[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return ""
+    return f", got {value!r}" if not isinstance(value, dict | list) else ""
+
+
+def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:
+    """What a key of a section takes, where that is one of some words."""
     if section is None:
-        return ""
-    return f"; known keys: {', '.join(field.encode_name for field in msgspec.structs.fields(section))}"
+        return []
+    info = msgspec.inspect.type_info(section)
+    assert isinstance(info, msgspec.inspect.StructType)
+    wanted = next((field.type for field in info.fields if field.encode_name == name), None)
+    return [str(word) for word in wanted.values] if isinstance(wanted, msgspec.inspect.LiteralType) else []
+
+
+_SECTIONS: dict[str, type[msgspec.Struct]] = {
+    "": CellFile, "cell": CellSection, "joints": JointsSection, "camera": CameraSection, "servo": ServoSection,
+    "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
+    "safety.contact": ContactSection,
+    "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
+    "zenoh.tls": TlsSection, "scene": SceneSection,
+}  # fmt: skip
 
 
 __all__ = ["LAWS", "CellFile", "CellFileError", "check_cell", "check_joints", "load_cell_file"]
