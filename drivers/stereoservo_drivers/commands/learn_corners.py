@@ -28,6 +28,7 @@ from stereoservo_drivers.detectors.landmarks import KINDS, ImageArray, encode_la
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PATIENCE_S = 10.0
+LARGEST_PICTURE = 256 << 20
 Sights = dict[str, list[ImageArray]]
 
 
@@ -84,8 +85,11 @@ def learn_corners(
         raise LearnError(
             "argument", "--ask-to-move is for live cameras; files go with --moved or --moved-images"
         )
-    if out.exists() and not force:
-        raise LearnError("exists", f"{out} exists; --force writes over it")
+    for file in (out,) if picture is None else (out, picture):
+        if file.exists() and not force:
+            raise LearnError("exists", f"{file} exists; --force writes over it")
+        if not file.absolute().parent.is_dir():
+            raise LearnError("argument", f"{file}: there is no folder {file.parent} to write it into")
     if picture is not None and picture.suffix.lower() not in SUFFIXES:
         raise LearnError("argument", f"--picture {picture}: one of {', '.join(SUFFIXES)} is valid")
     section = load_cell_file(cell)
@@ -192,6 +196,9 @@ def _folder(cell: CellFile, folder: Path, frames: int) -> Sights:
 def _read(file: Path) -> ImageArray:
     if not file.is_file():
         raise LearnError("images", f"{file}: there is no such file")
+    size = file.stat().st_size
+    if size > LARGEST_PICTURE:
+        raise LearnError("images", f"{file} has {size} bytes; pictures of at most {LARGEST_PICTURE} are read")
     data = np.fromfile(file, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
     if image is None:

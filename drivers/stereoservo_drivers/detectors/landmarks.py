@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import stat
 import zipfile
 from pathlib import Path
 from typing import Any, Literal
@@ -146,7 +147,10 @@ def decode_landmarks(data: bytes, path: Path | str = "<landmarks>") -> Landmarks
 def load_landmarks(path: Path) -> Landmarks:
     """Read and check a file of landmarks. Raises DriverError (``landmarks``)."""
     try:
-        size = path.stat().st_size
+        found = path.stat()
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # a pipe would be waited for
+            raise _bad(path, "is no regular file; `stereoservo learn-corners` writes one")
+        size = found.st_size
         if size > LARGEST_FILE:
             raise _bad(path, f"has {size} bytes; at most {LARGEST_FILE} are read: is it a file of landmarks?")
         return decode_landmarks(path.read_bytes(), path)

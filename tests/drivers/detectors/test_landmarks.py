@@ -232,3 +232,30 @@ def test_a_file_that_exists_is_left_alone(cell, tmp_path, capsys):
     status, answer = run(capsys, cell, tmp_path / "l.npz", "--images", tmp_path)
     assert (status, answer["error"]["code"]) == (1, "exists")
     assert (tmp_path / "l.npz").read_bytes() == b"mine"
+
+
+def test_a_pipe_is_no_file_of_landmarks_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.npz")
+    for path in (tmp_path / "pipe.npz", Path("/dev/zero")):
+        with pytest.raises(DriverError, match="no regular file"):
+            load_landmarks(path)
+
+
+def test_learning_reads_no_huge_picture_and_writes_over_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell, huge = tmp_path / "cell.toml", tmp_path / "huge.png"
+    cell.write_text(CELL)
+    with huge.open("wb") as file:
+        file.truncate(10 << 30)
+    drawn = tmp_path / "drawn.png"
+    drawn.write_bytes(b"mine")
+    pair = ["--pair", str(huge), str(huge), "--json"]
+    for more, out, told in (
+        ([], "out.npz", "10737418240 bytes"),
+        (["--picture", str(drawn)], "out.npz", "drawn.png exists"),
+        ([], "nowhere/out.npz", "there is no folder"),
+    ):
+        assert invoke(["learn-corners", str(cell), str(tmp_path / out), *pair, *more]) == 1
+        assert told in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert drawn.read_bytes() == b"mine"
