@@ -171,3 +171,17 @@ def test_cameras_of_a_running_daemon_are_left_alone(cell: Path, capfd: pytest.Ca
         code, checks = doctor(capfd, str(cell))
     assert code == 0
     assert "the daemon" in checks["cameras"]["message"]
+
+
+def test_one_source_of_two_cameras_is_a_failed_check_and_names_both(
+    cell: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(
+        camera_examination, "hardware_lock_path", lambda *_: tmp_path / "channel-video-0.lock"
+    )
+    code, checks = doctor(capfd, str(cell), "--seconds", "0.1")
+    assert code == 1
+    assert "'left' and 'right' are one and the same camera" in checks["cameras"]["message"]
+    assert "left rate" not in checks
+    with FileLock(tmp_path / "channel-video-0.lock", "released"):
+        pass

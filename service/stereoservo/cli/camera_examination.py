@@ -108,11 +108,20 @@ def examine_cameras(
         yield Finding("cameras", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`")
         return
     with ExitStack() as locks:
+        owners: dict[Path, str] = {}
         try:
             for section in plan.cell.camera:
                 path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
-                if path is not None:
-                    locks.enter_context(FileLock(path, f"camera {section.name!r}"))
+                if path is None:
+                    continue
+                if path in owners:
+                    yield Finding(
+                        "cameras", False, f"{owners[path]!r} and {section.name!r} are one and the same camera",
+                        "camera.options of one of them: each camera has its own",
+                    )  # fmt: skip
+                    return
+                locks.enter_context(FileLock(path, f"camera {section.name!r}"))
+                owners[path] = section.name
         except AlreadyRunningError as error:
             yield Finding("cameras", None, f"not examined: {error}")
             return
