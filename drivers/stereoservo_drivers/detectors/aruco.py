@@ -52,7 +52,7 @@ STATED_PX: dict[str, float] = {"pattern": 0.003, "subpixel": 0.25, "apriltag": 0
 """Standard deviation [px] that each refinement states, beside the noise's where that is known."""
 APRILTAG_OFFSET = 0.5
 """What CORNER_REFINE_APRILTAG adds to each coordinate: its pixels' centres lie at halves."""
-Id = Annotated[int, Meta(ge=0)]
+Id = Annotated[int, Meta(ge=0, le=1_000_000_000)]
 
 
 class TagMarkers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

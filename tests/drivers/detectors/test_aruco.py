@@ -288,6 +288,10 @@ def test_other_refinements_state_their_errors(refinement):
         ({"tags": [1], "markers": [{"tag": 2, "ids": [0, 1, 2, 3]}]}, "at most once"),
         ({"tags": [1, 2], "markers": [{"tag": 2, "ids": [4, 1, 2, 3]}]}, r"\[4\] are used twice"),
         ({"tags": [1], "floor_px": -1.0}, "floor_px"),
+        (
+            {"tags": [1], "first_marker": 2**63 - 1},
+            "first_marker = 9223372036854775807; valid: .* 0 to 1000000000",
+        ),
     ],
 )
 def test_bad_options_are_refused_by_name(options, words):
