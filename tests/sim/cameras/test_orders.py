@@ -74,3 +74,11 @@ def test_every_order_is_helped_with_and_can_be_done() -> None:
         assert line.split()[0] == verb
     assert set(_ACTS) | {"swap", "status", "help"} == set(GRAMMAR)
     assert set(LASTING) <= set(GRAMMAR)
+
+
+@pytest.mark.parametrize("number", ["1000001", "9" * 20, "9" * 400])
+def test_a_time_without_end_is_refused(number):
+    for order in (f"latency left {number}s", f"freeze left for {number}s", f"freeze left @ {number}s"):
+        with pytest.raises(OrderError, match="up to 1000000 s is valid"):
+            parse_order(order)
+    assert parse_order("latency left 1000000s").time_ns == 10**15
