@@ -146,7 +146,7 @@ def _word(wanted: Any) -> str:
         case inspect.BoolType():
             return "true or false"
         case inspect.StrType():
-            return "a text in quotes"
+            return "a text in quotes" + (f" that matches {wanted.pattern}" if wanted.pattern else "")
         case inspect.DictType():
             return f"a table of {{ NAME = {_words(wanted.value_type)} }}"
         case inspect.VarTupleType() | inspect.ListType() if isinstance(wanted.item_type, inspect.StructType):

@@ -47,7 +47,7 @@ def test_the_shipped_cell_is_unsynchronised_and_told_its_latency():
         ("quality = 95 ", "quality = 0 ", "quality = 0"),
         ('camera]]\nname = "right"\nrate', 'camera]]\nname = "left"\nrate', "name 'left' is used twice"),
         ("skew_ms = 15.0", 'skew_ms = 15.0\npath = "/left.mjpg"', "path '/left.mjpg' is used twice"),
-        ("skew_ms = 15.0", 'path = "left"', "path ="),
+        ("skew_ms = 15.0", 'path = "left"', 'path = "left"; valid: a text in quotes that matches ^(/[A-Za-z'),
         ("[emulate.cameras]\n", '[emulate.cameras]\nhost = "0.0.0.0"\n', "host ="),
     ],
 )  # fmt: skip
