@@ -19,6 +19,9 @@ ProgressCall = Callable[[str, int, int], None]
 NEAR = (0.8, 1.2)
 """Distances [m] at which a dot's diameter is 13 to 20 px; 1.6 m: 10 px."""
 ROWS: dict[str, Conditions] = {
+    "detection: up to all of it": Conditions(
+        tilt=70.0, distance=NEAR, blur=1.5, noise=10.0, gradient=0.5, clutter=9, drawn=True
+    ),
     "detection: all at once": Conditions(
         tilt=70.0, distance=NEAR, blur=1.5, noise=10.0, gradient=0.5, clutter=9
     ),

@@ -6,7 +6,7 @@ pixels sample it), lit, and only then given noise and whole grey levels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ class Conditions:
     ``gradient`` of the light lost from the left border to the right, ``clutter`` dots, ``banding`` amplitude over
     ``band_rows`` rows, ``shot`` variance a grey level [levels], ``gain`` of the light between two bounds (255 is
     white), ``cut``: depth to which a dark edge covers one dot of each face [px], ``jpeg`` quality (0: none),
-    ``motion`` [px].
+    ``motion`` [px]. ``drawn``: blur, noise, gradient and clutter of each picture are uniform between none and these.
     """
 
     tilt: float = 50.0
@@ -48,6 +48,16 @@ class Conditions:
     cut: float = 0.0
     jpeg: int = 0
     motion: float = 0.0
+    drawn: bool = False
+
+    def of_a_picture(self, rng: np.random.Generator) -> Conditions:
+        """The conditions of one picture."""
+        if not self.drawn:
+            return self
+        blur, noise, gradient = rng.uniform(0.0, 1.0, 3) * (self.blur, self.noise, self.gradient)
+        return replace(
+            self, blur=blur, noise=noise, gradient=gradient, clutter=int(rng.integers(self.clutter + 1))
+        )
 
 
 def look(tilt: float, azimuth: float, roll: float, distance: float, at: FloatArray) -> FloatArray:
@@ -78,6 +88,7 @@ def circle_conic(H: FloatArray, centre: FloatArray, radius: float) -> FloatArray
 
 def random_picture(conditions: Conditions, rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
     """A picture (HEIGHT, WIDTH) with both faces side by side and its dots' centres (14, 2) [px]."""
+    conditions = conditions.of_a_picture(rng)
     z = rng.uniform(*conditions.distance)
     image = np.full((HEIGHT, WIDTH), BLACK, np.float32)
     truth, conics = [], []
