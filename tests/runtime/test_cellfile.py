@@ -211,3 +211,18 @@ def test_thresholds_for_what_the_drives_do_not_tell_are_refused(
     core_settings(cell, DRIVE, (CAMERA,))
     with pytest.raises(CellFileError, match=f"safety.contact.{key}: states thresholds, and driver 'fake'"):
         core_settings(cell, msgspec.structs.replace(DRIVE, lacks=(lacks,)), (CAMERA,))
+
+
+@pytest.mark.parametrize(
+    ("static", "told"),
+    [
+        ("[9]", r"no camera's detector reports marker\(s\) 9; reported: 0, 1, 2, 3"),
+        ("[0, 1]", "leaves 2 of the 4 markers that the detectors report to the body .* calibration needs 3"),
+    ],
+)
+def test_static_markers_are_known_ones_and_leave_a_body(tmp_path: Path, static: str, told: str) -> None:
+    good = GOOD.replace("[calibration]\n", "[calibration]\nmin_markers = 3\n")
+    assert good != GOOD
+    assert settings(tmp_path, f"{good}\n[scene]\nstatic = [3]\n").scene_ids == (3,)
+    with pytest.raises(CellFileError, match=f"scene.static: {told}"):
+        settings(tmp_path, f"{good}\n[scene]\nstatic = {static}\n")

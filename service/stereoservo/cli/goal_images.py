@@ -1,4 +1,4 @@
-"""Set-points from recorded pictures: ``goal CELL --images DIR``, ``teach CELL NAME --images DIR``."""
+"""Set-points from recorded pictures: ``goal CELL --images DIR``."""
 
 from __future__ import annotations
 

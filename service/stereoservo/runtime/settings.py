@@ -207,6 +207,15 @@ def _scene_ids(cell: CellFile, cameras: tuple[CameraSettings, ...]) -> tuple[int
             f"no camera's detector reports marker(s) {', '.join(str(i) for i in unknown)}; reported: "
             f"{', '.join(str(i) for i in sorted(known))}",
         )
+    body = known - set(cell.scene.static)
+    needed = 3 if cell.calibration is None else cell.calibration.min_markers
+    if cell.scene.static and len(body) < needed:
+        raise CellFileError(
+            cell.cell.name,
+            "scene.static",
+            f"leaves {len(body)} of the {len(known)} markers that the detectors report to the body that the arm moves, "
+            f"and calibration needs {needed}: name only what stands still for good",
+        )
     return tuple(sorted(set(cell.scene.static)))
 
 

@@ -69,7 +69,9 @@ class CameraServer:
         except OSError as error:
             os.close(self._wake_read)
             os.close(self._wake_write)
-            raise EmulationError(f"cannot listen on 127.0.0.1:{port}: {error.strerror}") from error
+            raise EmulationError(
+                f"cannot listen on 127.0.0.1:{port}: {error.strerror}; another port, or 0 for a free one, would do"
+            ) from error
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
