@@ -27,11 +27,11 @@ from stereoservo.runtime.ports import (
 )
 from stereoservo_drivers.detectors import tag_registration
 from stereoservo_drivers.detectors.blobs import noise_level
+from stereoservo_drivers.detectors.frame_images import SMALLEST_IMAGE, sized_image
 from stereoservo_drivers.detectors.tag_registration import register_tag
 from stereoservo_drivers.detectors.tags import DictionaryName, dictionary, size_of, tag_cells
 from stereoservo_drivers.options import invalid
 
-SMALLEST_IMAGE = 32
 NOISY = 3.0
 """Noise [grey levels] from which the image that is searched, not the one that is measured, is smoothed."""
 SAME_TAG = 0.25
@@ -123,7 +123,8 @@ class TagDetector:
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """Tags of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
-        image = self._checked(frame)
+        image = sized_image(frame, self.camera, self._size)
+        self._size = (image.shape[1], image.shape[0])
         expected = self._expected(frame, prior)
         found: dict[int, _Found] = {}
         for tag, places in expected.items():
@@ -134,31 +135,6 @@ class TagDetector:
         if missing:
             found |= self._search(image, missing, expected)
         return self._observation(frame, found)
-
-    def _checked(self, frame: Frame) -> ImageArray:
-        image = frame.image
-        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
-            shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
-            raise DriverError(
-                "image_format",
-                f"camera {self.camera!r}: image of shape {shape}, {kind}; expected (height, width) of uint8",
-                shape=shape,
-                dtype=str(kind),
-            )
-        height, width = image.shape
-        if self._size is None and min(width, height) >= SMALLEST_IMAGE:
-            self._size = (width, height)
-        if (width, height) != self._size:
-            expected = (
-                f"{self._size[0]}x{self._size[1]}" if self._size else f"at least {SMALLEST_IMAGE} a side"
-            )
-            raise DriverError(
-                "image_size",
-                f"camera {self.camera!r}: image of {width}x{height} px; expected {expected}",
-                size=(width, height),
-                expected=self._size,
-            )
-        return np.ascontiguousarray(image)
 
     def _expected(self, frame: Frame, prior: Prior | None) -> dict[int, tuple[FloatArray, FloatArray]]:
         """Where a fresh prior puts all four corners of a tag: places (4, 2) and standard deviations (4,) [px]."""

@@ -25,6 +25,7 @@ from stereoservo.runtime.ports import (
     Frame,
     Prior,
 )
+from stereoservo_drivers.detectors.frame_images import gray_image
 from stereoservo_drivers.detectors.keypoint_matches import Keypoints, find_keypoints
 from stereoservo_drivers.detectors.landmark_search import (
     Surroundings,
@@ -166,15 +167,7 @@ class CornerDetector:
         return Keypoints(keypoints.pixels[near], keypoints.descriptors[near])
 
     def _checked(self, frame: Frame) -> ImageArray:
-        image = frame.image
-        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
-            shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
-            raise DriverError(
-                "image_format",
-                f"camera {self.camera!r}: image of shape {shape}, {kind}; expected (height, width) of uint8",
-                shape=shape,
-                dtype=str(kind),
-            )
+        image = gray_image(frame, self.camera)
         if image.shape != self._shape:
             (height, width), (h, w) = image.shape, self._shape
             raise DriverError(

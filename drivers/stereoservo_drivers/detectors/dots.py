@@ -28,10 +28,10 @@ from stereoservo_drivers.detectors.blobs import find_spots
 from stereoservo_drivers.detectors.centroids import measure_windows
 from stereoservo_drivers.detectors.components import scratch
 from stereoservo_drivers.detectors.faces import FaceOptions, Positive, patterns_of
+from stereoservo_drivers.detectors.frame_images import sized_image
 from stereoservo_drivers.detectors.measurements import FIELDS
 from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, settle_face
 
-SMALLEST_IMAGE = 32
 SAME_SPOT_PX = 2.0
 """A spot this near to a dot that was tracked is that dot."""
 
@@ -123,7 +123,8 @@ class DotDetector:
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """Dots of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
-        image = self._checked(frame)
+        image = sized_image(frame, self.camera, self._size)
+        self._size = (image.shape[1], image.shape[0])
         if prior is not None and self._fresh(frame, prior):
             found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9)
             if found[1].sum() >= self.options.min_dots:
@@ -147,31 +148,6 @@ class DotDetector:
     def _fresh(self, frame: Frame, prior: Prior) -> bool:
         age_s = abs(frame.t_shutter_ns - prior.t_ns) * 1e-9
         return len(prior.ids) > 0 and age_s <= self.options.max_prior_age_s
-
-    def _checked(self, frame: Frame) -> ImageArray:
-        image = frame.image
-        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
-            shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
-            raise DriverError(
-                "image_format",
-                f"camera {self.camera!r}: image of shape {shape}, {kind}; expected (height, width) of uint8",
-                shape=shape,
-                dtype=str(kind),
-            )
-        height, width = image.shape
-        if self._size is None and min(width, height) >= SMALLEST_IMAGE:
-            self._size = (width, height)
-        if (width, height) != self._size:
-            expected = (
-                f"{self._size[0]}x{self._size[1]}" if self._size else f"at least {SMALLEST_IMAGE} a side"
-            )
-            raise DriverError(
-                "image_size",
-                f"camera {self.camera!r}: image of {width}x{height} px; expected {expected}",
-                size=(width, height),
-                expected=self._size,
-            )
-        return np.ascontiguousarray(image)
 
     def _track(self, image: ImageArray, prior: Prior, dt_s: float) -> _Found:
         options = self.options

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from stereoservo_sim.emulation.errors import OrderError
+from stereoservo_sim.emulation.orders import misused, split_order, usage_lines
 from stereoservo_sim.emulation.times import duration_ns
 
 ALL = "all"
@@ -38,31 +39,21 @@ class Order(msgspec.Struct, frozen=True):
 
 def parse_order(text: str) -> Order:
     """An order from its text, e.g. ``freeze left for 2s @ 1.5s``. Raises OrderError."""
-    body, at, when = text.partition("@")
-    words = body.split()
-    if not words:
-        raise OrderError(f"an empty order; orders: {', '.join(GRAMMAR)}")
-    verb = words[0].lower()
-    if verb not in GRAMMAR:
-        raise OrderError(f"no order {words[0]!r}; orders: {', '.join(GRAMMAR)} (`help` explains them)")
-    parser, usage, _ = GRAMMAR[verb]
+    verb, words, at_ns = split_order(text, GRAMMAR)
     try:
-        words, lasting = _lasting(verb, words[1:])
-        order = parser(verb, words)
-        return msgspec.structs.replace(order, for_ns=lasting, at_ns=duration_ns(when.strip()) if at else None)
+        words, lasting = _lasting(verb, words)
+        return msgspec.structs.replace(GRAMMAR[verb][0](verb, words), for_ns=lasting, at_ns=at_ns)
     except OrderError as error:
-        raise OrderError(f"{text.strip()!r}: {error}; usage: {usage}") from None
+        raise misused(text, verb, GRAMMAR, error) from None
 
 
 def help_lines() -> list[str]:
     """One line an order."""
-    width = max(len(usage) for _, usage, _ in GRAMMAR.values())
-    lines = [f"{usage:<{width}}  {meaning}" for _, usage, meaning in GRAMMAR.values()]
-    return [
-        *lines,
-        f"{'ORDER for TIME':<{width}}  taken back after that time, e.g. `freeze left for 2s`; CAM may be all",
-        f"{'ORDER @ TIME':<{width}}  at that time after the start, e.g. `freeze left for 2s @ 1.5s`",
-    ]
+    return usage_lines(
+        GRAMMAR,
+        ("ORDER for TIME", "taken back after that time, e.g. `freeze left for 2s`; CAM may be all"),
+        ("ORDER @ TIME", "at that time after the start, e.g. `freeze left for 2s @ 1.5s`"),
+    )
 
 
 def _lasting(verb: str, words: list[str]) -> tuple[list[str], int]:
