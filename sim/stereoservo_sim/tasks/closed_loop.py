@@ -247,6 +247,10 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         metric_basis=None,
         marker_ids=tuple(range(m)),
         index={i: i for i in range(m)},
+        scene_ids=(),
+        scene_points=np.zeros((0, 4)),
+        scene_pixels=np.zeros((len(knowledge.matrices), 0, 2)),
+        rows={i: i for i in range(m)},
     )
 
 

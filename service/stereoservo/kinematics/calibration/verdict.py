@@ -40,6 +40,10 @@ STRATA: dict[Stratum, str] = {
 """What a stratum means for who works with the cell."""
 
 CURES = {
+    "too_few_points": "show the moved camera more markers, or static ones ([scene] static), or move the arm before it",
+    "points_coplanar": "show the moved camera markers off one plane: a second face, static ones, another pose",
+    "not_explained": "did markers slip, did a joint's zero or another camera move as well? Calibrate, or check, anew",
+    "too_uncertain": "let the moved camera see more: more markers, static ones ([scene] static), another pose",
     "bad_data": "the data are damaged or not of this cell: look at the text, record anew",
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
     "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
