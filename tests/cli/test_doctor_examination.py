@@ -9,10 +9,13 @@ from typing import Any
 
 import pytest
 
+from stereoservo.cli import examination as examination_module
 from stereoservo.cli import main as cli
 from stereoservo.runtime.directories import cell_directories, create_directories
+from stereoservo.runtime.interprocess import RunPlan
 from stereoservo.runtime.locks import FileLock
-from stereoservo.runtime.ports import DriverError, Finding
+from stereoservo.runtime.ports import Clock, DriverError, Finding
+from stereoservo.runtime.servo import make_driver
 from stereoservo_drivers.fake import FakeJointDriver
 
 Doctor = Callable[..., tuple[int, list[dict[str, Any]]]]
@@ -42,10 +45,18 @@ class Examination:
 def examination(monkeypatch: pytest.MonkeyPatch) -> Examination:
     found = Examination()
 
-    def examine(driver: FakeJointDriver, may_move: Callable[[str], bool]) -> Iterator[Finding]:
-        return found(driver, may_move)
+    class ExaminableFake(FakeJointDriver):
+        """A class of its own: what a protocol's isinstance has once said of a class, it keeps."""
 
-    monkeypatch.setattr(FakeJointDriver, "examine", examine, raising=False)
+        def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+            return found(self, may_move)
+
+    def make(plan: RunPlan, clock: Clock) -> FakeJointDriver:
+        driver = make_driver(plan, clock)
+        driver.__class__ = ExaminableFake
+        return driver
+
+    monkeypatch.setattr(examination_module, "make_driver", make)
     return found
 
 
