@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from stereoservo.runtime.ports import (
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
     CommandReport,
@@ -22,10 +22,9 @@ from stereoservo.runtime.ports import (
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
 from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
-from stereoservo_sim.drives.bank import DriveBank, IdealPlant, Plant
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world.simulated_cell import demo_cell
+from stereoservo_sim.world.velocity_drives import DriveBank, IdealPlant, Plant
 
-FloatArray = npt.NDArray[np.float64]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Count = Annotated[int, Meta(ge=1)]

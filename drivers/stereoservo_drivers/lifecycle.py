@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 
 
-class State(StrEnum):
+class LifecycleState(StrEnum):
     """Where a driver stands. From CLOSED a camera driver can be configured again, a joint driver cannot."""
 
     CREATED = "created"
@@ -16,7 +16,11 @@ class State(StrEnum):
     CLOSED = "closed"
 
 
-_CODES = {State.CREATED: "not_configured", State.CONFIGURED: "not_active", State.CLOSED: "closed"}
+_CODES = {
+    LifecycleState.CREATED: "not_configured",
+    LifecycleState.CONFIGURED: "not_active",
+    LifecycleState.CLOSED: "closed",
+}
 
 
 class DriverLifecycle:
@@ -24,9 +28,9 @@ class DriverLifecycle:
 
     def __init__(self, what: str) -> None:
         self.what = what
-        self.state = State.CREATED
+        self.state = LifecycleState.CREATED
 
-    def require(self, call: str, *allowed: State) -> None:
+    def require(self, call: str, *allowed: LifecycleState) -> None:
         """Raise DriverError (``not_configured``, ``not_active``, ``closed``, ``state``) unless in an
         allowed state.
         """

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 
 T = TypeVar("T", bound=msgspec.Struct)
 

@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stereoservo_drivers.detectors.plates import FACES, DotFace
-from stereoservo_drivers.detectors.tags import DICTIONARIES, cells_along, size_of, tag_cells
+from stereoservo.ports.dot_plates import FACES, DotFace
+from stereoservo_drivers.detectors.tag_registration import DICTIONARIES, cells_along, size_of, tag_cells
 
 Polarity = Literal["light", "dark"]
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}

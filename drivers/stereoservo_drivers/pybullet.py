@@ -10,20 +10,19 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from stereoservo.runtime.ports import CameraDescription, DriverContext, DriverError, Frame
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraDescription, DriverContext, DriverError, Frame
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
 from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
-from stereoservo_sim.drives.bank import Plant
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world.simulated_cell import demo_cell
+from stereoservo_sim.world.velocity_drives import Plant
 
 if TYPE_CHECKING:
-    from stereoservo_sim.rendering import Renderer
+    from stereoservo_sim.world.rendering import Renderer
 
-FloatArray = npt.NDArray[np.float64]
 NonNegative = Annotated[float, Meta(ge=0)]
 
 
@@ -45,7 +44,7 @@ class PybulletJointDriver(SimulatedArm):
 
     def make_plant(self, positions: FloatArray) -> Plant:
         """The arm in a physics engine of its own. Raises DriverError."""
-        from stereoservo_sim.physics import PhysicsError, PybulletPlant
+        from stereoservo_sim.world.physics import PhysicsError, PybulletPlant
 
         try:
             return PybulletPlant(self._robot, positions, self.step_ns * 1e-9)
@@ -86,7 +85,7 @@ class PybulletCameraDriver(SimulatedCamera):
             self._renderer.render(self.cell.base, np.random.default_rng(0))
 
     def _draw_anew(self) -> Renderer:
-        from stereoservo_sim.rendering import Renderer, RenderSettings
+        from stereoservo_sim.world.rendering import Renderer, RenderSettings
 
         options = self._render
         settings = RenderSettings(

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from stereoservo.runtime.ports import (
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import (
     CommandReport,
     DriverContext,
     DriverError,
@@ -18,11 +18,10 @@ from stereoservo.runtime.ports import (
     JointSpec,
     JointState,
 )
-from stereoservo_drivers.lifecycle import DriverLifecycle, State
-from stereoservo_sim.drives.bank import DriveBank, Plant
-from stereoservo_sim.history import CAPACITY, FILE_NAME, HistoryError, JointHistory
+from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
+from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
+from stereoservo_sim.world.velocity_drives import DriveBank, Plant
 
-FloatArray = npt.NDArray[np.float64]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 
@@ -68,7 +67,7 @@ class SimulatedArm:
         self._start = _start(self.driver, joints, base, options.start)
         self._life = DriverLifecycle(f"joint driver {self.driver!r}")
         self._bank: DriveBank | None = None
-        self._history: JointHistory | None = None
+        self._history: TrueJointHistory | None = None
         self._seq = 0
         self._write_seq = 0
         self._last_ns = 0
@@ -91,8 +90,8 @@ class SimulatedArm:
 
     def configure(self) -> None:
         """Set the arm up where it was left. Raises DriverError."""
-        self._life.require("configure()", State.CREATED, State.CONFIGURED)
-        if self._life.state is State.CONFIGURED:
+        self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
+        if self._life.state is LifecycleState.CONFIGURED:
             return
         now_ns = self._context.clock.now_ns()
         self._history = self._open_history(now_ns)
@@ -106,16 +105,16 @@ class SimulatedArm:
             timeout_ns=round(self._options.command_timeout_s * 1e9),
         )
         self._record(self._bank)
-        self._life.state = State.CONFIGURED
+        self._life.state = LifecycleState.CONFIGURED
 
     def activate(self) -> None:
         """Brakes off, at rest. Raises DriverError."""
-        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
-        self._life.state = State.ACTIVE
+        self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
+        self._life.state = LifecycleState.ACTIVE
 
     def read_state(self) -> JointState:
         """Encoders, motors' efforts and following errors now. Raises DriverError."""
-        self._life.require("read_state()", State.CONFIGURED, State.ACTIVE)
+        self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         bank = self._advance()
         self._seq += 1
         positions = self.encode(bank.plant.positions)
@@ -126,7 +125,7 @@ class SimulatedArm:
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
         """Command (n,) velocities. Raises DriverError: not active, wrong shape, not finite."""
-        self._life.require("write_velocity()", State.ACTIVE)
+        self._life.require("write_velocity()", LifecycleState.ACTIVE)
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (len(self._joints),):
             raise DriverError(
@@ -144,15 +143,15 @@ class SimulatedArm:
 
     def stop(self) -> None:
         """Brake to rest. Any state; never raises."""
-        if self._bank is not None and self._life.state in (State.CONFIGURED, State.ACTIVE):
+        if self._bank is not None and self._life.state in (LifecycleState.CONFIGURED, LifecycleState.ACTIVE):
             self._bank.brake(self._context.clock.now_ns())
             self._record(self._bank)
 
     def deactivate(self) -> None:
         """Brake; commands are refused from now on. Idempotent."""
-        if self._life.state is State.ACTIVE:
+        if self._life.state is LifecycleState.ACTIVE:
             self.stop()
-            self._life.state = State.CONFIGURED
+            self._life.state = LifecycleState.CONFIGURED
 
     def close(self) -> None:
         """Brake, release. Idempotent; never raises."""
@@ -163,7 +162,7 @@ class SimulatedArm:
             self._history.close()
         self._bank = None
         self._history = None
-        self._life.state = State.CLOSED
+        self._life.state = LifecycleState.CLOSED
 
     def encode(self, positions: FloatArray) -> FloatArray:
         """What encoders of the given resolution say, (n,)."""
@@ -189,17 +188,19 @@ class SimulatedArm:
         if self._history is not None:
             self._history.append(bank.t_ns, bank.plant.positions, bank.plant.velocities)
 
-    def _open_history(self, now_ns: int) -> JointHistory:
+    def _open_history(self, now_ns: int) -> TrueJointHistory:
         shared = self._context.services.get("world")
         if shared is not None:
-            if not isinstance(shared, JointHistory) or shared.joints != len(self._joints):
+            if not isinstance(shared, TrueJointHistory) or shared.joints != len(self._joints):
                 raise DriverError(
                     "world", f"services['world'] must be a JointHistory of {len(self._joints)} joints"
                 )
             return shared
         path = self._context.runtime_dir / FILE_NAME
         try:
-            return JointHistory.create(path, len(self._joints), now_ns=now_ns, capacity=self._options.history)
+            return TrueJointHistory.create(
+                path, len(self._joints), now_ns=now_ns, capacity=self._options.history
+            )
         except HistoryError as error:
             raise DriverError("history", str(error), path=str(path)) from error
 

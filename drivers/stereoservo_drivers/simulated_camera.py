@@ -9,16 +9,15 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from stereoservo.runtime.ports import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
-from stereoservo_drivers.lifecycle import DriverLifecycle, State
-from stereoservo_sim.history import FILE_NAME, HistoryError, JointHistory
-from stereoservo_sim.workpiece import Moved, MovedFile, MovedFileError
-from stereoservo_sim.world import SimulatedCell, simulated_cell, workpiece_cell
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
+from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
+from stereoservo_sim.world.history import FILE_NAME, HistoryError, TrueJointHistory
+from stereoservo_sim.world.simulated_cell import SimulatedCell, simulated_cell, workpiece_cell
+from stereoservo_sim.world.workpiece import Moved, MovedFile, MovedFileError
 
-FloatArray = npt.NDArray[np.float64]
 NonNegative = Annotated[float, Meta(ge=0)]
 HOLD_NS = 100_000_000
 
@@ -37,7 +36,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
     what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: one stands
     beside the body; where, the file ``simulated-workpiece.json`` there tells for every frame
-    (`stereoservo_sim.workpiece`).
+    (`stereoservo_sim.world.workpiece`).
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
     ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
     after activation without frames; ``freeze_after_s``: from then on the picture stands still though frames keep
@@ -95,7 +94,7 @@ class SimulatedCamera:
                 k1=options.k1,
             )
         self._life = DriverLifecycle(f"camera driver {self.driver!r} ({self.name})")
-        self._history: JointHistory | None = None
+        self._history: TrueJointHistory | None = None
         self._seed = context.seed if options.seed is None else options.seed
         self._period_ns = 1e9 / options.rate_hz
         told_s = options.latency_s if options.told_latency_s is None else options.told_latency_s
@@ -154,20 +153,22 @@ class SimulatedCamera:
 
     def configure(self) -> None:
         """Nothing to connect to: the arm may start later; also after :meth:`close`. Raises DriverError."""
-        self._life.require("configure()", State.CREATED, State.CONFIGURED, State.CLOSED)
-        self._life.state = State.CONFIGURED
+        self._life.require(
+            "configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED
+        )
+        self._life.state = LifecycleState.CONFIGURED
 
     def activate(self) -> None:
         """Frames from the next shutter on. Raises DriverError."""
-        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
-        if self._life.state is State.CONFIGURED:
+        self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
+        if self._life.state is LifecycleState.CONFIGURED:
             self._activated_ns = self._context.clock.now_ns()
             self._next = self._grid(self._activated_ns) + 1
-        self._life.state = State.ACTIVE
+        self._life.state = LifecycleState.ACTIVE
 
     def poll(self) -> list[Frame] | list[CameraObservation]:
         """The newest frame that has arrived since the last poll, or nothing. Raises DriverError."""
-        self._life.require("poll()", State.ACTIVE)
+        self._life.require("poll()", LifecycleState.ACTIVE)
         now_ns = self._context.clock.now_ns()
         k = self._grid(now_ns - round(self._options.latency_s * 1e9))
         if k < self._next:
@@ -187,8 +188,8 @@ class SimulatedCamera:
 
     def deactivate(self) -> None:
         """No more frames. Idempotent."""
-        if self._life.state is State.ACTIVE:
-            self._life.state = State.CONFIGURED
+        if self._life.state is LifecycleState.ACTIVE:
+            self._life.state = LifecycleState.CONFIGURED
 
     def close(self) -> None:
         """Release. Idempotent; never raises."""
@@ -196,7 +197,7 @@ class SimulatedCamera:
         if self._history is not None and self._history.path is not None:
             self._history.close()
         self._history = None
-        self._life.state = State.CLOSED
+        self._life.state = LifecycleState.CLOSED
 
     def _grid(self, t_ns: int) -> int:
         k = int((t_ns - self._options.phase_s * 1e9) // self._period_ns)
@@ -242,9 +243,9 @@ class SimulatedCamera:
         except MovedFileError as error:
             raise DriverError("workpiece", str(error), path=str(self._workpiece.path)) from error
 
-    def _open_history(self, now_ns: int) -> JointHistory | None:
+    def _open_history(self, now_ns: int) -> TrueJointHistory | None:
         shared = self._context.services.get("world")
-        if isinstance(shared, JointHistory):
+        if isinstance(shared, TrueJointHistory):
             return self._checked(shared)
         if self._history is not None:
             newest = self._history.newest()
@@ -256,12 +257,12 @@ class SimulatedCamera:
         path = self._context.runtime_dir / FILE_NAME
         if path.exists():
             try:
-                self._history = self._checked(JointHistory.open(path))
+                self._history = self._checked(TrueJointHistory.open(path))
             except HistoryError as error:
                 raise DriverError("history", str(error), path=str(path)) from error
         return self._history
 
-    def _checked(self, history: JointHistory) -> JointHistory:
+    def _checked(self, history: TrueJointHistory) -> TrueJointHistory:
         joints = len(self.cell.robot.joints)
         if history.joints != joints:
             raise DriverError(

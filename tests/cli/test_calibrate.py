@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stereoservo.calibration.trial_data import save_trials
 from stereoservo.cli import main as cli
-from stereoservo.cli import stored_trials
+from stereoservo.cli.calibrate import stored_trials
 from stereoservo.geometry.distortion import distort
-from stereoservo.kinematics.calibration.trials import save_trials
 from stereoservo.kinematics.model import load_model
-from stereoservo.runtime.directories import cell_directories
-from stereoservo.runtime.locks import FileLock
-from stereoservo_sim.synthetic import SyntheticCell, rx90
+from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.locks import FileLock
+from stereoservo_sim.world.synthetic import SyntheticCell, rx90
 
 SIGMA = 0.05
 Run = Callable[..., tuple[int, Any]]

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.cli import camera_examination
 from stereoservo.cli import main as cli
-from stereoservo.cli.camera_examination import WatchedCamera, annotated
-from stereoservo.runtime.camera_examination import CameraRecord
-from stereoservo.runtime.directories import cell_directories, create_directories
-from stereoservo.runtime.locks import FileLock
-from stereoservo.runtime.ports import (
+from stereoservo.cli.doctor import cameras
+from stereoservo.cli.doctor.camera_findings import CameraRecord
+from stereoservo.cli.doctor.cameras import WatchedCamera, annotated
+from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.locks import FileLock
+from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
     CameraStatistics,
@@ -156,7 +156,7 @@ def test_a_camera_that_cannot_be_opened_is_a_failed_check(
     monkeypatch.setattr(FakeCameraDriver, "configure", configure)
     monkeypatch.setattr(FakeCameraDriver, "activate", lambda _: None)
     monkeypatch.setattr(FakeCameraDriver, "poll", lambda _: [])
-    monkeypatch.setattr(camera_examination, "FIRST_FRAME_S", 0.1)
+    monkeypatch.setattr(cameras, "FIRST_FRAME_S", 0.1)
     code, checks = doctor(capfd, str(cell), "--seconds", "0.1")
     assert code == 1
     assert checks["camera left"]["message"] == "left: the lens cap is on"
@@ -176,9 +176,7 @@ def test_cameras_of_a_running_daemon_are_left_alone(cell: Path, capfd: pytest.Ca
 def test_one_source_of_two_cameras_is_a_failed_check_and_names_both(
     cell: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(
-        camera_examination, "hardware_lock_path", lambda *_: tmp_path / "channel-video-0.lock"
-    )
+    monkeypatch.setattr(cameras, "hardware_lock_path", lambda *_: tmp_path / "channel-video-0.lock")
     code, checks = doctor(capfd, str(cell), "--seconds", "0.1")
     assert code == 1
     assert "'left' and 'right' are one and the same camera" in checks["cameras"]["message"]

@@ -9,7 +9,11 @@ from typing import Any
 import pytest
 
 from stereoservo.cli import main as cli
-from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.client import InvalidReplyError
+from stereoservo.daemon.seqlock import create_stop_slot
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.wire import MessageError
 
 Run = Callable[..., tuple[int, Any, str]]
 
@@ -147,6 +151,22 @@ def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: R
     assert run("ls") == (0, {"cells": []}, "")
 
 
+def test_stop_takes_the_stop_slot_where_something_strange_answers(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def strange(*_: object, **__: object) -> None:
+        raise InvalidReplyError("command/stop", MessageError("payload is not JSON"))
+
+    monkeypatch.setattr("stereoservo.cli.stop.Client", strange)
+    slot = cell_directories("demo").stop_slot
+    slot.parent.mkdir(parents=True)
+    create_stop_slot(slot)
+    code, result, err = run("stop", "demo")
+    assert code == 1
+    assert result["error"]["code"] == "not_acknowledged"  # there is no servo process
+    assert "raising the stop slot" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -154,7 +174,7 @@ def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: R
         (("goal", "nowhere", "pick", "--joint", "j1=0"), "one of NAME"),
         (("goal", "nowhere", "--joint", "j1=nan"), "NAME=NUMBER with a finite number"),
         (("goal", "nowhere", "--joint", "j1"), "NAME=NUMBER"),
-        (("goal", "nowhere", "pick", "--law", "magic"), "Invalid enum value 'magic'"),
+        (("goal", "nowhere", "pick", "--law", ""), "law: Expected `str` of length >= 1"),
         (("goal", "nowhere", "pick", "--gain", "-1"), "gain: Expected `float` >= 0.0001"),
         (("goal", "nowhere", "pick", "--gain", "nan"), "gain is nan; finite numbers are valid"),
         (("goal", "nowhere", "pick", "--time-limit", "inf"), "time_limit_s is inf; finite numbers are valid"),

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from stereoservo.cli import examination as examination_module
 from stereoservo.cli import main as cli
-from stereoservo.runtime.directories import cell_directories, create_directories
-from stereoservo.runtime.interprocess import RunPlan
-from stereoservo.runtime.locks import FileLock
-from stereoservo.runtime.ports import Clock, DriverError, Finding
-from stereoservo.runtime.servo import make_driver
+from stereoservo.cli.doctor import joints as examination_module
+from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.servo import make_driver
+from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.locks import FileLock
+from stereoservo.ports.devices import Clock, DriverError, Finding
 from stereoservo_drivers.fake import FakeJointDriver
 
 Doctor = Callable[..., tuple[int, list[dict[str, Any]]]]

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from stereoservo.cli import goal_input
-from stereoservo.cli.goal_input import adaptive, make_goal, stream_lines, target_tree
-from stereoservo.cli.goal_text import plan_table, progress_words
+from stereoservo.cli.goal import target_options
+from stereoservo.cli.goal.command import plan_table
+from stereoservo.cli.goal.target_options import adaptive, make_goal, stream_lines, target_tree
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
+from stereoservo.cli.status import progress_words
 from stereoservo.cli.teach import read_drawing
-from stereoservo.gateway.messages import MessageError
-from stereoservo.runtime.commands import (
+from stereoservo.messages.goals import (
     AdaptiveGain,
     Approach,
     DisplacementTarget,
@@ -28,6 +28,7 @@ from stereoservo.runtime.commands import (
     PointTarget,
     TaughtTarget,
 )
+from stereoservo.messages.wire import MessageError
 
 EYE = [[float(i == j) for j in range(4)] for i in range(4)]
 FLAT = tuple(number for row in EYE for number in row)
@@ -43,7 +44,7 @@ def written(tmp_path: Path, tree: Any) -> Path:
 def made(tmp_path: Path, option: str, tree: Any) -> Any:
     files: dict[str, Path | None] = dict.fromkeys(("points", "displacement", "incidence"))
     files[option] = written(tmp_path, tree)
-    return make_goal(target_tree("", None, None, files, None, None), {"law": None}).target
+    return make_goal(target_tree("", None, None, files, None, None), law=None).target
 
 
 def test_targets_come_from_files(tmp_path: Path) -> None:
@@ -58,7 +59,7 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
     found = made(tmp_path, "incidence", {"incidences": [spec], "model_epoch": 1})
     assert isinstance(found, IncidenceTarget)
     taught = target_tree("pick", None, None, {}, "workpiece", "10,11,12")
-    assert make_goal(taught, {}).target == TaughtTarget("pick", "workpiece", (10, 11, 12))
+    assert make_goal(taught).target == TaughtTarget("pick", "workpiece", (10, 11, 12))
 
 
 @pytest.mark.parametrize(
@@ -106,8 +107,8 @@ def test_files_of_another_kind_are_named(tmp_path: Path) -> None:
 
 def test_an_adaptive_gain_is_two_or_three_numbers() -> None:
     target = {"kind": "taught", "name": "pick"}
-    assert make_goal(target, {"gain": adaptive("4:0.8")}).gain == AdaptiveGain(4.0, 0.8)
-    assert make_goal(target, {"gain": adaptive("4:0.8:30")}).gain == AdaptiveGain(4.0, 0.8, 30.0)
+    assert make_goal(target, gain=adaptive("4:0.8")).gain == AdaptiveGain(4.0, 0.8)
+    assert make_goal(target, gain=adaptive("4:0.8:30")).gain == AdaptiveGain(4.0, 0.8, 30.0)
 
 
 def test_a_stream_in_a_file_is_paced_by_its_stamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +123,7 @@ def test_a_stream_in_a_file_is_paced_by_its_stamps(tmp_path: Path, monkeypatch: 
         slept.append(seconds)
         now += seconds
 
-    monkeypatch.setattr(goal_input, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    monkeypatch.setattr(target_options, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
     found = list(stream_lines(str(path)))
     assert [stamp for stamp, _ in found] == [7.0, 7.5, 8.0]
     assert slept == [0.0, 0.5, 0.5]

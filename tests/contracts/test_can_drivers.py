@@ -12,13 +12,13 @@ from uuid import uuid4
 
 import pytest
 
-from stereoservo.runtime.ports import DriverContext, JointDriver
+from stereoservo.ports.devices import DriverContext, JointDriver
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.contracts import JointDriverContract
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.drives.building import DrivesSettings, make_rack
-from stereoservo_sim.drives.serving import RackServer, open_endpoint
+from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
 
 
 def can_joint(k: int, **changes: Any) -> dict[str, Any]:

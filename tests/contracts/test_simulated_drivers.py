@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from stereoservo.runtime.ports import CameraDriver, DriverContext, JointDriver
+from stereoservo.ports.devices import CameraDriver, DriverContext, JointDriver
 from stereoservo_drivers.contracts import CameraDriverContract, JointDriverContract
 from stereoservo_drivers.fake import FakeCameraDriver, FakeJointDriver
 from stereoservo_drivers.pybullet import PybulletCameraDriver, PybulletJointDriver
-from stereoservo_sim.history import JointHistory
+from stereoservo_sim.world.history import TrueJointHistory
 
 
 class TestFakeArm(JointDriverContract):
@@ -61,7 +61,7 @@ class TestFakeCameraOfASharedWorld(CameraDriverContract):
     """In one process the history may be an object; the arm has stood still since the clock began."""
 
     def make_context(self, tmp_path: Path) -> DriverContext:
-        world = JointHistory.in_memory(6)
+        world = TrueJointHistory.in_memory(6)
         return replace(super().make_context(tmp_path), services={"world": world})
 
     def make_driver(self, context: DriverContext) -> CameraDriver:

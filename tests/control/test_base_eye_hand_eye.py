@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from stereoservo.control.law import Options, Scene, Task
-from stereoservo.control.laws import LAWS
+from stereoservo.control.law_registry import LAWS
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.screw_transfer import (

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.cartesian import CartesianStep, cartesian_law
-from stereoservo.control.cartesian2 import cartesian2_reasons
-from stereoservo.control.cartesian_kernel import cartesian_step
-from stereoservo.control.law import Options, Scene, Task
-from stereoservo.control.laws import LAWS
+from oracles.cartesian import CartesianStep, cartesian_law
+from stereoservo.control.cartesian import cartesian_step
+from stereoservo.control.law import LawStep, Options, Scene, Task
+from stereoservo.control.law_registry import LAWS
+from stereoservo.control.laws.cartesian2 import cartesian2_reasons
 from stereoservo.kinematics.composition import Composition, displacement
-from stereoservo.trajectory.three_points import ComponentStatus
+from stereoservo.planning.three_point_decomposition import ComponentStatus
 
 PERIOD = 0.04
 BOTH = ("cartesian2", "cartesian3")
@@ -255,7 +255,7 @@ def test_an_arm_without_the_tilt_turns_what_it_can_and_says_so(virtual):
     world = virtual.World(generators, T0, virtual.random_frame(np.random.default_rng(9)), np.zeros(4))
     step = assert_same(inputs(virtual, world, SERIAL, T0, T_star, True, dt_s=PERIOD))
     assert step.status[1] == ComponentStatus.NOT_REACHABLE
-    (reason,) = cartesian2_reasons(*step[1:])
+    (reason,) = cartesian2_reasons(LawStep(*step, 1.0))
     assert (reason.code, reason.unit) == ("NOT_REACHABLE", "rad")
     assert np.abs(step.velocity[3]) > 0.1
 
@@ -263,6 +263,6 @@ def test_an_arm_without_the_tilt_turns_what_it_can_and_says_so(virtual):
 def test_two_that_wait_for_each_other_for_ever_are_told(virtual):
     waits = int(ComponentStatus.WAITS)
     step = CartesianStep(np.zeros(6), np.array([1.0, 2.0]), np.array([0.0, 1e-4]), np.array([waits, waits]))
-    reasons = cartesian2_reasons(*step[1:])
+    reasons = cartesian2_reasons(LawStep(*step, 1.0))
     assert [reason.code for reason in reasons] == ["VISIBILITY_BLOCKED"] * 2
     assert all(reason.level == "hold" and "trajectory" in reason.hint for reason in reasons)

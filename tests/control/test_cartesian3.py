@@ -5,11 +5,13 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.cartesian3 import cartesian3_law, cartesian3_reasons
-from stereoservo.control.cartesian_kernel import cartesian3_step
-from stereoservo.control.stereo_kernel import stereo_step
+from oracles.cartesian import cartesian3_law
+from stereoservo.control.cartesian import cartesian3_step
+from stereoservo.control.law import LawStep
+from stereoservo.control.laws.cartesian3 import cartesian3_reasons
+from stereoservo.control.stereo_cycle import stereo_step
 from stereoservo.kinematics.kernels import image_jacobian
-from stereoservo.trajectory.three_points import ComponentStatus
+from stereoservo.planning.three_point_decomposition import ComponentStatus
 
 PERIOD = 0.04
 
@@ -57,7 +59,7 @@ def test_the_kernel_is_the_reference_in_special_cases(virtual):
     line = np.stack([arguments[1][0], 0.5 * (arguments[1][0] + arguments[1][1]), arguments[1][1]])
     step = assert_same((arguments[0], line, *arguments[2:]))
     np.testing.assert_array_equal(step.velocity, np.zeros(6))
-    assert {r.code for r in cartesian3_reasons(*step[1:])} == {"NO_FACE"}
+    assert {r.code for r in cartesian3_reasons(LawStep(*step, 1.0))} == {"NO_FACE"}
     step = assert_same((np.zeros((6, 4, 4)), *arguments[1:]))
     np.testing.assert_array_equal(step.velocity, np.zeros(6))
 
@@ -70,7 +72,7 @@ def test_reasons_name_the_component(virtual):
     )
     world = virtual.World(generators, T0, virtual.random_frame(np.random.default_rng(9)), np.zeros(4))
     step = assert_same(inputs(virtual, world, T0, T_star))
-    (reason,) = cartesian3_reasons(*step[1:])
+    (reason,) = cartesian3_reasons(LawStep(*step, 1.0))
     assert (reason.code, reason.unit) == ("NOT_REACHABLE", "rad")
     assert "hinge" in reason.subject
     assert reason.value is None
@@ -80,7 +82,7 @@ def test_reasons_name_the_component(virtual):
     T_star = virtual.pose(Rotation.from_euler("y", 120, degrees=True), [1.2, 0, 1.0])
     world = virtual.free_arm(np.random.default_rng(4), T0)
     step = assert_same(inputs(virtual, world, T0, T_star))
-    waiting = {r.subject.split(" ")[0]: r for r in cartesian3_reasons(*step[1:])}
+    waiting = {r.subject.split(" ")[0]: r for r in cartesian3_reasons(LawStep(*step, 1.0))}
     assert waiting["translation"].code == "VISIBILITY_WAIT"
     assert waiting["translation"].threshold < waiting["translation"].value
     assert step.task_error[1] == pytest.approx(np.radians(240), rel=1e-6)

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo.control.damped import damped_least_squares_reference, null_direction_reference
-from stereoservo.kinematics.linear_kernels import damped_least_squares, null_direction, right_singular
+from oracles.damped import null_direction_reference
+from stereoservo.numerics.linear import damped_least_squares, null_direction, right_singular
+from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
 
 
 @pytest.mark.parametrize("seed", range(20))

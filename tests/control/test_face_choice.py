@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.face_choice_kernel import CLEARLY_BETTER, LASTING, triangle_sight
 from stereoservo.control.faces import NOT_CHOSEN, FaceChoice, choose_face, kept_faces, law_scene, sights_along
+from stereoservo.control.faces_kernel import CLEARLY_BETTER, LASTING, triangle_sight
 from stereoservo.control.law import Options
-from stereoservo.control.laws import LAWS
+from stereoservo.control.law_registry import LAWS
 from stereoservo.control.primitives_kernel import minors
 
 from .bodies import SIGMA, Body, scene_of, six_faces, task_of, upright

@@ -14,8 +14,28 @@ from stereoservo.control.filters import (
     empty_track,
     observe,
     predict,
-    steady_gains,
 )
+
+
+def steady_gains(period_s: float, settings: TrackSettings) -> tuple[float, float]:
+    """``α`` and ``β`` of the filter at regular observations every ``period_s`` [s], once it has settled."""
+    index = settings.density_px2_s3 * period_s**3 / settings.sigma_px**2
+
+    def alpha(beta: float) -> float:
+        return 0.5 * (math.sqrt(beta * (8.0 + beta / 3.0)) - beta)
+
+    low, high = 0.0, 6.0 - 2.0 * math.sqrt(6.0) + 1.0
+    while alpha(high) < 1.0:
+        high *= 2.0
+    for _ in range(200):
+        beta = 0.5 * (low + high)
+        rest = 1.0 - alpha(beta)
+        if rest <= 0.0 or beta**2 > index * rest:
+            high = beta
+        else:
+            low = beta
+    return alpha(low), low
+
 
 ALL = np.ones((1, 1))
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereoservo.control.law import Options, Scene, Task
-from stereoservo.control.laws import LAWS
+from stereoservo.control.law_registry import LAWS
 from stereoservo.control.moved_cameras import image_of_moved_cameras, with_resected_cameras
 from stereoservo.kinematics.composition import Composition, displacement
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.incidence import incidence_task
-from stereoservo.control.incidence_freedoms import incidence_freedoms
+from stereoservo.control.incidence import incidence_freedoms, incidence_task
 from stereoservo.control.law import Scene
 from stereoservo.control.mobility import FREEDOMS
 

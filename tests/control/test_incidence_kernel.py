@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from oracles.incidence import incidence_reference, joint_metric_reference
 from stereoservo.control.incidence import (
     KINDS,
     IncidenceTask,
@@ -14,8 +15,7 @@ from stereoservo.control.incidence import (
     joint_task,
     no_second_task,
 )
-from stereoservo.control.incidence_images_kernel import joint_metric
-from stereoservo.control.incidence_reference import incidence_reference, joint_metric_reference
+from stereoservo.control.incidence_kernel import joint_metric
 from stereoservo.control.law import Options, Scene
 from stereoservo.kinematics.composition import Composition
 

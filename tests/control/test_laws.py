@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.cartesian_kernel import cartesian_step
-from stereoservo.control.image import image_velocity
-from stereoservo.control.image_kernel import image_step, limit_into
+from oracles.image import image_velocity
+from oracles.points import points_velocity
+from oracles.trajectory import trajectory_velocity
+from stereoservo.control.cartesian import cartesian_step
+from stereoservo.control.image_servoing import image_step, limit_into
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
-from stereoservo.control.laws import CLASSICAL, LAWS
-from stereoservo.control.laws_rehearsal import rehearse_laws
-from stereoservo.control.points import euclidean_points, points_velocity
-from stereoservo.control.points_kernel import points_step
-from stereoservo.control.trajectory import trajectory_velocity
-from stereoservo.control.trajectory_kernel import trajectory_step
+from stereoservo.control.law_registry import LAWS
+from stereoservo.control.law_warmup import warm_up_laws
+from stereoservo.control.laws.points import points_step
+from stereoservo.control.laws.trajectory import trajectory_step
 from stereoservo.kinematics.composition import Composition, displacement
+from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
 
 PERIOD = 0.04
 FREE, SERIAL = Composition.SIMULTANEOUS, Composition.BASE_FIRST
@@ -323,8 +324,8 @@ def test_euclidean_points_are_the_pseudo_inverse_in_metres(virtual, seed):
         )
 
 
-def test_after_the_rehearsal_no_law_has_anything_to_compile(virtual):
-    rehearse_laws()
+def test_after_the_warm_up_no_law_has_anything_to_compile(virtual):
+    warm_up_laws()
     kernels = (image_step, points_step, cartesian_step, trajectory_step, limit_into)
     compiled = [len(kernel.signatures) for kernel in kernels]
     assert min(compiled) > 0

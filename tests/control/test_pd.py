@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.control.law import Task
 from stereoservo.control.pd import damped_rates, joint_feature_rates, pd_task, tracking_error
 from stereoservo.kinematics.kernels import image_jacobian
-from stereoservo.kinematics.linear_kernels import damped_least_squares
+from stereoservo.numerics.linear import damped_least_squares
 
 LAG = 0.06
 DT = 0.01

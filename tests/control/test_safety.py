@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from stereoservo.control import safety
-from stereoservo.control.safety import SafetyConfigurationError, SafetyInputs, SafetyLimits, safety_stage
+from stereoservo.core import limit
+from stereoservo.core.limit import SafetyConfigurationError, SafetyInputs, SafetyLimits, safety_stage
 
 DT = 0.004
 
@@ -62,7 +62,7 @@ def test_any_input_gives_a_finite_command_within_velocity_and_acceleration(
     assert (np.abs(result.limited) <= limits.velocity_max * (1 + 1e-12)).all()
     assert (np.abs(result.limited - previous) <= limits.acceleration_max * DT * (1 + 1e-9) + 1e-15).all()
     if not np.isfinite(raw).all():
-        assert safety.NON_FINITE_COMMAND in codes(result)
+        assert limit.NON_FINITE_COMMAND in codes(result)
         assert result.braking
     for reason in result.reasons:
         assert reason.hint
@@ -78,9 +78,9 @@ def test_any_input_gives_a_finite_command_within_velocity_and_acceleration(
 def test_the_direction_is_kept_unless_positions_or_acceleration_act(raw, previous, scale):
     raw, previous = np.array(raw), np.array(previous)
     result = safety_stage(SafetyInputs(raw, np.zeros(3), previous, DT, speed_scale=scale), make_limits())
-    if codes(result) & {safety.ACCELERATION_LIMITED, safety.JOINT_LIMIT}:
+    if codes(result) & {limit.ACCELERATION_LIMITED, limit.JOINT_LIMIT}:
         change = result.limited - previous
-        if safety.JOINT_LIMIT not in codes(result):  # a share of the way to a multiple of raw
+        if limit.JOINT_LIMIT not in codes(result):  # a share of the way to a multiple of raw
             factor = 1.0 if not raw.any() else None
             assert (
                 factor == 1.0
@@ -91,6 +91,26 @@ def test_the_direction_is_kept_unless_positions_or_acceleration_act(raw, previou
     multiple = 0.0 if size == 0.0 else result.limited[np.abs(raw).argmax()] / raw[np.abs(raw).argmax()]
     assert multiple >= 0.0
     np.testing.assert_allclose(result.limited, multiple * raw, atol=1e-12)
+
+
+@settings(max_examples=200, deadline=None)
+@given(raw=st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3), scale=st.floats(0.05, 1.0))
+def test_far_from_its_limits_no_joint_is_clipped_whatever_speed_is_asked(raw, scale):
+    """From the middle of their ranges the joints can brake from any speed within their velocity limits."""
+    raw, limits = np.array(raw), make_limits()
+    over = max(1.0, float((np.abs(raw) / (scale * limits.velocity_max)).max()))
+    result = safety_stage(SafetyInputs(raw, np.zeros(3), raw / over, DT, speed_scale=scale), limits)
+    np.testing.assert_allclose(result.limited, raw / over, rtol=1e-12, atol=1e-12)
+    assert limit.JOINT_LIMIT not in codes(result)
+
+
+def test_a_joint_that_brakes_for_its_limit_does_not_slow_the_others():
+    limits = make_limits()
+    q, asked = np.array([1.48, 0.0, 0.0]), np.array([40.0, 0.25, -0.5])
+    result = safety_stage(SafetyInputs(asked, q, np.array([0.0, 0.25, -0.5]), DT), limits)
+    assert codes(result) == {limit.JOINT_LIMIT, limit.ACCELERATION_LIMITED}
+    np.testing.assert_array_equal(result.limited[1:], asked[1:])
+    assert 0.0 < result.limited[0] <= limits.acceleration_max[0] * DT
 
 
 @settings(max_examples=60, deadline=None)
@@ -176,7 +196,7 @@ def test_a_joint_outside_may_only_move_inward(outside):
     out = safety_stage(SafetyInputs(np.array([-inward, 0.2, 0.0]), q, np.zeros(3), DT), limits)
     assert out.limited[0] == 0.0
     assert out.limited[1] > 0.0
-    (reason,) = [r for r in out.reasons if r.code == safety.JOINT_LIMIT]
+    (reason,) = [r for r in out.reasons if r.code == limit.JOINT_LIMIT]
     assert reason.subject == "j1"
     assert reason.value == outside
     assert reason.hint.startswith("jog j1 down" if outside > 0 else "jog j1 up")
@@ -200,7 +220,7 @@ def test_a_braking_joint_has_its_full_deceleration_while_another_one_is_slow():
         q = q + command * DT
         weakest = min(weakest, 1.49 - q[0])
     assert -1e-9 <= weakest < 0.02
-    assert safety.JOINT_LIMIT in codes(result)
+    assert limit.JOINT_LIMIT in codes(result)
 
 
 def test_braking_is_uniform_and_ends_at_rest():
@@ -210,7 +230,7 @@ def test_braking_is_uniform_and_ends_at_rest():
     steps = 0
     while np.abs(command).max() > 0:
         result = safety_stage(SafetyInputs(np.full(3, 0.3), np.zeros(3), command, DT, brake=True), limits)
-        assert codes(result) == {safety.BRAKING}
+        assert codes(result) == {limit.BRAKING}
         assert np.linalg.norm(command) > np.linalg.norm(result.limited)
         command = result.limited
         np.testing.assert_allclose(command, direction * np.linalg.norm(command), atol=1e-12)
@@ -223,9 +243,9 @@ def test_stale_joints_brake():
     moving = np.array([0.3, 0.0, 0.0])
     fresh = safety_stage(SafetyInputs(moving, np.zeros(3), moving, DT, joint_age_s=0.1), make_limits())
     assert not fresh.braking
-    for age in (0.11, math.nan, math.inf):
+    for age in (0.11, math.nan, math.inf, -math.inf, -3600.0, -1e-9):
         result = safety_stage(SafetyInputs(moving, np.zeros(3), moving, DT, joint_age_s=age), make_limits())
-        assert codes(result) == {safety.JOINTS_STALE, safety.BRAKING}
+        assert codes(result) == {limit.JOINTS_STALE, limit.BRAKING}
         assert result.limited[0] < moving[0]
 
 
@@ -233,9 +253,12 @@ def test_stale_joints_brake():
     ("age", "needs", "expected", "braking"),
     [
         (0.05, True, set(), False),
-        (0.3, True, {safety.COASTING}, False),
-        (0.51, True, {safety.FEATURES_STALE, safety.BRAKING}, True),
-        (math.nan, True, {safety.FEATURES_STALE, safety.BRAKING}, True),
+        (0.3, True, {limit.COASTING}, False),
+        (0.51, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
+        (math.nan, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
+        (-1e-9, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
+        (-3600.0, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
+        (-3600.0, False, set(), False),
         (5.0, False, set(), False),
     ],
 )
@@ -253,7 +276,7 @@ def test_speed_scale_keeps_direction_and_says_so():
     result = safety_stage(SafetyInputs(raw, np.zeros(3), 0.1 * raw, DT, speed_scale=0.1), limits)
     np.testing.assert_allclose(result.limited, 0.1 * raw)
     (reason,) = result.reasons
-    assert (reason.code, reason.subject, reason.value) == (safety.VELOCITY_SCALED, "j3", 1.0)
+    assert (reason.code, reason.subject, reason.value) == (limit.VELOCITY_SCALED, "j3", 1.0)
     assert reason.threshold == pytest.approx(0.1)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.sight import way_in_sight
-from stereoservo.control.sight_kernel import way_in_sight as kernel
+from oracles.face_visibility import way_in_sight
+from stereoservo.control.face_visibility import way_in_sight as kernel
 
 
 def problem(virtual, rng, angle=None):

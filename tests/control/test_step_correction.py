@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from stereoservo.control import step_correction as reference
-from stereoservo.control import step_correction_kernel as kernels
+from oracles import step_correction as reference
+from stereoservo.control import step_correction as kernels
 from stereoservo.kinematics.composition import Composition, displacement
 
 COMPOSITIONS = list(Composition)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stereoservo.control.stereo import StereoCycle, stereo_law
-from stereoservo.control.stereo_kernel import stereo_step
+from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.kernels import triangulate
+from stereoservo_sim.benchmarks.stereo_reference import stereo_law
 
 
 def case(seed, n=6):

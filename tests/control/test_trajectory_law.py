@@ -5,10 +5,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from oracles.trajectory import trajectory_velocity
 from stereoservo.control.law import Options, Scene, Task
-from stereoservo.control.laws import LAWS
-from stereoservo.control.trajectory import trajectory, trajectory_velocity
-from stereoservo.geometry.velocities import twist_matrix
+from stereoservo.control.law_registry import LAWS
+from stereoservo.control.laws.trajectory import trajectory
+from stereoservo.geometry.screws import twist_matrix
 from stereoservo.kinematics.composition import Composition, displacement
 
 PERIOD, DURATION = 0.04, 3.0

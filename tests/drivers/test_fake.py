@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import VirtualClock
-from stereoservo.runtime.ports import DriverContext, DriverError
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.fake import FakeJointDriver
-from stereoservo_sim.history import FILE_NAME, JointHistory
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
+from stereoservo_sim.world.simulated_cell import demo_cell
 
 MS = 1_000_000
 
@@ -48,7 +48,7 @@ def test_encoder_has_its_resolution(tmp_path):
     clock = VirtualClock()
     driver = active({"encoder": 0.01, "joints": [{"name": "a"}]}, context(tmp_path, clock))
     position = run(driver, clock, [0.1], 37).positions[0]
-    truth = JointHistory.open(tmp_path / FILE_NAME).newest()[1][0]
+    truth = TrueJointHistory.open(tmp_path / FILE_NAME).newest()[1][0]
     assert position == pytest.approx(round(truth / 0.01) * 0.01, abs=1e-12)
     assert position != truth
 
@@ -58,7 +58,7 @@ def test_the_truth_is_recorded_with_its_stamps(tmp_path):
     driver = active({"joints": [{"name": "a", "acceleration": 2.0}]}, context(tmp_path, clock))
     begin = clock.now_ns()
     run(driver, clock, [0.4], 100)
-    history = JointHistory.open(tmp_path / FILE_NAME)
+    history = TrueJointHistory.open(tmp_path / FILE_NAME)
     for t in (0.05, 0.1, 0.3, 0.35):
         # 0.2 s of acceleration, then constant speed.
         expected = t * t if t < 0.2 else 0.04 + 0.4 * (t - 0.2)
@@ -66,7 +66,7 @@ def test_the_truth_is_recorded_with_its_stamps(tmp_path):
 
 
 def test_a_shared_world_takes_the_truth(tmp_path):
-    world = JointHistory.in_memory(6)
+    world = TrueJointHistory.in_memory(6)
     clock = VirtualClock()
     driver = active({}, context(tmp_path, clock, world=world))
     run(driver, clock, np.full(6, 0.1), 10)
@@ -74,7 +74,7 @@ def test_a_shared_world_takes_the_truth(tmp_path):
     assert world.count >= 10
     assert not (tmp_path / FILE_NAME).exists()
     with pytest.raises(DriverError, match="JointHistory of 6 joints"):
-        active({}, context(tmp_path, world=JointHistory.in_memory(2)))
+        active({}, context(tmp_path, world=TrueJointHistory.in_memory(2)))
 
 
 def test_a_restarted_arm_stands_where_it_was_left(tmp_path):
@@ -122,7 +122,7 @@ def test_the_nth_call_fails_and_those_after_it(tmp_path, call):
 
 def test_a_drive_whose_link_breaks_stops_by_its_own_timeout(tmp_path):
     clock = VirtualClock()
-    world = JointHistory.in_memory(6)
+    world = TrueJointHistory.in_memory(6)
     driver = active({"faults": {"fail_write": 20}}, context(tmp_path, clock, world=world))
     run(driver, clock, np.full(6, 0.3), 19)
     for _ in range(100):
@@ -142,7 +142,7 @@ def test_activation_can_fail(tmp_path):
 
 def test_a_frozen_feedback_repeats_its_last_state(tmp_path):
     clock = VirtualClock()
-    world = JointHistory.in_memory(6)
+    world = TrueJointHistory.in_memory(6)
     driver = active({}, context(tmp_path, clock, world=world))
     before = run(driver, clock, np.full(6, 0.1), 5)
     driver.faults.freeze_encoder_after = 1
@@ -170,7 +170,7 @@ def test_dropped_commands_are_reported_as_sent_but_move_nothing(tmp_path):
 
 def test_delayed_states_are_old_and_say_so(tmp_path):
     clock = VirtualClock()
-    world = JointHistory.in_memory(6)
+    world = TrueJointHistory.in_memory(6)
     driver = active({"faults": {"delay_s": 0.02}, "encoder": 0.0}, context(tmp_path, clock, world=world))
     state = run(driver, clock, np.full(6, 0.2), 50)
     assert clock.now_ns() - state.t_ns == pytest.approx(20 * MS, abs=5 * MS)

@@ -13,11 +13,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereoservo.runtime.ports import DriverContext, Frame
+from stereoservo.ports.devices import DriverContext, Frame
+from stereoservo.ports.dot_plates import FACES
 from stereoservo_drivers.commands.print_plate import print_plate
 from stereoservo_drivers.detectors.aruco import TagDetector
 from stereoservo_drivers.detectors.dots import DotDetector
-from stereoservo_drivers.detectors.plates import FACES
 from stereoservo_drivers.plates import DotPlates, PlateError, faces_named, lay_out
 
 app = typer.Typer()

@@ -8,18 +8,18 @@ import sys
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import VirtualClock
-from stereoservo.runtime.ports import DriverContext, DriverError
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.fake import FakeJointDriver
 from stereoservo_drivers.pybullet import PybulletCameraDriver, PybulletJointDriver
-from stereoservo_sim.history import JointHistory
+from stereoservo_sim.world.history import TrueJointHistory
 
 MS = 1_000_000
 
 
 def drive(kind, tmp_path, profile, cycles):
     """True positions after each cycle, (cycles, 6)."""
-    clock, world = VirtualClock(), JointHistory.in_memory(6)
+    clock, world = VirtualClock(), TrueJointHistory.in_memory(6)
     driver = kind({}, DriverContext(clock, "t", tmp_path, tmp_path, services={"world": world}))
     driver.configure()
     driver.activate()
@@ -63,8 +63,8 @@ def run_python(code):
 def test_nothing_is_printed(tmp_path):
     result = run_python(
         "from pathlib import Path\n"
-        "from stereoservo.runtime.clock import VirtualClock\n"
-        "from stereoservo.runtime.ports import DriverContext\n"
+        "from stereoservo.ports.clock import VirtualClock\n"
+        "from stereoservo.ports.devices import DriverContext\n"
         "from stereoservo_drivers.pybullet import PybulletJointDriver\n"
         f"p = Path({str(tmp_path)!r})\n"
         "d = PybulletJointDriver({}, DriverContext(VirtualClock(), 't', p, p))\n"
@@ -81,9 +81,13 @@ def test_nothing_is_printed(tmp_path):
         (
             "stereoservo_drivers.pybullet",
             "PybulletJointDriver",
-            ("cv2", "numba", "stereoservo_sim.rendering"),
+            ("cv2", "numba", "stereoservo_sim.world.rendering"),
         ),
-        ("stereoservo_drivers.pybullet", "PybulletCameraDriver", ("pybullet", "stereoservo_sim.physics")),
+        (
+            "stereoservo_drivers.pybullet",
+            "PybulletCameraDriver",
+            ("pybullet", "stereoservo_sim.world.physics"),
+        ),
         ("stereoservo_drivers.fake", "FakeJointDriver", ("cv2", "numba", "pybullet")),
     ],
 )
@@ -91,8 +95,8 @@ def test_a_process_loads_only_what_it_needs(tmp_path, module, driver, absent):
     result = run_python(
         "import sys\n"
         "from pathlib import Path\n"
-        "from stereoservo.runtime.clock import VirtualClock\n"
-        "from stereoservo.runtime.ports import DriverContext\n"
+        "from stereoservo.ports.clock import VirtualClock\n"
+        "from stereoservo.ports.devices import DriverContext\n"
         f"from {module} import {driver}\n"
         f"p = Path({str(tmp_path)!r})\n"
         f"d = {driver}({{}}, DriverContext(VirtualClock(), 't', p, p, 'left'))\n"

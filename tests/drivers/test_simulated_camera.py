@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import VirtualClock
-from stereoservo.runtime.ports import DriverContext, DriverError
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_drivers.fake import FakeCameraDriver, FakeJointDriver
 from stereoservo_drivers.pybullet import PybulletCameraDriver
-from stereoservo_sim.history import FILE_NAME, JointHistory
-from stereoservo_sim.workpiece import Moved, MovedFile
-from stereoservo_sim.world import demo_cell, simulated_cell
+from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
+from stereoservo_sim.world.simulated_cell import demo_cell, simulated_cell
+from stereoservo_sim.world.workpiece import Moved, MovedFile
 
 MS = 1_000_000
 CELL = demo_cell()
@@ -27,7 +27,7 @@ class Cell:
 
     def __init__(self, tmp_path, cameras, arm=True, shared=True):
         self.clock = VirtualClock()
-        self.world = JointHistory.in_memory(6)
+        self.world = TrueJointHistory.in_memory(6)
         self.services = {"world": self.world} if shared else {}
         self.path = tmp_path
         self.arm = None
@@ -170,7 +170,7 @@ def test_an_arm_that_appears_later_and_restarts_is_followed(tmp_path):
     cell.arm.activate()
     velocity = [0.1, 0, 0, 0, 0, 0.4]
     (items,) = cell.run(0.5, velocity)
-    history = JointHistory.open(tmp_path / FILE_NAME)
+    history = TrueJointHistory.open(tmp_path / FILE_NAME)
     truth = CELL.truth_pixels(history.at(items[-1].t_shutter_ns))["left"]
     assert np.abs(items[-1].pixels - truth).max() < 1e-6
     cell.arm.close()

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stereoservo.gateway.sights import Sight
+from stereoservo.core.cycle import Event, Sample
+from stereoservo.daemon.taught_goals import taught_goal
+from stereoservo.gateway.observation_cache import MarkerObservation
 from stereoservo.geometry.displacements import exp_rotation
 from stereoservo.geometry.distortion import distort
 from stereoservo.geometry.strata import euclidean_to_projective
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
-from stereoservo.runtime.cycle import Event, Sample
-from stereoservo.runtime.taught import taught_goal
 
 WIDTH, HEIGHT = 640, 480
 DISTANCE = 0.9
@@ -103,7 +103,9 @@ class Cameras:
         """What a gateway would hold of them."""
         return {
             name: {
-                marker: Sight(tuple((u + sigma * rng.normal(size=2)).tolist()), max(sigma, 1e-6), marker in moves)
+                marker: MarkerObservation(
+                    tuple((u + sigma * rng.normal(size=2)).tolist()), max(sigma, 1e-6), marker in moves
+                )
                 for marker, u in seen.items()
             }
             for name, seen in self.pixels(points).items()

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.gateway.reanchoring import Reanchoring
-from stereoservo.gateway.stores import ModelStore
+from stereoservo.core.cycle import Event
+from stereoservo.gateway.persistence import ModelStore
+from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
 from stereoservo.kinematics.model import CellModel, load_model, save_model
-from stereoservo.runtime.cycle import Event
-from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.synthetic import rx90
+from stereoservo_sim.world.exact_model import exact_model
+from stereoservo_sim.world.synthetic import rx90
 
 MATRIX = np.array([[800.0, 1.0, 320.0, 3.0], [2.0, 790.0, 240.0, -4.0], [0.0, 0.01, 1.0, 1.5]])
 
@@ -34,7 +34,7 @@ def gateway(tmp_path: Path) -> Any:
     model = exact_model(rx90())
     bench = SimpleNamespace(models=ModelStore(tmp_path), log=Log(), model=model)
     save_model(model, bench.models.path(model.epoch))
-    bench.reanchoring = Reanchoring(
+    bench.reanchoring = RelocalizationJobs(
         bench.models,
         None,
         bench.log,

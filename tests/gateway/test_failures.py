@@ -7,15 +7,15 @@ from typing import Any, cast
 
 import pytest
 
-from stereoservo.control.reasons import Reason
-from stereoservo.gateway.calibration import Calibration
-from stereoservo.gateway.errors import FailedError
-from stereoservo.gateway.messages import EventMessage
+from stereoservo.client import FailedError
+from stereoservo.core.cycle import Event
+from stereoservo.daemon.kernel_compilation import example_settings
+from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.persistence import ModelStore
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.servolink import ServoLink
-from stereoservo.gateway.stores import ModelStore
-from stereoservo.runtime.cycle import Event
-from stereoservo.runtime.warmup import _settings
+from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.wire import EventMessage
 
 
 def event(**fields: Any) -> EventMessage:
@@ -40,8 +40,10 @@ def test_without_name_or_reason_it_has_failed() -> None:
 
 def test_trial_motions_without_a_stop_fail_with_their_code(tmp_path: Path) -> None:
     log = EventLog("boot", lambda _: None)
-    link = cast("ServoLink", object())  # nothing is given to the core: there is no model
-    calibration = Calibration(_settings(), ModelStore(tmp_path), link, log, tmp_path / "checks.jsonl")
+    link = cast(ServoConnection, object())  # nothing is given to the core: there is no model
+    calibration = CalibrationJobs(
+        example_settings(), ModelStore(tmp_path), link, log, tmp_path / "checks.jsonl"
+    )
     calibration.core_event(Event(1, 1, "calibration_finished", id="g"), fresh=True)
     (told,) = log.since(1).events
     assert (told.kind, told.name) == ("calibration_failed", "too_few_stops")

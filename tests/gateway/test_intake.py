@@ -3,15 +3,15 @@
 import msgspec
 import pytest
 
+from stereoservo.core.cycle import Event
+from stereoservo.daemon.kernel_compilation import example_settings
 from stereoservo.gateway import intake as intake_module
+from stereoservo.gateway.goal_transfer import TransferredGoal
 from stereoservo.gateway.intake import Intake
-from stereoservo.gateway.keys import KeySpace
-from stereoservo.gateway.matching import TransferError
-from stereoservo.gateway.messages import Reply, encode
+from stereoservo.gateway.point_alignment import TransferError
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.transfer import Resolved
 from stereoservo.gateway.validation import GoalContext
-from stereoservo.runtime.commands import (
+from stereoservo.messages.goals import (
     AcknowledgeGoal,
     Command,
     FeatureTarget,
@@ -26,8 +26,8 @@ from stereoservo.runtime.commands import (
     Teach,
     UpdateGoal,
 )
-from stereoservo.runtime.cycle import Event
-from stereoservo.runtime.warmup import _settings
+from stereoservo.messages.keys import KeySpace
+from stereoservo.messages.wire import Reply, encode
 
 ID = "12345678-aaaa"
 KEYS = KeySpace("demo")
@@ -59,7 +59,7 @@ class StubLink:
         self.asked: list[tuple[Command, str]] = []
         self.up = True
 
-    def ask(self, command: Command, operator: str) -> int | None:
+    def send_command(self, command: Command, operator: str) -> int | None:
         if not self.up:
             return None
         self.asked.append((command, operator))
@@ -80,10 +80,10 @@ class StubTeaching:
     def __init__(self) -> None:
         self.expected: list[tuple[int, tuple[int, ...]]] = []
 
-    def resolve(self, target: TaughtTarget) -> Resolved:
+    def resolve(self, target: TaughtTarget) -> TransferredGoal:
         if target.relative_to is not None:
             raise TransferError("marker 12 is 8.3 px off")
-        return Resolved(FeatureTarget(POINTS, 7), "known to 0.1 px")
+        return TransferredGoal(FeatureTarget(POINTS, 7), "known to 0.1 px")
 
     def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
         return target
@@ -102,7 +102,7 @@ class Bench:
             self.link,
             self.replies,
             self.log,
-            lambda: GoalContext(_settings(), ("pick",), None),
+            lambda: GoalContext(example_settings(), ("pick",), None),
             self.teaching,
             "boot",
         )  # type: ignore[arg-type]
@@ -264,6 +264,25 @@ def test_bad_commands_are_refused_with_the_place(bench: Bench) -> None:
     assert "NaN is not a JSON number" in texts[0]
     assert "there are: stop, enable" in texts[1]
     assert "-1 to 1 is valid" in texts[2]
+    assert bench.link.asked == []
+
+
+@pytest.mark.parametrize("payload", [b'{"id":5,"x":"\xff"}', b'{"id":' + b"[" * 60_000])
+def test_bytes_that_no_decoder_takes_are_refused_like_any_others(bench: Bench, payload: bytes) -> None:
+    bench.intake.goal_query(Message(KEYS.goal("anna"), payload))
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), payload))
+    bench.intake.command_query(Message(KEYS.command("jog", "bob"), payload))
+    assert [reply.message for _, reply in bench.replies.sent] == ["the message is not valid"] * 2
+    assert bench.kinds() == ["goal_refused"]
+    assert bench.intake.boundary.refusals.count == 3
+
+
+def test_an_error_that_no_check_foresees_is_a_refusal(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench.teaching, "resolve", lambda target: {}[target.name])
+    bench.goal(Goal(ID, TaughtTarget("pick")))
+    assert bench.replies.sent[0][1].problems == ("KeyError: 'pick'",)
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), encode(Goal(ID, TaughtTarget("pick")))))
+    assert bench.kinds() == ["goal_refused"]
     assert bench.link.asked == []
 
 

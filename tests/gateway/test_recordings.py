@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from stereoservo.gateway import recordings
-from stereoservo.gateway.messages import EventMessage, decode
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.recordings import CannotRecordError, ImageOrders
-from stereoservo.runtime.directories import CellDirectories
-from stereoservo.runtime.image_order import RecordedImages, order_path, read_order
+from stereoservo.gateway.recordings import CannotRecordError, ImageRecordings
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.recording_request import RecordedImages, read_request, request_path
+from stereoservo.messages.wire import EventMessage, decode
 
 
 class Bench:
@@ -30,15 +30,15 @@ class Bench:
             cameras=[SimpleNamespace(name=name, delivers=delivers) for name, delivers in cameras.items()],
         )
         log = EventLog("boot", lambda payload: self.events.append(decode(payload, EventMessage)))
-        self.orders = ImageOrders(plan, log)
+        self.orders = ImageRecordings(plan, log)
         self.flight = directory / "flight.mcap"
 
     def tell(self, camera: str, frames: int, left_out: int = 0, why: str = "ended") -> None:
         file = str(self.flight.with_suffix(".images") / f"{camera}.avi")
-        self.orders.told(RecordedImages(camera, file, frames, left_out, 1000, why))
+        self.orders.add_report(RecordedImages(camera, file, frames, left_out, 1000, why))
 
     def ordered(self) -> str | None:
-        order = read_order(order_path(self.directories))
+        order = read_request(request_path(self.directories))
         return None if order is None else order.directory
 
 
@@ -51,15 +51,15 @@ def test_a_recording_is_summed_up_once_all_cameras_have_told(
     assert bench.ordered() == str(tmp_path / "flight.images")
     assert "third deliver observations" in bench.events[-1].message
     bench.tell("right", 40, 2, "the disk is full")
-    bench.orders.follow()
+    bench.orders.poll()
     assert bench.orders.running
     bench.orders.end()
     assert bench.ordered() is None
-    bench.orders.follow()
+    bench.orders.poll()
     assert [event.kind for event in bench.events] == ["images"]
     bench.tell("left", 50)
-    bench.orders.follow()
-    bench.orders.follow()
+    bench.orders.poll()
+    bench.orders.poll()
     assert [event.kind for event in bench.events] == ["images", "images_recorded"]
     found = bench.events[-1].images
     assert found is not None
@@ -75,11 +75,11 @@ def test_a_recording_is_summed_up_once_all_cameras_have_told(
 def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames", right="frames")
     bench.orders.begin(bench.flight)
-    bench.orders.told(RecordedImages("right", "/elsewhere/right.avi", 9, 0, 9))
+    bench.orders.add_report(RecordedImages("right", "/elsewhere/right.avi", 9, 0, 9))
     bench.orders.end()
     bench.tell("left", 5)
     bench.now += recordings.LAST_WORD_S + 0.1
-    bench.orders.follow()
+    bench.orders.poll()
     found = bench.events[-1].images
     assert found is not None
     assert "has not said" in found.cameras[1].why
@@ -91,12 +91,12 @@ def test_a_new_recording_does_not_wait_for_the_last_one(
 ) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames")
     bench.orders.begin(bench.flight)
-    first = read_order(order_path(bench.directories))
+    first = read_request(request_path(bench.directories))
     bench.orders.end()
     bench.now += 0.1
     bench.flight = tmp_path / "second.mcap"
     bench.orders.begin(bench.flight)
-    second = read_order(order_path(bench.directories))
+    second = read_request(request_path(bench.directories))
     assert first is not None
     assert second is not None
     assert first.number != second.number
@@ -109,5 +109,5 @@ def test_cameras_without_pictures_are_refused_with_the_reason(
     bench = Bench(tmp_path, monkeypatch, left="observations", right="observations")
     with pytest.raises(CannotRecordError, match="left, right deliver observations"):
         bench.orders.check()
-    order_path(bench.directories).write_text('{"number": 1, "directory": "/old"}')
+    request_path(bench.directories).write_text('{"number": 1, "directory": "/old"}')
     assert Bench(tmp_path, monkeypatch, left="frames").ordered() is None, "of a gateway that has died"

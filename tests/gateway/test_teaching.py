@@ -10,15 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.gateway.matching import TransferError
-from stereoservo.gateway.messages import Synthesise
+from stereoservo.core.cycle import Event, Sample
+from stereoservo.gateway.observation_cache import ObservationCache
+from stereoservo.gateway.persistence import TaughtStore
+from stereoservo.gateway.point_alignment import TransferError
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.sights import NewestSights
-from stereoservo.gateway.stores import TaughtStore
-from stereoservo.gateway.teaching import Teaching
-from stereoservo.runtime.commands import Feature, FeatureTarget, IncidenceSpec, IncidenceTarget, TaughtTarget
-from stereoservo.runtime.cycle import Event, Sample
-from stereoservo.runtime.ports import CameraObservation
+from stereoservo.gateway.teaching import TaughtGoalRegistry
+from stereoservo.messages.goals import Feature, FeatureTarget, IncidenceSpec, IncidenceTarget, TaughtTarget
+from stereoservo.messages.wire import Synthesise
+from stereoservo.ports.devices import CameraObservation
 
 from .scene import BODY, TOOL, WORK, Cameras, make_model, placed, some_pose
 
@@ -31,9 +31,9 @@ class Bench:
     def __init__(self, path: Path) -> None:
         self.model: Any = MODEL
         self.log = EventLog("boot", lambda _: None)
-        self.sights = NewestSights({"left": 0.0, "right": 0.0})
+        self.sights = ObservationCache({"left": 0.0, "right": 0.0})
         self.store = TaughtStore(path / "taught.json")
-        self.teaching = Teaching(self.store, self.sights, lambda: self.model, self.log)
+        self.teaching = TaughtGoalRegistry(self.store, self.sights, lambda: self.model, self.log)
 
     def show(self, points: Any) -> None:
         """A frame of both cameras, now."""

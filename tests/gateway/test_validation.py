@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereoservo.gateway.messages import decode, encode
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.settings import CameraSettings
+from stereoservo.daemon.kernel_compilation import example_settings
 from stereoservo.gateway.validation import GoalContext, check_command, check_goal
-from stereoservo.runtime.commands import (
-    LAWS,
+from stereoservo.messages.goals import (
     AcknowledgeGoal,
     AdaptiveGain,
     Centre,
@@ -29,11 +30,10 @@ from stereoservo.runtime.commands import (
     Teach,
     UpdateGoal,
 )
-from stereoservo.runtime.settings import CameraSettings
-from stereoservo.runtime.warmup import _settings
+from stereoservo.messages.wire import decode, encode
 
 SETTINGS = msgspec.structs.replace(
-    _settings(),
+    example_settings(),
     cameras=(
         CameraSettings("left", 640, 480, 30.0, "eye_to_hand", (0, 1, 2, 3)),
         CameraSettings("right", 320, 240, 30.0, "eye_to_hand", (0, 1, 2)),
@@ -174,11 +174,14 @@ def test_every_law_takes_every_target_that_fixes_a_pose(law: Any) -> None:
         (PointTarget({**POINTS, 9: POINTS[0]}, 1), "9: the model has no such marker; it has: 0, 1, 2, 3, 4, 5"),
         (PointTarget({**POINTS, 70: POINTS[0]}, 1), "70: no detector of the cell knows it; they know: 0, 1"),
         (PointTarget({**POINTS, 0: (0.0, 0.0, 0.0, 0.0)}, 1), "points.0: (0, 0, 0, 0) is no point"),
+        (PointTarget({**POINTS, 0: (0.0, 5e-324, 0.0, 0.0)}, 1), "points.0: its largest number is 4.94066e-324"),
+        (PointTarget({**POINTS, 0: (0.0, -1e308, 0.0, 1.0)}, 1), "points.0: its largest number is 1e+308; 1e-100 to"),
         (PointTarget({0: POINTS[0], 1: POINTS[1], 2: (0.3, 0, 2.0, 2.0)}, 1), "0, 1, 2 lie on one line"),
         (DisplacementTarget(EYE), "neither of model_epoch and basis given; exactly one"),
         (DisplacementTarget(EYE, 1, (0, 1, 2, 3, 4)), "both of model_epoch and basis given"),
         (DisplacementTarget(EYE, basis=(0, 1, 2, 3, 3)), "basis: 3 stands 2 times; ids that differ"),
         (DisplacementTarget(EYE, basis=(0, 1, 2, 3, 9)), "basis: 9: the model has no such marker"),
+        (DisplacementTarget((1e308,) * 16, 1), "matrix: its largest number is 1e+308; 1e-100 to 1e+100 is valid"),
         (DisplacementTarget((0.0,) * 16, 1), "matrix: is singular (singular values 0, 0, 0, 0)"),
         (DisplacementTarget(MIRROR, 1), "determinant is negative, which makes a mirror image"),
         (TaughtTarget("park", None, (6, 7, 8)), "common: 6, 7, 8 belongs to relative_to"),
@@ -195,6 +198,10 @@ def test_every_law_takes_every_target_that_fixes_a_pose(law: Any) -> None:
         (incidence("point-on-point", PIN, Feature(markers=(1,))), "1 is of the marker body itself"),
         (incidence("point-on-point", PIN, HOLE, model_epoch=None), "target.model_epoch is needed with them"),
         (incidence("point-on-line", PIN, Feature(points=2 * HOLE.points)), "do not span a line; 2 points in general"),
+        (
+            incidence("point-on-line", PIN, Feature(points=((0.0, 0.0, 0.0, 5e-324),) * 2)),
+            "points[0]: its largest number is 4.94066e-324",
+        ),
         (incidence("point-on-point", PIN, Feature(pixels={"left": ((1, 1),)})), "of 1 camera(s) (left); two or more"),
         (
             incidence("point-on-point", PIN, Feature(pixels={"left": ((1, 1),), "up": ((1, 1),)})),
@@ -217,6 +224,7 @@ def test_targets_that_cannot_be_say_what_would_have_been_valid(target: Any, expe
 @pytest.mark.parametrize(
     ("target", "options", "expected"),
     [
+        (SEEN, {"law": "pbvs"}, "law: no law 'pbvs'; valid: stereo, image, points, cartesian3, cartesian2, trajectory"),
         (SEEN, {"law": "stereo", "profile": "linear"}, "profile: 'linear' belongs to law 'trajectory'; the goal's is"),
         (SEEN, {"law": "cartesian3", "jacobian": "mean"}, "jacobian: 'mean' belongs to laws stereo, image, points"),
         (SEEN, {"law": "stereo", "centre": Centre((0, 1))}, "centre: belongs to laws cartesian3, cartesian2"),
@@ -226,7 +234,8 @@ def test_targets_that_cannot_be_say_what_would_have_been_valid(target: Any, expe
         (SEEN, {"cameras": ("left", "up")}, "cameras: no camera 'up'; cameras: left, right"),
         (SEEN, {"cameras": ()}, "cameras: is empty; some of left, right are needed"),
         (SEEN, {"cameras": ("left", "left")}, "cameras: 'left' stands twice"),
-        (SEEN, {"cameras": ("left",)}, "cameras: left alone; law 'stereo' takes two or more, 'image' works with one"),
+        (SEEN, {"law": "stereo", "cameras": ("left",)},
+         "cameras: left alone; law 'stereo' takes two or more, 'image' works with one"),
         (
             FeatureTarget({"left": GOOD}), {"law": "image", "cameras": ("right",)},
             "cameras: right, but the set-points are of left",

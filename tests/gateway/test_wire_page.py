@@ -7,17 +7,17 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from stereoservo.gateway.keys import VERBS
-from stereoservo.gateway.messages import Synthesise, decode
+from stereoservo.core.settings import CameraSettings
+from stereoservo.daemon.kernel_compilation import example_settings
 from stereoservo.gateway.validation import GoalContext, check_command, check_goal
-from stereoservo.runtime.commands import Goal, Target, UpdateGoal
-from stereoservo.runtime.settings import CameraSettings
-from stereoservo.runtime.warmup import _settings
+from stereoservo.messages.goals import Goal, Target, UpdateGoal
+from stereoservo.messages.keys import VERBS
+from stereoservo.messages.wire import Synthesise, decode
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
 EXAMPLES = [msgspec.json.decode(block) for block in re.findall(r"```json\n(.*?)```", PAGE, re.DOTALL)]
 CELL = msgspec.structs.replace(
-    _settings(),
+    example_settings(),
     cameras=tuple(
         CameraSettings(name, 640, 480, 30.0, "eye_to_hand", tuple(range(15))) for name in ("left", "right")
     ),

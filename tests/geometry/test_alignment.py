@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from oracles.projective_points import move_cameras
 from stereoservo.geometry.alignment import (
     DRAWING,
     POINTS_NEEDED,
@@ -24,8 +25,7 @@ from stereoservo.geometry.cameras import (
     triangulate,
     triangulation_covariance,
 )
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import move_cameras, move_points
+from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import carried_point_covariance
 from stereoservo.geometry.strata import euclidean_to_projective
 

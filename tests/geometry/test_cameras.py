@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from oracles.optimal_triangulation import triangulate_linear
 from stereoservo.geometry.cameras import (
     camera_centre,
     canonical_pair,
@@ -15,10 +16,9 @@ from stereoservo.geometry.cameras import (
     reprojection_residuals,
     resection,
     triangulate,
-    triangulate_linear,
     triangulation_covariance,
 )
-from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.homography import homography_from_points
 
 WIDTH, HEIGHT = 640, 480

@@ -5,24 +5,26 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.geometry.displacements import (
+from oracles.displacement_logarithms import (
     bracket,
-    conjugate,
     dual_generator,
-    exp_generator,
-    exp_rotation,
-    exp_translation,
     log_rotation,
     log_translation,
-    nearest_rotation_generator,
-    nearest_translation_generator,
     normalise_displacement,
     rotation_angle,
     rotation_axis,
     rotation_generator,
     translation_generator,
 )
-from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.displacements import (
+    conjugate,
+    exp_generator,
+    exp_rotation,
+    exp_translation,
+    nearest_rotation_generator,
+    nearest_translation_generator,
+)
+from stereoservo.geometry.homogeneous import GeometryError
 
 seeds = st.integers(0, 2**32 - 1)
 angles = st.floats(-3.1, 3.1)

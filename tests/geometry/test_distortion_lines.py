@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from stereoservo.geometry.distortion import distort
-from stereoservo.geometry.distortion_lines import lens_from_lines
-from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.distortion import distort, lens_from_lines
+from stereoservo.geometry.homogeneous import GeometryError
 
 
 def edges(lens, rng, sigma, count=12, points=25):

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.geometry.errors import GeometryError
 from stereoservo.geometry.fundamental import (
     epipolar_distances,
     fundamental_linear,
@@ -10,6 +9,7 @@ from stereoservo.geometry.fundamental import (
     fundamental_robust,
     sampson_distances,
 )
+from stereoservo.geometry.homogeneous import GeometryError
 
 
 def same(F, G):

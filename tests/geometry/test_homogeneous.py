@@ -4,14 +4,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import (
+from oracles.projective_points import (
     affine_middle,
     collinearity_residual,
     coplanarity_residual,
     crossing_of_diagonals,
-    from_homogeneous,
     incidence_residual,
+)
+from stereoservo.geometry.homogeneous import (
+    GeometryError,
+    from_homogeneous,
     line_of_planes,
     plane_of_points,
     planes_through_line,

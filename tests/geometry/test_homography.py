@@ -4,9 +4,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from oracles.frame_change import homography_from_basis, homography_refine
 from stereoservo.geometry.cameras import project_many
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homography import homography_from_basis, homography_from_points, homography_refine
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.homography import homography_from_points
 
 seeds = st.integers(0, 2**32 - 1)
 

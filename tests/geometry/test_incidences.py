@@ -5,9 +5,10 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from oracles.frame_change import homography_refine
 from stereoservo.geometry.cameras import project, project_many, triangulate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homography import homography_from_points, homography_refine
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.homography import homography_from_points
 from stereoservo.geometry.incidences import (
     Incidence,
     homography_from_incidences,

@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from oracles.projective_points import move_cameras, move_planes
 from stereoservo.geometry.cameras import project
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import move_cameras, move_planes, plane_of_points
+from stereoservo.geometry.homogeneous import GeometryError, plane_of_points
 from stereoservo.geometry.lines import (
     crossing_angles,
     image_lines,

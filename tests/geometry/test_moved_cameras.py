@@ -5,6 +5,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from oracles.frame_change import (
+    STANDARD_BASIS,
+    canonical_frame,
+    carry_over,
+    frame_change,
+    frame_change_from_points,
+    scene_frame,
+)
+from oracles.optimal_triangulation import fundamental_of_cameras
+from oracles.projective_points import move_cameras
 from stereoservo.geometry.cameras import (
     canonical_pair,
     pixel_normaliser,
@@ -14,21 +24,13 @@ from stereoservo.geometry.cameras import (
     triangulation_covariance,
 )
 from stereoservo.geometry.displacements import conjugate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import move_cameras, move_points
+from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import (
-    STANDARD_BASIS,
-    canonical_frame,
     carried_point_covariance,
-    carry_over,
-    frame_change,
-    frame_change_from_points,
     plane_deviations,
     refuse_coplanar,
     resect_moved_camera,
-    scene_frame,
 )
-from stereoservo.geometry.optimal import fundamental_of_cameras
 from stereoservo.geometry.screws import screw_twist
 from stereoservo.geometry.strata import euclidean_to_projective
 

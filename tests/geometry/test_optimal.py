@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from oracles.optimal_triangulation import fundamental_of_cameras, optimal_pixels, triangulate_optimal
+from oracles.projective_points import move_cameras
 from stereoservo.geometry.cameras import project_many, triangulate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import move_cameras
-from stereoservo.geometry.optimal import fundamental_of_cameras, optimal_pixels, triangulate_optimal
+from stereoservo.geometry.homogeneous import GeometryError
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,26 +5,19 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.geometry.displacements import (
-    conjugate,
-    exp_rotation,
-    exp_translation,
-    normalise_displacement,
-)
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.lines import line_through_points
-from stereoservo.geometry.screws import (
+from oracles.displacement_logarithms import normalise_displacement
+from oracles.screw_motions import (
     exp_screw,
-    exp_twist,
     log_displacement,
     nearest_twist,
     screw_axis,
     screw_pitch,
-    screw_twist,
     split_twist,
-    twist_angle,
 )
-from stereoservo.geometry.velocities import twist_matrix
+from stereoservo.geometry.displacements import conjugate, exp_rotation, exp_translation
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.lines import line_through_points
+from stereoservo.geometry.screws import exp_twist, screw_twist, twist_angle, twist_matrix
 
 seeds = st.integers(0, 2**32 - 1)
 pitches = st.floats(-1.0, 1.0)

@@ -4,26 +4,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stereoservo.geometry.cameras import pixel_normaliser, project
-from stereoservo.geometry.displacements import conjugate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import move_cameras, move_planes, move_points
-from stereoservo.geometry.strata import (
+from oracles.projective_points import move_cameras, move_planes
+from oracles.strata_relations import (
     absolute_dual_quadric,
     affine_to_euclidean,
-    affine_to_projective,
-    decompose_camera,
     euclidean_to_affine,
-    euclidean_to_projective,
     fixed_plane_residual,
     fixed_quadric_residual,
-    heights_of_one_side,
     infinity_homography,
     plane_at_infinity,
-    projective_to_affine,
-    projective_to_euclidean,
     strata_of,
     strata_of_quadric,
+)
+from stereoservo.geometry.cameras import pixel_normaliser, project
+from stereoservo.geometry.displacements import conjugate
+from stereoservo.geometry.homogeneous import GeometryError, move_points
+from stereoservo.geometry.strata import (
+    affine_to_projective,
+    decompose_camera,
+    euclidean_to_projective,
+    heights_of_one_side,
+    projective_to_affine,
+    projective_to_euclidean,
     upper_triangular,
 )
 

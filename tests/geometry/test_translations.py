@@ -7,25 +7,31 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from stereoservo.geometry.cameras import triangulate, triangulation_covariance
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import from_homogeneous, to_homogeneous
-from stereoservo.geometry.reprojection_fit import linearise, point_charts, read_images, with_rest
-from stereoservo.geometry.translation_consensus import estimate_translations
-from stereoservo.geometry.translation_fit import bundle_translations, refine_translations, shared_plane
-from stereoservo.geometry.translation_planar import planar_start
-from stereoservo.geometry.translations import (
+from oracles.jordan_frames import (
     JORDAN_TRANSLATION,
-    TRACE_FREE,
-    Weighting,
     direction_from_stack,
-    direction_given_plane,
-    image_weighting,
     jordan_commutator,
     jordan_frame,
+    split_generator,
+)
+from stereoservo.geometry.cameras import triangulate, triangulation_covariance
+from stereoservo.geometry.homogeneous import GeometryError, from_homogeneous, to_homogeneous
+from stereoservo.geometry.reprojection_fit import linearise, point_charts, read_images, with_rest
+from stereoservo.geometry.strata import projective_to_affine
+from stereoservo.geometry.translation_consensus import estimate_translations
+from stereoservo.geometry.translation_fit import (
+    bundle_translations,
+    planar_start,
+    refine_translations,
+    shared_plane,
+)
+from stereoservo.geometry.translations import (
+    TRACE_FREE,
+    Weighting,
+    direction_given_plane,
+    image_weighting,
     plane_at_infinity_from_stack,
     raw_generator,
-    split_generator,
     translation_from_homography,
     translation_homography,
 )
@@ -474,7 +480,7 @@ def test_the_affine_upgrade_makes_parallels_of_parallels():
     rng = np.random.default_rng(13)
     scene, shifts = Scene(rng), shifts_of(rng, 4)
     fit = estimate_translations(scene.Ps, scene.pixels(scene.moved(shifts)), 0.01).fit
-    N = from_homogeneous(fit.points @ fit.affine_upgrade.T)
+    N = from_homogeneous(fit.points @ projective_to_affine(fit.plane).T)
     design = to_homogeneous(N)
     map_, *_ = np.linalg.lstsq(design, scene.X, rcond=None)
     assert np.abs(design @ map_ - scene.X).max() < 1e-8  # an affinity maps it to the truth

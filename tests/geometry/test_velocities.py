@@ -4,10 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from stereoservo.geometry.displacements import conjugate, exp_rotation
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import move_points
-from stereoservo.geometry.velocities import (
+from oracles.rigid_velocities import (
     body_from_spatial,
     body_velocity,
     dual_displacement,
@@ -18,9 +15,10 @@ from stereoservo.geometry.velocities import (
     spatial_from_body,
     spatial_velocity,
     transfer_velocity,
-    twist_matrix,
-    twist_vectors,
 )
+from stereoservo.geometry.displacements import conjugate, exp_rotation
+from stereoservo.geometry.homogeneous import GeometryError, move_points
+from stereoservo.geometry.screws import twist_matrix, twist_vectors
 
 seeds = st.integers(0, 2**32 - 1)
 

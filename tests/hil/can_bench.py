@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.gateway.client import Client, ClientError
-from stereoservo.runtime.cellfile import load_cell_file
-from stereoservo.runtime.daemon import DaemonProcess
-from stereoservo.runtime.directories import CellDirectories, cell_directories
+from stereoservo.client import Client, ClientError
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.directories import CellDirectories, cell_directories
+from stereoservo.messages.discovery import DaemonProcess
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, ANY_SERVER, move_to_channel, move_to_server
-from stereoservo_sim.emulation.process import EmulatorProcess
-from stereoservo_sim.history import FILE_NAME, JointHistory
+from stereoservo_sim.emulators.emulator_process import EmulatorProcess
+from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
 
 from .conftest import at_rest, eventually
 
@@ -123,7 +123,7 @@ class CanBench:
 
     def truth(self) -> tuple[int, np.ndarray]:
         """When and where the emulated arm was last recorded, (n,) [rad]."""
-        history = JointHistory.open(self.directories.runtime / FILE_NAME)
+        history = TrueJointHistory.open(self.directories.runtime / FILE_NAME)
         try:
             newest = history.newest()
         finally:

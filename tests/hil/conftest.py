@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from stereoservo.cli import main as cli
-from stereoservo.gateway.client import Client
-from stereoservo.runtime.daemon import DaemonProcess
-from stereoservo.runtime.directories import CellDirectories, cell_directories
+from stereoservo.client import Client
+from stereoservo.messages.directories import CellDirectories, cell_directories
+from stereoservo.messages.discovery import DaemonProcess
 
 CELL = "hil"
 QUICK_CALIBRATION = """
@@ -81,7 +81,7 @@ def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def cell_file(roots: Path) -> Path:
     """The fake cell, with a quick calibration around the simulated cell's base."""
-    from stereoservo_sim.world import demo_cell
+    from stereoservo_sim.world.simulated_cell import demo_cell
 
     path = roots / f"{CELL}.toml"
     assert cli.invoke(["init", str(path)]) == 0

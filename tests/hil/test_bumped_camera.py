@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from stereoservo.gateway.client import Client
-from stereoservo.runtime.commands import JointTarget
-from stereoservo.runtime.directories import CellDirectories
-from stereoservo_sim.workpiece import Moved, MovedFile
+from stereoservo.client import Client
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.goals import JointTarget
+from stereoservo_sim.world.workpiece import Moved, MovedFile
 
 from .conftest import eventually
 

@@ -12,14 +12,13 @@ import msgspec
 import pytest
 
 from stereoservo.cli import main as cli
-from stereoservo.gateway.client import Client
-from stereoservo.gateway.following import EventWatch
-from stereoservo.gateway.stores import ModelStore
+from stereoservo.client import Client, EventWatch
+from stereoservo.daemon.jobs.check_job import load_checks
+from stereoservo.gateway.persistence import ModelStore
 from stereoservo.kinematics.model import load_model, save_model
-from stereoservo.runtime.check_history import load_checks
-from stereoservo.runtime.commands import Calibrate
-from stereoservo.runtime.daemon import DaemonProcess
-from stereoservo.runtime.directories import CellDirectories
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.messages.goals import Calibrate
 
 from .conftest import CELL, at_rest, eventually
 

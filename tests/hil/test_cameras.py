@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.gateway.client import Client
-from stereoservo.gateway.following import GoalHandle
-from stereoservo.gateway.messages import EventMessage
+from stereoservo.client import Client, GoalHandle
+from stereoservo.messages.wire import EventMessage
 
 from .can_bench import CanBench, codes, recover
 from .conftest import at_rest, eventually, processes

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.gateway.client import Client, RefusedError
+from stereoservo.client import Client, RefusedError
 
 from .can_bench import CanBench, codes, lifecycle, moving, recover, reset_is_refused
 from .conftest import at_rest, eventually, processes

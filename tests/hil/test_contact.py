@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.gateway.client import Client, RefusedError
-from stereoservo.runtime.daemon import DaemonProcess
+from stereoservo.client import Client, RefusedError
+from stereoservo.messages.discovery import DaemonProcess
 
 from .conftest import CELL, eventually
 

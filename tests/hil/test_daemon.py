@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.gateway.client import Client, ClientError, EventWatch, RefusedError
-from stereoservo.gateway.messages import Reply, decode
+from stereoservo.client import Client, ClientError, EventWatch, RefusedError
 from stereoservo.geometry.cameras import project
 from stereoservo.geometry.distortion import distort
-from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import load_model
-from stereoservo.runtime.commands import DisplacementTarget, FeatureTarget
-from stereoservo.runtime.daemon import DaemonProcess
-from stereoservo.runtime.directories import CellDirectories
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.messages.goals import DisplacementTarget, FeatureTarget
+from stereoservo.messages.wire import Reply, decode
+from stereoservo.numerics.arrays import FloatArray
 
 from .conftest import CELL, at_rest, eventually, moved_away, processes
 
@@ -67,12 +67,12 @@ def test_events_are_numbered_and_can_be_read_from_any_number(client: Client) -> 
 @pytest.mark.parametrize("number", ["abc", "-1", "²", "9" * 5000])
 def test_a_number_that_is_none_is_refused_and_the_gateway_lives(client: Client, number: str) -> None:
     boot = client.status().boot
-    reply = decode(client._get(f"{client.keys.event}?from={number}"), Reply)
+    reply = decode(client.query(f"{client.keys.event}?from={number}"), Reply)
     assert not reply.accepted
     assert "a number is valid" in reply.problems[0]
     features = b'{"kind": "features", "set_points": {"left": {"0": [1, 1]}}, "model_epoch": %s}'
     payload = b'{"id": "00000000", "target": ' + features + b"}"
-    reply = decode(client._get(client.keys.goal("x"), payload % (b"9" * 30)), Reply)
+    reply = decode(client.query(client.keys.goal("x"), payload % (b"9" * 30)), Reply)
     assert not reply.accepted
     assert client.status().boot == boot
 
@@ -280,7 +280,7 @@ def test_a_client_that_dies_in_mid_goal_stops_the_arm_when_its_lease_runs_out(cl
     moved_away(client)
     code = f"""
 import time
-from stereoservo.gateway.client import Client
+from stereoservo.client import Client
 client = Client({CELL!r})
 handle = client.goal("park", gain=0.05, lease_s=0.6, time_limit_s=60.0, tolerance_px=0.01)
 print(handle.id, flush=True)

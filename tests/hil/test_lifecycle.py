@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.gateway.client import (
+from stereoservo.client import (
     Client,
     DaemonLostError,
     EventWatch,
@@ -20,13 +20,19 @@ from stereoservo.gateway.client import (
     NoReplyError,
     RefusedError,
 )
-from stereoservo.gateway.messages import EventMessage
-from stereoservo.gateway.session import SessionError
-from stereoservo.runtime.commands import Goal, JointTarget
-from stereoservo.runtime.daemon import DaemonError, DaemonProcess, NotRunningError, find_daemon, live_cells
-from stereoservo.runtime.directories import CellDirectories
-from stereoservo.runtime.handover import StopSlot
-from stereoservo.runtime.replay import replay
+from stereoservo.client.session import SessionError
+from stereoservo.daemon.seqlock import StopSlot
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.discovery import (
+    DaemonError,
+    DaemonProcess,
+    NotRunningError,
+    find_daemon,
+    live_cells,
+)
+from stereoservo.messages.goals import Goal, JointTarget
+from stereoservo.messages.wire import EventMessage
+from stereoservo.recording.replay import replay
 
 from .conftest import CELL, at_rest, eventually, moved_away, processes
 
@@ -201,7 +207,7 @@ def test_a_signal_ends_it_with_the_arm_stopped(
 
 
 def test_ctrl_c_while_it_starts_leaves_nothing(start: Start, directories: CellDirectories) -> None:
-    for wait in ("describe", "servo"):
+    for wait in ("cell_preparation", "servo"):
         daemon = start(ready=False)
         eventually(f"{wait} runs", lambda name=wait: name in processes(directories))  # type: ignore[misc]
         assert daemon.stop(signal.SIGINT) == 130

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.gateway.client import Client
-from stereoservo.runtime.daemon import DaemonProcess
-from stereoservo.runtime.image_files import ImageLimits, ImageReader, ImageWriter
-from stereoservo.runtime.ports import Frame
-from stereoservo.runtime.replay import replay
+from stereoservo.client import Client
+from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.ports.devices import Frame
+from stereoservo.ports.image_files import ImageLimits, ImageReader, ImageWriter
+from stereoservo.recording.replay import replay
 
 from .conftest import CELL, eventually
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.joint_sights import SeenChain, seen_chain
-from stereoservo_sim.exact_model import exact_model
+from stereoservo.kinematics.joint_reprojection import SeenChain, seen_chain
+from stereoservo_sim.world.exact_model import exact_model
 
 
 def perfect(cell, seed, zero=None):

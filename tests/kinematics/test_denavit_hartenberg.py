@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, ReadOutError, denavit_hartenberg
-from stereoservo_sim import synthetic
-from stereoservo_sim.exact_model import exact_model
+from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
 
 METRIC_ARMS = (
     synthetic.rx90, synthetic.offset_wrist, synthetic.seven, synthetic.gantry_with_wrist, synthetic.mixed,

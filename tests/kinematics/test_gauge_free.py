@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
-from stereoservo_sim import synthetic
-from stereoservo_sim.exact_model import exact_model
+from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
 
 STRATA = {
     "rx90": "metric",

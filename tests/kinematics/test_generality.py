@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.geometry.distortion import distort
-from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import propagated
 from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, ReadOutError, denavit_hartenberg
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
-from stereoservo_sim import synthetic
-from stereoservo_sim.exact_model import exact_model
+from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
 
 SIGMA = 0.05
 

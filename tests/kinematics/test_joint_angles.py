@@ -13,7 +13,7 @@ from stereoservo.kinematics.joint_angles import (
     sensitivity,
     way_home,
 )
-from stereoservo.kinematics.joint_sights import (
+from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
     SeenChain,
     joint_problem,
@@ -21,7 +21,7 @@ from stereoservo.kinematics.joint_sights import (
     points_seen,
     predicted_pixels,
 )
-from stereoservo_sim import synthetic
+from stereoservo_sim.world import synthetic
 
 CELLS = {
     "rx90": synthetic.rx90,

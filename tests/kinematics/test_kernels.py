@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.geometry import cameras
 from stereoservo.kinematics import kernels
 from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.numerics import compilation
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -194,20 +195,20 @@ def test_pixels_that_are_not_numbers_spoil_their_own_point_only():
 
 
 def test_kernels_compile_where_no_cache_directory_is_writable(monkeypatch):
-    njit = kernels.numba.njit
+    njit = compilation.numba.njit
 
     def without_cache(**options):
         if options.pop("cache", False):
             raise RuntimeError("cannot cache function: no locator available")
         return njit(**options)
 
-    monkeypatch.setattr(kernels.numba, "njit", without_cache)
+    monkeypatch.setattr(compilation.numba, "njit", without_cache)
 
     def double(x):
         return 2.0 * x
 
     with pytest.warns(RuntimeWarning, match="no locator available; compiling at every start"):
-        compiled = kernels.kernel(double)
+        compiled = compilation.kernel(double)
     assert compiled(3.0) == 6.0
     assert compiled.signatures
 

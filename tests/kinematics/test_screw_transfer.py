@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.geometry.errors import GeometryError
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.screw_transfer import (
@@ -28,8 +28,8 @@ from stereoservo.kinematics.screw_transfer import (
     seen_from_other_end,
     tool_frame,
 )
-from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.synthetic import gantry_with_wrist, rx90
+from stereoservo_sim.world.exact_model import exact_model
+from stereoservo_sim.world.synthetic import gantry_with_wrist, rx90
 
 H = 1e-6
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import can
 import msgspec
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can import socketcan
 from stereoservo_drivers.can.bus_errors import BUS_OFF, BusError, bus_error
 from stereoservo_drivers.can.frames import CanFrame

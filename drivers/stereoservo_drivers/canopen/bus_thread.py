@@ -11,10 +11,10 @@ import threading
 import time
 from dataclasses import dataclass
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.listening import Subscriptions
+from stereoservo_drivers.canopen.bringup import Subscriptions
 from stereoservo_drivers.canopen.master import Master, MasterFault
 
 PUMP_WAIT_S = 0.002

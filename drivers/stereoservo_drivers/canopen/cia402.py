@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stereoservo.runtime.ports import FloatArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.cia402_words import (
     ENABLE_STEPS,
@@ -76,7 +76,7 @@ def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
     return (STATUS_AND_POSITION, *further)
 
 
-class Axis:
+class DriveAxis:
     """What is known of one drive. ``codes``: its emergencies since the last error reset, newest last.
 
     ``enabled``, ``faulty``: what ``state`` says. ``heard_poll``: number of the poll before its last heartbeat.
@@ -147,7 +147,7 @@ class Cia402Codec:
     """
 
     def __init__(self, options: CanOptions) -> None:
-        self.axes = tuple(Axis(index, joint) for index, joint in enumerate(options.joint))
+        self.axes = tuple(DriveAxis(index, joint) for index, joint in enumerate(options.joint))
         count = len(self.axes)
         self.feedback = Feedback(
             positions=np.full(count, np.nan),
@@ -179,13 +179,13 @@ class Cia402Codec:
         self.bit_name = tuple(name for _, name in bits)
 
     @staticmethod
-    def _rpdo(axis: Axis, word: ControlWord) -> CanFrame:
+    def _rpdo(axis: DriveAxis, word: ControlWord) -> CanFrame:
         return CanFrame(axis.command_id, _COMMAND.pack(word, 0))
 
     # -- receiving ------------------------------------------------------------------------------------------
 
     def _register(
-        self, axis: Axis, further: tuple[tuple[str, ...], ...], bits: list[tuple[int, str]]
+        self, axis: DriveAxis, further: tuple[tuple[str, ...], ...], bits: list[tuple[int, str]]
     ) -> None:
         node = axis.node_id
         decoders = [self._status_and_position(axis, len(bits))]
@@ -196,7 +196,7 @@ class Cia402Codec:
         self._takers[EMCY_ID + node] = lambda data: self._take_emergency(axis, data)
         self._takers[HEARTBEAT_ID + node] = lambda data: self._take_heartbeat(axis, data)
 
-    def _status_and_position(self, axis: Axis, bit: int) -> Callable[[bytes], int]:
+    def _status_and_position(self, axis: DriveAxis, bit: int) -> Callable[[bytes], int]:
         positions, k = self.feedback.positions, axis.index
         unpack, size = _STATUS_AND_POSITION.unpack, _STATUS_AND_POSITION.size
         position, unwrapped = axis.scale.position, axis.counts.update
@@ -212,7 +212,9 @@ class Cia402Codec:
 
         return take
 
-    def _further(self, axis: Axis, pdo: tuple[str, ...], number: int, bit: int) -> Callable[[bytes], int]:
+    def _further(
+        self, axis: DriveAxis, pdo: tuple[str, ...], number: int, bit: int
+    ) -> Callable[[bytes], int]:
         layout = struct.Struct("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
         scale, feedback, k = axis.scale, self.feedback, axis.index
         kinds: dict[str, tuple[FloatArray | None, Callable[[int], float]]] = {
@@ -239,10 +241,10 @@ class Cia402Codec:
             return NOT_CYCLIC
         return take(frame.data)
 
-    def _event(self, axis: Axis, code: str, message: str, value: int, hint: str) -> None:
+    def _event(self, axis: DriveAxis, code: str, message: str, value: int, hint: str) -> None:
         self._events.append(AxisFault(axis.index, code, f"node {axis.node_id}: {message}", value, hint))
 
-    def _wrong_length(self, axis: Axis, pdo: str, got: int, mapped: int) -> int:
+    def _wrong_length(self, axis: DriveAxis, pdo: str, got: int, mapped: int) -> int:
         self._event(
             axis,
             "mapping",
@@ -252,7 +254,7 @@ class Cia402Codec:
         )
         return NOT_CYCLIC
 
-    def _take_status(self, axis: Axis, word: int) -> None:
+    def _take_status(self, axis: DriveAxis, word: int) -> None:
         limited_before = axis.at_limit
         axis.take_status(word)
         if axis.at_limit and not limited_before and axis.state is DriveState.OPERATION_ENABLED:
@@ -265,7 +267,7 @@ class Cia402Codec:
                 "see the limit switches (0x60FD); reset, enable and move the joint inward",
             )
 
-    def _take_emergency(self, axis: Axis, data: bytes) -> int:
+    def _take_emergency(self, axis: DriveAxis, data: bytes) -> int:
         if len(data) < 2:  # no error code, and not the error reset that zeros would be
             return NOT_CYCLIC
         code = int.from_bytes(data[:2], "little")
@@ -274,7 +276,7 @@ class Cia402Codec:
             self._event(axis, "emergency", f"emergency {error_words(code)}", code, error_hint(code))
         return NOT_CYCLIC
 
-    def _take_heartbeat(self, axis: Axis, data: bytes) -> int:
+    def _take_heartbeat(self, axis: DriveAxis, data: bytes) -> int:
         if len(data) != 1:
             return NOT_CYCLIC
         axis.heard_poll = self._polls
@@ -324,7 +326,7 @@ class Cia402Codec:
                 events += self._levels(axis)
         return tuple(events)
 
-    def _levels(self, axis: Axis) -> list[AxisFault]:
+    def _levels(self, axis: DriveAxis) -> list[AxisFault]:
         who, found = f"node {axis.node_id}", []
         if axis.faulty:
             hint = error_hint(axis.codes[-1]) if axis.codes else "remove the cause, then reset"
@@ -402,7 +404,7 @@ class Cia402Codec:
         ]
 
     @staticmethod
-    def _velocity(axis: Axis, velocity: float) -> CanFrame:
+    def _velocity(axis: DriveAxis, velocity: float) -> CanFrame:
         axis.commanded = velocity
         units = axis.scale.velocity_units(velocity)
         return CanFrame(axis.command_id, _COMMAND.pack(_ENABLE_OPERATION, units))

@@ -11,10 +11,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Link
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Axis, Cia402Codec
+from stereoservo_drivers.canopen.bringup import Link, listening, until
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     HEARTBEAT_CONSUMER,
     MODES,
@@ -44,7 +44,6 @@ from stereoservo_drivers.canopen.cia402_words import (
     error_words,
     is_communication_error,
 )
-from stereoservo_drivers.canopen.listening import listening, until
 from stereoservo_drivers.canopen.options import CanOptions
 
 if TYPE_CHECKING:
@@ -334,7 +333,7 @@ def _look(drive: RemoteDrive) -> None:
 
 
 def _lost_the_bus(drive: RemoteDrive) -> bool:
-    axis: Axis = drive.axis
+    axis: DriveAxis = drive.axis
     code = drive.read_if_there(0x603F) or 0
     return any(is_communication_error(known) for known in (*axis.codes, code))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.canopen.cia402 import COMMAND, EMCY_ID, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Link
+from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
 from stereoservo_drivers.canopen.cia402_configuration import MODES, SHIPPED_EDS
-from stereoservo_drivers.canopen.listening import listening, until
 from stereoservo_drivers.canopen.options import CanOptions
 
 if TYPE_CHECKING:

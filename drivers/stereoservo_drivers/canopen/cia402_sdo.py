@@ -17,10 +17,10 @@ from canopen.objectdictionary.datatypes import SIGNED_TYPES
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 from canopen.sdo.client import ReadableStream, WritableStream
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import Link
-from stereoservo_drivers.canopen.cia402 import Axis
+from stereoservo_drivers.canopen.cia402 import DriveAxis
 from stereoservo_drivers.canopen.cia402_words import (
     ABORT_NO_OBJECT,
     ABORT_NO_SUBINDEX,
@@ -82,7 +82,7 @@ class _LinkSdoClient(SdoClient):
 class RemoteDrive:
     """The drive of ``axis`` over ``link``, its objects as ``dictionary`` (an EDS) has them. Use it as a context."""
 
-    def __init__(self, link: Link, axis: Axis, dictionary: canopen.ObjectDictionary) -> None:
+    def __init__(self, link: Link, axis: DriveAxis, dictionary: canopen.ObjectDictionary) -> None:
         self.axis = axis
         self.node_id = axis.node_id
         self.name = axis.name

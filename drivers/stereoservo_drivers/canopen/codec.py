@@ -10,7 +10,7 @@ from typing import Protocol
 
 import msgspec
 
-from stereoservo.runtime.ports import FloatArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.can.frames import CanFrame
 
 NOT_CYCLIC = -1

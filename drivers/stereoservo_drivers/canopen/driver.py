@@ -10,27 +10,33 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from stereoservo.runtime.clock import VirtualClock
-from stereoservo.runtime.ports import (
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import (
     CommandReport,
     DriverContext,
     DriverError,
     Finding,
-    FloatArray,
     JointDriverDescription,
     JointState,
 )
 from stereoservo_drivers.can.channel import Channel
+from stereoservo_drivers.canopen.bringup import Bringup
 from stereoservo_drivers.canopen.bus_thread import BusThread
+from stereoservo_drivers.canopen.cia402 import Cia402Codec
+from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
+from stereoservo_drivers.canopen.codec import Codec
 from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFault, MasterSettings, Mode
+from stereoservo_drivers.canopen.odrive import OdriveCodec
+from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
 from stereoservo_drivers.canopen.option_checks import check_options
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_drivers.canopen.protocols import make_bringup, make_codec
-from stereoservo_drivers.lifecycle import DriverLifecycle, State
+from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.options import decode_options
 
 DRIVER = "canopen"
@@ -83,7 +89,7 @@ class CanJointDriver:
         A drive that is found in fault does not fail the first call: the fault is latched, and the next call clears it.
         Raises DriverError.
         """
-        self._life.require("configure()", State.CREATED, State.CONFIGURED)
+        self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
         if isinstance(self._context.clock, VirtualClock):
             raise DriverError(
                 "real_time",
@@ -91,9 +97,9 @@ class CanJointDriver:
                 "driver 'pybullet' in lockstep",
             )
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        if self._life.state is State.CREATED:
+        if self._life.state is LifecycleState.CREATED:
             self._connect()
-            self._life.state = State.CONFIGURED
+            self._life.state = LifecycleState.CONFIGURED
         elif self.bus is None or not self.bus.alive:
             self._connect()
             self._clear()
@@ -165,9 +171,9 @@ class CanJointDriver:
 
     def activate(self) -> None:
         """Enable all axes at velocity zero. Raises DriverError, also while a fault is latched."""
-        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
+        self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         self._require_no_fault()
-        if self._life.state is State.ACTIVE:
+        if self._life.state is LifecycleState.ACTIVE:
             return
         self.master.request_enable(time.monotonic_ns())
 
@@ -179,13 +185,13 @@ class CanJointDriver:
             self.master.request_disable()
             raise DriverError("enable_timeout", f"the CAN bus's thread is stuck in mode {self.master.mode}")
         self._require_no_fault()
-        self._life.state = State.ACTIVE
+        self._life.state = LifecycleState.ACTIVE
 
     def deactivate(self) -> None:
         """Bring to rest, then switch off. Idempotent. Raises DriverError where a drive does not say that it is off."""
-        if self._life.state is not State.ACTIVE:
+        if self._life.state is not LifecycleState.ACTIVE:
             return
-        self._life.state = State.CONFIGURED
+        self._life.state = LifecycleState.CONFIGURED
         self.master.request_disable()
         limit_s = self.master.stop_limit_s + OFF_MARGIN_S
         if not self._wait(self._is_off, limit_s):
@@ -219,7 +225,7 @@ class CanJointDriver:
             except DriverError as error:
                 self.master.latch(MasterFault(error.code, str(error)))
         self._release()
-        self._life.state = State.CLOSED
+        self._life.state = LifecycleState.CLOSED
 
     def _release(self) -> None:
         if self.bus is not None:
@@ -230,14 +236,14 @@ class CanJointDriver:
         """What `stereoservo doctor` wants to know of bus and drives; closes the driver."""
         from stereoservo_drivers.canopen.examination import examine  # for this one command
 
-        self._life.require("examine()", State.CREATED)
+        self._life.require("examine()", LifecycleState.CREATED)
         return examine(self, self._context.cell_dir, may_move)
 
     # -- the cycle of the caller ----------------------------------------------------------------------------
 
     def read_state(self) -> JointState:
         """The newest complete set, stamped with its poll. Raises DriverError, a latched fault's once."""
-        self._life.require("read_state()", State.CONFIGURED, State.ACTIVE)
+        self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         self.master.port_called(time.monotonic_ns())
         if self.master.fault is not self._told:
             self._require_no_fault()
@@ -248,7 +254,7 @@ class CanJointDriver:
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
         """The newest command, (n,). Raises DriverError: not active, a latched fault, wrong shape, not finite."""
-        self._life.require("write_velocity()", State.ACTIVE)
+        self._life.require("write_velocity()", LifecycleState.ACTIVE)
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (len(self.options.joint),):
             raise DriverError(
@@ -295,3 +301,18 @@ def _effort_unit(joint: CanJoint, protocol: str) -> str:
     if protocol == "cia402" and joint.rated_torque is None:
         return "of rated"
     return "N m" if joint.kind == "revolute" else "N"
+
+
+def make_codec(options: CanOptions) -> Codec:
+    """The cyclic part. Raises DriverError (``option``) where the options do not fit the protocol."""
+    if options.protocol == "odrive":
+        return OdriveCodec(options)
+    return Cia402Codec(options)
+
+
+def make_bringup(options: CanOptions, codec: Codec, cell_dir: Path) -> Bringup:
+    """What goes before the cycle of ``codec``, which ``make_codec`` gave for the same ``options``."""
+    if isinstance(codec, OdriveCodec):
+        return OdriveBringup(options, codec, cell_dir)
+    assert isinstance(codec, Cia402Codec)
+    return Cia402Bringup(options, codec, cell_dir)

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stereoservo.runtime.ports import DriverError, Finding, FloatArray
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import DriverError, Finding
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.bringup import listening
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
-from stereoservo_drivers.canopen.listening import listening
 from stereoservo_drivers.canopen.node_checks import examine_nodes
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
@@ -237,7 +238,7 @@ def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> I
         if error is None:
             yield jog_finding(trace)
             continue
-        cure = jog_finding(trace).cure if trace.asked else ""
+        cure = jog_finding(trace).remedy if trace.asked else ""
         yield Finding(name, False, str(error), cure)
         return
 

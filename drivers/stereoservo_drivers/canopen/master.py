@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import StrEnum
 
+import msgspec
 import numpy as np
 
-from stereoservo.runtime.ports import FloatArray, JointState
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import JointState
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import AxisFault, Codec
-from stereoservo_drivers.canopen.limits import limit_command
-from stereoservo_drivers.canopen.master_data import MasterFault, MasterSettings, MasterStatistics, Mode
 from stereoservo_drivers.canopen.monitors import (
     FloodMonitor,
     FrameCounter,
@@ -27,6 +28,8 @@ from stereoservo_drivers.canopen.monitors import (
     ReversalMonitor,
     Trip,
 )
+from stereoservo_drivers.canopen.odrive import RESOLUTION_TURNS
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale
 
 __all__ = ["ENABLE_LIMIT_S", "Master", "MasterFault", "MasterSettings", "MasterStatistics", "Mode"]
@@ -129,10 +132,6 @@ class Master:
     def request_disable(self) -> None:
         """From the next tick on bring to rest, then switch off."""
         self._request = "disable"
-
-    def request_quick_stop(self) -> None:
-        """Quick stop all axes; as any latched fault it lasts until ``clear``."""
-        self.latch(MasterFault("quick_stop", "a quick stop was asked for", hint="reset, then enable"))
 
     def latch(self, fault: MasterFault) -> None:
         """Take ``fault``: the first one latches, later ones are kept in ``also`` (each code and axis once)."""
@@ -381,3 +380,102 @@ class Master:
             return self._zero
         assert self._sample is not None  # running: there has been a complete cycle
         return limit_command(velocities, self._max_velocity, self._sample.positions, self._low, self._high)[0]
+
+
+class Mode(StrEnum):
+    """What the master does with the axes."""
+
+    OFF = "off"
+    ENABLING = "enabling"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    LATCHED = "latched"
+
+
+class MasterFault(msgspec.Struct, frozen=True):
+    """What ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: where there are some."""
+
+    code: str
+    message: str
+    axis: str = ""
+    value: float | None = None
+    limit: float | None = None
+    hint: str = ""
+    t_ns: int = 0
+
+    def text(self) -> str:
+        """All of it as one sentence for people."""
+        return self.message + (f": {self.hint}" if self.hint else "")
+
+
+class MasterSettings(msgspec.Struct, frozen=True):
+    """What the master needs of the cell file's options. ``resolution_counts``: smallest step of a position."""
+
+    joints: tuple[CanJoint, ...]
+    rate_hz: float
+    bitrate: int
+    heartbeat_ms: int
+    max_missed_cycles: int
+    command_timeout_s: float
+    loop_timeout_ms: int
+    resolution_counts: float = 1.0
+
+    @classmethod
+    def of(cls, options: CanOptions) -> MasterSettings:
+        """The settings in ``options``."""
+        return cls(
+            joints=options.joint,
+            rate_hz=options.rate_hz,
+            bitrate=options.bitrate,
+            heartbeat_ms=options.heartbeat_ms,
+            max_missed_cycles=options.max_missed_cycles,
+            command_timeout_s=options.command_timeout_s,
+            loop_timeout_ms=options.loop_timeout_ms,
+            resolution_counts=RESOLUTION_TURNS if options.protocol == "odrive" else 1.0,
+        )
+
+
+@dataclass
+class MasterStatistics:
+    """Since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two ticks.
+
+    ``answered_ns``: from the newest complete cycle's poll to its last frame; ``answered_max_ns``: the largest.
+    """
+
+    cycles: int = 0
+    complete: int = 0
+    incomplete: int = 0
+    lost: int = 0
+    doubled: int = 0
+    foreign: int = 0
+    heartbeats: int = 0
+    longest_cycle_ns: int = 0
+    answered_ns: int = 0
+    answered_max_ns: int = 0
+
+
+def limit_command(
+    velocities: FloatArray,
+    max_velocities: FloatArray,
+    positions: FloatArray,
+    position_min: FloatArray,
+    position_max: FloatArray,
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Velocities (n,) that may be sent, and why they differ (``drive_velocity_limit``, ``position_limit``).
+
+    Beyond a velocity limit all joints are scaled alike, so that the direction of motion is kept. A joint at or
+    beyond a position limit may only move inward; the others go on. Joints whose position is not known
+    (NaN) do not move.
+    """
+    reasons: tuple[str, ...] = ()
+    excess = float((np.abs(velocities) / max_velocities).max())
+    if excess > 1.0:
+        velocities = velocities / excess
+        reasons = ("drive_velocity_limit",)
+    above, below = positions > position_min, positions < position_max
+    if (above & below).all():
+        return velocities, reasons
+    allowed = (above | (velocities >= 0.0)) & (below | (velocities <= 0.0)) & np.isfinite(positions)
+    if (~allowed & (velocities != 0.0)).any():
+        reasons = (*reasons, "position_limit")
+    return np.where(allowed, velocities, 0.0), reasons

@@ -11,7 +11,7 @@ from collections import Counter, deque
 import msgspec
 import numpy as np
 
-from stereoservo.runtime.ports import FloatArray
+from stereoservo.numerics.arrays import FloatArray
 
 DOUBLES_IN_A_ROW = 3
 """One double may be a frame that waited on a busy bus; several in a row are two drives with one node id."""

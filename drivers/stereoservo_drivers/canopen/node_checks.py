@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from stereoservo.runtime.ports import DriverError, Finding
+from stereoservo.ports.devices import DriverError, Finding
 from stereoservo_drivers.canopen.bringup import Link
-from stereoservo_drivers.canopen.cia402 import Axis, Cia402Codec
+from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import MODES, eds_path, load_eds
 from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
@@ -47,7 +47,7 @@ def scan(link: Link) -> dict[int, int]:
     return {node: len(frames) for node, frames in answers.items() if frames}
 
 
-def _not_one(axis: Axis, count: int, strangers: list[int]) -> Finding:
+def _not_one(axis: DriveAxis, count: int, strangers: list[int]) -> Finding:
     if count > 1:
         return Finding(
             axis.name, False, f"{count} drives answer as node {axis.node_id}",

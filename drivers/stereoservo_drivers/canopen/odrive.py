@@ -16,7 +16,8 @@ import struct
 
 import numpy as np
 
-from stereoservo.runtime.ports import DriverError, FloatArray
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions

@@ -13,11 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen import odrive
-from stereoservo_drivers.canopen.bringup import Link
-from stereoservo_drivers.canopen.listening import listening, until
+from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.odrive import OdriveCodec, frame_id
 from stereoservo_drivers.canopen.options import CanOptions
 

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.load import BusLoad, cycle_load, refusal
 from stereoservo_drivers.canopen.cia402 import FEEDBACK_OBJECTS, tpdo_feedback
 from stereoservo_drivers.canopen.odrive import SHARE

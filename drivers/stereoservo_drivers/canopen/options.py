@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from stereoservo.runtime.ports import JointSpec
+from stereoservo.ports.devices import JointSpec
 
 Positive = Annotated[float, Meta(gt=0)]
 NodeId = Annotated[int, Meta(ge=1, le=126)]

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stereoservo.runtime.ports import Finding, FloatArray
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import Finding
 from stereoservo_drivers.canopen.options import CanJoint
 from stereoservo_drivers.canopen.units import JointScale
 

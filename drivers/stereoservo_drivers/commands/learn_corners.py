@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 import typer
 
-from stereoservo.runtime import plugins
-from stereoservo.runtime.cellfile import CellFile, load_cell_file
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.daemon import daemon_info
-from stereoservo.runtime.directories import cell_directories
-from stereoservo.runtime.image_files import ImageReader
-from stereoservo.runtime.ports import CameraDriver, DriverContext, DriverError, Frame
-from stereoservo_drivers.detectors.landmark_learning import LearningSettings, learn_landmarks
-from stereoservo_drivers.detectors.landmark_pictures import draw_landmarks
-from stereoservo_drivers.detectors.landmarks import KINDS, ImageArray, encode_landmarks
+from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.discovery import daemon_info
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports import plugins
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import CameraDriver, DriverContext, DriverError, Frame
+from stereoservo.ports.image_files import ImageReader
+from stereoservo_drivers.detectors.landmark_learning import LearningSettings, draw_landmarks, learn_landmarks
+from stereoservo_drivers.detectors.landmarks import KINDS, encode_landmarks
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PATIENCE_S = 10.0

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import (
+from stereoservo.ports.devices import (
     CameraDriver,
     CameraObservation,
     DriverContext,

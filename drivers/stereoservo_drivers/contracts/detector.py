@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import CameraObservation, Detector, DriverContext, Frame, Prior
+from stereoservo.ports.devices import CameraObservation, Detector, DriverContext, Frame, Prior
 from stereoservo_drivers.contracts.camera import check_observation
 from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_budget
 

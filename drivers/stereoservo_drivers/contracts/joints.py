@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import DriverContext, DriverError, JointDriver
+from stereoservo.ports.devices import DriverContext, DriverError, JointDriver
 from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_budget
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import MonotonicClock, VirtualClock
-from stereoservo.runtime.ports import DriverContext
+from stereoservo.ports.clock import MonotonicClock, VirtualClock
+from stereoservo.ports.devices import DriverContext
 
 
 class PacedSuite:

@@ -15,21 +15,25 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from stereoservo.runtime.ports import (
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.ports.devices import (
     CameraObservation,
     DetectorDescription,
     DriverContext,
     DriverError,
-    FloatArray,
     Frame,
-    ImageArray,
     Prior,
 )
 from stereoservo_drivers.detectors import tag_registration
-from stereoservo_drivers.detectors.blobs import noise_level
+from stereoservo_drivers.detectors.acquisition import noise_level
 from stereoservo_drivers.detectors.frame_images import SMALLEST_IMAGE, sized_image
-from stereoservo_drivers.detectors.tag_registration import register_tag
-from stereoservo_drivers.detectors.tags import DictionaryName, dictionary, size_of, tag_cells
+from stereoservo_drivers.detectors.tag_registration import (
+    DictionaryName,
+    dictionary,
+    register_tag,
+    size_of,
+    tag_cells,
+)
 from stereoservo_drivers.options import invalid
 
 NOISY = 3.0

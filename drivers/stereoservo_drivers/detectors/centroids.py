@@ -22,26 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo_drivers.detectors.compilation import (
-    BOOL,
-    FLOAT,
-    IMAGE,
-    INT,
-    INT32,
-    compile_for,
-    given,
-    kernel,
-    written,
-)
+from stereoservo.numerics.compilation import kernel
 from stereoservo_drivers.detectors.components import (
-    MAX_WINDOW,
-    crowded,
-    extremes,
-    nearest_component,
-    ring_level,
-)
-from stereoservo_drivers.detectors.levels import inside, surroundings
-from stereoservo_drivers.detectors.measurements import (
     AREA,
     BACKGROUND,
     BORDER,
@@ -62,6 +44,7 @@ from stereoservo_drivers.detectors.measurements import (
     LIT,
     LOPSIDED,
     LOPSIDED_NOISE,
+    MAX_WINDOW,
     NO_COMPONENT,
     NO_CONTRAST,
     NOISE,
@@ -73,7 +56,22 @@ from stereoservo_drivers.detectors.measurements import (
     SHAPE,
     U,
     V,
+    crowded,
+    extremes,
+    nearest_component,
+    ring_level,
 )
+from stereoservo_drivers.detectors.kernel_types import (
+    BOOL,
+    FLOAT,
+    IMAGE,
+    INT,
+    INT32,
+    compile_for,
+    given,
+    written,
+)
+from stereoservo_drivers.detectors.levels import inside, surroundings
 
 SKIRT = 2.2
 """Distance to the ellipse, to first order, up to which a pixel outside counts [px] (in truth up to 2.8 at 4

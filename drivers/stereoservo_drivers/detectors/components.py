@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo_drivers.detectors.compilation import kernel
-from stereoservo_drivers.detectors.measurements import QXX, QXY, QYY, U, V
+from stereoservo.numerics.compilation import kernel
 
 MAX_WINDOW = 160
 """Largest side of a window [px]."""
@@ -175,3 +174,11 @@ def crowded(labels, box, label, near, reach, out):
                     if specks < 0:
                         return True
     return False
+
+
+U, V, CXX, CXY, CYY, AREA, QXX, QXY, QYY, CONTRAST, NOISE, LOPSIDED, LOPSIDED_NOISE = range(13)
+BXX, BXY, BYY, BRIGHT, BACKGROUND, FLUX, FLUX_NOISE = range(13, 20)
+LIT, DARK, SLOPE, SLOPE_XX, SLOPE_XY, SLOPE_YY, PULL, EXX, EXY, EYY = 20, 24, 28, 30, 31, 32, 33, 37, 38, 39
+FIELDS = 40
+
+OK, NO_CONTRAST, NO_COMPONENT, BORDER, SHAPE, DIVERGED = range(6)

@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from stereoservo.runtime.ports import (
+from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from stereoservo.ports.devices import (
     CameraObservation,
     DetectorDescription,
     DriverContext,
@@ -26,9 +27,10 @@ from stereoservo.runtime.ports import (
     Prior,
 )
 from stereoservo_drivers.detectors.frame_images import gray_image
-from stereoservo_drivers.detectors.keypoint_matches import Keypoints, find_keypoints
 from stereoservo_drivers.detectors.landmark_search import (
+    Keypoints,
     Surroundings,
+    find_keypoints,
     nothing,
     search_by_keypoints,
     seek,
@@ -37,10 +39,6 @@ from stereoservo_drivers.detectors.landmark_search import (
 from stereoservo_drivers.detectors.landmarks import KINDS, load_landmarks
 from stereoservo_drivers.detectors.patch_alignment import (
     Alignment,
-    BoolArray,
-    FloatArray,
-    ImageArray,
-    IntArray,
     ReferencePatches,
     build_pyramid,
     compile_kernels,

@@ -12,25 +12,22 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from stereoservo.runtime.ports import (
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.ports.devices import (
     CameraObservation,
     DetectorDescription,
     DriverContext,
     DriverError,
-    FloatArray,
     Frame,
-    ImageArray,
     Prior,
 )
-from stereoservo_drivers.detectors import acquisition, centroids, covariances, patterns, tracking
-from stereoservo_drivers.detectors.acquisition import Expectation
-from stereoservo_drivers.detectors.blobs import find_spots
+from stereoservo_drivers.detectors import acquisition, centroids, face_tracking, levels, patterns
+from stereoservo_drivers.detectors.acquisition import Expectation, find_spots
 from stereoservo_drivers.detectors.centroids import measure_windows
-from stereoservo_drivers.detectors.components import scratch
-from stereoservo_drivers.detectors.faces import FaceOptions, Positive, patterns_of
+from stereoservo_drivers.detectors.components import FIELDS, scratch
+from stereoservo_drivers.detectors.face_options import FaceOptions, Positive, patterns_of
+from stereoservo_drivers.detectors.face_tracking import SHAPE, expect, judge, settle_face
 from stereoservo_drivers.detectors.frame_images import sized_image
-from stereoservo_drivers.detectors.measurements import FIELDS
-from stereoservo_drivers.detectors.tracking import SHAPE, expect, judge, settle_face
 
 SAME_SPOT_PX = 2.0
 """A spot this near to a dot that was tracked is that dot."""
@@ -107,8 +104,8 @@ class DotDetector:
         self._labels, self._stack = scratch()
         centroids.compile_kernels()
         patterns.compile_kernels()
-        tracking.compile_kernels()
-        covariances.compile_kernels()
+        face_tracking.compile_kernels()
+        levels.compile_kernels()
         self._size = self.options.image_size
         self._every_id = np.array([pattern.ids for pattern in self._patterns])
         self._order = np.argsort(self._every_id.ravel())
@@ -240,7 +237,7 @@ class DotDetector:
         rows = self._order[used.ravel()[self._order]]
         ids, chosen = self._every_id.ravel()[rows], dots.reshape(-1, FIELDS)[rows]
         spread = np.empty((len(ids), 2, 2))
-        covariances.covariances(chosen, self.options.floor_px, spread)
+        levels.covariances(chosen, self.options.floor_px, spread)
         return CameraObservation(
             camera=frame.camera,
             seq=frame.seq,

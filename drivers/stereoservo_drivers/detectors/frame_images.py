@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.runtime.ports import DriverError, Frame, ImageArray
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports.devices import DriverError, Frame
 
 SMALLEST_IMAGE = 32
 """Of a side [px]."""

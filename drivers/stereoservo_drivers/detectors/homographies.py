@@ -1,6 +1,6 @@
 """Planar dot patterns under homographies: fit, picture of a dot, check. Numba kernels; no state.
 
-Pattern coordinates are those of :class:`~stereoservo_drivers.detectors.plates.DotFace` in units of half its
+Pattern coordinates are those of :class:`~stereoservo.ports.dot_plates.DotFace` in units of half its
 corner distance. A face seen from in front has a homography of positive determinant and positive depths; a
 mirrored pattern has not.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo_drivers.detectors.compilation import kernel
+from stereoservo.numerics.compilation import kernel
 
 ODD_NOISE, ODD_REST = 25.0, 70.0
 
@@ -261,7 +261,7 @@ def _left_out(pattern, pixels, used, frame, h, A, b, out):
 
 
 @kernel
-def odd_dot(pattern, pixels, used, sigma, out):
+def outlier_dot(pattern, pixels, used, sigma, out):
     """The dot that fits its face worse than noise and the others' misfit allow, -1 if none does; of six or more.
 
     ``sigma`` [px] of a dot; ``out`` (n, 3) as :func:`_left_out` writes it. Beyond ODD_NOISE variances of noise and
@@ -317,7 +317,7 @@ def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
 
 
 @kernel
-def drop_strangers(pattern, pixels, used, tolerance, sigma, least, H):
+def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
     """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of where the others
     put it.
 

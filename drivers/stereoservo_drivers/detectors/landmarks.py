@@ -18,11 +18,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.runtime.ports import DriverError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-ImageArray = npt.NDArray[np.uint8]
+from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
+from stereoservo.ports.devices import DriverError
 
 SCHEMA = 1
 LARGEST_FILE = 256 * 2**20
@@ -71,7 +68,7 @@ class Landmarks(msgspec.Struct, frozen=True, eq=False):
         )
 
 
-class _Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _LandmarkHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     schema: int
     cameras: tuple[str, ...]
     averaged: tuple[int, ...]
@@ -80,7 +77,7 @@ class _Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def encode_landmarks(landmarks: Landmarks) -> bytes:
     """Landmarks as npz bytes: a JSON header, PNG pictures, arrays. Raises DriverError (``landmarks``)."""
     check_landmarks(landmarks, "landmarks")
-    header = _Header(
+    header = _LandmarkHeader(
         SCHEMA, tuple(c.name for c in landmarks.cameras), tuple(c.averaged for c in landmarks.cameras)
     )
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -108,7 +105,7 @@ def decode_landmarks(data: bytes, path: Path | str = "<landmarks>") -> Landmarks
             raise ValueError(f"it unpacks to {size} bytes; at most {LARGEST_FILE} are read")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-        header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_Header)
+        header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_LandmarkHeader)
         if header.schema != SCHEMA:
             raise _bad(path, f"schema is {header.schema}; this version reads {SCHEMA}")
         if len(header.averaged) != len(header.cameras):

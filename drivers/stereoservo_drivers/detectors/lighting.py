@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo_drivers.detectors.compilation import kernel
-from stereoservo_drivers.detectors.levels import EVEN
-from stereoservo_drivers.detectors.measurements import (
+from stereoservo.numerics.compilation import kernel
+from stereoservo_drivers.detectors.components import (
     AREA,
     BACKGROUND,
     BRIGHT,
@@ -31,6 +30,7 @@ from stereoservo_drivers.detectors.measurements import (
     SLOPE_XY,
     SLOPE_YY,
 )
+from stereoservo_drivers.detectors.levels import EVEN
 
 BEND = 0.24
 """Length over which light bends as much as it lies off its plane, in rms distances of a face's dots."""
@@ -230,7 +230,7 @@ def _follow(dot, slope, noise, ground, moved):
 
 
 @kernel
-def take_light_back(areas, used, dark_noise, bright_noise, dots, moved):
+def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
     """Move the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) to where they were under even light.
 
     ``areas`` (n,) [px²] as the face's homography predicts them. Adds to EXX .. EYY what remains uncertain: the slopes,

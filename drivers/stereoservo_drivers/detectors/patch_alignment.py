@@ -17,20 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import types
 
-from stereoservo_drivers.detectors.compilation import (
-    FLOAT,
-    IMAGE,
-    INT,
-    compile_for,
-    given,
-    kernel,
-    written,
-)
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-ImageArray = npt.NDArray[np.uint8]
+from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, INT, compile_for, given, written
 
 TEMPLATE_LEVELS = 4
 SMALLEST_LEVEL = 24

@@ -6,12 +6,11 @@ Pattern coordinates are those of :mod:`~stereoservo_drivers.detectors.homographi
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo_drivers.detectors.compilation import FLOAT, INT, compile_for, given, kernel, written
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle, misfits
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo_drivers.detectors.kernel_types import FLOAT, INT, compile_for, given, written
 
 CLEAR = 1.6
 """Least ratio of misfits between the second-best and the best explanation of the same dots."""

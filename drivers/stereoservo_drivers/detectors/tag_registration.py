@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo_drivers.detectors.compilation import FLOAT, compile_for, given, kernel, written
-
-FloatArray = npt.NDArray[np.float64]
-ImageArray = npt.NDArray[np.uint8]
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, given, written
 
 PARAMETERS = 13
 """Homography from pixels to the tag (8), log of the blur, white level, its two slopes, black as a part of white: light
@@ -416,3 +418,49 @@ def compile_kernels() -> None:
         given(FLOAT, 1),
         written(FLOAT, 2),
     )
+
+
+DictionaryName = Literal[
+    "36h11", "36h10", "25h9", "16h5", "original", "mip_36h12",
+    "4x4_50", "4x4_100", "4x4_250", "4x4_1000", "5x5_50", "5x5_100", "5x5_250", "5x5_1000",
+    "6x6_50", "6x6_100", "6x6_250", "6x6_1000", "7x7_50", "7x7_100", "7x7_250", "7x7_1000",
+]  # fmt: skip
+
+_CONSTANTS = {
+    "36h11": "DICT_APRILTAG_36h11",
+    "36h10": "DICT_APRILTAG_36h10",
+    "25h9": "DICT_APRILTAG_25h9",
+    "16h5": "DICT_APRILTAG_16h5",
+    "original": "DICT_ARUCO_ORIGINAL",
+    "mip_36h12": "DICT_ARUCO_MIP_36h12",
+    **{f"{n}x{n}_{size}": f"DICT_{n}X{n}_{size}" for n in (4, 5, 6, 7) for size in (50, 100, 250, 1000)},
+}
+DICTIONARIES: tuple[str, ...] = tuple(_CONSTANTS)
+"""Every dictionary there is, by the name that a cell file gives it."""
+
+
+@cache
+def dictionary(name: str) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of that name. Raises KeyError."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, _CONSTANTS[name]))
+
+
+def size_of(name: str) -> int:
+    """How many tags the dictionary has: ids 0 .. n - 1. Raises KeyError."""
+    return int(dictionary(name).bytesList.shape[0])
+
+
+def cells_along(name: str) -> int:
+    """Cells along a side, the black border included. Raises KeyError."""
+    return int(dictionary(name).markerSize) + 2
+
+
+def tag_cells(name: str, tag: int) -> npt.NDArray[np.float64]:
+    """Darkness (n, n) of a tag's cells, its black border included: 1 black, 0 white; rows downwards.
+
+    Raises KeyError, IndexError.
+    """
+    if not 0 <= tag < size_of(name):
+        raise IndexError(f"tag {tag} is not in {name}: 0..{size_of(name) - 1}")
+    image = cv2.aruco.generateImageMarker(dictionary(name), tag, cells_along(name))
+    return np.where(np.asarray(image) > 127, 0.0, 1.0)

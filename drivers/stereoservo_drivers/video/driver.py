@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from stereoservo.runtime.ports import (
+from stereoservo.ports.devices import (
     CameraDescription,
     CameraStatistics,
     DriverContext,
     DriverError,
     Frame,
 )
-from stereoservo_drivers.lifecycle import DriverLifecycle, State
+from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, decode_video_options
 from stereoservo_drivers.video.playback import Playback
 from stereoservo_drivers.video.reader import Reader
 from stereoservo_drivers.video.sources import CaptureSource, LiveSource, Settings
-from stereoservo_drivers.video.watch import Watch
+from stereoservo_drivers.video.stream_monitor import Watch
 
 LIVE_BUDGET_US = 1000.0
 RECORDED_BUDGET_US = 50_000.0
@@ -86,8 +86,10 @@ class VideoCameraDriver:
 
         Raises DriverError: what is wrong with the source, ``image_size``, ``open_timeout``, ``end_of_file``.
         """
-        self._life.require("configure()", State.CREATED, State.CONFIGURED, State.CLOSED)
-        if self._life.state is State.CONFIGURED:
+        self._life.require(
+            "configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED
+        )
+        if self._life.state is LifecycleState.CONFIGURED:
             return
         if self._over is not None:
             raise _again(self._over)
@@ -99,7 +101,7 @@ class VideoCameraDriver:
             raise
         self._feed = feed
         self._openings += 1
-        self._life.state = State.CONFIGURED
+        self._life.state = LifecycleState.CONFIGURED
 
     def _new_feed(self) -> Feed:
         place, options, context = self._place, self._options, self._context
@@ -114,14 +116,14 @@ class VideoCameraDriver:
 
     def activate(self) -> None:
         """Frames from now on. Raises DriverError."""
-        self._life.require("activate()", State.CONFIGURED, State.ACTIVE)
-        if self._life.state is State.CONFIGURED and self._feed is not None:
+        self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
+        if self._life.state is LifecycleState.CONFIGURED and self._feed is not None:
             self._feed.begin()
-        self._life.state = State.ACTIVE
+        self._life.state = LifecycleState.ACTIVE
 
     def poll(self) -> list[Frame]:
         """The newest frame since the last poll, or none. Raises DriverError: the source failed or is over."""
-        self._life.require("poll()", State.ACTIVE)
+        self._life.require("poll()", LifecycleState.ACTIVE)
         assert self._feed is not None
         try:
             frame = self._feed.take()
@@ -133,8 +135,8 @@ class VideoCameraDriver:
 
     def deactivate(self) -> None:
         """No more frames; the source stays open. Idempotent."""
-        if self._life.state is State.ACTIVE:
-            self._life.state = State.CONFIGURED
+        if self._life.state is LifecycleState.ACTIVE:
+            self._life.state = LifecycleState.CONFIGURED
 
     def close(self) -> None:
         """Release the source, waiting half a second at most. Idempotent; never raises."""
@@ -142,7 +144,7 @@ class VideoCameraDriver:
             self._settings = self._feed.settings
             self._feed.close()
             self._feed = None
-        self._life.state = State.CLOSED
+        self._life.state = LifecycleState.CLOSED
 
     def statistics(self) -> CameraStatistics:
         """Counts since the driver was first configured, over reconnections; any state."""

@@ -19,11 +19,11 @@ from urllib.parse import SplitResult, unquote, urljoin, urlunsplit
 import cv2
 import numpy as np
 
-from stereoservo.runtime.ports import Clock, DriverError
-from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, Part, number_in
+from stereoservo.ports.devices import Clock, DriverError
+from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, MultipartPart, number_in
 from stereoservo_drivers.video.options import Place, VideoOptions, place_of
 from stereoservo_drivers.video.pictures import check_size, jpeg_flag, jpeg_size
-from stereoservo_drivers.video.sources import Picture, Settings
+from stereoservo_drivers.video.sources import Settings, SourcePicture
 
 CHUNK = 1 << 18
 MOST_READS = 64
@@ -124,9 +124,9 @@ class MjpegSource:
             )
         return boundary
 
-    def read(self) -> Picture | None:
+    def read(self) -> SourcePicture | None:
         """The newest whole picture, waiting for one; None: it was spoiled. Raises DriverError."""
-        parts: list[Part] = []
+        parts: list[MultipartPart] = []
         assert self._response is not None
         assert self._parser is not None
         for _ in range(MOST_READS):
@@ -161,7 +161,7 @@ class MjpegSource:
             return True
         return bool(select.select([connection], [], [], 0)[0])
 
-    def _decoded(self, part: Part, skipped: int) -> Picture | None:
+    def _decoded(self, part: MultipartPart, skipped: int) -> SourcePicture | None:
         told = part.headers.get("content-type", "image/jpeg").partition(";")[0].strip().lower()
         if told not in ("image/jpeg", "image/jpg"):
             raise self._place.error(
@@ -184,7 +184,7 @@ class MjpegSource:
             return None
         self._spoiled = 0
         number = number_in(part.headers.get("x-sequence"))
-        return Picture(image, part.t_ns, number, skipped)
+        return SourcePicture(image, part.t_ns, number, skipped)
 
     def interrupt(self) -> None:
         """Wake the thread that waits in :meth:`open` or :meth:`read`."""

@@ -20,7 +20,7 @@ class MultipartError(Exception):
 
 
 @dataclass
-class Part:
+class MultipartPart:
     """One part: when its first byte was there, its headers by name in lower case, its body; ``cut``: not all of it."""
 
     t_ns: int
@@ -37,23 +37,23 @@ class MultipartParser:
         self._delimiter = b"--" + boundary.encode("latin-1").lstrip(b"-")
         self._largest = largest
         self._buffer = bytearray()
-        self._part: Part | None = None
+        self._part: MultipartPart | None = None
         self._length: int | None = None
         self._in_body = False
         self._scanned = 0
 
-    def feed(self, data: bytes, t_ns: int) -> list[Part]:
+    def feed(self, data: bytes, t_ns: int) -> list[MultipartPart]:
         """Take ``data`` received at ``t_ns``; the parts that it completes.
 
         Raises MultipartError: ``frame_too_large``, ``not_mjpeg``.
         """
         self._buffer += data
-        parts: list[Part] = []
+        parts: list[MultipartPart] = []
         while True:
             if self._part is None:
                 if not self._find_part():
                     return parts
-                self._part = Part(t_ns)
+                self._part = MultipartPart(t_ns)
             if not self._in_body and not self._read_headers(self._part):
                 return parts
             if not self._read_body(self._part):
@@ -79,7 +79,7 @@ class MultipartParser:
         self._scanned = 0
         return True
 
-    def _read_headers(self, part: Part) -> bool:
+    def _read_headers(self, part: MultipartPart) -> bool:
         found = _HEADERS_END.search(self._buffer, 0, LONGEST_HEADERS + 4)
         end, width = (found.start(), len(found[0])) if found else (-1, 0)
         self._bound_headers(len(self._buffer) if end < 0 else end)
@@ -103,7 +103,7 @@ class MultipartParser:
         if length > LONGEST_HEADERS:
             raise MultipartError("not_mjpeg", f"headers of a part above {LONGEST_HEADERS} bytes")
 
-    def _read_body(self, part: Part) -> bool:
+    def _read_body(self, part: MultipartPart) -> bool:
         length = self._length
         boundary = self._buffer.find(b"\n" + self._delimiter, self._scanned)
         if length is not None and (boundary < 0 or boundary + 1 >= length):
@@ -122,7 +122,7 @@ class MultipartParser:
     def _rescan_from_tail(self) -> None:
         self._scanned = max(0, len(self._buffer) - len(self._delimiter) - 1)
 
-    def _complete(self, part: Part, length: int, *, cut: bool) -> bool:
+    def _complete(self, part: MultipartPart, length: int, *, cut: bool) -> bool:
         part.body = bytes(self._buffer[:length])
         part.cut = cut
         del self._buffer[:length]

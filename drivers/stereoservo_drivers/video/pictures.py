@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stereoservo.runtime.ports import DriverError, ImageArray
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video.options import Channel, Flip, Place, VideoOptions
 
 _CHANNELS = {"blue": 0, "green": 1, "red": 2}

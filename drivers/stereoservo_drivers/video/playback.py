@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from stereoservo.runtime.ports import Clock, DriverError, Frame
+from stereoservo.ports.devices import Clock, DriverError, Frame
 from stereoservo_drivers.video.options import Place, VideoOptions, frozen_frames
 from stereoservo_drivers.video.pictures import one_channel
 from stereoservo_drivers.video.recorded import Recording, open_recording
 from stereoservo_drivers.video.sources import Settings
-from stereoservo_drivers.video.watch import Watch
+from stereoservo_drivers.video.stream_monitor import Watch
 
 MOST_A_POLL = 8
 """Frames that one poll passes over when it comes late: a bound of its time."""

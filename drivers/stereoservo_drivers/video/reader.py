@@ -7,11 +7,11 @@ import time
 
 import cv2
 
-from stereoservo.runtime.ports import DriverError, Frame
+from stereoservo.ports.devices import DriverError, Frame
 from stereoservo_drivers.video.options import Place, VideoOptions, frozen_frames
 from stereoservo_drivers.video.pictures import check_size, one_channel
-from stereoservo_drivers.video.sources import LiveSource, Picture, Settings
-from stereoservo_drivers.video.watch import Watch
+from stereoservo_drivers.video.sources import LiveSource, Settings, SourcePicture
+from stereoservo_drivers.video.stream_monitor import Watch
 
 JOIN_S = 0.5
 """How long :meth:`Reader.close` waits for its thread. One that hangs in a library is left to end by itself; it is a
@@ -114,7 +114,7 @@ class Reader:
             self._error = error
             self._changed.notify_all()
 
-    def _keep(self, picture: Picture) -> None:
+    def _keep(self, picture: SourcePicture) -> None:
         options = self._options
         check_size(self._place, options, picture.image.shape[1], picture.image.shape[0])
         image = one_channel(picture.image, options.channel, options.flip)

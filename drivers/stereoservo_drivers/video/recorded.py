@@ -13,8 +13,9 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from stereoservo.runtime.image_files import ImageFileError, ImageReader, sidecar_of
-from stereoservo.runtime.ports import DriverError, Frame, ImageArray
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports.devices import DriverError, Frame
+from stereoservo.ports.image_files import ImageFileError, ImageReader, sidecar_of
 from stereoservo_drivers.video.options import Place, VideoOptions
 from stereoservo_drivers.video.pictures import PICTURE_FLAG, check_size, jpeg_size
 

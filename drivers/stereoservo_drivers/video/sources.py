@@ -9,7 +9,8 @@ from typing import Protocol
 
 import cv2
 
-from stereoservo.runtime.ports import Clock, ImageArray
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports.devices import Clock
 from stereoservo_drivers.video.options import Place, VideoOptions
 
 Settings = dict[str, tuple[float | None, float | None]]
@@ -18,7 +19,7 @@ MANUAL_EXPOSURE = 1.0
 
 
 @dataclass(frozen=True)
-class Picture:
+class SourcePicture:
     """What a source gives: ``image`` ``(height, width[, 3])``, when it was received, the source's number of it, and how
     many pictures received before it were passed over.
     """
@@ -38,7 +39,7 @@ class LiveSource(Protocol):
         """Connect. Blocks for the time-out of opening at most, as far as the libraries hold it. Raises DriverError."""
         ...
 
-    def read(self) -> Picture | None:
+    def read(self) -> SourcePicture | None:
         """Wait for the next picture; None: one came that is not whole. Raises DriverError."""
         ...
 
@@ -122,7 +123,7 @@ class CaptureSource:
         known = capture.set(what, value)
         self.settings[name] = value, capture.get(what) if known else None
 
-    def read(self) -> Picture | None:
+    def read(self) -> SourcePicture | None:
         """The next picture. Raises DriverError."""
         capture = self._capture
         assert capture is not None
@@ -132,7 +133,7 @@ class CaptureSource:
             )
         received_ns = self._clock.now_ns()
         whole, image = capture.retrieve()
-        return Picture(image, received_ns) if whole else None
+        return SourcePicture(image, received_ns) if whole else None
 
     def interrupt(self) -> None:
         """Nothing wakes `cv2.VideoCapture.grab`: it ends by its own time-out."""

@@ -1,14 +1,18 @@
-"""``stereoservo drivers``."""
+"""``stereoservo drivers``: lists the plug-ins."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from stereoservo.cli.output import JsonOption, emit
-from stereoservo.runtime import plugins
+from stereoservo.control.law_registry import LAWS
+from stereoservo.ports import plugins
 
 
 def drivers(json: JsonOption = False) -> None:
-    """List drivers, detectors and commands that are installed; broken ones with their error."""
+    """List drivers, detectors, laws and commands that are installed; broken ones with their error."""
     groups = {group.rpartition(".")[2]: plugins.list_plugins(group, check=True) for group in plugins.GROUPS}
+    groups["laws"] = [replace(law, error=LAWS.errors.get(law.name, law.error)) for law in groups["laws"]]
     tree = {
         kind: [
             {"name": p.name, "value": p.value, "distribution": p.distribution, "error": p.error or None}

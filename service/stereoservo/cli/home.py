@@ -1,4 +1,4 @@
-"""``stereoservo home``."""
+"""``stereoservo home``: moves every joint to the home position."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from stereoservo.cli import interruption
-from stereoservo.cli.goal import follow
+from stereoservo.cli.goal.command import follow
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption
-from stereoservo.gateway.client import Client
+from stereoservo.client import Client
 
 
 def home(

@@ -1,4 +1,4 @@
-"""``stereoservo init``: a commented cell file, its limits taken from what the driver says of itself."""
+"""``stereoservo init``: writes a commented cell file with the limits that the driver reports."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit
-from stereoservo.runtime import plugins
-from stereoservo.runtime.cellfile import check_joints, load_cell_file
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.directories import CELL_NAME
-from stereoservo.runtime.ports import CameraDescription, DriverContext, DriverError, JointDriverDescription
+from stereoservo.messages.cell_file import check_joints, load_cell_file
+from stereoservo.messages.directories import CELL_NAME
+from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo.ports import plugins
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import CameraDescription, DriverContext, DriverError, JointDriverDescription
 
 
 def init(
@@ -90,7 +91,7 @@ def _text(
     lines += [
         "[servo]",
         f"rate_hz = {min(joints.rate_hz, 250.0):g}                 # cycles of the loop a second",
-        'law = "cartesian3"             # default law of goals: "cartesian3" or "stereo"',
+        f'law = "{DEFAULT_LAW}"             # default law of goals, of: {", ".join(plugins.names(plugins.LAWS))}',
         "gain = 1.5                     # [1/s]",
         "tolerance_px = 0.25            # a goal is reached when every marker is this close ...",
         "hold_frames = 10               # ... for so many frames",

@@ -1,4 +1,4 @@
-"""Ctrl-C as an exception and as a flag: raised in a destructor or a library's callback, the exception alone is lost."""
+"""Ctrl-C as exception and as flag: an exception raised in a destructor or a library's callback is lost."""
 
 from __future__ import annotations
 

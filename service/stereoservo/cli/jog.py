@@ -1,4 +1,4 @@
-"""``stereoservo jog``: a dead man's switch. The arm moves only while this process renews its lease."""
+"""``stereoservo jog``: moves joints at given velocities while this process renews its lease (a dead man's switch)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, pairs
-from stereoservo.gateway.client import Client, ClientError
+from stereoservo.client import Client, ClientError
 
 LEASE_S = 0.3
 EVERY_S = 0.1

@@ -1,9 +1,9 @@
-"""``stereoservo ls``."""
+"""``stereoservo ls``: lists running cells."""
 
 from __future__ import annotations
 
 from stereoservo.cli.output import JsonOption, emit
-from stereoservo.runtime.daemon import live_cells
+from stereoservo.messages.discovery import live_cells
 
 
 def ls(json: JsonOption = False) -> None:

@@ -1,12 +1,14 @@
-"""``stereoservo``: one module a command, imported when it is called; further commands by entry point."""
+"""Entry point ``stereoservo``: finds the command, imports its module, reports failures and the exit code."""
 
 from __future__ import annotations
 
-import importlib
+import ast
+import importlib.util
 import os
 import signal
 import sys
 import traceback
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -17,7 +19,7 @@ from typer.models import CommandInfo
 import stereoservo
 from stereoservo.cli import interruption
 from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
-from stereoservo.runtime import plugins
+from stereoservo.ports import plugins
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads cost more than they give here
 
@@ -25,22 +27,22 @@ COMMANDS: dict[str, str] = {
     "run": "run:run",
     "status": "status:status",
     "stop": "stop:stop",
-    "goal": "goal:goal",
+    "goal": "goal.command:goal",
     "teach": "teach:teach",
     "jog": "jog:jog",
     "home": "home:home",
-    "calibrate": "calibrate:calibrate",
+    "calibrate": "calibrate.command:calibrate",
     "watch": "watch:watch",
-    "enable": "verbs:enable",
-    "disable": "verbs:disable",
-    "hold": "verbs:hold",
-    "resume": "verbs:resume",
-    "reset": "verbs:reset",
-    "acknowledge": "verbs:acknowledge",
+    "enable": "operator_commands:enable",
+    "disable": "operator_commands:disable",
+    "hold": "operator_commands:hold",
+    "resume": "operator_commands:resume",
+    "reset": "operator_commands:reset",
+    "acknowledge": "operator_commands:acknowledge",
     "record": "record:record",
     "replay": "replay:replay",
     "drivers": "drivers:drivers",
-    "doctor": "doctor:doctor",
+    "doctor": "doctor.command:doctor",
     "init": "init:init",
     "ls": "ls:ls",
     "warmup": "warmup:warmup",
@@ -52,9 +54,7 @@ _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class LazyGroup(TyperGroup):
-    """Imports a command when it is asked for. A broken plug-in is listed with its error and takes no other
-    with it.
-    """
+    """The commands, each imported when it is called; a broken plug-in is listed with its error and breaks no other."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
@@ -70,6 +70,37 @@ class LazyGroup(TyperGroup):
                 cmd_name, _broken(error), {"allow_extra_args": True, "ignore_unknown_options": True}
             )
         return _command(cmd_name, function)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The list of ``--help``; the commands of this distribution are not imported for it."""
+        names = self.list_commands(ctx)
+        width = formatter.width - 6 - max(len(name) for name in names)
+        own = {
+            plugin.name: plugin.value
+            for plugin in plugins.list_plugins(plugins.COMMANDS)
+            if plugin.distribution.split()[0] == "stereoservo"
+        } | {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
+        rows = []
+        for name in names:
+            command = _described(name, own[name]) if name in own else self.get_command(ctx, name)
+            rows.append((name, command.get_short_help_str(width)))
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+def _described(name: str, where: str) -> Any:
+    """A command that has only its help, read from the source of ``module:function`` without an import of it."""
+    module, _, function = where.partition(":")
+    spec = importlib.util.find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    (found,) = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == function)
+
+    def described() -> None: ...
+
+    described.__doc__ = ast.get_docstring(found)
+    return _command(name, described)
 
 
 def _load(name: str) -> Any:
@@ -118,7 +149,7 @@ def root(
 
 
 def invoke(arguments: list[str]) -> int:
-    """Run one command line; gives the exit code. Prints failures as the contract says."""
+    """Run one command line; returns the exit code. Failures are printed, as JSON with ``--json``."""
     as_json = "--json" in arguments
     try:
         code = get_command(app).main(args=arguments, prog_name="stereoservo", standalone_mode=False)

@@ -1,11 +1,10 @@
-"""What every command does alike: exactly one JSON object on stdout with ``--json``, messages on stderr,
-exit codes.
-"""
+"""What all commands share: options, arguments, exit codes, and output as text or as exactly one JSON object."""
 
 from __future__ import annotations
 
 import re
 import sys
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -89,6 +88,24 @@ def pairs(items: list[str], what: str) -> dict[str, float]:
             raise CommandError("argument", f"{what} {item!r}: NAME=NUMBER with a finite number is valid")
         found[name] = number
     return found
+
+
+def marker_ids(text: str, what: str) -> list[int]:
+    """``"10,11,12"`` as marker ids. Raises CommandError."""
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise CommandError(
+            "argument", f"{what} {text!r}: marker ids with commas, 10,11,12, are valid"
+        ) from error
+
+
+def read_file(path: Path) -> bytes:
+    """A file's bytes. Raises CommandError."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CommandError("file", f"{path}: {error.strerror}") from error
 
 
 def _snake(name: str) -> str:

@@ -1,4 +1,4 @@
-"""``stereoservo record``."""
+"""``stereoservo record``: records the flight of a running cell."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import msgspec
 import typer
 
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, note
-from stereoservo.gateway.client import Client, EventWatch
-from stereoservo.runtime.image_order import ImagesRecorded
+from stereoservo.client import Client, EventWatch
+from stereoservo.messages.recording_request import ImagesRecorded
 
 LAST_WORD_S = 10.0
 """The gateway gives its cameras 5 s to finish their files."""

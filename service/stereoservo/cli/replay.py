@@ -1,4 +1,4 @@
-"""``stereoservo replay``."""
+"""``stereoservo replay``: runs a recording through the core again and compares."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit
-from stereoservo.runtime.replay import replay as replay_file
+from stereoservo.recording.replay import replay as replay_file
 
 
 def replay(

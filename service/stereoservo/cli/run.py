@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit, note
-from stereoservo.runtime.interprocess import COMMISSIONING_SPEED, RunPlan
-from stereoservo.runtime.supervisor import run_cell
+from stereoservo.daemon.ipc_messages import COMMISSIONING_SPEED, RunPlan
+from stereoservo.daemon.supervisor import run_cell
 
 
 def run(

@@ -1,13 +1,12 @@
-"""``stereoservo status``."""
+"""``stereoservo status``: the state of a cell in words."""
 
 from __future__ import annotations
 
 import math
 
-from stereoservo.cli.goal_text import progress_words
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, emit
-from stereoservo.gateway.client import Client
-from stereoservo.gateway.messages import StateMessage
+from stereoservo.client import Client
+from stereoservo.messages.wire import StateMessage
 
 
 def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
@@ -46,8 +45,20 @@ def describe(state: StateMessage) -> str:
     return "\n".join(lines)
 
 
+def progress_words(state: StateMessage) -> str:
+    """Progress of the active goal; empty where it is unknown."""
+    words = []
+    if state.progress is not None:
+        words.append(f"{100.0 * state.progress:.0f} % of its way")
+    if state.seconds_left is not None:
+        words.append(f"{state.seconds_left:.1f} s left")
+    if state.error_px is not None:
+        words.append(f"error {state.error_px:.3f} px")
+    return ", ".join(words)
+
+
 def _health(state: StateMessage) -> list[str]:
-    """How far each camera agrees with the model, what is wrong where it does not, and stamps that are off."""
+    """Agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
     health = state.health
     if health.verdict == "unknown":
         return []

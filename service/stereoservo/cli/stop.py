@@ -1,4 +1,4 @@
-"""``stereoservo stop``: by zenoh, and where the gateway does not answer, by the stop slot itself."""
+"""``stereoservo stop``: over zenoh, or by the stop slot where the gateway does not answer."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import time
 from pathlib import Path
 
 from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
-from stereoservo.gateway.client import Client, NoReplyError
-from stereoservo.gateway.session import SessionError
-from stereoservo.runtime.cellfile import load_cell_file
-from stereoservo.runtime.daemon import NotRunningError
-from stereoservo.runtime.directories import cell_directories
-from stereoservo.runtime.handover import SlotError, StopSlot
+from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionError
+from stereoservo.daemon.seqlock import SlotError, StopSlot
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.discovery import NotRunningError
 
 ACKNOWLEDGE_S = 1.0
 
@@ -21,7 +20,7 @@ def stop(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption =
     try:
         with Client(cell, endpoint=endpoint, timeout_s=1.0) as client:
             reply = client.stop()
-    except (NoReplyError, SessionError, NotRunningError) as error:
+    except (InvalidReplyError, NoReplyError, SessionError, NotRunningError) as error:
         if endpoint is not None:
             raise
         _raise_slot(cell, error)

@@ -1,4 +1,4 @@
-"""``stereoservo teach``."""
+"""``stereoservo teach``: stores the current view, or a drawing, as a goal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.goal_input import numbers, read
 from stereoservo.cli.output import (
     CellArgument,
     CommandError,
@@ -16,9 +15,11 @@ from stereoservo.cli.output import (
     JsonOption,
     OperatorOption,
     emit,
+    marker_ids,
+    read_file,
 )
-from stereoservo.gateway.client import Client
-from stereoservo.gateway.messages import Synthesise, decode, encode
+from stereoservo.client import Client
+from stereoservo.messages.wire import Synthesise, decode, encode
 
 
 def teach(
@@ -57,7 +58,7 @@ def teach(
             reply = client.synthesise(wanted)
         emit(reply, reply.message, json)
         return
-    markers = () if tool is None else tuple(numbers(tool, "--tool"))
+    markers = () if tool is None else tuple(marker_ids(tool, "--tool"))
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         event = client.teach(name, frames, tool=markers)
     emit(event, event.message, json)
@@ -66,7 +67,7 @@ def teach(
 def read_drawing(path: Path, name: str) -> Synthesise:
     """A drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
     try:
-        tree: Any = msgspec.json.decode(read(path))
+        tree: Any = msgspec.json.decode(read_file(path))
     except msgspec.DecodeError as error:
         raise CommandError("file", f"{path}: is not JSON: {error}") from error
     if not isinstance(tree, dict):

@@ -1,4 +1,4 @@
-"""``stereoservo watch``."""
+"""``stereoservo watch``: prints what the cell publishes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from stereoservo.cli.goal_text import progress_words
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, emit
-from stereoservo.control.reasons import Reason
-from stereoservo.gateway.client import Client
-from stereoservo.gateway.messages import EventMessage, FeaturesMessage, StateMessage
+from stereoservo.cli.status import progress_words
+from stereoservo.client import Client
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
 STATE_EVERY_S = 1.0
 

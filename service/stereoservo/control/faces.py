@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.face_choice_kernel import choose_face_step, faces_fronting
 from stereoservo.control.faces_kernel import (
     all_triples,
+    choose_face_step,
     coplanar_groups,
     covering_groups,
+    faces_fronting,
     marker_covariances,
     marker_distances,
     marker_information,
@@ -29,9 +30,9 @@ from stereoservo.control.faces_kernel import (
     triangle_altitudes,
     turned_average,
 )
-from stereoservo.control.law import IntArray, Scene, Task
+from stereoservo.control.law import Scene, Task
 from stereoservo.control.primitives_kernel import minors
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 FLAT_PX = 0.05
 """A good ``sigma_px`` for the markers of a calibrated model on plates flat to some tenths of a millimetre.

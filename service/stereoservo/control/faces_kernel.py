@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from stereoservo.control.law import IntArray
 from stereoservo.control.primitives_kernel import dot, minors
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import exp_twist, invert4, kernel
-from stereoservo.trajectory.motion_frame import average_over_turns
+from stereoservo.kinematics.kernels import exp_twist, invert4
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.motion_frame import average_over_turns
 
 AVERAGING_ROUNDS = 3
 """How often an arm's turns are averaged over, one joint after another."""
@@ -303,3 +303,162 @@ def triangle_altitudes(points: FloatArray, form: FloatArray, triples: IntArray) 
             left = _form(off, form, off) - (mixed * mixed / length if length > 0.0 else 0.0)
             out[t] = min(out[t], math.sqrt(max(0.0, left)))
     return out
+
+
+LEAST_ALTITUDE = 10.0
+"""Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
+CLEARLY_BETTER = 2.0
+"""Ratio of image areas from which on another triangle takes over."""
+LASTING = 8.0
+"""How many times its area a triangle counts that shows its front at the goal too."""
+
+
+@kernel
+def faces_fronting(
+    points: FloatArray,
+    triples: IntArray,
+    sided: FloatArray,
+    displacements: FloatArray,
+    camera_centres: FloatArray,
+) -> FloatArray:
+    """1 (K, f, c) where a face of the body, moved by ``displacements`` (K, 4, 4), shows its front; else 0.
+
+    ``points`` (m, 4) now, of height 1 like ``camera_centres`` (c, 4); ``triples`` (f, 3) in outward order; a face whose
+    outward side is not known, ``sided`` (f,) 0, counts as seen from both.
+    """
+    samples, faces, cameras = displacements.shape[0], triples.shape[0], camera_centres.shape[0]
+    out = np.ones((samples, faces, cameras))
+    moved = np.empty((3, 4))
+    for s in range(samples):
+        for f in range(faces):
+            if not sided[f] > 0.0:
+                continue
+            for corner in range(3):
+                for i in range(4):
+                    moved[corner, i] = dot(displacements[s, i], points[triples[f, corner]])
+            plane = minors(moved[0], moved[1], moved[2])
+            for c in range(cameras):
+                if not dot(plane, camera_centres[c]) > 0.0:
+                    out[s, f, c] = 0.0
+    return out
+
+
+@kernel
+def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
+    """Cameras that see a triangle well, and its areas there, in squared deviations of its worst marker, summed."""
+    count, area = 0, 0.0
+    for c in range(weights.shape[0]):
+        weight = min(weights[c, i], weights[c, j], weights[c, k])
+        if not weight > 0.0:
+            continue
+        ux, uy = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
+        vx, vy = pixels[c, k, 0] - pixels[c, i, 0], pixels[c, k, 1] - pixels[c, i, 1]
+        wx, wy = vx - ux, vy - uy
+        double = abs(ux * vy - uy * vx)
+        longest = math.sqrt(max(ux * ux + uy * uy, vx * vx + vy * vy, wx * wx + wy * wy))
+        if double * weight >= LEAST_ALTITUDE * longest and longest > 0.0:
+            count += 1
+            area += 0.5 * double * weight * weight
+    return count, area
+
+
+@kernel
+def choose_triangle(
+    members: FloatArray,
+    lasting: FloatArray,
+    usable: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    face_now: int,
+    triple_now: IntArray,
+) -> tuple[int, IntArray, int]:
+    """Face (-1: across faces), its three markers and the cameras that see them (0: there are none).
+
+    See `control.faces.choose_face`; the order of the markers is not yet outward. ``lasting`` (f,), ``usable`` (m,).
+    """
+    faces, markers = members.shape
+    best = np.zeros(3, np.int64)
+    best_face, best_count, best_area = -1, 0, 0.0
+    # faces first; across faces only where none is seen
+    for f in range(faces + 1):
+        if f == faces and best_count > 0:
+            break
+        for i in range(markers):
+            if not (usable[i] > 0.0 and (f == faces or members[f, i] > 0.0)):
+                continue
+            for j in range(i + 1, markers):
+                if not (usable[j] > 0.0 and (f == faces or members[f, j] > 0.0)):
+                    continue
+                for k in range(j + 1, markers):
+                    if not (usable[k] > 0.0 and (f == faces or members[f, k] > 0.0)):
+                        continue
+                    count, area = triangle_sight(i, j, k, pixels, weights)
+                    if f < faces and lasting[f] > 0.0:
+                        area *= LASTING
+                    if count > best_count or (count == best_count and area > best_area):
+                        best_face, best_count, best_area = (f if f < faces else -1), count, area
+                        best[0], best[1], best[2] = i, j, k
+    if face_now >= -1 and (face_now >= 0 or best_face < 0):
+        good = True
+        for corner in range(3):
+            good = good and usable[triple_now[corner]] > 0.0
+        if good:
+            count, area = triangle_sight(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
+            if face_now >= 0 and lasting[face_now] > 0.0:
+                area *= LASTING
+            if count > 0 and count >= best_count and best_area <= CLEARLY_BETTER * area:
+                return face_now, triple_now.copy(), count
+    return best_face, best, best_count
+
+
+@kernel
+def choose_face_step(
+    triples: IntArray,
+    members: FloatArray,
+    sided: FloatArray,
+    body: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    targets: FloatArray,
+    target_known: FloatArray,
+    camera_centres: FloatArray,
+    face_now: int,
+    triple_now: IntArray,
+) -> tuple[int, IntArray, int, FloatArray]:
+    """`control.faces.choose_face` on arrays: face, outward triple (3,), cameras and kept (c,)."""
+    faces, markers = members.shape
+    cameras = camera_centres.shape[0]
+    usable = np.zeros(markers)
+    for p in range(markers):
+        height = points[p, 0] + points[p, 1] + points[p, 2] + points[p, 3]
+        if target_known[p] > 0.0 and math.isfinite(height):
+            usable[p] = 1.0
+    lasting = np.zeros(faces)
+    for f in range(faces):
+        plane = minors(targets[triples[f, 0]], targets[triples[f, 1]], targets[triples[f, 2]])
+        for c in range(cameras):
+            if sided[f] > 0.0 and dot(plane, camera_centres[c]) > 0.0:
+                lasting[f] = 1.0
+    face, triple, count = choose_triangle(members, lasting, usable, pixels, weights, face_now, triple_now)
+    kept = np.zeros(cameras)
+    if count == 0:
+        return -2, triple_now.copy(), 0, kept
+    i, j, k = triple
+    side = 0.0
+    if face >= 0 and sided[face] > 0.0:
+        outward = minors(body[triples[face, 0]], body[triples[face, 1]], body[triples[face, 2]])
+        side = dot(outward, minors(body[i], body[j], body[k]))
+    else:  # the side that most cameras see
+        plane = minors(points[i], points[j], points[k])
+        for c in range(cameras):
+            if weights[c, i] > 0.0 and weights[c, j] > 0.0 and weights[c, k] > 0.0:
+                side += 1.0 if dot(plane, camera_centres[c]) > 0.0 else -1.0
+    if side < 0.0:
+        triple[1], triple[2] = k, j
+    now = minors(points[triple[0]], points[triple[1]], points[triple[2]])
+    then = minors(targets[triple[0]], targets[triple[1]], targets[triple[2]])
+    for c in range(cameras):
+        if dot(now, camera_centres[c]) > 0.0 and dot(then, camera_centres[c]) > 0.0:
+            kept[c] = 1.0
+    return face, triple, count, kept

@@ -17,12 +17,13 @@ State is plain arrays, functions are pure.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import kernel
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 
 
 class TrackSettings(msgspec.Struct, frozen=True):
@@ -221,26 +222,6 @@ def predict_track(
     return pixels, speeds, tracked.copy()
 
 
-def steady_gains(period_s: float, settings: TrackSettings) -> tuple[float, float]:
-    """``α`` and ``β`` of the filter at regular observations every ``period_s`` [s], once it has settled."""
-    index = settings.density_px2_s3 * period_s**3 / settings.sigma_px**2
-
-    def alpha(beta: float) -> float:
-        return 0.5 * (math.sqrt(beta * (8.0 + beta / 3.0)) - beta)
-
-    low, high = 0.0, 6.0 - 2.0 * math.sqrt(6.0) + 1.0
-    while alpha(high) < 1.0:
-        high *= 2.0
-    for _ in range(200):
-        beta = 0.5 * (low + high)
-        rest = 1.0 - alpha(beta)
-        if rest <= 0.0 or beta**2 > index * rest:
-            high = beta
-        else:
-            low = beta
-    return alpha(low), low
-
-
 class ClientClock(msgspec.Struct, frozen=True):
     """How a client's stamps lie to the times at which they arrive: ``offset_s`` = arrival less stamp, of the fastest.
 
@@ -262,3 +243,35 @@ def arrived(clock: ClientClock, stamp_s: float, arrival_s: float) -> ClientClock
         risen = clock.offset_s + clock.drift * max(0.0, arrival_s - clock.arrival_s)
         offset = min(offset, risen)
     return msgspec.structs.replace(clock, offset_s=offset, arrival_s=arrival_s)
+
+
+SLOPE_UNIT_PX = 100.0
+"""Slopes are stated in 1/s per so many pixels."""
+
+
+class GainCurve(NamedTuple):
+    """``near`` and ``far`` [1/s], ``slope`` > 0 [1/s per 100 px]: how fast the gain leaves ``near``."""
+
+    near: float
+    far: float
+    slope: float
+
+
+def gain_at(curve: GainCurve, error_px: float | None) -> float:
+    """The gain [1/s] at an error [px], the largest distance over markers and cameras; None: not measured.
+
+    What is not known, or no number, takes the smaller of the two gains.
+    """
+    return adaptive_gain(curve.near, curve.far, curve.slope, math.nan if error_px is None else error_px)
+
+
+@kernel
+def adaptive_gain(near: float, far: float, slope: float, error_px: float) -> float:
+    """`gain_at` as a kernel; NaN: not measured. Equal gains are constant, a negative error counts as none."""
+    if math.isnan(error_px):
+        return min(near, far)
+    span = abs(near - far)
+    if span == 0.0 or error_px <= 0.0:
+        return near
+    gain = far + (near - far) * math.exp(-slope * (error_px / SLOPE_UNIT_PX) / span)
+    return max(min(near, far), min(max(near, far), gain))

@@ -7,20 +7,36 @@ reference; the loop runs `incidence_kernel.incidence_kernel`, which says how res
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.incidence_images_kernel import fixed_dimension, joint_metric, moving_count
-from stereoservo.control.incidence_kernel import incidence_kernel
-from stereoservo.control.law import IntArray, LawStep, Options, Scene
-from stereoservo.control.reasons import Reason
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import image_jacobian
-from stereoservo.trajectory.rooms import limit_pull
+from stereoservo.control.incidence_kernel import (
+    METRIC_FLOOR,
+    fixed_dimension,
+    incidence_kernel,
+    joint_metric,
+    moving_count,
+)
+from stereoservo.control.law import Options, Scene
+from stereoservo.control.mobility import (
+    REACH,
+    Freedom,
+    attainable_motions,
+    body_frame,
+    missing_freedom,
+    rigid_motions,
+)
+from stereoservo.control.mobility_kernel import point_jacobian
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.kernels import image_jacobian, invert4
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.planning.constraint_margins import limit_pull
 
 KINDS = (
     "point-on-point",
@@ -40,7 +56,7 @@ FLAT = 1e-6
 
 
 class IncidenceStatus(IntEnum):
-    """What becomes of an incidence. Codes up to 2 mean the same as in `trajectory.three_points.ComponentStatus`."""
+    """What becomes of an incidence. Codes up to 2 are those of `planning.three_point_decomposition.ComponentStatus`."""
 
     MOVES = 0
     DONE = 1
@@ -250,11 +266,6 @@ def incidence_step(
     return IncidenceStep(velocity, error, status, rank, conditioning, share)
 
 
-def as_law_step(step: IncidenceStep) -> LawStep:
-    """In the form of all laws: ``error`` and ``allowed`` in pixels, one component an incidence."""
-    return LawStep(step.velocity, step.error_px, step.error_px, step.status, step.conditioning)
-
-
 def incidence_reasons(step: IncidenceStep, task: IncidenceTask, names: Sequence[str]) -> tuple[Reason, ...]:
     """Why the task goes no further: one reason a cause, its subject the ``names`` (k,) of the incidences concerned."""
     reasons = []
@@ -283,3 +294,61 @@ def incidence_reasons(step: IncidenceStep, task: IncidenceTask, names: Sequence[
             known = value if np.isfinite(value) else None
             reasons.append(Reason(code, "hold", subject, known, task.tolerance_px, "px", hint))
     return tuple(reasons)
+
+
+DEAR = 10.0
+"""Cost of a motion that no joint makes, relative to one that joints make, so that these are used first."""
+
+
+def incidence_freedoms(
+    scene: Scene,
+    task: IncidenceTask,
+    plane_at_infinity: FloatArray,
+    H_projective_to_euclidean: FloatArray | None = None,
+    camera: str = "the first camera",
+    tolerance: float = REACH,
+    anywhere: bool = False,
+) -> tuple[Freedom | None, ...]:
+    """For each incidence by itself the freedom that it lacks here, None where the arm brings it nearer in all respects.
+
+    To first order, as the arm stands: a freedom that is lost at a singularity counts as missing. ``anywhere``: only
+    one that the arm lacks wherever it stands (a SCARA's tilts, the turns of slides). What the body would have to do
+    besides all that the arm can is named; ``tolerance``: part of the residual that may be left, besides the task's
+    own. Raises GeometryError as `mobility.mobility` does.
+    """
+    E = body_frame(
+        scene.operators, scene.matrices, scene.points, plane_at_infinity, H_projective_to_euclidean
+    )
+    rigid = np.ascontiguousarray(rigid_motions(E))
+    if anywhere:
+        scene = scene._replace(
+            operators=attainable_motions(E, scene.operators), composition=Composition.SIMULTANEOUS
+        )
+    operators = np.concatenate([scene.operators, rigid])
+    free = scene._replace(operators=operators, composition=Composition.SIMULTANEOUS)
+    form = np.ascontiguousarray(invert4(E)[:3])
+    cost = np.sqrt((point_jacobian(operators, scene.points, form) ** 2).sum(axis=0))
+    cost = np.maximum(cost, METRIC_FLOOR * cost.max(initial=1.0))
+    cost[len(scene.operators) :] *= DEAR
+    options = Options(1.0)
+    found: list[Freedom | None] = []
+    for k in range(len(task.kinds)):
+        alone = IncidenceTask(
+            task.kinds[k : k + 1], task.markers[k : k + 1], task.fixed[k : k + 1], task.tolerance_px
+        )
+        step = incidence_step(scene, alone, options)
+        body = incidence_step(free, alone, options, metric=cost)
+        # On a ridge, or at its goal, nothing tells the motion that is needed.
+        needed = step.error_px[0] > task.tolerance_px and body.share > 1.0 - tolerance
+        unmade = math.sqrt(1.0 - step.share**2)
+        if not needed or unmade <= tolerance or unmade * step.error_px[0] <= task.tolerance_px:
+            found.append(None)
+            continue
+        wanted = (body.velocity[len(scene.operators) :, None, None] * rigid).sum(axis=0)
+        found.append(
+            missing_freedom(
+                scene.operators, scene.matrices, scene.points, plane_at_infinity, wanted,
+                H_projective_to_euclidean, camera, tolerance,
+            )
+        )  # fmt: skip
+    return tuple(found)

@@ -1,6 +1,6 @@
-"""What every law gets and gives: one interface, arrays only. A law is a pure function of these (thesis 8).
+"""Interface of control laws: the struct `Law` that a plug-in registers, and what its step takes and returns.
 
-``Scene`` is the present, ``Task`` where to go, ``Options`` how; `control.laws.LAWS` has the laws by name.
+Arrays only; a law is a pure function of them. `control.law_registry.LAWS` holds the installed laws by name.
 """
 
 from __future__ import annotations
@@ -9,15 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from math import inf
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.control.reasons import Reason
-from stereoservo.geometry.homogeneous import FloatArray
-
-IntArray = npt.NDArray[np.int64]
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 
 class JacobianChoice(IntEnum):
@@ -61,7 +58,7 @@ class Task(NamedTuple):
     ``centre`` now and ``centre_target``, (4,) of height 1: one point of the body. ``face`` (3,): markers that span
     the face whose sight is kept.
 
-    Of a planned way, for law ``trajectory``; empty where there is none: ``joint_rates`` (n,) [rad/s or m/s],
+    Of a plan, for planned laws; empty where there is none: ``joint_rates`` (n,) [rad/s or m/s],
     ``joint_error`` (n,) planned joints less the arm's, ``joint_weight`` [0, 1] what share of their weight they have.
     """
 
@@ -96,7 +93,7 @@ class Options(NamedTuple):
 
 class LawStep(NamedTuple):
     """``velocity`` (n,) [rad/s or m/s]. ``error`` (k,), ``allowed`` (k,), ``status`` (k,): of the law's components, see
-    `trajectory.three_points.ComponentStatus`; k = 0 for laws in the images. ``conditioning``: of the normal matrix, 0
+    `ComponentStatus` of the planning; k = 0 for laws in the images. ``conditioning``: of the normal matrix, 0
     singular; 1 where there is none.
     """
 
@@ -107,12 +104,59 @@ class LawStep(NamedTuple):
     conditioning: float
 
 
+Path = Literal["free", "straight", "planned"]
+"""Where a law leads the body: where its errors take it, on the straight line that is checked before, along a plan."""
+OneCamera = Literal["suffices", "continues", "refused"]
+"""What a law does with one camera: made for it, goes on by prediction once it has begun, or is refused."""
+
+
+@dataclass(frozen=True)
+class LawProperties:
+    """What a user weighs when choosing a law: the row of a law in the table of docs/goals-and-laws.md, in Markdown."""
+
+    centre: str
+    face: str
+    works_on: str
+    noise_at_rest: str
+    one_camera: str
+    fails_when: str
+
+
 @dataclass(frozen=True)
 class Law:
-    """A law by its step. ``components``, ``units``: of its error; ``needs_pose``: works on ``target_points``."""
+    """A control law as a plug-in: its step, what the daemon must know of it, and its words.
+
+    ``step`` maps (Scene, Task, Options) to a LawStep. It is pure, allocates little and returns within a fraction of
+    the cycle. ``reasons`` of a step: what holds it up, empty where nothing does. ``components``, ``units``: of
+    ``LawStep.error``, which has as many elements.
+
+    ``needs_pose``: the step reads ``target_points``; ``path`` and ``one_camera``: see `Path` and `OneCamera`;
+    ``follows_streams``: the target may move while the law runs. ``options``: fields of a goal that belong to this
+    law, of ``centre``, ``jacobian`` and ``profile``.
+
+    ``summary``: one line for lists. ``colour``: in figures. ``rank``: where the law stands in lists.
+    """
 
     step: Callable[[Scene, Task, Options], LawStep]
-    needs_pose: bool
+    summary: str
+    needs_pose: bool = False
+    path: Path = "free"
+    one_camera: OneCamera = "continues"
+    follows_streams: bool = True
+    options: tuple[str, ...] = ()
     components: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     reasons: Callable[[LawStep], tuple[Reason, ...]] = lambda step: ()
+    properties: LawProperties | None = None
+    colour: str = "#7f7f7f"
+    rank: int = 1000
+
+    @property
+    def planned(self) -> bool:
+        """Whether the law follows a plan, and waits for one."""
+        return self.path == "planned"
+
+    @property
+    def needs_goal_pose(self) -> bool:
+        """Whether a goal of this law must determine a pose: for the step, or for the plan."""
+        return self.needs_pose or self.planned

@@ -1,4 +1,4 @@
-"""What the loop asks of an arm's freedoms in every step, in numba; tested against `mobility_reference`.
+"""Freedoms of an arm at its present posture, in numba: rank, joints to block, self-motion away from limits.
 
 Freedoms count by the motion of the body's points in right-angled coordinates of any unit: ``rows`` (3m, n) is their
 Jacobian (`point_jacobian`). Pixels would tell sideways from depth, not strong joints from weak ones. No BLAS, LAPACK or
@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import kernel
-from stereoservo.kinematics.linear_kernels import right_singular
-from stereoservo.trajectory.rooms import limit_pull
-
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import right_singular
+from stereoservo.planning.constraint_margins import limit_pull
 
 LOST = 1e-3
 """Singular value, relative to the largest, below which a freedom is lost; the operators are estimates."""
@@ -190,38 +187,6 @@ def joints_to_block(rows: FloatArray, unit: FloatArray, capacity: int, least: fl
             chosen += 1
         blocked[index[chosen]] = True
     return blocked
-
-
-@kernel
-def missing_share(rows: FloatArray, motion: FloatArray) -> float:
-    """Part in [0, 1] of a wanted motion (r,) of the points that no joint motion makes; 0 for none wanted, 1 for NaN.
-
-    ``motion``: the same rows of the wanted generator, `point_jacobian` of it alone.
-    """
-    count, n = rows.shape
-    total = 0.0
-    for r in range(count):
-        total += motion[r] * motion[r]
-    if total == 0.0:
-        return 0.0
-    rank, values, V = drivable_freedoms(rows, np.ones(n))
-    if not math.isfinite(total) or rank == 0:
-        return 1.0
-    rest = motion.copy()
-    u = np.empty(count)
-    for i in range(rank):
-        s = 0.0
-        for r in range(count):
-            u[r] = 0.0
-            for j in range(n):
-                u[r] += rows[r, j] * V[j, i] / values[i]
-            s += u[r] * rest[r]
-        for r in range(count):
-            rest[r] -= s * u[r]
-    left = 0.0
-    for r in range(count):
-        left += rest[r] * rest[r]
-    return math.sqrt(min(1.0, left / total))
 
 
 @kernel

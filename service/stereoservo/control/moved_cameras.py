@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.image import image
 from stereoservo.control.law import LawStep, Options, Scene, Task
+from stereoservo.control.laws.image import image
 from stereoservo.geometry.cameras import camera_centre
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.moved_cameras import resect_moved_camera
+from stereoservo.numerics.arrays import FloatArray
 
 
 def with_resected_cameras(scene: Scene) -> Scene:

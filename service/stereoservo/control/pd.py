@@ -20,8 +20,8 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.control.law import Task
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import kernel
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 
 
 def pd_task(task: Task, measured_rates: FloatArray, measured: FloatArray, damping: float) -> Task:

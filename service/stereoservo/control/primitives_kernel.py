@@ -1,4 +1,4 @@
-"""`trajectory.primitives` in numba: small algebra of points and planes, and the primitive motions of an arm.
+"""`planning.primitives` in numba: small algebra of points and planes, and the primitive motions of an arm.
 
 Names, order and thresholds are those of the reference; read that first. No BLAS, no allocation of note.
 """
@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.kernels import kernel
-from stereoservo.kinematics.linear_kernels import null_direction, right_singular
-from stereoservo.trajectory.primitives import (
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import null_direction, right_singular
+from stereoservo.planning.primitives import (
     DEGENERATE_RATIO,
     NOISE_RATIO,
     RANK_RATIO,

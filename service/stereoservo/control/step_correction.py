@@ -2,66 +2,174 @@
 
 The screws of a law hold for an instant: driven together for a whole step, joints turn one another's axes, and what
 comes out is off by the brackets of (8.46). Instead of their series, Newton's method finds the step of the joints that
-displaces the body's points exactly as meant, from the first-order step on. The readable reference of
-`control.step_correction_kernel`.
+displaces the body's points exactly as meant, from the first-order step on.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.composition import Composition, displacement, moved_operators
+from stereoservo.kinematics.kernels import exp_twist, multiply4_into, transform_points_into
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import add_equation, damped_solve
 
 ITERATIONS = 6
 CONVERGED = 1e-12
 """Of the joints' step: below it another iteration changes nothing."""
-
 SLACK = 1.0 + 1e-9
 """What the squared error may grow by: near its least value it does not tell steps apart."""
-
 BRACKETS = 6
 """Terms of the series of how exp turns a sum's operators; a step is small."""
-
 DAMPING = 1e-12
 """Relative to the largest diagonal of the normal matrix: an arm that can do it in many ways takes the least change."""
 
+STRUCTURE = 1e-18
+"""Squared relative residue of ``Ĥ³ = −cĤ`` below which the closed form of the exponential holds."""
+SIMULTANEOUS = 2
+TIP_FIRST = 1
 
-def corrected_step(
-    operators: FloatArray, composition: Composition, points: FloatArray, wanted: FloatArray, step: FloatArray
-) -> FloatArray:
-    """The joints' step (n,) that brings ``points`` (k, 4) to ``wanted`` (k, 4), from ``step`` (n,) to first order.
 
-    ``operators`` (n, 4, 4) before it; the points, 3 or more, span the body. Where no step does it (an arm of few
-    freedoms) the nearest; where Newton's method does not get nearer than ``step`` is, ``step``.
+@kernel
+def exponential_into(
+    G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray
+) -> None:
+    """``exp(amount G)`` into (4, 4): in closed form of a revolution or translation (4.27, 3.21), else the series.
+
+    ``square``, ``cube`` (4, 4): scratch.
     """
-    found, before = step.copy(), np.inf
-    best = step
+    multiply4_into(G, G, square)
+    multiply4_into(G, square, cube)
+    c = -0.5 * (square[0, 0] + square[1, 1] + square[2, 2] + square[3, 3])
+    size, rest = 0.0, 0.0
+    for i in range(4):
+        for k in range(4):
+            size += G[i, k] * G[i, k]
+            rest += (cube[i, k] + c * G[i, k]) ** 2
+    if rest <= STRUCTURE * size**3 and c >= 0.0:
+        rate = math.sqrt(c)
+        if rate * abs(amount) > 1e-8:
+            half = math.sin(0.5 * rate * amount)
+            first, second = math.sin(rate * amount) / rate, 2.0 * half * half / c
+        else:
+            first, second = amount, 0.5 * amount * amount
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = first * G[i, k] + second * square[i, k]
+            H[i, i] += 1.0
+        return
+    whole = exp_twist(amount * G)
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = whole[i, k]
+
+
+@kernel
+def step_into(
+    operators: FloatArray,
+    composition: int,
+    step: FloatArray,
+    H: FloatArray,
+    turned: FloatArray,
+    work: FloatArray,
+) -> None:
+    """The displacement by ``step`` into ``H`` (4, 4), `step_correction.step_operators` into ``turned`` (n, 4, 4).
+
+    ``work`` (5, 4, 4): scratch.
+    """
+    n = step.shape[0]
+    first, second, factor, inverse, total = work[0], work[1], work[2], work[3], work[4]
+    if composition == SIMULTANEOUS:
+        for i in range(4):
+            for k in range(4):
+                s = 0.0
+                for j in range(n):
+                    s += step[j] * operators[j, i, k]
+                total[i, k] = s
+        exponential_into(total, 1.0, first, second, H)
+        for j in range(n):
+            for i in range(4):
+                for k in range(4):
+                    turned[j, i, k] = operators[j, i, k]
+                    factor[i, k] = operators[j, i, k]
+            for order in range(BRACKETS):
+                multiply4_into(total, factor, first)
+                multiply4_into(factor, total, second)
+                for i in range(4):
+                    for k in range(4):
+                        factor[i, k] = (first[i, k] - second[i, k]) / (order + 2)
+                        turned[j, i, k] += factor[i, k]
+        return
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = 1.0 if i == k else 0.0
+            inverse[i, k] = H[i, k]
+    for nth in range(n):
+        j = n - 1 - nth if composition == TIP_FIRST else nth
+        G = operators[j]
+        multiply4_into(H, G, total)
+        multiply4_into(total, inverse, turned[j])
+        exponential_into(G, step[j], first, second, factor)
+        multiply4_into(H, factor, total)
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = total[i, k]
+        exponential_into(G, -step[j], first, second, factor)
+        multiply4_into(factor, inverse, total)
+        for i in range(4):
+            for k in range(4):
+                inverse[i, k] = total[i, k]
+
+
+@kernel
+def corrected_step(
+    operators: FloatArray, composition: int, points: FloatArray, wanted: FloatArray, step: FloatArray
+) -> FloatArray:
+    """`step_correction.corrected_step` as a kernel."""
+    n, count = step.shape[0], points.shape[0]
+    found, best = step.copy(), step.copy()
+    H = np.empty((4, 4))
+    turned = np.empty((n, 4, 4))
+    work = np.empty((5, 4, 4))
+    N = np.empty((n, n))
+    b = np.empty(n)
+    change = np.empty(n)
+    rows = np.empty((4, n))
+    moved = np.empty((count, 4))
+    before = math.inf
     for _ in range(ITERATIONS):
-        moved = points @ displacement(operators, composition, found).T
-        residual = wanted - moved
-        error = float((residual**2).sum())
+        step_into(operators, composition, found, H, turned, work)
+        transform_points_into(H, points, moved)
+        error = 0.0
+        for p in range(count):
+            for i in range(4):
+                error += (wanted[p, i] - moved[p, i]) ** 2
         if not error <= SLACK * before:
             break
-        best, before = found, error
-        turned = step_operators(operators, composition, found)
-        J = np.einsum("nij,kj->kin", turned, moved).reshape(-1, len(step))
-        N = J.T @ J
-        N += DAMPING * np.diag(N).max() * np.eye(len(step))
-        change = np.linalg.solve(N, J.T @ residual.reshape(-1))
-        found = found + change
-        if float(np.abs(change).max()) < CONVERGED:
-            return found
+        before = error
+        for j in range(n):
+            best[j] = found[j]
+            b[j] = 0.0
+            for k in range(n):
+                N[j, k] = 0.0
+        for p in range(count):
+            for j in range(n):
+                for i in range(4):
+                    s = 0.0
+                    for k in range(4):
+                        s += turned[j, i, k] * moved[p, k]
+                    rows[i, j] = s
+            for i in range(4):
+                add_equation(rows[i], wanted[p, i] - moved[p, i], 1.0, N, b)
+        damped_solve(N, b, DAMPING, change)
+        most = 0.0
+        for j in range(n):
+            found[j] += change[j]
+            most = max(most, abs(change[j]))
+        if most < CONVERGED:
+            for j in range(n):
+                best[j] = found[j]
+            break
     return best
-
-
-def step_operators(operators: FloatArray, composition: Composition, step: FloatArray) -> FloatArray:
-    """``∂H/∂q_j H⁻¹`` (n, 4, 4) of the displacement ``H`` by ``step`` (n,): the operators after it, or of a sum."""
-    if composition != Composition.SIMULTANEOUS:
-        return moved_operators(operators, composition, step)
-    X = np.tensordot(step, operators, axes=1)
-    total, term = operators.copy(), operators
-    for k in range(BRACKETS):
-        term = (X @ term - term @ X) / (k + 2)
-        total = total + term
-    return total

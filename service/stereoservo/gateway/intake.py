@@ -1,5 +1,4 @@
-"""Goals and commands from zenoh: decoded strictly, checked statically, forwarded to the core, answered
-when it has.
+"""Intake of goals and commands: decoded strictly, validated, forwarded to the core, answered with its reply.
 
 Nothing here waits: an unanswered request is kept with its deadline.
 """
@@ -14,14 +13,14 @@ from typing import Any
 
 import msgspec
 
-from stereoservo.gateway.keys import InvalidKeyError, KeySpace
-from stereoservo.gateway.matching import TransferError
-from stereoservo.gateway.messages import MessageError, Reply, decode, decode_command, encode
+from stereoservo.core.cycle import Event
+from stereoservo.gateway.boundary import Boundary
+from stereoservo.gateway.point_alignment import TransferError
 from stereoservo.gateway.publisher import EventLog, ReplyThread
-from stereoservo.gateway.servolink import ServoLink
-from stereoservo.gateway.teaching import Teaching
+from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.gateway.validation import GoalContext, check_command, check_goal
-from stereoservo.runtime.commands import (
+from stereoservo.messages.goals import (
     AcknowledgeGoal,
     CancelGoal,
     Command,
@@ -34,7 +33,8 @@ from stereoservo.runtime.commands import (
     Teach,
     UpdateGoal,
 )
-from stereoservo.runtime.cycle import Event
+from stereoservo.messages.keys import KeySpace
+from stereoservo.messages.wire import Reply, decode, decode_command, encode
 
 REPLY_TIMEOUT_S = 1.0
 PLANNED_REPLY_TIMEOUT_S = 5.0
@@ -64,16 +64,16 @@ class _Answered(Exception):  # noqa: N818 - not an error: the way out with a rep
 
 
 class Intake:
-    """Takes goals and commands of all operators."""
+    """Handles goals and commands of all operators."""
 
     def __init__(
         self,
         keys: KeySpace,
-        link: ServoLink,
+        link: ServoConnection,
         replies: ReplyThread,
         log: EventLog,
         context: Callable[[], GoalContext],
-        teaching: Teaching,
+        teaching: TaughtGoalRegistry,
         boot: str,
     ) -> None:
         self._keys = keys
@@ -83,6 +83,7 @@ class Intake:
         self._context = context
         self._teaching = teaching
         self._boot = boot
+        self.boundary = Boundary(boot)
         self._pending: dict[int, _Pending] = {}
         self._goals: OrderedDict[str, Reply] = OrderedDict()
         self._note = ""
@@ -91,36 +92,46 @@ class Intake:
     # -- from zenoh -----------------------------------------------------------------------------------------
 
     def goal_query(self, query: Any) -> None:
-        """A goal by ``get``: the reply says accepted or refused."""
-        self._take(query, str(query.key_expr), _payload(query), self._goal)
+        """Handle a goal sent as a query: the reply accepts or refuses it."""
+        self._take(query, query, self._goal)
 
     def goal_sample(self, sample: Any) -> None:
-        """A goal, or what concerns one, by ``put``: nobody hears a reply, so a refusal becomes an event."""
-        self._take(None, str(sample.key_expr), sample.payload.to_bytes(), self._goal)
+        """Handle a goal, its renewal or update sent as a put: a refusal becomes an event."""
+        self._take(None, sample, self._goal)
 
     def command_query(self, query: Any) -> None:
-        """A command by ``get``."""
-        self._take(query, str(query.key_expr), _payload(query), self._command)
+        """Handle a command sent as a query."""
+        self._take(query, query, self._command)
 
-    def _take(
-        self, query: Any, key: str, payload: bytes, work: Callable[[str, bytes], tuple[str, Command]]
-    ) -> None:
+    def _take(self, query: Any, message: Any, work: Callable[[str, bytes], tuple[str, Command]]) -> None:
+        key = str(message.key_expr)
         if query is not None and "*" in key:
             query.drop()  # somebody looks around; goals and commands are addressed
             return
-        operator, self._note = "", ""
+        payload = payload_of(message)
         streamed = query is None and b'"update"' in payload
+        self.boundary.take(
+            key,
+            lambda: self._forward(query, key, payload, work, streamed),
+            lambda refusal: self._answer(query, refusal, key, streamed),
+        )
+
+    def _forward(
+        self,
+        query: Any,
+        key: str,
+        payload: bytes,
+        work: Callable[[str, bytes], tuple[str, Command]],
+        streamed: bool,
+    ) -> None:
+        operator, self._note = "", ""
         try:
             operator, command = work(key, payload)
-            number = self._link.ask(command, operator)
+            number = self._link.send_command(command, operator)
             if number is None:
                 raise _Answered(
                     self._refused("the servo process does not take requests; see `stereoservo status`")
                 )
-        except (MessageError, InvalidKeyError) as error:
-            self._answer(
-                query, self._refused("the message is not valid", str(error)), operator or key, streamed
-            )
         except _Answered as answered:
             self._answer(query, answered.reply, operator or key, streamed)
         else:
@@ -198,11 +209,6 @@ class Intake:
         streamed = pending.query is None and isinstance(pending.command, UpdateGoal)
         self._answer(pending.query, reply, pending.operator, streamed)
 
-    def operator_of(self, request: int) -> str:
-        """Who made a request that still waits; empty when unknown."""
-        pending = self._pending.get(request)
-        return "" if pending is None else pending.operator
-
     def expire(self) -> None:
         """Answer what the core left unanswered."""
         now = time.monotonic()
@@ -241,5 +247,6 @@ class Intake:
             )
 
 
-def _payload(query: Any) -> bytes:
-    return b"" if query.payload is None else bytes(query.payload.to_bytes())
+def payload_of(message: Any) -> bytes:
+    """The bytes of a query or a sample; none are empty."""
+    return b"" if message.payload is None else bytes(message.payload.to_bytes())

@@ -1,5 +1,4 @@
-"""The gateway process: zenoh on one side, the servo process on the other; recorder, journal, taught goals,
-models, fits.
+"""The gateway process: connects zenoh clients with the servo process, and keeps models, taught goals and recordings.
 
 Nothing that the arm waits for runs here; its silence means hold. ``python -m stereoservo.gateway.process
 RUNTIME_DIRECTORY PARENT_PID``.
@@ -11,7 +10,9 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,46 @@ import msgspec
 import zenoh
 from zenoh.handlers import RingChannel
 
-from stereoservo.gateway.calibration import Calibration
-from stereoservo.gateway.description import cell_info
-from stereoservo.gateway.intake import Intake
-from stereoservo.gateway.keys import VERBS, InvalidKeyError, KeySpace
-from stereoservo.gateway.matching import TransferError
-from stereoservo.gateway.messages import (
+from stereoservo.client.session import SessionError, close_session, open_session
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.cycle import Event
+from stereoservo.daemon.ipc_messages import (
+    OBSERVATION_LAYOUT,
+    PlanError,
+    RunPlan,
+    load_plan,
+    observation_decoder,
+    report_decoder,
+)
+from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
+from stereoservo.daemon.seqlock import SlotError, SlotReader
+from stereoservo.daemon.seqpacket import ChannelServer
+from stereoservo.daemon.taught_goals import TaughtFileError
+from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.intake import Intake, payload_of
+from stereoservo.gateway.observation_cache import ObservationCache
+from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
+from stereoservo.gateway.publisher import (
+    SILENT,
+    EventLog,
+    Publishers,
+    ReplyThread,
+    cell_info,
+    features_message,
+    state_message,
+)
+from stereoservo.gateway.recordings import CannotRecordError, Recordings
+from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
+from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.gateway.stop_thread import StopThread
+from stereoservo.gateway.teaching import TaughtGoalRegistry
+from stereoservo.gateway.validation import GoalContext
+from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, stop_config
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.directories import DirectoryError
+from stereoservo.messages.discovery import DaemonInfo
+from stereoservo.messages.keys import VERBS, KeySpace
+from stereoservo.messages.wire import (
     CellInfo,
     MessageError,
     Record,
@@ -35,59 +70,19 @@ from stereoservo.gateway.messages import (
     encode,
     schema,
 )
-from stereoservo.gateway.publisher import (
-    SILENT,
-    EventLog,
-    Publishers,
-    ReplyThread,
-    features_message,
-    state_message,
-)
-from stereoservo.gateway.reanchoring import Reanchoring
-from stereoservo.gateway.recordings import CannotRecordError, Recordings
-from stereoservo.gateway.servolink import ServoLink
-from stereoservo.gateway.session import (
-    SessionError,
-    close_session,
-    endpoint_of,
-    gateway_config,
-    open_session,
-    stop_config,
-)
-from stereoservo.gateway.sights import NewestSights
-from stereoservo.gateway.stop import StopThread
-from stereoservo.gateway.stores import Journal, ModelStore, TaughtStore
-from stereoservo.gateway.teaching import Teaching
-from stereoservo.gateway.validation import GoalContext
-from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime.channel import ChannelServer
-from stereoservo.runtime.cycle import Event
-from stereoservo.runtime.daemon import DaemonInfo
-from stereoservo.runtime.directories import DirectoryError
-from stereoservo.runtime.handover import SlotError, SlotReader
-from stereoservo.runtime.interprocess import (
-    OBSERVATION_LAYOUT,
-    PlanError,
-    RunPlan,
-    load_plan,
-    observation_decoder,
-    report_decoder,
-)
-from stereoservo.runtime.lifeline import Termination, die_with_parent, say
-from stereoservo.runtime.taught import TaughtFileError
 
 STATE_EVERY_S = 0.05
 IDLE_S = 0.003
-LAST_TURNS = 100
+FINAL_PASSES = 100
 SERVO_STALE_S = 0.5
 DRAIN = 32
 EXIT_SETUP = 3
-OWN_VERBS = ("record", "synthesise")
+GATEWAY_VERBS = ("record", "synthesise")
 """Commands that the gateway carries out itself."""
 
 
 class Gateway:
-    """All that the gateway process holds; ``turn`` is one pass of its loop."""
+    """All that the gateway process holds; ``run_once`` is one pass of its loop."""
 
     def __init__(self, plan: RunPlan) -> None:
         self.plan = plan
@@ -103,22 +98,26 @@ class Gateway:
         self.endpoint = endpoint_of(plan.cell, directories.zenoh_socket)
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.log = EventLog(self.boot, self._publish_event)
-        self._link = ServoLink(directories)
-        self._link.records = bool(plan.record)
+        self._servo = ServoConnection(directories)
+        self._servo.records = bool(plan.record)
         self._replies = ReplyThread()
-        self._calibration = Calibration(self.settings, self._models, self._link, self.log, directories.checks)
-        self._reanchoring = Reanchoring(
-            self._models, self._link, self.log, lambda: self._calibration.model, self._use_model
+        self._calibration = CalibrationJobs(
+            self.settings, self._models, self._servo, self.log, directories.checks
         )
-        self._sights = NewestSights({camera.name: camera.systematic_px for camera in self.settings.cameras})
-        self._teaching = Teaching(
+        self._relocalization = RelocalizationJobs(
+            self._models, self._servo, self.log, lambda: self._calibration.model, self._use_model
+        )
+        self._marker_cache = ObservationCache(
+            {camera.name: camera.systematic_px for camera in self.settings.cameras}
+        )
+        self._teaching = TaughtGoalRegistry(
             TaughtStore(directories.taught, self._models.of_epoch),
-            self._sights,
+            self._marker_cache,
             lambda: self._calibration.model,
             self.log,
         )
         self._intake = Intake(
-            self.keys, self._link, self._replies, self.log, self._context, self._teaching, self.boot
+            self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot
         )
         self._reports = ChannelServer(directories.reports_socket)
         self._observations = [
@@ -144,10 +143,10 @@ class Gateway:
         self._command_queries = [
             session.declare_queryable(keys.any_command(verb), RingChannel(32))
             for verb in VERBS
-            if verb not in ("enable", *OWN_VERBS)
+            if verb not in ("enable", *GATEWAY_VERBS)
         ]
-        self._own_queries = [
-            session.declare_queryable(keys.any_command(verb), RingChannel(32)) for verb in OWN_VERBS
+        self._gateway_queries = [
+            session.declare_queryable(keys.any_command(verb), RingChannel(32)) for verb in GATEWAY_VERBS
         ]
         self._event_queries = session.declare_queryable(keys.event, RingChannel(32))
         self._state_queries = session.declare_queryable(keys.state, RingChannel(32))
@@ -170,26 +169,26 @@ class Gateway:
 
     # -- the loop -------------------------------------------------------------------------------------------
 
-    def turn(self) -> bool:
+    def run_once(self) -> bool:
         """One pass; whether there was anything to do."""
-        self._link.keep()
-        if self._link.connected and self._state is not None and not self._greeted:
+        self._servo.poll_connection()
+        if self._servo.connected and self._state is not None and not self._greeted:
             self._greeted = True
             self._calibration.load(self._state.model_epoch)
-        events = self._link.events()
-        self._take_state()
+        events = self._servo.events()
+        self._read_state()
         for event in events:
             self._core_event(event)
         busy = self._queries() or bool(events)
         self._intake.expire()
-        self._tell_features()
-        self._tell_state()
-        self._take_reports()
-        for item in self._link.steps():
+        self._publish_features()
+        self._publish_state()
+        self._read_reports()
+        for item in self._servo.steps():
             self._recordings.take(item)
-        self._recordings.images.follow()
-        self._calibration.follow()
-        self._reanchoring.follow()
+        self._recordings.images.poll()
+        self._calibration.poll()
+        self._relocalization.poll()
         if not self._announced and self._greeted:
             self._announced = True
             self._announce()
@@ -197,16 +196,23 @@ class Gateway:
 
     def _queries(self) -> bool:
         busy = False
-        for source, take in (
+        sources: tuple[tuple[Any, Callable[[Any], None]], ...] = (
             (self._goal_puts, self._intake.goal_sample),
             (self._goal_queries, self._intake.goal_query),
             *((queryable, self._intake.command_query) for queryable in self._command_queries),
-            *((queryable, self._take_own) for queryable in self._own_queries),
-            (self._event_queries, self._answer_events),
-            (self._state_queries, self._answer_state),
-            (self._info_queries, self._answer_info),
-            (self._schema_queries, self._answer_schema),
-        ):
+            *(
+                (queryable, partial(self._answer, work=self._gateway_command))
+                for queryable in self._gateway_queries
+            ),
+            (self._event_queries, partial(self._answer, work=self._events_from, key=self.keys.event)),
+            (self._state_queries, partial(self._answer, work=self._newest_state, key=self.keys.state)),
+            (
+                self._info_queries,
+                partial(self._answer, work=lambda _: encode(self.info()), key=self.keys.info),
+            ),
+            (self._schema_queries, partial(self._answer, work=self._schema)),
+        )
+        for source, take in sources:
             for _ in range(DRAIN):
                 item = source.try_recv()
                 if item is None:
@@ -217,23 +223,24 @@ class Gateway:
             self._intake.command_query(self._stop.enables.popleft())
         return busy
 
-    def _take_own(self, query: Any) -> None:
-        key = str(query.key_expr)
-        if "*" in key:
+    def _answer(self, query: Any, work: Callable[[Any], bytes], key: str = "") -> None:
+        """Reply with what ``work`` makes of ``query``, on ``key`` (default: the query's own, where it is concrete)."""
+        asked = str(query.key_expr)
+        if not key and "*" in asked:
             query.drop()
             return
-        payload = query.payload.to_bytes() if query.payload is not None else b"{}"
-        try:
-            verb, _ = self.keys.command_of(key)
-            if verb == "record":
-                reply = self._record(decode(payload, Record))
-            else:
-                reply = Reply(True, self._teaching.synthesise(decode(payload, Synthesise)), boot=self.boot)
-        except (MessageError, InvalidKeyError) as error:
-            reply = Reply(False, "the message is not valid", problems=(str(error),), boot=self.boot)
-        except TransferError as error:
-            reply = Reply(False, "no goal could be made", problems=(str(error),), boot=self.boot)
-        self._replies.reply(query, encode(reply))
+        self._intake.boundary.take(
+            asked,
+            lambda: self._replies.reply(query, work(query), key),
+            lambda refusal: self._replies.reply(query, encode(refusal), key),
+        )
+
+    def _gateway_command(self, query: Any) -> bytes:
+        payload = payload_of(query) or b"{}"
+        verb, _ = self.keys.command_of(str(query.key_expr))
+        if verb == "record":
+            return encode(self._record(decode(payload, Record)))
+        return encode(Reply(True, self._teaching.synthesise(decode(payload, Synthesise)), boot=self.boot))
 
     def _record(self, wanted: Record) -> Reply:
         try:
@@ -241,7 +248,7 @@ class Gateway:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._link.records = wanted.on
+        self._servo.records = wanted.on
         if not wanted.on:
             steps = self._recordings.stop()
             return Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
@@ -249,37 +256,23 @@ class Gateway:
             return Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
         return Reply(True, "recording begins; its event names the file", boot=self.boot)
 
-    def _answer_events(self, query: Any) -> None:
+    def _events_from(self, query: Any) -> bytes:
         given = str(query.parameters)
         number = dict(part.split("=", 1) for part in given.split(";") if "=" in part).get("from", "1")
         if not (number.isascii() and number.isdigit() and len(number) < 20):
-            problem = f"from={number[:40]}: a number is valid, 1 to {self.log.last + 1}"
-            reply = Reply(False, "the query is not valid", problems=(problem,), boot=self.boot)
-            self._replies.reply(query, encode(reply), self.keys.event)
-            return
-        self._replies.reply(query, encode(self.log.since(int(number))), self.keys.event)
+            raise MessageError(f"from={number[:40]}: a number is valid, 1 to {self.log.last + 1}")
+        return encode(self.log.since(int(number)))
 
-    def _answer_state(self, query: Any) -> None:
-        answer: StateMessage | Reply | None = self._state
-        if answer is None:
-            answer = Reply(False, "the servo process has shown no state yet", boot=self.boot)
-        self._replies.reply(query, encode(answer), self.keys.state)
+    def _newest_state(self, query: Any) -> bytes:
+        if self._state is None:
+            return encode(Reply(False, "the servo process has shown no state yet", boot=self.boot))
+        return encode(self._state)
 
-    def _answer_info(self, query: Any) -> None:
-        self._replies.reply(query, encode(self.info()), self.keys.info)
-
-    def _answer_schema(self, query: Any) -> None:
-        if "*" in str(query.key_expr):
-            query.drop()
-            return
-        try:
-            payload = schema(self.keys.schema_of(str(query.key_expr)))
-        except (MessageError, InvalidKeyError) as error:
-            payload = encode(Reply(False, "there is no such schema", problems=(str(error),), boot=self.boot))
-        self._replies.reply(query, payload)
+    def _schema(self, query: Any) -> bytes:
+        return schema(self.keys.schema_of(str(query.key_expr)), tuple(LAWS))
 
     def info(self) -> CellInfo:
-        """What the cell is."""
+        """Description of the cell, as served on ``info``."""
         model = self._calibration.model
         return cell_info(
             self.plan,
@@ -303,7 +296,7 @@ class Gateway:
             self._teaching.taught(event)
         self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
-        self._reanchoring.core_event(event, fresh=fresh)
+        self._relocalization.core_event(event, fresh=fresh)
         if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"):
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
@@ -311,23 +304,23 @@ class Gateway:
 
     # -- telling --------------------------------------------------------------------------------------------
 
-    def _tell_features(self) -> None:
+    def _publish_features(self) -> None:
         for reader in self._observations:
             data = reader.poll()
             if data is None:
                 continue
             observation = observation_decoder.decode(data)
-            self._sights.add(observation)
+            self._marker_cache.add(observation)
             try:
                 payload = encode(features_message(observation))
             except MessageError as error:
-                say("gateway", str(error))
+                write_log("gateway", str(error))
                 continue
             self._publishers.features[observation.camera].put(payload)
 
-    def _take_state(self) -> None:
+    def _read_state(self) -> None:
         now = time.monotonic()
-        state = self._link.state()
+        state = self._servo.state()
         if state is not None:
             self._state_heard = now
             self._state = state_message(
@@ -341,20 +334,20 @@ class Gateway:
         elif self._state is not None and self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
             self._state = msgspec.structs.replace(self._state, servo_alive=False)
 
-    def _tell_state(self) -> None:
+    def _publish_state(self) -> None:
         now = time.monotonic()
         if self._state is None or now - self._state_sent < STATE_EVERY_S:
             return
         self._state_sent = now
         self._publishers.state.put(encode(self._state))
 
-    def _take_reports(self) -> None:
+    def _read_reports(self) -> None:
         self._reports.accept()
         for peer in self._reports.peers:
             for data in peer.receive():
                 report = report_decoder.decode(data)
                 if report.images is not None:
-                    self._recordings.images.told(report.images)
+                    self._recordings.images.add_report(report.images)
                 self.log.add(
                     report.kind,
                     t_ns=report.t_ns,
@@ -385,8 +378,8 @@ class Gateway:
     def close(self) -> None:
         """Finish the recording, end the fit, close the sessions within a time limit."""
         self._calibration.cancel()
-        self._reanchoring.cancel()
-        for item in self._link.steps(100_000):
+        self._relocalization.cancel()
+        for item in self._servo.steps(100_000):
             self._recordings.take(item)
         self._recordings.stop()
         with suppress(zenoh.ZError):  # telling is good manners, not needed
@@ -398,7 +391,7 @@ class Gateway:
             self._goal_puts,
             self._goal_queries,
             *self._command_queries,
-            *self._own_queries,
+            *self._gateway_queries,
             self._event_queries,
             self._state_queries,
             self._info_queries,
@@ -406,7 +399,7 @@ class Gateway:
             *self._publishers.all,
         ]
         close_session(self._session, declared)
-        self._link.close()
+        self._servo.close()
         self._reports.close()
         self._journal.close()
 
@@ -416,12 +409,12 @@ def run(plan: RunPlan, termination: Termination) -> None:
     gateway = Gateway(plan)
     try:
         while not termination.asked:
-            if not gateway.turn():
+            if not gateway.run_once():
                 time.sleep(IDLE_S)
         for _ in range(
-            LAST_TURNS
+            FINAL_PASSES
         ):  # what the servo process said last, that it stopped above all, is still told
-            if not gateway.turn():
+            if not gateway.run_once():
                 break
     finally:
         gateway.close()
@@ -435,7 +428,7 @@ def main() -> int:
     try:
         run(load_plan(runtime), termination)
     except (DirectoryError, OSError, PlanError, SessionError, SlotError, TaughtFileError) as error:
-        say("gateway", str(error))
+        write_log("gateway", str(error))
         return EXIT_SETUP
     return 0
 

@@ -1,6 +1,4 @@
-"""What the gateway publishes: state, features and numbered events, and the replies, each from where it may
-block.
-"""
+"""Messages that the gateway publishes (state, features, cell info, numbered events), and the thread for replies."""
 
 from __future__ import annotations
 
@@ -9,26 +7,37 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zenoh
 
-from stereoservo.gateway.keys import KeySpace
-from stereoservo.gateway.messages import (
+import stereoservo
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.cycle import Event
+from stereoservo.core.settings import CoreSettings
+from stereoservo.daemon.ipc_messages import RunPlan, ServoState
+from stereoservo.daemon.taught_goals import TaughtGoal
+from stereoservo.gateway.boundary import LimitedLog
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.keys import KeySpace
+from stereoservo.messages.wire import (
     ENCODING,
+    CameraInfo,
+    CellInfo,
     EventList,
     EventMessage,
     FeaturesMessage,
+    JointInfo,
     LoopInfo,
     MessageError,
+    ModelInfo,
     StateMessage,
+    TaughtInfo,
     encode,
 )
-from stereoservo.runtime.cycle import Event
-from stereoservo.runtime.interprocess import RunPlan, ServoState
-from stereoservo.runtime.lifeline import say
-from stereoservo.runtime.ports import CameraObservation
+from stereoservo.ports.devices import CameraObservation
 
 KEPT_EVENTS = 10_000
 EVENTS_A_REPLY = 300
@@ -41,6 +50,7 @@ class ReplyThread:
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[Any, str, bytes] | None] = queue.SimpleQueue()
+        self._unsent = LimitedLog()
         self._thread = threading.Thread(target=self._work, name="replies", daemon=True)
         self._thread.start()
 
@@ -54,8 +64,8 @@ class ReplyThread:
             try:
                 with query:
                     query.reply(key, payload, encoding=ENCODING)
-            except zenoh.ZError as error:
-                say("gateway", f"a reply on {key} could not be sent: {error}")
+            except Exception as error:  # one query that takes no reply must not leave the others without
+                self._unsent.add(f"a reply on {key!r} could not be sent: {type(error).__name__}: {error}")
 
     def close(self) -> None:
         """Send what waits, within a second, and end."""
@@ -219,3 +229,65 @@ class Publishers:
     def all(self) -> list[Any]:
         """All of them, to undeclare."""
         return [self.state, self.event, *self.features.values()]
+
+
+def cell_info(
+    plan: RunPlan,
+    settings: CoreSettings,
+    boot: str,
+    model: CellModel | None,
+    model_path: Path | None,
+    taught: dict[str, TaughtGoal],
+    recording: str,
+) -> CellInfo:
+    """Description of the cell: joints, cameras, laws, model, taught goals."""
+    limits = settings.limits
+    return CellInfo(
+        cell=settings.cell,
+        version=stereoservo.__version__,
+        boot=boot,
+        joints=tuple(
+            JointInfo(
+                name,
+                kind,
+                float(limits.position_min[i]),
+                float(limits.position_max[i]),
+                float(limits.velocity_max[i]),
+            )
+            for i, (name, kind) in enumerate(zip(settings.joint_names, settings.joint_kinds, strict=True))
+        ),
+        cameras=tuple(
+            CameraInfo(
+                camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids
+            )
+            for camera in settings.cameras
+        ),
+        laws=tuple(LAWS),
+        law=settings.law,
+        tolerance_px=settings.tolerance_px,
+        model=None
+        if model is None
+        else ModelInfo(
+            model.epoch,
+            model.stratum,
+            model.marker_ids,
+            model.created,
+            None if model.statistics is None else model.statistics.rms_px,
+            str(model_path),
+        ),
+        taught=tuple(
+            TaughtInfo(
+                name,
+                goal.target.model_epoch or 0,
+                goal.created,
+                tuple(sorted({marker for seen in goal.others.values() for marker in seen} - set(goal.tool))),
+                goal.tool,
+            )
+            for name, goal in sorted(taught.items())
+        ),
+        can_calibrate=settings.trials is not None,
+        can_home=settings.home is not None,
+        dry_run=plan.dry_run,
+        commissioning=plan.commissioning,
+        recording=recording,
+    )

@@ -6,32 +6,33 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
+from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.runtime.image_order import (
-    ImageOrder,
+from stereoservo.messages.recording_request import (
+    ImageRecordingRequest,
     ImagesRecorded,
     RecordedImages,
-    give_order,
     images_directory,
-    order_path,
+    request_path,
+    write_request,
 )
-from stereoservo.runtime.interprocess import FromServoSteps, RecordedCheckpoint, RecordingStart, RunPlan
-from stereoservo.runtime.recorder import FlightRecorder
+from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 LAST_WORD_S = 5.0
 """How long vision processes have to finish their files before the gateway says that they did not."""
 
 
 class CannotRecordError(Exception):
-    """What was asked for cannot be recorded; the text says why."""
+    """A recording is not possible; the text has the cause."""
 
 
-class ImageOrders:
-    """Has the vision processes record, and gathers what they say came of it."""
+class ImageRecordings:
+    """Image recording by the vision processes: requests it and collects their reports."""
 
     def __init__(self, plan: RunPlan, log: EventLog) -> None:
         self._log = log
-        self._path = order_path(plan.directories)
+        self._path = request_path(plan.directories)
         self._cameras = tuple(camera.name for camera in plan.cameras if camera.delivers == "frames")
         self._others = tuple(camera.name for camera in plan.cameras if camera.delivers != "frames")
         self._directory = ""
@@ -57,9 +58,9 @@ class ImageOrders:
         """Have all cameras record beside ``recording``."""
         if self._until is not None:
             self._until = 0.0  # the recording before has had its time
-            self.follow()
+            self.poll()
         directory = images_directory(recording)
-        give_order(self._path, ImageOrder(time.monotonic_ns(), str(directory)))
+        write_request(self._path, ImageRecordingRequest(time.monotonic_ns(), str(directory)))
         self._directory, self._until, self._told = str(directory), None, {}
         left = f"; {', '.join(self._others)} deliver observations and are not in it" if self._others else ""
         self._log.add(
@@ -73,13 +74,13 @@ class ImageOrders:
             self._path.unlink(missing_ok=True)
             self._until = time.monotonic() + LAST_WORD_S
 
-    def told(self, images: RecordedImages) -> None:
+    def add_report(self, images: RecordedImages) -> None:
         """Take what a vision process said of its recording."""
         if self._directory and Path(images.file).parent == Path(self._directory):
             self._told[images.camera] = images
 
-    def follow(self) -> None:
-        """Sum up once all have told, or have had their time."""
+    def poll(self) -> None:
+        """Report the recorded images once all cameras have reported, or after a time limit."""
         if self._until is None:
             return
         missing = [name for name in self._cameras if name not in self._told]
@@ -114,7 +115,7 @@ class Recordings:
         self._log = log
         self._recorder: FlightRecorder | None = None
         self._with_images = False
-        self.images = ImageOrders(plan, log)
+        self.images = ImageRecordings(plan, log)
         self.path = ""
         self.steps = 0
 
@@ -130,7 +131,7 @@ class Recordings:
         if self._recorder is not None and not self.images.running:
             self.images.begin(self._recorder.path)
 
-    def take(self, item: FromServoSteps) -> None:
+    def take(self, item: StepMessage) -> None:
         """Take what the servo process sent; its first message begins a file."""
         if isinstance(item, RecordingStart):
             again = self._with_images
@@ -140,14 +141,8 @@ class Recordings:
             self._log.add("recording", message=self.path, origin="gateway")
             if again:
                 self.want_images()
-        elif self._recorder is None:
-            return
-        elif isinstance(item, RecordedCheckpoint):
-            if item.lost:
-                self._recorder.gap(item.lost, item.t_ns)
-            self._recorder.checkpoint(item.step, item.state, item.t_ns)
-        else:
-            self._recorder.step(item.data, item.t_ns)
+        elif self._recorder is not None:
+            self._recorder.write(item)
 
     def _new_path(self) -> Path:
         """The file that was asked for; another where it exists (a gateway that was restarted goes on in a new one)."""

@@ -1,6 +1,4 @@
-"""Taught goals on their way in and out: what the core saw is stored with its model, drawings become goals, and a goal
-that is sent is resolved to set-points for the model and the workpiece of now.
-"""
+"""Taught goals: stored with their model, made from drawings, and resolved to set-points for the current model."""
 
 from __future__ import annotations
 
@@ -11,29 +9,33 @@ from datetime import UTC, datetime
 
 import msgspec
 
-from stereoservo.gateway.drawings import synthesise
-from stereoservo.gateway.matching import TransferError
-from stereoservo.gateway.messages import Synthesise
+from stereoservo.core.cycle import Event
+from stereoservo.daemon.taught_goals import TaughtGoal, taught_goal
+from stereoservo.gateway.cad_goals import synthesise
+from stereoservo.gateway.goal_transfer import TransferredGoal, resolve
+from stereoservo.gateway.observation_cache import MarkerObservations, ObservationCache
+from stereoservo.gateway.persistence import TaughtStore
+from stereoservo.gateway.point_alignment import TransferError
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.sights import NewestSights, Sights
-from stereoservo.gateway.stores import TaughtStore
-from stereoservo.gateway.transfer import Resolved, resolve
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime.commands import Feature, IncidenceTarget, TaughtTarget
-from stereoservo.runtime.cycle import Event
-from stereoservo.runtime.taught import TaughtGoal, taught_goal
+from stereoservo.messages.goals import Feature, IncidenceTarget, TaughtTarget
+from stereoservo.messages.wire import Synthesise
 
 KNOWN_TOOLS = 100
 
 
-class Teaching:
+class TaughtGoalRegistry:
     """The cell's taught goals, the model that reads them, and what the cameras see now."""
 
     def __init__(
-        self, store: TaughtStore, sights: NewestSights, model: Callable[[], CellModel | None], log: EventLog
+        self,
+        store: TaughtStore,
+        observations: ObservationCache,
+        model: Callable[[], CellModel | None],
+        log: EventLog,
     ) -> None:
         self._store = store
-        self._sights = sights
+        self._marker_cache = observations
         self._model = model
         self._log = log
         self._tools: OrderedDict[int, tuple[int, ...]] = OrderedDict()
@@ -49,7 +51,7 @@ class Teaching:
         return self._store.goals
 
     def expect(self, request: int, tool: tuple[int, ...]) -> None:
-        """What ``request`` will teach is meant by the markers ``tool``."""
+        """Set the tool's markers of the goal that ``request`` will teach."""
         if tool:
             self._tools[request] = tool
             while len(self._tools) > KNOWN_TOOLS:
@@ -78,21 +80,23 @@ class Teaching:
         self._log.add("taught", message=message, name=wanted.name, origin="gateway")
         return message
 
-    def resolve(self, target: TaughtTarget) -> Resolved:
+    def resolve(self, target: TaughtTarget) -> TransferredGoal:
         """A taught goal as set-points. Raises KeyError, TransferError."""
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
 
     def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
-        """Incidences with standing markers replaced by their pixels of now. Raises TransferError."""
-        sights = self._seen()
+        """Incidences with static markers replaced by their current pixels. Raises TransferError."""
+        observations = self._seen()
         incidences = tuple(
-            msgspec.structs.replace(spec, fixed=_standing(spec.fixed, sights)) if spec.fixed.markers else spec
+            msgspec.structs.replace(spec, fixed=_standing(spec.fixed, observations))
+            if spec.fixed.markers
+            else spec
             for spec in target.incidences
         )
         return msgspec.structs.replace(target, incidences=incidences)
 
-    def _seen(self) -> Sights:
-        return self._sights.now(time.monotonic_ns())
+    def _seen(self) -> MarkerObservations:
+        return self._marker_cache.now(time.monotonic_ns())
 
     def _keep(self, name: str, goal: TaughtGoal) -> bool:
         try:
@@ -108,11 +112,11 @@ class Teaching:
         )
 
 
-def _standing(feature: Feature, sights: Sights) -> Feature:
+def _standing(feature: Feature, observations: MarkerObservations) -> Feature:
     """A feature spanned by markers beside the body, by where two or more cameras see them now."""
     pixels = {
         camera: tuple(seen[marker].pixel for marker in feature.markers)
-        for camera, seen in sights.items()
+        for camera, seen in observations.items()
         if all(marker in seen for marker in feature.markers)
     }
     text = ", ".join(str(marker) for marker in feature.markers)
@@ -121,7 +125,9 @@ def _standing(feature: Feature, sights: Sights) -> Feature:
         raise TransferError(
             f"markers {text} of a fixed feature are all seen by {cameras} now; two cameras are needed"
         )
-    if any(seen[marker].moves for seen in sights.values() for marker in feature.markers if marker in seen):
+    if any(
+        seen[marker].moves for seen in observations.values() for marker in feature.markers if marker in seen
+    ):
         raise TransferError(
             f"markers {text} of a fixed feature move now; send the goal when they stand still"
         )

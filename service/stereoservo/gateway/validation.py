@@ -1,29 +1,23 @@
-"""Static checks of goals and commands, before the core sees them: everything that can be known without the arm's state.
+"""Validation of goals and commands that needs no state of the arm.
 
 Each problem names the field, its value and what would have been valid; all of them are told at once.
 """
 
 from __future__ import annotations
 
-import msgspec
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
-from stereoservo.gateway.validation_targets import (
-    MIN_MARKERS,
-    GoalContext,
-    check_displacement,
-    check_features,
-    check_incidence,
-    check_joint_target,
-    check_markers,
-    check_points,
-    check_taught,
-    listed,
-)
-from stereoservo.runtime.commands import (
-    LAWS,
+import msgspec
+import numpy as np
+
+from stereoservo.control.law_registry import LAWS, OPTIONS, UnknownLawError
+from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.messages.goals import (
     AdaptiveGain,
     Command,
     DisplacementTarget,
+    Feature,
     FeatureTarget,
     Goal,
     IncidenceTarget,
@@ -35,20 +29,13 @@ from stereoservo.runtime.commands import (
     Teach,
     UpdateGoal,
 )
-from stereoservo.runtime.settings import CoreSettings
 
-IMAGE_LAWS = ("stereo", "image", "points")
-"""Laws with a Jacobian of image or scene points, developed around a choice of them (8.1.1)."""
-CENTRED_LAWS = ("cartesian3", "cartesian2", "trajectory")
-"""Laws that lead one point of the body on a line."""
-STEREO_LAWS = ("stereo", "points")
-"""Laws that need two cameras."""
 LAW_FIELDS = ("law", "points", "jacobian", "centre", "cameras", "profile", "gain", "tolerance_px", "blend_px")
 INCIDENCE_FIELDS = ("law", "points", "jacobian", "centre", "profile")
 
 
 def check_goal(goal: Goal, context: GoalContext) -> list[str]:
-    """What is wrong with ``goal``; empty when nothing is."""
+    """The problems of ``goal``; empty for a valid one."""
     return [*_check_target(goal.target, context), *_check_options(goal, context)]
 
 
@@ -104,21 +91,29 @@ def _not_with_joints(goal: Goal) -> list[str]:
 
 
 def _check_law(goal: Goal, settings: CoreSettings) -> list[str]:
-    law = goal.law or settings.law
+    name = goal.law or settings.law
+    try:
+        law = LAWS[name]
+    except UnknownLawError as error:
+        return [f"law: {error}"]
     problems = []
-    if goal.profile is not None and law != "trajectory":
-        problems.append(f"profile: {goal.profile!r} belongs to law 'trajectory'; the goal's is {law!r}")
-    if goal.jacobian is not None and law not in IMAGE_LAWS:
+    for option in OPTIONS:
+        value = getattr(goal, option)
+        if value is not None and option not in law.options:
+            given = f"{value!r} " if isinstance(value, str) else ""
+            problems.append(
+                f"{option}: {given}belongs to {_laws_named(LAWS.having(option))}; the goal's is {name!r}"
+            )
+    if goal.cameras is not None and len(goal.cameras) == 1 and law.one_camera == "refused":
+        single = [repr(other) for other, its in LAWS.items() if its.one_camera == "suffices"]
         problems.append(
-            f"jacobian: {goal.jacobian!r} belongs to laws {listed(IMAGE_LAWS)}; the goal's is {law!r}"
-        )
-    if goal.centre is not None and law not in CENTRED_LAWS:
-        problems.append(f"centre: belongs to laws {listed(CENTRED_LAWS)}; the goal's is {law!r}")
-    if goal.cameras is not None and len(goal.cameras) == 1 and law in STEREO_LAWS:
-        problems.append(
-            f"cameras: {listed(goal.cameras)} alone; law {law!r} takes two or more, 'image' works with one"
+            f"cameras: {listed(goal.cameras)} alone; law {name!r} takes two or more, {listed(single)} works with one"
         )
     return problems
+
+
+def _laws_named(names: Sequence[str]) -> str:
+    return f"law {names[0]!r}" if len(names) == 1 else f"laws {listed(names)}"
 
 
 def _check_cameras(goal: Goal, settings: CoreSettings) -> list[str]:
@@ -155,8 +150,8 @@ def _check_centre(goal: Goal, context: GoalContext) -> list[str]:
     problems = []
     if centre.model_epoch is None:
         problems.append("centre.model_epoch: is needed with a point: it says in which model's frame that is")
-    if centre.point is not None and not any(centre.point):
-        problems.append("centre.point: (0, 0, 0, 0) is no point; one coordinate at least differs from 0")
+    if centre.point is not None:
+        problems += check_homogeneous("centre.point", centre.point)
     return problems
 
 
@@ -179,7 +174,7 @@ def _check_handover(goal: Goal, settings: CoreSettings) -> list[str]:
 
 
 def check_command(command: Command, context: GoalContext) -> list[str]:
-    """What is wrong with a command, like :func:`check_goal`."""
+    """The problems of a command, like :func:`check_goal`."""
     if isinstance(command, Jog):
         return _check_jog(command, context.settings)
     if isinstance(command, UpdateGoal):
@@ -224,3 +219,271 @@ def _said(value: object) -> str:
 
 
 __all__ = ["GoalContext", "check_command", "check_goal"]
+
+
+MIN_MARKERS = 3
+POINTS_OF = {"point": 1, "line": 2, "plane": 3}
+SINGULAR = 1e-12
+"""Least singular value of a displacement relative to its largest."""
+STRAIGHT = 1e-9
+"""Third singular value of points on one line, as unit vectors."""
+
+
+MAX_SIZE = 1e100
+"""Of the largest number of what is homogeneous; its inverse is the smallest."""
+
+
+@dataclass(frozen=True)
+class GoalContext:
+    """Settings, names of taught goals and markers against which goals are checked.
+
+    ``model_markers``: of the model in use, None where there is none.
+    """
+
+    settings: CoreSettings
+    taught: tuple[str, ...]
+    model_markers: tuple[int, ...] | None
+
+
+def listed(names: Iterable[object]) -> str:
+    """Names for people."""
+    return ", ".join(str(name) for name in names) or "none"
+
+
+def check_features(target: FeatureTarget, context: GoalContext, where: str = "target") -> list[str]:
+    """Set-points: cameras and markers that there are, pixels inside of images, enough markers."""
+    cameras = {camera.name: camera for camera in context.settings.cameras}
+    problems = []
+    if not target.set_points:
+        problems.append(
+            f"{where}.set_points: is empty; set-points for some of the cameras {listed(cameras)} are needed"
+        )
+    markers: set[int] = set()
+    for name, points in target.set_points.items():
+        place = f"{where}.set_points.{name}"
+        camera = cameras.get(name)
+        if camera is None:
+            problems.append(f"{place}: no camera {name!r}; cameras: {listed(cameras)}")
+            continue
+        if not points:
+            problems.append(f"{place}: has no marker; markers: {listed(camera.marker_ids)}")
+        for marker, pixel in points.items():
+            problems += _marker_of_camera(f"{place}.{marker}", marker, camera, context)
+            problems += _inside(f"{place}.{marker}", pixel, camera)
+            markers.add(marker)
+    if not problems and len(markers) < MIN_MARKERS:
+        problems.append(
+            f"{where}.set_points: {len(markers)} marker(s) ({listed(sorted(markers))}); at least "
+            f"{MIN_MARKERS} fix a pose"
+        )
+    return problems
+
+
+def _marker_of_camera(where: str, marker: int, camera: CameraSettings, context: GoalContext) -> list[str]:
+    if marker not in camera.marker_ids:
+        return [
+            f"{where}: the detector of camera {camera.name!r} knows no marker {marker}; it "
+            f"knows: {listed(camera.marker_ids)}"
+        ]
+    return _marker_of_model(where, marker, context)
+
+
+def _marker_of_model(where: str, marker: int, context: GoalContext) -> list[str]:
+    if context.model_markers is not None and marker not in context.model_markers:
+        return [f"{where}: the model has no marker {marker}; it has: {listed(context.model_markers)}"]
+    return []
+
+
+def _inside(where: str, pixel: tuple[float, float], camera: CameraSettings) -> list[str]:
+    u, v = pixel
+    if -0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5:
+        return []
+    return [
+        f"{where}: pixel ({u:g}, {v:g}) is outside the image; u from -0.5 to {camera.width - 0.5:g}, "
+        f"v from -0.5 to {camera.height - 0.5:g} are valid"
+    ]
+
+
+def check_markers(where: str, markers: Sequence[int], context: GoalContext, *, body: bool) -> list[str]:
+    """Problems of marker ids: repeated, unknown to all detectors, or (``body``) not in the model, else in it."""
+    problems = []
+    known = context.settings.marker_ids
+    for marker in dict.fromkeys(markers):
+        place = f"{where}: {marker}"
+        if markers.count(marker) > 1:
+            problems.append(f"{place} stands {markers.count(marker)} times; ids that differ are valid")
+        if marker not in known:
+            problems.append(f"{place}: no detector of the cell knows it; they know: {listed(known)}")
+        elif context.model_markers is not None and (marker in context.model_markers) != body:
+            others = [m for m in known if m not in context.model_markers]
+            problems.append(
+                f"{place}: the model has no such marker; it has: {listed(context.model_markers)}"
+                if body
+                else f"{place} is of the marker body itself; markers beside it: {listed(others)}"
+            )
+    return problems
+
+
+def check_homogeneous(where: str, point: Sequence[float]) -> list[str]:
+    """A homogeneous point: not zero, and of a size that can be squared."""
+    if not any(point):
+        return [f"{where}: (0, 0, 0, 0) is no point; one coordinate at least differs from 0"]
+    return _check_size(where, point)
+
+
+def _check_size(where: str, numbers: Sequence[float]) -> list[str]:
+    """Numbers of which only the ratios count: with others than these the norm overflows, or is zero."""
+    largest = max(abs(number) for number in numbers)
+    if 1.0 / MAX_SIZE <= largest <= MAX_SIZE:
+        return []
+    return [
+        f"{where}: its largest number is {largest:g}; {1.0 / MAX_SIZE:g} to {MAX_SIZE:g} is valid, scale it"
+    ]
+
+
+def check_points(target: PointTarget, context: GoalContext) -> list[str]:
+    """Projective points of markers: ids, no zero vector, three at least and not on one line."""
+    problems = check_markers("target.points", list(target.points), context, body=True)
+    for marker, point in target.points.items():
+        problems += check_homogeneous(f"target.points.{marker}", point)
+    if problems:
+        return problems
+    ids = listed(sorted(target.points))
+    if len(target.points) < MIN_MARKERS:
+        return [f"target.points: {len(target.points)} marker(s) ({ids}); at least {MIN_MARKERS} fix a pose"]
+    M = np.array(list(target.points.values()))
+    singular = np.linalg.svd(M / np.linalg.norm(M, axis=1, keepdims=True), compute_uv=False)
+    if not singular[2] > STRAIGHT * singular[0]:
+        problems.append(f"target.points: markers {ids} lie on one line; three that do not are needed")
+    return problems
+
+
+def check_displacement(target: DisplacementTarget, context: GoalContext) -> list[str]:
+    """In exactly one frame, five markers that differ, and a matrix that can be a displacement."""
+    problems = []
+    if (target.model_epoch is None) == (target.basis is None):
+        given = "neither" if target.basis is None else "both"
+        problems.append(
+            f"target: {given} of model_epoch and basis given; exactly one says in which frame the matrix is"
+        )
+    if target.basis is not None:
+        problems += check_markers("target.basis", list(target.basis), context, body=True)
+    matrix = np.array(target.matrix).reshape(4, 4)
+    if any(target.matrix) and (wrong := _check_size("target.matrix", target.matrix)):
+        return problems + wrong
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    if not singular[3] > SINGULAR * singular[0]:
+        problems.append(
+            f"target.matrix: is singular (singular values {listed(f'{x:.3g}' for x in singular)}); it must not be"
+        )
+    elif np.linalg.det(matrix / singular[0]) < 0:
+        problems.append(
+            "target.matrix: its determinant is negative, which makes a mirror image; a displacement's is positive"
+        )
+    return problems
+
+
+def check_taught(target: TaughtTarget, context: GoalContext) -> list[str]:
+    """A name that there is; common markers only with what they are common to."""
+    problems = []
+    if target.name not in context.taught:
+        problems.append(f"target.name: no taught goal {target.name!r}; taught: {listed(context.taught)}")
+    if not target.common:
+        return problems
+    if target.relative_to is None:
+        problems.append(
+            f"target.common: {listed(target.common)} belongs to relative_to; 'workpiece' and 'cameras' are valid there"
+        )
+    if len(set(target.common)) < MIN_MARKERS:
+        problems.append(
+            f"target.common: {len(set(target.common))} marker(s) ({listed(target.common)}); 5 are needed, with a "
+            f"metric model {MIN_MARKERS}"
+        )
+    return problems + check_markers("target.common", target.common, context, body=False)
+
+
+def check_joint_target(target: JointTarget, settings: CoreSettings, where: str = "target") -> list[str]:
+    """Joints that there are, inside of their limits."""
+    problems = []
+    if not target.positions:
+        problems.append(f"{where}.positions: is empty; joints: {listed(settings.joint_names)}")
+    limits = settings.limits
+    for name, position in target.positions.items():
+        place = f"{where}.positions.{name}"
+        if name not in settings.joint_names:
+            problems.append(f"{place}: no joint {name!r}; joints: {listed(settings.joint_names)}")
+            continue
+        i = settings.joint_names.index(name)
+        low = float(limits.position_min[i]) + limits.position_margin
+        high = float(limits.position_max[i]) - limits.position_margin
+        if not low <= position <= high:
+            problems.append(
+                f"{place}: {position:g} is outside the joint's limits; {low:.4g} to {high:.4g} is valid"
+            )
+    return problems
+
+
+def check_incidence(target: IncidenceTarget, context: GoalContext) -> list[str]:
+    """Each feature given in one way, with as many points as its kind spans."""
+    problems = []
+    for k, incidence in enumerate(target.incidences):
+        moving, _, fixed = incidence.kind.partition("-on-")
+        for name, feature, kind in (("moving", incidence.moving, moving), ("fixed", incidence.fixed, fixed)):
+            where = f"target.incidences[{k}].{name}"
+            problems += _check_feature(where, feature, kind, target.model_epoch is not None, context)
+    if isinstance(target.secondary, JointTarget):
+        problems += check_joint_target(target.secondary, context.settings, "target.secondary")
+    elif isinstance(target.secondary, FeatureTarget):
+        problems += check_features(target.secondary, context, "target.secondary")
+    return problems
+
+
+def _check_feature(
+    where: str, feature: Feature, kind: str, has_epoch: bool, context: GoalContext
+) -> list[str]:
+    given = [way for way in ("markers", "points", "pixels") if getattr(feature, way)]
+    if where.endswith("moving") and given != ["markers"]:
+        return [f"{where}: given by {listed(given)}; what moves is given by markers of the body"]
+    if len(given) != 1:
+        return [f"{where}: given by {listed(given)}; exactly one of markers, points, pixels is valid"]
+    need = POINTS_OF[kind]
+    if feature.pixels:
+        return _check_pixels(f"{where}.pixels", feature.pixels, kind, context)
+    count = len(feature.markers or feature.points)
+    problems = []
+    if count != need:
+        problems.append(f"{where}.{given[0]}: {count} given; a {kind} is spanned by {need}")
+    if feature.markers:
+        # A fixed feature's markers stand on the workpiece; the gateway puts their pixels in their place.
+        problems += check_markers(f"{where}.markers", feature.markers, context, body=where.endswith("moving"))
+        return problems
+    if not has_epoch:
+        problems.append(
+            f"{where}.points: are in the frame of a model; target.model_epoch is needed with them"
+        )
+    for i, point in enumerate(feature.points):
+        problems += check_homogeneous(f"{where}.points[{i}]", point)
+    M = np.array(feature.points)
+    if not problems and len(M) == need > 1:
+        singular = np.linalg.svd(M / np.linalg.norm(M, axis=1, keepdims=True), compute_uv=False)
+        if not singular[-1] > STRAIGHT * singular[0]:
+            problems.append(f"{where}.points: do not span a {kind}; {need} points in general position do")
+    return problems
+
+
+def _check_pixels(
+    where: str, pixels: Mapping[str, Sequence[tuple[float, float]]], kind: str, context: GoalContext
+) -> list[str]:
+    cameras = {camera.name: camera for camera in context.settings.cameras}
+    problems = []
+    if len(pixels) < 2:
+        problems.append(f"{where}: of {len(pixels)} camera(s) ({listed(pixels)}); two or more fix a point")
+    for name, seen in pixels.items():
+        if name not in cameras:
+            problems.append(f"{where}.{name}: no camera {name!r}; cameras: {listed(cameras)}")
+            continue
+        if len(seen) != POINTS_OF[kind]:
+            problems.append(f"{where}.{name}: {len(seen)} given; a {kind} is spanned by {POINTS_OF[kind]}")
+        for i, pixel in enumerate(seen):
+            problems += _inside(f"{where}.{name}[{i}]", pixel, cameras[name])
+    return problems

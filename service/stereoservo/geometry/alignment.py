@@ -22,8 +22,7 @@ from stereoservo.geometry.cameras import (
     triangulate,
     triangulation_covariance,
 )
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, move_points, to_homogeneous, whitener
+from stereoservo.geometry.homogeneous import GeometryError, move_points, to_homogeneous, whitener
 from stereoservo.geometry.homography import homography_from_points, pixel_whitening, unit_determinant
 from stereoservo.geometry.moved_cameras import (
     OFF_PLANE,
@@ -31,6 +30,7 @@ from stereoservo.geometry.moved_cameras import (
     plane_deviations,
     refuse_coplanar,
 )
+from stereoservo.numerics.arrays import FloatArray
 
 Family = Literal["rigid", "similar", "affine", "projective"]
 POINTS_NEEDED: dict[Family, int] = {"rigid": 3, "similar": 3, "affine": 4, "projective": 5}

@@ -6,12 +6,9 @@ Cameras are stacked first: ``Ps`` (c, 3, 4), pixels (c, n, 2) [px]. A missing pi
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, plane_of_points, to_homogeneous, whitener
-
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.geometry.homogeneous import GeometryError, plane_of_points, to_homogeneous, whitener
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 NOMINAL_FOCAL = 2.0
 """Focal length [half image widths] that the canonical pair assumes to place its frame: 53° across."""
@@ -102,25 +99,6 @@ def check_views(
     if not (np.isfinite(w[seen]).all() and (w[seen] >= 0).all()):
         raise GeometryError("not_finite", "weights must be finite and not negative where a pixel is given")
     return np.where(seen[..., None], pixels, 0.0), np.where(seen, w, 0.0)
-
-
-def triangulate_linear(Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Points ``(n, 4)`` from pixels ``(c, n, 2)`` by the linear constraints (2.71), depth in the first
-    camera 1.
-
-    ``weights`` (c, n) [1/px] multiply the constraints. NaN rows where fewer than two cameras see a point or
-    its rays are one. Raises GeometryError on shapes that do not fit.
-    """
-    values, w = check_views(Ps, pixels, weights)
-    rows = (values[..., None] * Ps[:, None, 2:, :] - Ps[:, None, :2, :]) * w[..., None, None]
-    stacked = rows.transpose(1, 0, 2, 3).reshape(values.shape[1], -1, 4)
-    scale = np.abs(Ps).max()
-    _, singular, v = np.linalg.svd(stacked / scale, full_matrices=True)
-    M: FloatArray = v[:, 3, :]
-    depth = M @ Ps[0, 2]
-    good = ((w > 0).sum(axis=0) >= 2) & (depth != 0.0)
-    good &= singular[:, 2] ** 2 > DEFINITENESS * singular[:, 0] ** 2
-    return np.where(good[:, None], M / np.where(good, depth, np.nan)[:, None], np.nan)
 
 
 def triangulate(

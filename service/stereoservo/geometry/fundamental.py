@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from stereoservo.geometry.cameras import from_pixels, isotropic_normaliser
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, to_homogeneous
+from stereoservo.geometry.homogeneous import GeometryError, to_homogeneous
+from stereoservo.numerics.arrays import FloatArray
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 

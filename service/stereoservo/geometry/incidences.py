@@ -10,11 +10,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from stereoservo.geometry.cameras import project_many, triangulation_covariance
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.homography import unit_determinant
 from stereoservo.geometry.lines import image_lines
 from stereoservo.geometry.subspaces import TOLERANCE, basis, dual
+from stereoservo.numerics.arrays import FloatArray
 
 PRIMITIVES = {1: "point", 2: "line", 3: "plane"}
 

@@ -12,13 +12,10 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.geometry.cameras import camera_centre
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import RANK_TOLERANCE, FloatArray, to_homogeneous
-
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.geometry.homogeneous import RANK_TOLERANCE, GeometryError, to_homogeneous
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 CERTAINTY = 3.0
 """Standard deviations of a segment's direction by which it must differ from the epipolar line."""

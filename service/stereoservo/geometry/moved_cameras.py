@@ -1,4 +1,4 @@
-"""Virtual rigid stereo: a projective frame carried by scene points, so that cameras may be moved (2.19-2.21).
+"""Change of the projective frame when cameras are moved, from static scene points (2.19-2.21).
 
 Five points of which no four are coplanar are a frame of space. When cameras have moved, their new canonical frame
 differs from the old one by one homography ``H``, which the points' images give; what was known moves with it: points
@@ -14,45 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoservo.geometry.cameras import (
-    camera_centre,
     projection_jacobian,
     reprojection_residuals,
     resection,
-    triangulate,
-    triangulation_covariance,
 )
-from stereoservo.geometry.displacements import conjugate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, move_cameras, move_points, unit_rows, whitener
-from stereoservo.geometry.homography import (
-    homography_covariance,
-    homography_from_basis,
-    homography_from_points,
-    homography_refine,
-    pixel_whitening,
-)
+from stereoservo.geometry.homogeneous import GeometryError, unit_rows, whitener
+from stereoservo.numerics.arrays import FloatArray
 
-STANDARD_BASIS = np.vstack([np.eye(4), np.ones(4)])
-"""``E₁`` to ``E₅``: the coordinates of the five points in the frame that they carry."""
 OFF_PLANE = 5.0
 """Standard deviations by which points must stand off their best common plane not to count as coplanar."""
 EXACT = 1e-9
 """Standard deviation, relative to their norm, that points without a covariance are taken to have."""
-
-
-def scene_frame(points: FloatArray) -> FloatArray:
-    """``H_PP`` (4, 4): the standard basis onto five scene points ``(5, 4)``, ``M_p ~ H_PP E_p`` (2.19, 2.20, errata).
-
-    ``H_PP = [M₁..M₄] diag([M₁..M₄]⁻¹ M₅)``; with an upgrade of the cameras' frame, ``X ~ H_PE H_PP E`` (2.21). Raises
-    GeometryError naming four points that are coplanar.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    if points.shape != (5, 4):
-        raise GeometryError(
-            "shape", f"points have shape {points.shape}; five carry a frame, (5, 4)", shape=points.shape
-        )
-    refuse_coplanar(points)
-    return homography_from_basis(STANDARD_BASIS, points)
 
 
 def plane_deviations(points: FloatArray, covariance: FloatArray | None = None) -> tuple[FloatArray, float]:
@@ -122,116 +94,6 @@ class FrameChange:
     points: tuple[int, ...]
     rms: float
     degrees_of_freedom: int
-
-
-def frame_change(
-    M_old: FloatArray,
-    Ps_new: FloatArray,
-    pixels_new: FloatArray,
-    sigma: float = 1.0,
-    M_covariance: FloatArray | None = None,
-) -> FrameChange:
-    """What brings the old frame into that of moved cameras, of least reprojection error (2.19-2.21 for n >= 5 points).
-
-    ``M_old`` (n, 4): scene points that stood still, in the old frame; ``Ps_new`` (c, 3, 4): the moved cameras in their
-    own new frame, c >= 2; ``pixels_new`` (c, n, 2) [px] of noise ``sigma`` [px], NaN where missing. ``M_covariance``
-    (n, 4, 4): that of ``M_old`` at its scale; without it they count as exact.
-
-    Raises GeometryError for fewer than five points seen by two cameras, and naming those that are coplanar: four of
-    five, or all but one.
-    """
-    M_old, pixels = np.asarray(M_old, dtype=np.float64), np.asarray(pixels_new, dtype=np.float64)
-    if M_old.ndim != 2 or M_old.shape[1] != 4 or pixels.shape != (len(Ps_new), len(M_old), 2):
-        raise GeometryError(
-            "shape",
-            f"points {M_old.shape}, cameras {np.shape(Ps_new)}, pixels {pixels.shape} do not fit; (n, 4), (c, 3, 4), "
-            "(c, n, 2) are needed",
-            points=M_old.shape,
-            pixels=pixels.shape,
-        )
-    known = np.isfinite(M_old).all(axis=1)
-    seen = np.isfinite(pixels).all(axis=2)
-    sigmas = np.where(seen, sigma, np.inf)
-    M_new = triangulate(Ps_new, pixels, sigma, iterations=6)
-    both = np.flatnonzero(known & np.isfinite(M_new).all(axis=1))
-    if len(both) < 5:
-        raise GeometryError(
-            "too_few",
-            f"{len(both)} of {len(M_old)} points are known and seen by two cameras ({both.tolist()}); a frame needs "
-            "at least 5",
-            points=both.tolist(),
-        )
-    refuse_coplanar(
-        M_new[both], triangulation_covariance(Ps_new, M_new[both], sigmas[:, both]), both.tolist()
-    )
-    used = np.flatnonzero(known & seen.any(axis=0))
-    own = None if M_covariance is None else np.asarray(M_covariance, dtype=np.float64)[used]
-    start = homography_from_points(M_old[both], M_new[both])
-    H = homography_refine(start, Ps_new, M_old[used], pixels[:, used], sigma, own)
-    covariance = homography_covariance(H, Ps_new, M_old[used], pixels[:, used], sigma, own)
-    residuals = _whitened_residuals(H, Ps_new, M_old[used], pixels[:, used], sigma, own)
-    freedom = residuals.size - 15
-    return FrameChange(
-        H, covariance, tuple(used.tolist()), float(np.sqrt(residuals @ residuals / freedom)), freedom
-    )
-
-
-def _whitened_residuals(
-    H: FloatArray,
-    Ps: FloatArray,
-    M: FloatArray,
-    pixels: FloatArray,
-    sigma: float,
-    M_covariance: FloatArray | None,
-) -> FloatArray:
-    """Residuals of all measured coordinates in standard deviations, flat."""
-    seen = np.asarray(np.isfinite(pixels).all(axis=2))
-    residuals = np.where(seen[..., None], reprojection_residuals(Ps @ H, M, pixels), 0.0)
-    whitening = pixel_whitening(Ps, H, M, np.where(seen, 1.0 / sigma, 0.0), M_covariance)
-    flat = residuals.transpose(1, 0, 2).reshape(len(M), -1, 1)
-    return (whitening @ flat)[np.repeat(seen.T, 2, axis=1)].ravel()
-
-
-def frame_change_from_points(M_old: FloatArray, M_new: FloatArray) -> FloatArray:
-    """``H`` (4, 4) from the points' old and new reconstructions ``(n, 4)`` alone, linear; exact for five (2.20).
-
-    ``|det H| = 1``, the sign keeps heights. Rows with NaN are left out. Raises GeometryError naming coplanar points.
-    """
-    M_old, M_new = np.asarray(M_old, dtype=np.float64), np.asarray(M_new, dtype=np.float64)
-    if M_old.ndim != 2 or M_old.shape[1] != 4 or M_old.shape != M_new.shape:
-        raise GeometryError(
-            "shape", f"point sets have shapes {M_old.shape} and {M_new.shape}; both must be (n, 4)"
-        )
-    seen = np.flatnonzero(np.isfinite(M_old).all(axis=1) & np.isfinite(M_new).all(axis=1))
-    refuse_coplanar(M_old[seen], None, seen.tolist())
-    refuse_coplanar(M_new[seen], None, seen.tolist())
-    return homography_from_points(M_old[seen], M_new[seen])
-
-
-@dataclass(frozen=True)
-class Carried:
-    """What was known, in the new frame: points ``(m, 4)``, generators ``(n, 4, 4)``, cameras ``(c, 3, 4)``."""
-
-    points: FloatArray
-    generators: FloatArray
-    cameras: FloatArray
-
-
-def carry_over(
-    H: FloatArray,
-    points: FloatArray | None = None,
-    generators: FloatArray | None = None,
-    cameras: FloatArray | None = None,
-) -> Carried:
-    """Points ``H M``, generators ``H Ĝ H⁻¹`` and cameras ``P H⁻¹`` of the old frame in the new one.
-
-    Cameras are those that stood still while others moved. What is not given comes back empty.
-    """
-    return Carried(
-        move_points(H, np.zeros((0, 4)) if points is None else points),
-        conjugate(H, np.zeros((0, 4, 4)) if generators is None else np.asarray(generators, dtype=np.float64)),
-        move_cameras(H, np.zeros((0, 3, 4)) if cameras is None else cameras),
-    )
 
 
 def carried_point_covariance(
@@ -304,26 +166,3 @@ def _refuse_flat_view(P: FloatArray, spread: FloatArray) -> None:
             deviations=deviations,
             needed=OFF_PLANE,
         )
-
-
-def canonical_frame(P: FloatArray, normaliser: FloatArray, points: FloatArray) -> FloatArray:
-    """``H`` (4, 4) from the old frame to the canonical one of a moved first camera ``P`` (3, 4): ``P H⁻¹ = [N⁻¹ | 0]``.
-
-    The plane (0, 0, 0, 1) stays in its place, scaled so that ``points`` (n, 4), which the camera sees, have mean height
-    1 at depth 1. Raises GeometryError where the camera's centre, or a middle of the points, lies in that plane.
-    """
-    H = np.vstack([normaliser @ P, np.eye(4)[3:]])
-    depth, height = points @ H[2], points @ H[3]
-    side = 1.0 if (depth > 0).sum() >= (depth < 0).sum() else -1.0
-    mean = float(np.mean(height / depth))
-    centre = camera_centre(P)
-    if not (abs(mean) > 1e-9 and abs(centre[3]) > 1e-9 * np.linalg.norm(centre)):
-        raise GeometryError(
-            "degenerate",
-            f"the plane (0, 0, 0, 1) passes through the camera's centre {centre.tolist()} or between the points",
-            centre=centre.tolist(),
-            height=mean,
-        )
-    H[:3] *= side
-    H[3] *= side / mean
-    return H

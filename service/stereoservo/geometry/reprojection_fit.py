@@ -10,12 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-10

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.geometry.displacements import conjugate, exp_rotation
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, whitener
+from stereoservo.geometry.homogeneous import GeometryError, whitener
 from stereoservo.geometry.reprojection_fit import Images, Motion, covariance_of, minimise, read_images
 from stereoservo.geometry.rotations import (
     RotationChart,
@@ -23,8 +22,7 @@ from stereoservo.geometry.rotations import (
     rotation_parameter_derivatives,
     rotation_parameters,
 )
-
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +44,6 @@ class RotationFit:
     cost: float
     freedom: int
     evaluations: int
-
-    @property
-    def variance_factor(self) -> float:
-        """Estimated over stated variance of the pixels; 1 where the model and the stated noise are right."""
-        return self.cost / max(1, self.freedom)
 
 
 def rotation_motion(chart: RotationChart, angles: FloatArray) -> Motion:

@@ -6,22 +6,14 @@ Exponential, logarithm and single generators stand in `displacements`; the fit t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.geometry.displacements import (
-    HALF_TURN_SINE,
-    generator_between,
-    nearest_rotation_generator,
-)
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.numerics.arrays import FloatArray
 
-EVEN_SHARE = 0.17
-"""``Σ sin²θ / Σ (1 − cos θ)²`` below which the eigenspaces of the even part are the better ones: 3/4 π."""
 ROTATION_TOLERANCE = 1e-6
 """``|Ĥ³ + Ĥ| / |Ĥ|³`` above which a matrix is no generator of a rotation."""
 HALF_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -59,40 +51,10 @@ class RotationFrame:
         """``h₁, h₂`` (2, 4): two planes through the axis, normal to each other."""
         return self.planes[:2]
 
-    @property
-    def normal_planes(self) -> FloatArray:
-        """``h₃, h₄`` (2, 4): they span the pencil of fixed planes normal to the axis, infinity among them."""
-        return self.planes[2:]
-
     def changed(self, C: FloatArray) -> RotationFrame:
         """The frame ``C S`` of the same rotation (4.11), ``C`` (4, 4) of `rotation_commutator`."""
         S = np.asarray(C, dtype=np.float64) @ self.planes
         return RotationFrame(S, np.asarray(np.linalg.inv(S).T, dtype=np.float64))
-
-
-def jordan_rotation(theta: float) -> FloatArray:
-    """``J_R(θ)`` (4, 4) (4.8): the rotation by ``theta`` [rad] about z."""
-    J = np.eye(4)
-    J[:2, :2] = [[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]
-    return J
-
-
-def rotation_commutator(parameters: npt.ArrayLike) -> FloatArray:
-    """``C_R`` (4, 4) of ``(a, b, c, d, e, f)`` (4.10), the scale μ taken into them; commutes with ``J_R(θ)``.
-
-    Raises GeometryError for parameters that make it singular.
-    """
-    p = np.asarray(parameters, dtype=np.float64)
-    if p.shape != (6,):
-        raise GeometryError("shape", f"parameters have shape {p.shape}; (6,) is needed", shape=p.shape)
-    a, b, c, d, e, f = p
-    if not (np.isfinite(p).all() and a * a + b * b > 0 and abs(c * f - d * e) > 1e-12):
-        raise GeometryError(
-            "degenerate",
-            f"a² + b² is {a * a + b * b:.3g}, cf - de is {c * f - d * e:.3g}; neither may be zero",
-            parameters=p.tolist(),
-        )
-    return np.array([[a, -b, 0, 0], [b, a, 0, 0], [0, 0, c, d], [0, 0, e, f]])
 
 
 def check_rotation_generator(G: FloatArray) -> FloatArray:
@@ -124,57 +86,6 @@ def rotation_frame(G: FloatArray) -> RotationFrame:
     first = U[:, 0]
     columns = np.stack([first, G @ first, Vt[2], Vt[3]])
     return RotationFrame(np.linalg.inv(columns.T), columns)
-
-
-def circle_centres(G: FloatArray, M: FloatArray) -> FloatArray:
-    """Centres ``M + Ĥ²M`` (n, 4) of the circles on which points ``M`` (n, 4) go round (4.36)."""
-    return np.asarray(M + M @ (G @ G).T, dtype=np.float64)
-
-
-def circle_directions(G: FloatArray, M: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Radial ``Ĥ²M`` and tangential direction ``ĤM`` (n, 4) of points ``M`` (n, 4) (4.35), at infinity."""
-    return np.asarray(M @ (G @ G).T, dtype=np.float64), np.asarray(M @ G.T, dtype=np.float64)
-
-
-def generator_from_homographies(Hs: Sequence[FloatArray] | FloatArray, angles: npt.ArrayLike) -> FloatArray:
-    """``Ĥ`` (4, 4) from rotations ``Hs`` (k, 4, 4), normalised, of one axis by known ``angles`` (k,) [rad].
-
-    The logarithm (4.28), ``sin θ Ĥ = (H − H⁻¹)/2``, by least squares over all of them, so that each weighs as
-    much as it tells and a turn near π hurts nobody. Where all are near π, the odd part is read between the
-    eigenspaces of the even one, ``(1 − cos θ) Ĥ² = (H + H⁻¹)/2 − I``. ``Ĥ³ = −Ĥ`` holds to rounding.
-
-    Raises GeometryError: ``shape`` where numbers do not fit, ``degenerate`` where all angles vanish,
-    ``half_turn`` where every angle is a multiple of π (the axis is known then, the generator is not).
-    """
-    stack = np.asarray(Hs, dtype=np.float64)
-    theta = np.asarray(angles, dtype=np.float64)
-    if stack.ndim != 3 or stack.shape[1:] != (4, 4) or theta.shape != stack.shape[:1] or not len(theta):
-        raise GeometryError(
-            "shape",
-            f"homographies {stack.shape} and angles {theta.shape} do not fit; (k, 4, 4) and (k,) are needed",
-            homographies=stack.shape,
-            angles=theta.shape,
-        )
-    if not (np.isfinite(stack).all() and np.isfinite(theta).all()):
-        raise GeometryError("not_finite", "homographies and angles must be finite")
-    sine, cosine = np.sin(theta), 2.0 * np.sin(0.5 * theta) ** 2
-    odd_weight, even_weight = float(sine @ sine), float(cosine @ cosine)
-    if even_weight <= HALF_TURN_SINE**4:
-        raise GeometryError(
-            "degenerate", "all angles are multiples of 2π; a rotation is needed", angles=theta.tolist()
-        )
-    if odd_weight <= HALF_TURN_SINE**2:
-        raise GeometryError(
-            "half_turn",
-            f"angles {theta.tolist()} rad are multiples of π; half a turn tells its axis, not its generator",
-            angles=theta.tolist(),
-        )
-    inverses = np.linalg.inv(stack)
-    odd = np.einsum("k,kij->ij", sine / odd_weight, 0.5 * (stack - inverses))
-    if odd_weight > EVEN_SHARE * even_weight:
-        return nearest_rotation_generator(odd)
-    even = np.einsum("k,kij->ij", cosine / even_weight, 0.5 * (stack + inverses) - np.eye(4))
-    return generator_between(odd, even)
 
 
 @dataclass(frozen=True, eq=False)

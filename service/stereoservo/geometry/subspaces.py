@@ -16,8 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, unit_rows
+from stereoservo.geometry.homogeneous import GeometryError, unit_rows
+from stereoservo.numerics.arrays import FloatArray
 
 TOLERANCE = 1e-9
 """Sine below which a vector counts as lying in a subspace, unless the caller states another."""
@@ -62,24 +62,6 @@ def dual(vectors: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
 def dimension(points: FloatArray, tolerance: float = TOLERANCE) -> int:
     """Dimension k of the span of points ``(m, N)``: 0 a point, 1 a line, 2 a plane; -1 the empty subspace."""
     return len(basis(points, tolerance)) - 1
-
-
-def join(*subspaces: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
-    """Smallest subspace that holds all of the multi-columns ``(m_i, N)``: a multi-column ``(K, N)`` (2.62).
-
-    Raises GeometryError where none is given or their N differ.
-    """
-    _same_space(*subspaces)
-    return basis(np.concatenate([basis(points, tolerance) for points in subspaces]), tolerance)
-
-
-def meet(*subspaces: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
-    """Largest subspace that lies in all of the multi-columns ``(m_i, N)``: a multi-column ``(K, N)``, K = 0 if none.
-
-    The dual of the join of the duals. Raises GeometryError where none is given or their N differ.
-    """
-    _same_space(*subspaces)
-    return dual(np.concatenate([dual(points, tolerance) for points in subspaces]), tolerance)
 
 
 def _same_space(*subspaces: FloatArray) -> None:
@@ -149,8 +131,3 @@ def relation(first: FloatArray, second: FloatArray, tolerance: float = TOLERANCE
 def coincident(first: FloatArray, second: FloatArray, tolerance: float = TOLERANCE) -> bool:
     """Whether two spans are one (2.77): equal dimensions and a vanishing incidence matrix."""
     return relation(first, second, tolerance).position == "coincident"
-
-
-def included(inner: FloatArray, outer: FloatArray, tolerance: float = TOLERANCE) -> bool:
-    """Whether the span of ``inner`` (m, N) lies in that of ``outer`` (m', N): the weak form of (2.77)."""
-    return relation(inner, outer, tolerance).position in ("first_in_second", "coincident")

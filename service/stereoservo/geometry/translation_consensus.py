@@ -10,17 +10,20 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.geometry.cameras import triangulate, triangulation_covariance
 from stereoservo.geometry.displacements import conjugate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.reprojection_fit import Images, covariance_of, minimise, read_images, with_rest
 from stereoservo.geometry.strata import heights_of_one_side
-from stereoservo.geometry.translation_fit import TranslationFit, bundle_translations, homography_motion
-from stereoservo.geometry.translation_planar import planar_start, plane_basis
+from stereoservo.geometry.translation_fit import (
+    TranslationFit,
+    bundle_translations,
+    homography_motion,
+    planar_start,
+    plane_basis,
+)
 from stereoservo.geometry.translations import (
     Weighting,
     direction_given_plane,
@@ -29,9 +32,8 @@ from stereoservo.geometry.translations import (
     translation_from_homography,
     translation_homography,
 )
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
 Reason = Literal["", "unseen", "points", "conditioning", "not_a_translation", "no_motion", "other_plane"]
 
 TAIL = 1e-3

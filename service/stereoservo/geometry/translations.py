@@ -11,118 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.geometry.cameras import check_views, projection_jacobian_many
 from stereoservo.geometry.displacements import conjugate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray, whitener
-
-NILPOTENT_TOLERANCE = 1e-8
-"""``|Ĥ²| / |Ĥ|²`` above which a matrix is no generator of a translation."""
-
-
-@dataclass(frozen=True, eq=False)
-class JordanFrame:
-    """A frame in which a projective translation is the unit translation along z: ``H = S⁻¹ J S`` (3.5).
-
-    ``planes`` (4, 4): rows ``h₁..h₄`` of S; ``points`` (4, 4): rows ``k₁..k₄``, the columns of S⁻¹
-    (3.15). ``k₃`` is the direction of translation, ``h₄`` the plane at infinity; ``k₁``, ``k₂`` other
-    directions, ``k₄`` a finite point; ``h₁``, ``h₂`` planes along the translation, ``h₃`` one across it.
-    """
-
-    planes: FloatArray
-    points: FloatArray
-
-    @property
-    def direction(self) -> FloatArray:
-        """``k₃`` (4,)."""
-        k: FloatArray = self.points[2]
-        return k
-
-    @property
-    def plane_at_infinity(self) -> FloatArray:
-        """``h₄`` (4,)."""
-        h: FloatArray = self.planes[3]
-        return h
-
-    @property
-    def fixed_points(self) -> FloatArray:
-        """``k₁, k₂, k₃`` (3, 4): they span the plane at infinity, fixed point by point (3.9)."""
-        return self.points[:3]
-
-    @property
-    def fixed_planes(self) -> FloatArray:
-        """``h₁, h₂, h₄`` (3, 4): they span the planes along the translation, which meet in ``k₃`` (3.10)."""
-        return self.planes[[0, 1, 3]]
-
-    def changed(self, C: FloatArray) -> JordanFrame:
-        """The frame ``C S`` of the same translation (3.7), ``C`` (4, 4) of `jordan_commutator`."""
-        return _frame_of(np.asarray(C, dtype=np.float64) @ self.planes)
-
-
-JORDAN_TRANSLATION = np.eye(4) + np.outer(np.eye(4)[2], np.eye(4)[3])
-"""``J_T`` (3.4): the unit translation along z."""
-
-
-def split_generator(G: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``(k, h)`` with ``Ĥ = k hᵀ``, ``|h| = 1`` (3.14), of a translation's generator ``G`` (4, 4).
-
-    The sign is free: ``(−k, −h)`` is the same generator. Raises GeometryError where G is not nilpotent of
-    rank one (``Ĥ² = 0``, 3.24).
-    """
-    G = np.asarray(G, dtype=np.float64)
-    if G.shape != (4, 4) or not np.isfinite(G).all():
-        raise GeometryError(
-            "shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape
-        )
-    U, singular, Vt = np.linalg.svd(G)
-    square = float(np.linalg.norm(G @ G))
-    size = float(singular[0])
-    if not (size > 0 and square <= NILPOTENT_TOLERANCE * size**2 and singular[1] <= 1e-6 * size):
-        raise GeometryError(
-            "degenerate",
-            f"singular values {singular.tolist()}, |G²| {square:.3g}; a translation's generator has rank one "
-            "and square zero",
-            singular=singular.tolist(),
-            square=square,
-        )
-    return U[:, 0] * size, Vt[0]
-
-
-def jordan_frame(G: FloatArray) -> JordanFrame:
-    """One Jordan frame of the translation ``exp(Ĥ) = I + Ĥ``, ``G`` (4, 4) = ``τĤ`` (3.5, 3.8).
-
-    All others are ``frame.changed(jordan_commutator(...))``. Raises GeometryError where G is no generator
-    of a translation.
-    """
-    k, h = split_generator(G)
-    k = k - h * (h @ k)
-    across = np.linalg.svd(np.stack([k, h]))[2][2:]
-    return _frame_of(np.vstack([across, k / (k @ k), h]))
-
-
-def _frame_of(S: FloatArray) -> JordanFrame:
-    points = np.asarray(np.linalg.inv(S).T, dtype=np.float64)
-    return JordanFrame(S, points)
-
-
-def jordan_commutator(parameters: npt.ArrayLike) -> FloatArray:
-    """``C_T`` (4, 4) of its ten parameters ``(μ, c11, c12, c14, c21, c22, c24, c31, c32, c34)`` (3.6).
-
-    It commutes with ``J_T``. Raises GeometryError for parameters that make it singular.
-    """
-    p = np.asarray(parameters, dtype=np.float64)
-    if p.shape != (10,):
-        raise GeometryError("shape", f"parameters have shape {p.shape}; (10,) is needed", shape=p.shape)
-    C = np.eye(4)
-    C[:3, [0, 1, 3]] = p[1:].reshape(3, 3)
-    minor = float(p[1] * p[5] - p[2] * p[4])
-    if not (np.isfinite(p).all() and p[0] != 0 and abs(minor) > 1e-12):
-        raise GeometryError(
-            "degenerate", f"mu is {p[0]}, c11 c22 - c12 c21 is {minor:.3g}; neither may be zero", minor=minor
-        )
-    return np.asarray(p[0] * C, dtype=np.float64)
+from stereoservo.geometry.homogeneous import GeometryError, whitener
+from stereoservo.numerics.arrays import FloatArray
 
 
 def raw_generator(H: FloatArray) -> FloatArray:
@@ -304,17 +197,6 @@ def plane_at_infinity_from_stack(
     """
     stack = np.concatenate([weighting.weighted(H) for H in _some(Hs)])
     return weighting.plane(np.linalg.svd(stack)[2][0])
-
-
-def direction_from_stack(
-    Hs: Sequence[FloatArray] | FloatArray, weighting: Weighting = UNWEIGHTED
-) -> FloatArray:
-    """Direction ``(4,)``, unit norm, common to homographies ``(n, 4, 4)`` of parallel translations (3.38).
-
-    Raises GeometryError for an empty stack and for a homography without trace.
-    """
-    stack = np.concatenate([weighting.weighted(H).T for H in _some(Hs)])
-    return weighting.point(np.linalg.svd(stack)[2][0])
 
 
 def direction_given_plane(H: FloatArray, plane: FloatArray, weighting: Weighting = UNWEIGHTED) -> FloatArray:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.geometry.strata import projective_to_affine, upper_triangular
 from stereoservo.kinematics.model import CellModel, Stratum
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

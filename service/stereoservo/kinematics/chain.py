@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from stereoservo.geometry.cameras import projection_jacobian_many
 from stereoservo.geometry.displacements import exp_generator
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.numerics.arrays import FloatArray
 
 KIND_CODES = {"revolute": 0, "prismatic": 1}
 
@@ -110,18 +110,6 @@ class ProjectiveChain:
         """``∂M/∂q_j = Ĥ_j|_Q M`` (m, 4, n) of points ``(m, 4)`` as they are at ``q`` (5.47)."""
         jacobian: FloatArray = np.einsum("jik,mk->mij", self.operators_at(q), M_now)
         return jacobian
-
-    def point_jacobian_zero_reference(self, q: FloatArray, M0: FloatArray) -> FloatArray:
-        """``∂M/∂q_j = Ĥ_j|_Q H(q) M(0)`` (m, 4, n) of points ``(m, 4)`` given at the zero (5.38)."""
-        return self.point_jacobian(q, M0 @ self.displacement(q).T)
-
-    def rezeroed(self, Q: FloatArray) -> ProjectiveChain:
-        """The same arm with its zero at ``Q`` (n,): generators become ``Ĥ_j|_Q`` (5.22). Points must move
-        with ``H(Q)``.
-        """
-        return ProjectiveChain(
-            self.kinds, self.operators_at(Q), np.array(Q, dtype=np.float64), self.tip_first
-        )
 
     def image_jacobian(self, Ps: FloatArray, q: FloatArray, M_now: FloatArray) -> FloatArray:
         """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3,

@@ -11,9 +11,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.geometry.screws import exp_twist as exp_twist_reference
-from stereoservo.kinematics.kernels import exp_twist, invert4, kernel, multiply4_into
+from stereoservo.kinematics.kernels import exp_twist, invert4, multiply4_into
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 
 
 class Composition(IntEnum):
@@ -94,3 +95,22 @@ def move_operators(operators: FloatArray, composition: int, step: FloatArray) ->
         multiply4_into(product, invert4(H), moved[j])
         _follow_joint(H, operators[j], step[j], product)
     return moved
+
+
+def displacement_basis(projective_to_euclidean: FloatArray, points: FloatArray) -> FloatArray:
+    """Twists (6, 4, 4): translations along three axes, then rotations about them through the middle of ``points``
+    (m, 4). A unit of translation is the largest distance of a point from the middle, so that all six are of one size.
+    """
+    H = np.asarray(projective_to_euclidean, dtype=np.float64)
+    euclidean = points @ H.T
+    euclidean = euclidean[:, :3] / euclidean[:, 3:]
+    middle = euclidean.mean(axis=0)
+    size = float(np.sqrt(((euclidean - middle) ** 2).sum(axis=1).max())) or 1.0
+    basis = np.zeros((6, 4, 4))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[k, k, 3] = size
+        basis[3 + k, j, i], basis[3 + k, i, j] = 1.0, -1.0
+        basis[3 + k, j, 3], basis[3 + k, i, 3] = -middle[i], middle[j]
+    twists: FloatArray = np.linalg.inv(H) @ basis @ H
+    return twists

@@ -11,12 +11,10 @@ from collections.abc import Callable
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.kinematics.calibration.charts import conjugation
 from stereoservo.kinematics.model import CellModel, ModelCovariance
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.kinematics.parameterization import conjugation
+from stereoservo.numerics.arrays import FloatArray
 
 STEP = 0.01
 """Standard deviations to either side over which derivatives are taken."""

@@ -28,7 +28,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.kinematics.axes import (
     Axes,
@@ -43,8 +42,8 @@ from stereoservo.kinematics.axes import (
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import standard_deviations
 from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 LinkKind = Literal["skew", "meeting", "parallel", "to_prismatic", "last"]
 
 PARALLEL = np.radians(5.0)

@@ -10,15 +10,19 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.kinematics.axes import framed
 from stereoservo.kinematics.covariance import standard_deviations
-from stereoservo.kinematics.image_quantities import Group, axis_images, lenses, sights
 from stereoservo.kinematics.model import CellModel
-from stereoservo.kinematics.stratum_quantities import affine_quantities, metric_quantities
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.kinematics.quantities import (
+    Group,
+    affine_quantities,
+    axis_images,
+    lenses,
+    metric_quantities,
+    sights,
+)
+from stereoservo.numerics.arrays import FloatArray
 
 
 class Quantity(msgspec.Struct, frozen=True):

@@ -14,16 +14,14 @@ import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import qmc
 
-from stereoservo.geometry.homogeneous import FloatArray
-from stereoservo.kinematics.joint_sights import (
+from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
     JointProblem,
     SeenChain,
     joint_problem,
     points_seen,
 )
-
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 STARTS = 512
 """Starts of a global search; up to ``GRID`` a joint where that is fewer."""

@@ -9,39 +9,14 @@ caller.
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.geometry.homogeneous import FloatArray
-
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-KindArray = npt.NDArray[np.uint8]
-BoolArray = npt.NDArray[np.bool_]
+from stereoservo.numerics.arrays import BoolArray, FloatArray, KindArray
+from stereoservo.numerics.compilation import kernel
 
 PIVOT_TOLERANCE = 1e-14
 """Relative Cholesky pivot below which a point's rays count as one."""
-
-
-def kernel(function: _F) -> _F:
-    """Compile for the loop: cached on disk, exact arithmetic, no Python objects.
-
-    Numba renews a cached kernel when its own file changes, not when a kernel that it calls changes in another
-    file: after an edit here, touch the callers' files. Where no cache directory is writable the kernel is
-    compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
-    """
-    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
-    try:
-        compiled = numba.njit(cache=True, **options)(function)
-    except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
-        warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=2)
-        compiled = numba.njit(**options)(function)
-    return cast(_F, compiled)
 
 
 @kernel
@@ -279,6 +254,26 @@ def symmetric_eigen4(A: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @kernel
+def _views(weights: FloatArray, p: int) -> int:
+    """Number of cameras that see point ``p``: positive ``weights`` (c, n)."""
+    views = 0
+    for c in range(weights.shape[0]):
+        if weights[c, p] > 0.0:
+            views += 1
+    return views
+
+
+@kernel
+def _eliminated_and_free(row: FloatArray) -> tuple[int, int, int, int]:
+    """Index of the largest entry of ``row`` (4,) by size, and the three others in order."""
+    k = 0
+    for i in range(1, 4):
+        if abs(row[i]) > abs(row[k]):
+            k = i
+    return k, 1 if k == 0 else 0, 2 if k <= 1 else 1, 3 if k <= 2 else 2
+
+
+@kernel
 def _triangulate_point(
     Ps: FloatArray,
     pixels: FloatArray,
@@ -290,21 +285,11 @@ def _triangulate_point(
 ) -> bool:
     """One point into ``M[p]``; ``work`` (3,) scratch. False where its rays do not determine it."""
     cameras = Ps.shape[0]
-    views = 0
-    for c in range(cameras):
-        if weights[c, p] > 0.0:
-            views += 1
-    if views < 2:
+    if _views(weights, p) < 2:
         return False
     # Depth 1 in camera 0 is kept by eliminating the coordinate k that its third row weighs most.
-    k = 0
-    for i in range(1, 4):
-        if abs(Ps[0, 2, i]) > abs(Ps[0, 2, k]):
-            k = i
+    k, i0, i1, i2 = _eliminated_and_free(Ps[0, 2])
     pivot = Ps[0, 2, k]
-    i0 = 1 if k == 0 else 0
-    i1 = 2 if k <= 1 else 1
-    i2 = 3 if k <= 2 else 2
     f0, f1, f2 = -Ps[0, 2, i0] / pivot, -Ps[0, 2, i1] / pivot, -Ps[0, 2, i2] / pivot
     for i in range(4):
         M[p, i] = 0.0
@@ -426,3 +411,103 @@ def exp_twist(G: FloatArray) -> FloatArray:
             for k in range(4):
                 H[i, k] = product[i, k]
     return H
+
+
+ITERATIONS = 30
+"""Newton steps of the inverse at most."""
+CONVERGED = 1e-14
+"""Step, relative to the radius, at which the inverse ends."""
+
+
+@kernel
+def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. ``k = 0`` leaves it as it is, to the bit."""
+    k, r0 = lens[0], lens[3]
+    if k == 0.0:
+        return u, v
+    x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
+    bend = k * (x * x + y * y)
+    if not 1.0 + 3.0 * bend > 0.0:
+        return math.nan, math.nan
+    return lens[1] + (u - lens[1]) * (1.0 + bend), lens[2] + (v - lens[2]) * (1.0 + bend)
+
+
+@kernel
+def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Ideal pixel of the raw one ``(u, v)`` by Newton's method on the radius; NaN where there is none.
+
+    A lens of ``k = 0`` leaves it as it is, to the bit.
+    """
+    k, r0 = lens[0], lens[3]
+    if k == 0.0:
+        return u, v
+    x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
+    raw = math.sqrt(x * x + y * y)
+    if not math.isfinite(raw) or (k < 0.0 and not raw < 2.0 / 3.0 * math.sqrt(-1.0 / (3.0 * k))):
+        return math.nan, math.nan
+    radius = raw
+    for _ in range(ITERATIONS):
+        bend = k * radius * radius
+        step = (radius * (1.0 + bend) - raw) / (1.0 + 3.0 * bend)
+        radius -= step
+        if abs(step) <= CONVERGED * max(radius, 1.0):
+            break
+    scale = 1.0 / (1.0 + k * radius * radius)
+    return lens[1] + (u - lens[1]) * scale, lens[2] + (v - lens[2]) * scale
+
+
+@kernel
+def distortion_jacobian(lens: FloatArray, u: float, v: float) -> tuple[float, float, float]:
+    """``∂raw/∂ideal`` at the ideal pixel ``(u, v)``, a symmetric matrix: its entries uu, uv, vv."""
+    k, r0 = lens[0], lens[3]
+    x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
+    even = 1.0 + k * (x * x + y * y)
+    return even + 2.0 * k * x * x, 2.0 * k * x * y, even + 2.0 * k * y * y
+
+
+@kernel
+def _propagate(a: float, b: float, d: float, C: FloatArray, out: FloatArray) -> None:
+    """``out = J C Jᵀ`` for the symmetric ``J = (a b; b d)`` and (2, 2) ``C``."""
+    uu, uv = a * C[0, 0] + b * C[1, 0], a * C[0, 1] + b * C[1, 1]
+    vu, vv = b * C[0, 0] + d * C[1, 0], b * C[0, 1] + d * C[1, 1]
+    out[0, 0], out[0, 1] = uu * a + uv * b, uu * b + uv * d
+    out[1, 0], out[1, 1] = vu * a + vv * b, vu * b + vv * d
+
+
+@kernel
+def undistort_sights(
+    lens: FloatArray, pixels: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Ideal pixels (k, 2) with covariances (k, 2, 2) [px²] of raw ones, and which (k,) the lens can have made."""
+    n = pixels.shape[0]
+    ideal = np.empty((n, 2))
+    spread = np.empty((n, 2, 2))
+    seen = np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        u, v = undistort_pixel(lens, pixels[i, 0], pixels[i, 1])
+        ideal[i, 0], ideal[i, 1] = u, v
+        a, b, d = distortion_jacobian(lens, u, v)
+        determinant = a * d - b * b
+        seen[i] = math.isfinite(u) and math.isfinite(v) and determinant > 0.0
+        _propagate(d / determinant, -b / determinant, a / determinant, covariances[i], spread[i])
+    return ideal, spread, seen
+
+
+@kernel
+def distort_expected(
+    lens: FloatArray, pixels: FloatArray, velocities: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Raw pixels (k, 2), velocities (k, 2), covariances (k, 2, 2) of ideal ones, and which (k,) lie within the fold."""
+    n = pixels.shape[0]
+    raw = np.empty((n, 2))
+    speed = np.empty((n, 2))
+    spread = np.empty((n, 2, 2))
+    seen = np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        raw[i, 0], raw[i, 1] = distort_pixel(lens, pixels[i, 0], pixels[i, 1])
+        a, b, d = distortion_jacobian(lens, pixels[i, 0], pixels[i, 1])
+        speed[i, 0] = a * velocities[i, 0] + b * velocities[i, 1]
+        speed[i, 1] = b * velocities[i, 0] + d * velocities[i, 1]
+        _propagate(a, b, d, covariances[i], spread[i])
+        seen[i] = math.isfinite(raw[i, 0]) and math.isfinite(raw[i, 1])
+    return raw, speed, spread, seen

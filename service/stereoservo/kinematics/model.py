@@ -10,16 +10,15 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.messages.cell_file import Mount
+from stereoservo.numerics.arrays import FloatArray
 
 MODEL_SCHEMA = 2
 READABLE_SCHEMAS = (1, 2)
 """Schema 1 knew neither lenses nor mounts: pinholes that stand still."""
 
 Stratum = Literal["projective", "affine", "metric"]
-Mount = Literal["eye_to_hand", "eye_in_hand"]
 
 
 def pinhole() -> FloatArray:

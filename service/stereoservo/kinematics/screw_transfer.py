@@ -26,11 +26,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.geometry.displacements import conjugate
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.lines import cross_matrix
-from stereoservo.geometry.velocities import twist_matrix, twist_vectors
+from stereoservo.geometry.screws import twist_matrix, twist_vectors
 from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray
 
 TWIST_TOLERANCE = 1e-4
 """What an operator may leave beside a Euclidean twist, relative to it, before it is said to be in another frame."""

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from stereoservo.calibration.bundle_adjustment import jacobian, solve
+from stereoservo.calibration.rig_model import RigModel, full_charts, residuals, rig_at
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.single_joint_fit import measurements
+from stereoservo.calibration.trial_data import TrialData
 from stereoservo.kinematics.axes import framed
-from stereoservo.kinematics.calibration.bundle import Rig, full_charts, jacobian, moved, residuals, solve
-from stereoservo.kinematics.calibration.fit import fit_model
-from stereoservo.kinematics.calibration.separate import measurements
-from stereoservo.kinematics.calibration.trials import TrialData
 from stereoservo_sim.benchmarks.timing import summary, timed
-from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.synthetic import SyntheticCell, rx90, two_faces
-
-FloatArray = npt.NDArray[np.float64]
-ProgressCall = Callable[[str, int, int], None]
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.exact_model import exact_model
+from stereoservo_sim.world.synthetic import SyntheticCell, rx90, two_faces
 
 SIGMA = 0.05
 """[px]"""
@@ -92,12 +89,12 @@ def _beside_scipy(
 ) -> dict[str, Any]:
     """The metric bundle, ours and scipy's on the dense Jacobian of the same residuals, from one common start."""
     parts = framed(exact_model(cell))
-    truth = Rig(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
+    truth = RigModel(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
     data = measurements(trials, trials.visible, trials.positions - parts.zero)
     charts = full_charts(truth, "metric")
     slope = jacobian(truth, charts, np.zeros(charts.size), data)
     noise = np.random.default_rng([seed, 2000]).standard_normal(charts.size)
-    start = moved(truth, charts, START * np.linalg.solve(np.linalg.qr(slope, mode="r"), noise))
+    start = rig_at(truth, charts, START * np.linalg.solve(np.linalg.qr(slope, mode="r"), noise))
     here = full_charts(start, "metric")
     costs: dict[str, float] = {}
 
@@ -106,7 +103,7 @@ def _beside_scipy(
 
     def dense(k: int) -> None:
         found = least_squares(
-            lambda x: residuals(moved(start, here, x), data),
+            lambda x: residuals(rig_at(start, here, x), data),
             np.zeros(here.size),
             jac=lambda x: jacobian(start, here, x, data),
             x_scale="jac",

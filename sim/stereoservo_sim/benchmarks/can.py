@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from stereoservo_sim.benchmarks.can_drives import RATE_HZ, fastest_paced, run_drives, saturate
 from stereoservo_sim.benchmarks.can_transports import TRANSPORTS, time_transport
-
-ProgressCall = Callable[[str, int, int], None]
+from stereoservo_sim.progress import ProgressCall
 
 BACK_TO_BACK_S = 0.2
 """For each repetition, of every transport."""

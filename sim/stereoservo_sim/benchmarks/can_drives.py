@@ -13,21 +13,20 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from stereoservo.runtime.cellfile import load_cell_file
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.ports import DriverContext, DriverError
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.load import cycle_load, frame_bits
+from stereoservo_drivers.canopen.bringup import Subscriptions
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC, Codec
-from stereoservo_drivers.canopen.driver import CanJointDriver
-from stereoservo_drivers.canopen.listening import Subscriptions
+from stereoservo_drivers.canopen.driver import CanJointDriver, make_bringup, make_codec
 from stereoservo_drivers.canopen.options import CanOptions
-from stereoservo_drivers.canopen.protocols import make_bringup, make_codec
 from stereoservo_sim.benchmarks.can_peer import AXES, LOOP_PRIORITY, peer, real_time
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.drives.building import drives_of_cell
+from stereoservo_sim.emulators.bus.factory import drives_of_cell
 
 SPEED = 0.05
 """[rad/s], amplitude of the commands."""

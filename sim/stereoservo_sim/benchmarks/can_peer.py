@@ -21,7 +21,7 @@ from typing import Any
 
 import msgspec
 
-from stereoservo.runtime.loop import realtime_for_a_while
+from stereoservo.daemon.pacing import realtime_for_a_while
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.slcan_adapter import SlcanAdapter
 from stereoservo_drivers.canopen.options import CanOptions
@@ -107,8 +107,8 @@ def _answer_syncs(fd: int) -> None:
 
 def serve_drives(text: str) -> None:
     """Emulated drives of an ideal plant on a free TCP port. ``text``: ``{"bit_time": …, "options": …}``."""
-    from stereoservo_sim.drives.building import DrivesSettings, make_rack
-    from stereoservo_sim.drives.serving import RackServer, open_endpoint
+    from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint
+    from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
 
     wanted: dict[str, Any] = json.loads(text)
     options = msgspec.convert(wanted["options"], CanOptions)

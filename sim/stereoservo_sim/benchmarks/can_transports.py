@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.channel import Channel, ChannelSettings
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_sim.benchmarks.can_peer import ANSWERS, COMMANDS, LOOP_PRIORITY, SYNC, peer, real_time
@@ -37,7 +37,7 @@ class _InlinePeer:
         self._channel.close()
 
 
-class _Line:
+class _Transport:
     """A channel and, where the nodes are in this process, them."""
 
     def __init__(self, settings: ChannelSettings, inline: bool) -> None:
@@ -67,9 +67,9 @@ class _Line:
 
 
 @contextmanager
-def _line(transport: str) -> Iterator[_Line]:
+def _line(transport: str) -> Iterator[_Transport]:
     if transport == "virtual":
-        line = _Line(ChannelSettings("virtual", "bench_can"), inline=True)
+        line = _Transport(ChannelSettings("virtual", "bench_can"), inline=True)
         try:
             yield line
         finally:
@@ -82,7 +82,7 @@ def _line(transport: str) -> Iterator[_Line]:
             channel,
             interface_options=STOCK_OPTIONS if stock else {},
         )
-        line = _Line(settings, inline=False)
+        line = _Transport(settings, inline=False)
         try:
             yield line
         finally:
@@ -111,7 +111,7 @@ def time_transport(transport: str, seconds: float, paced_cycles: int) -> dict[st
     return figures
 
 
-def _paced(line: _Line, cycles: int) -> list[float]:
+def _paced(line: _Transport, cycles: int) -> list[float]:
     """Seconds of each cycle that came complete, at the paced rate or as fast as the transport can."""
     latencies = []
     due = time.monotonic()

@@ -9,27 +9,25 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.control.law import Law, LawStep, Options, Scene, Task
-from stereoservo.control.laws import LAWS
-from stereoservo.control.stereo import StereoCycle, stereo_law
-from stereoservo.control.stereo_kernel import stereo_step
+from stereoservo.control.law_registry import LAWS
+from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
+from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward, image_jacobian, project_points, transform_points
-from stereoservo.runtime.commands import Enable, FeatureTarget, Goal, LawName, Request, RunGoal
-from stereoservo.runtime.core import ServoCore
-from stereoservo.runtime.cycle import ModelUpdate, StepInputs, StepOutputs
-from stereoservo.runtime.ports import CameraObservation, JointState
-from stereoservo.runtime.settings import CameraSettings, CoreSettings, LimitSettings
+from stereoservo.messages.goals import Enable, FeatureTarget, Goal, LawName, Request, RunGoal
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, JointState
+from stereoservo_sim.benchmarks.stereo_reference import stereo_law
 from stereoservo_sim.benchmarks.timing import summary, timed
-from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.synthetic import SyntheticCell, rx90
-
-FloatArray = npt.NDArray[np.float64]
-ProgressCall = Callable[[str, int, int], None]
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.exact_model import exact_model
+from stereoservo_sim.world.synthetic import SyntheticCell, rx90
 
 GAIN, DAMPING = 1.0, 1e-6
 RATE_HZ, FRAME_EVERY = 250.0, 10

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -10,12 +9,17 @@ from rich.console import Console
 from rich.table import Table
 
 from stereoservo_sim.benchmarks.faults_wall import run_wall
-from stereoservo_sim.drives.fault_cases import CASES
-from stereoservo_sim.drives.fault_table import run_row
-from stereoservo_sim.drives.fault_trials import AXES, RAMP_COUNTS_S2, RATE_HZ, SPEED_COUNTS_S, TrialError
-from stereoservo_sim.experiments.errors import ExperimentError
-
-ProgressCall = Callable[[str, int, int], None]
+from stereoservo_sim.emulators.bus.fault_cases import CASES
+from stereoservo_sim.emulators.bus.fault_table import run_row
+from stereoservo_sim.emulators.bus.fault_trials import (
+    AXES,
+    RAMP_COUNTS_S2,
+    RATE_HZ,
+    SPEED_COUNTS_S,
+    TrialError,
+)
+from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.progress import ProgressCall
 
 WALL_SHARE = 3
 """For so many trials in bit time one in real time, which takes seconds."""

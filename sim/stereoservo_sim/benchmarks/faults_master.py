@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.ports import DriverContext, DriverError
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_sim.benchmarks.can_peer import LOOP_PRIORITY, real_time
 

@@ -23,13 +23,13 @@ from typing import Any, Self
 
 import msgspec
 
-from stereoservo.runtime.cellfile import load_cell_file
+from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.drives.building import drives_of_cell
-from stereoservo_sim.emulation.process import EmulatorProcess
-from stereoservo_sim.experiments.errors import ExperimentError
+from stereoservo_sim.emulators.bus.factory import drives_of_cell
+from stereoservo_sim.emulators.emulator_process import EmulatorProcess
+from stereoservo_sim.experiments.experiment import ExperimentError
 
 CELL = "hil-can"
 SPEED = 0.125

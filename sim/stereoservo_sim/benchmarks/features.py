@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.ports import DriverContext, Frame, Prior
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverContext, Frame, Prior
 from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_sim.benchmarks.features_robustness import robustness
 from stereoservo_sim.benchmarks.timing import summary, timed
-from stereoservo_sim.rendering import Renderer, RenderSettings
-from stereoservo_sim.world import demo_cell
-
-ProgressCall = Callable[[str, int, int], None]
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.rendering import Renderer, RenderSettings
+from stereoservo_sim.world.simulated_cell import demo_cell
 
 IMAGES = 8
 """Pictures that the repetitions take in turn."""

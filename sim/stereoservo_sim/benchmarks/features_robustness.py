@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from stereoservo.runtime.ports import CameraObservation, Frame, Prior
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, Frame, Prior
+from stereoservo.ports.dot_plates import DEFAULT_BODY
 from stereoservo_drivers.detectors.dots import DotDetector
-from stereoservo_drivers.detectors.plates import DEFAULT_BODY
-from stereoservo_sim.benchmarks.features_scenes import Conditions, FloatArray, random_picture
-from stereoservo_sim.experiments.random_rigs import wilson
-
-ProgressCall = Callable[[str, int, int], None]
+from stereoservo_sim.benchmarks.features_scenes import Conditions, random_picture
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.summaries import wilson
 
 NEAR = (0.8, 1.2)
 """Distances [m] at which a dot's diameter is 13 to 20 px; 1.6 m: 10 px."""

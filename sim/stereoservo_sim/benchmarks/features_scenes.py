@@ -13,11 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from stereoservo_drivers.detectors.plates import DEFAULT_BODY
-from stereoservo_sim.coverage import blend_ellipse, blend_polygon
-
-FloatArray = npt.NDArray[np.float64]
-ImageArray = npt.NDArray[np.uint8]
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.ports.dot_plates import DEFAULT_BODY
+from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
 
 FINE = 4
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0

@@ -18,11 +18,6 @@ def shipped_cell_path(name: str) -> Path:
         return path
 
 
-def demo_cell_text() -> str:
-    """The demo's cell file as text."""
-    return demo_cell_path().read_text(encoding="utf-8")
-
-
 def demo_cell_path() -> Path:
     """Path of the demo's cell file in the installed package."""
     return shipped_cell_path("demo")

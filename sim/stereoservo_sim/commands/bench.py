@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from stereoservo_sim.commands.progress import ProgressCall, progress_bar
-from stereoservo_sim.experiments.errors import ExperimentError
+from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.progress import ProgressCall, progress_bar
 
 Bench = Callable[[int, int, ProgressCall], dict[str, Any]]
 

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,16 +16,18 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from stereoservo.runtime.cellfile import CellFile, load_cell_file
+from stereoservo.control.law_registry import LAWS, UnknownLawError
+from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo_sim.cells import CELLS, shipped_cell_path
-from stereoservo_sim.demonstration.conduct import (
+from stereoservo_sim.demonstration.emulated import has_emulated_cameras, has_emulated_drives
+from stereoservo_sim.demonstration.results import summary
+from stereoservo_sim.demonstration.runner import (
     DemoFailedError,
-    Stage,
+    DemonstrationProgress,
     conduct_live,
     conduct_lockstep,
 )
-from stereoservo_sim.demonstration.emulated import has_emulated_cameras, has_emulated_drives
-from stereoservo_sim.demonstration.results import summary
+from stereoservo_sim.demonstration.scenario import GOALS
 from stereoservo_sim.demonstration.truth import true_cell
 
 
@@ -45,6 +48,10 @@ def demo(
             "--cell", metavar="NAME|PATH", help=f"{', '.join(CELLS)}, or a .toml file of a simulated cell."
         ),
     ] = CELLS[0],
+    law: Annotated[
+        str | None,
+        typer.Option("--law", help="Of the first goal, in place of its own: a law that is installed."),
+    ] = None,
 ) -> None:
     """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
     try:
@@ -52,11 +59,14 @@ def demo(
         _check(load_cell_file(path), lockstep)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--cell") from error
+    if law is not None and law not in LAWS:
+        raise typer.BadParameter(str(UnknownLawError(law, tuple(LAWS))), param_hint="--law")
+    goals = GOALS if law is None else (replace(GOALS[0], law=law), *GOALS[1:])
     out.mkdir(parents=True, exist_ok=True)
     conduct = conduct_lockstep if lockstep else conduct_live
     started = time.monotonic()
     with _telling() as stage:
-        demonstration = conduct(path, out.resolve(), seed, stage)
+        demonstration = conduct(path, out.resolve(), seed, stage, goals)
     result = summary(demonstration, seconds=time.monotonic() - started)
     if json:
         sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
@@ -96,11 +106,11 @@ def _check(cell: CellFile, lockstep: bool) -> None:
 
 
 @contextmanager
-def _telling() -> Iterator[Stage]:
+def _telling() -> Iterator[DemonstrationProgress]:
     """Progress on a terminal, plain lines elsewhere; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield Stage(tell=_line(console), progress=lambda _: None)
+        yield DemonstrationProgress(tell=_line(console), progress=lambda _: None)
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
@@ -110,7 +120,7 @@ def _telling() -> Iterator[Stage]:
             bar.console.print(text, highlight=False)
             bar.update(task, description=text[:60])
 
-        yield Stage(tell=tell, progress=lambda fraction: bar.update(task, completed=fraction))
+        yield DemonstrationProgress(tell=tell, progress=lambda fraction: bar.update(task, completed=fraction))
 
 
 def _line(console: Console) -> Callable[[str], None]:

@@ -15,8 +15,8 @@ from typing import Annotated
 import msgspec
 import typer
 
-from stereoservo.runtime.cellfile import CellFile, load_cell_file
-from stereoservo.runtime.lifeline import Termination, die_with_parent
+from stereoservo.daemon.process_control import Termination, die_with_parent
+from stereoservo.messages.cell_file import CellFile, load_cell_file
 
 PRIORITY = 5
 """SCHED_FIFO where it is allowed: below the servo process, above everything that only computes."""
@@ -88,9 +88,9 @@ def _cell_path(cell: str) -> Path:
 
 
 def _drives(settings: _Settings, termination: Termination) -> None:
-    from stereoservo.runtime.directories import cell_directories, create_directories
-    from stereoservo.runtime.locks import FileLock
-    from stereoservo_sim.history import FILE_NAME
+    from stereoservo.messages.directories import cell_directories, create_directories
+    from stereoservo.messages.locks import FileLock
+    from stereoservo_sim.world.history import FILE_NAME
 
     path = _cell_path(settings.cell)
     cell = load_cell_file(path)
@@ -105,8 +105,8 @@ def _drives(settings: _Settings, termination: Termination) -> None:
 @contextlib.contextmanager
 def _named(path: Path, key: str) -> Iterator[None]:
     """What is wrong with a cell's options, with the file and the section that they stand in."""
-    from stereoservo.runtime.ports import DriverError
-    from stereoservo_sim.emulation.errors import EmulationError
+    from stereoservo.ports.devices import DriverError
+    from stereoservo_sim.emulators.fault_engine import EmulationError
 
     try:
         yield
@@ -119,10 +119,10 @@ def _named(path: Path, key: str) -> Iterator[None]:
 def _serve(
     path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination
 ) -> None:
-    from stereoservo_sim.drives.building import drives_of_cell, make_rack
-    from stereoservo_sim.drives.serving import RackServer, open_endpoint, served_channel
-    from stereoservo_sim.emulation.console import Console, Printer
-    from stereoservo_sim.emulation.errors import OrderError
+    from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint, served_channel
+    from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_rack
+    from stereoservo_sim.emulators.console import Console, Printer
+    from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
     with _named(path, "joints.options"):
         options, drives = drives_of_cell(cell)
@@ -140,7 +140,7 @@ def _serve(
     try:
         for text in settings.orders:
             rack.order(text, rack.t_ns)
-    except OrderError as error:
+    except FaultCommandError as error:
         endpoint.close()
         raise typer.BadParameter(str(error), param_hint="--order") from error
     printer = Printer(settings.as_json)
@@ -162,8 +162,8 @@ def _serve(
 
 
 def _cameras(settings: _Settings, termination: Termination) -> None:
-    from stereoservo_sim.cameras.serving import serve_cameras
-    from stereoservo_sim.emulation.errors import OrderError
+    from stereoservo_sim.emulators.cameras.camera_console import serve_cameras
+    from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
     if settings.bit_time is not None:
         raise typer.BadParameter("cameras have no bus; it is for drives", param_hint="--bit-time")
@@ -174,7 +174,7 @@ def _cameras(settings: _Settings, termination: Termination) -> None:
                 load_cell_file(path), channel=settings.channel, orders=settings.orders, as_json=settings.as_json,
                 ended=lambda: termination.asked,
             )  # fmt: skip
-        except OrderError as error:
+        except FaultCommandError as error:
             raise typer.BadParameter(str(error), param_hint="--order") from error
 
 

@@ -13,8 +13,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stereoservo.control.laws import LAWS
-from stereoservo_sim.commands.progress import progress_bar
+from stereoservo.control.law_registry import LAWS
+from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo_sim.progress import progress_bar
 from stereoservo_sim.tasks.calibrations import FRAMES, STOPS
 from stereoservo_sim.tasks.campaign import SettingsError, default_jobs, run_campaign
 from stereoservo_sim.tasks.closed_loop import LoopSettings
@@ -22,7 +23,7 @@ from stereoservo_sim.tasks.setting import DEFAULT_GAIN, DEFAULT_RATE_HZ
 from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks
 
 LawOption = StrEnum("LawOption", {name: name for name in LAWS})  # type: ignore[misc]
-DEFAULT_LAW = LawOption("cartesian3")
+LAW = LawOption(DEFAULT_LAW)
 
 
 class ArmOption(StrEnum):
@@ -68,7 +69,7 @@ def simulate(
             "exact: from the truth; coarse: metric, with 10 % focal and 5° hand-eye error."
         ),
     ] = CalibrationOption.SELF,
-    law: Annotated[LawOption, typer.Option(help="The law.")] = DEFAULT_LAW,
+    law: Annotated[LawOption, typer.Option(help="The law.")] = LAW,
     jacobian: Annotated[JacobianOption, typer.Option(help="Of laws in the images.")] = JacobianOption.MEAN,
     centre: Annotated[
         str, typer.Option(help="Point that goes straight: middle (of the markers), or a marker, 0 to 3.")

@@ -6,7 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from stereoservo.runtime.cellfile import CellFile
+from stereoservo.messages.cell_file import CellFile
 
 SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)

@@ -6,18 +6,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.kinematics.calibration.trials import TrialData
-from stereoservo.runtime.calibration_job import CalibrationJob
-from stereoservo.runtime.commands import LAWS
-from stereoservo.runtime.cycle import Event, StepInputs, StepOutputs
-from stereoservo.runtime.replay import ReplayResult, replay
-from stereoservo.runtime.settings import CoreSettings
-from stereoservo_sim.world import SimulatedCell
+from stereoservo.calibration.trial_data import TrialData
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.cycle import Event, StepInputs, StepOutputs
+from stereoservo.core.settings import CoreSettings
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.recording.replay import ReplayResult, replay
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 JUDGED_S = 1.0
 
 
@@ -33,7 +31,7 @@ class Course:
 
 
 @dataclass
-class Flight(Course):
+class RecordedDemonstration(Course):
     """A course out of a recording that was replayed, and the calibration's stops."""
 
     result: ReplayResult
@@ -62,7 +60,7 @@ class Judgement:
     joints: FloatArray = field(repr=False)
 
 
-def read_flight(recording: Path) -> Flight:
+def read_flight(recording: Path) -> RecordedDemonstration:
     """Replay a recording and keep what the report needs. Raises RecordingError."""
     times: list[int] = []
     errors: list[float] = []
@@ -80,10 +78,10 @@ def read_flight(recording: Path) -> Flight:
 
     settings: list[CoreSettings] = []
     result = replay(recording, observe=observe, header=settings.append)
-    job = CalibrationJob(settings[0])
+    job = TrialCollector(settings[0])
     for event in events:
         job.add(event)
-    return Flight(
+    return RecordedDemonstration(
         np.array(times),
         np.array(errors),
         np.array(commands),

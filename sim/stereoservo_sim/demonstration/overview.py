@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from stereoservo_sim.demonstration.judge import Judgement
-from stereoservo_sim.rendering import Renderer, RenderSettings
-from stereoservo_sim.report_figures import COLOURS
-from stereoservo_sim.world import SimulatedCell
+from stereoservo_sim.demonstration.report_figures import COLOURS
+from stereoservo_sim.world.rendering import Renderer, RenderSettings
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 
 def write_overview(path: Path, goals: Sequence[Judgement], cell: SimulatedCell, tolerance_px: float) -> None:

@@ -8,11 +8,10 @@ from typing import Any
 import msgspec
 
 from stereoservo.kinematics.model import CellModel
-from stereoservo_sim.demonstration.conduct import Demonstration
 from stereoservo_sim.demonstration.judge import Judgement, judge_goal, read_flight
 from stereoservo_sim.demonstration.overview import write_overview
-from stereoservo_sim.demonstration.pages import write_pages
-from stereoservo_sim.demonstration.scenario import GOALS
+from stereoservo_sim.demonstration.report_pages import write_pages
+from stereoservo_sim.demonstration.runner import Demonstration
 from stereoservo_sim.demonstration.truth import true_cell
 
 MAX_ERROR_PX = 0.3
@@ -31,7 +30,7 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
             goal.name, goal.law, demonstration.outcomes[goal.name], flight, demonstration.truth_t,
             demonstration.truth_q, truth,
         )
-        for goal in GOALS
+        for goal in demonstration.goals
     ]  # fmt: skip
     report = demonstration.out / "report.html"
     write_pages(report, demonstration, flight, goals)

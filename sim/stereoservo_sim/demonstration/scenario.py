@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
-from stereoservo.runtime.commands import DisplacementTarget, LawName, TaughtTarget
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.messages.goals import DisplacementTarget, LawName, TaughtTarget
+from stereoservo.numerics.arrays import FloatArray
 
 TEACH_FRAMES = 20
 REST_S = 0.4  # after a move, before the cameras are believed

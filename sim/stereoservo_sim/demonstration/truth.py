@@ -11,17 +11,15 @@ from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.runtime.cellfile import CameraSection, CellFile
-from stereoservo_sim.cameras.settings import cameras_of_cell
-from stereoservo_sim.emulation.errors import EmulationError
-from stereoservo_sim.history import FILE_NAME, JointHistory
-from stereoservo_sim.workpiece import Moved
-from stereoservo_sim.world import SimulatedCell, simulated_cell, workpiece_cell
+from stereoservo.messages.cell_file import CameraSection, CellFile
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo_sim.emulators.cameras.stream_settings import cameras_of_cell
+from stereoservo_sim.emulators.fault_engine import EmulationError
+from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
+from stereoservo_sim.world.simulated_cell import SimulatedCell, simulated_cell, workpiece_cell
+from stereoservo_sim.world.workpiece import Moved
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 POLL_S = 1.0
 
 
@@ -67,7 +65,7 @@ def _simulated_options(section: CameraSection, cell: CellFile) -> Mapping[str, A
 class TruthLog:
     """Copies the arm's true joint positions out of its history before the ring overwrites them."""
 
-    def __init__(self, history: JointHistory) -> None:
+    def __init__(self, history: TrueJointHistory) -> None:
         self._history = history
         self._next = 0
         self._times: list[IntArray] = []
@@ -78,7 +76,7 @@ class TruthLog:
     @classmethod
     def of_directory(cls, runtime_dir: Path) -> TruthLog:
         """The log of the arm whose joint driver runs in ``runtime_dir``. Raises HistoryError."""
-        return cls(JointHistory.open(runtime_dir / FILE_NAME))
+        return cls(TrueJointHistory.open(runtime_dir / FILE_NAME))
 
     def take(self) -> None:
         """Copy what is new."""

@@ -10,18 +10,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import exp_twist, multiply4_into
-from stereoservo_sim.synthetic import (
-    RX90_ROWS,
-    SyntheticCell,
-    dh_link,
-    placed,
-    rotation,
-    translation,
-)
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.tasks.setting import (
     HEIGHT,
     HOMOGENEOUS_MARKERS,
@@ -32,8 +24,15 @@ from stereoservo_sim.tasks.setting import (
     intrinsics,
 )
 from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
+from stereoservo_sim.world.synthetic import (
+    RX90_ROWS,
+    SyntheticCell,
+    dh_link,
+    placed,
+    rotation,
+    translation,
+)
 
-FloatArray = npt.NDArray[np.float64]
 ArmName = Literal["free", "rx90"]
 
 MID_RANGE = translation(0.0, 0.0, 1.1) @ rotation("y", 15) @ rotation("x", -10)

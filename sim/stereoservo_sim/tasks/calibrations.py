@@ -16,16 +16,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.screws import exp_twist
-from stereoservo.kinematics.calibration.fit import fit_model
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.model import CellModel
-from stereoservo_sim.exact_model import exact_model, twists
-from stereoservo_sim.synthetic import SyntheticCell
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, Reach, free_cell, rx90_cell
 from stereoservo_sim.tasks.setting import (
     FOCAL_ERROR,
@@ -35,8 +34,9 @@ from stereoservo_sim.tasks.setting import (
     cartesian_twists,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
+from stereoservo_sim.world.exact_model import exact_model, twists
+from stereoservo_sim.world.synthetic import SyntheticCell
 
-FloatArray = npt.NDArray[np.float64]
 CalibrationName = Literal["self", "exact", "coarse"]
 
 STOPS, FRAMES = 41, 25
@@ -49,7 +49,7 @@ MAX_TURN, MAX_TRAVEL = np.radians(50.0), 0.25
 """[rad], [m] to either side."""
 
 
-class Calibration(NamedTuple):
+class TaskCalibration(NamedTuple):
     """An arm with its model; None where it is metric and wrong, a task's own. ``facts``: for the report.
 
     ``focal_error`` (share), ``hand_eye_error_deg``: of a metric model.
@@ -89,25 +89,25 @@ class Knowledge:
         return found
 
 
-def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed: int) -> Calibration:
+def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed: int) -> TaskCalibration:
     """Once a file and seed. Raises CalibrationError where the trial motions give no model."""
     cell = free_cell() if arm == "free" else rx90_cell()
     if calibration == "coarse":
         return metric_model(arm, cell, FOCAL_ERROR, HAND_EYE_ERROR_DEG)
     if calibration == "exact":
-        return Calibration(arm, cell, exact_model(cell), {})
+        return TaskCalibration(arm, cell, exact_model(cell), {})
     return self_calibrated(arm, cell, noise_px, seed)
 
 
 def metric_model(
     arm: ArmName, cell: SyntheticCell, focal_error: float, hand_eye_error_deg: float
-) -> Calibration:
+) -> TaskCalibration:
     """Metric, with focal lengths too long by a share, and the arm turned about each task's own axis."""
     facts: dict[str, object] = {"focal_error": focal_error, "hand_eye_error_deg": hand_eye_error_deg}
-    return Calibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
+    return TaskCalibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
 
 
-def self_calibrated(arm: ArmName, cell: SyntheticCell, noise_px: float, seed: int) -> Calibration:
+def self_calibrated(arm: ArmName, cell: SyntheticCell, noise_px: float, seed: int) -> TaskCalibration:
     """From trial motions about the cell's home. Raises CalibrationError."""
     started = time.perf_counter()
     cell = with_trial_ranges(cell)
@@ -123,7 +123,7 @@ def self_calibrated(arm: ArmName, cell: SyntheticCell, noise_px: float, seed: in
         "stratum": result.model.stratum,
         "seconds": round(time.perf_counter() - started, 3),
     }
-    return Calibration(arm, cell, result.model, facts)
+    return TaskCalibration(arm, cell, result.model, facts)
 
 
 def with_trial_ranges(cell: SyntheticCell) -> SyntheticCell:
@@ -153,7 +153,7 @@ def _shows_face(cell: SyntheticCell, positions: FloatArray) -> npt.NDArray[np.bo
     return np.asarray((cosine > np.cos(np.radians(TRIAL_ANGLE_DEG))).all(axis=0))
 
 
-def known_at_start(calibration: Calibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
+def known_at_start(calibration: TaskCalibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
     """The controller's knowledge at the start of ``task``; ``reach``: of a serial arm."""
     if calibration.model is None:
         return _coarse(calibration, task, reach)
@@ -184,7 +184,7 @@ def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
     return start[:3, 3] - MID_RANGE[:3, 3], turn
 
 
-def _coarse(calibration: Calibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
+def _coarse(calibration: TaskCalibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
     """Metric, in the rig's frame: focal lengths too long, the arm turned about the plate's middle at the start."""
     matrices = camera_matrices(1.0 + calibration.focal_error)
     infinity = np.array([0.0, 0.0, 0.0, 1.0])

@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from stereoservo_sim.experiments.random_rigs import wilson
-from stereoservo_sim.tasks.calibrations import Calibration, calibrate
+from stereoservo_sim.summaries import wilson
+from stereoservo_sim.tasks.calibrations import TaskCalibration, calibrate
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, run_task
 from stereoservo_sim.tasks.task_file import AlignmentTask
 
@@ -21,7 +21,7 @@ Tell = Callable[[int, int], None]
 CHUNK = 4
 """Tasks that a process takes at once."""
 
-_worker: tuple[Calibration, LoopSettings] | None = None
+_worker: tuple[TaskCalibration, LoopSettings] | None = None
 
 
 class SettingsError(Exception):
@@ -56,7 +56,7 @@ def run_campaign(
 
 
 def _batches(
-    tasks: Sequence[AlignmentTask], calibration: Calibration, settings: LoopSettings, jobs: int
+    tasks: Sequence[AlignmentTask], calibration: TaskCalibration, settings: LoopSettings, jobs: int
 ) -> Iterator[list[TaskResult]]:
     if jobs == 1 or len(tasks) <= CHUNK:
         for task in tasks:
@@ -77,7 +77,7 @@ def _batches(
                 future.cancel()
 
 
-def _start(calibration: Calibration, settings: LoopSettings) -> None:
+def _start(calibration: TaskCalibration, settings: LoopSettings) -> None:
     global _worker  # noqa: PLW0603 - one a process, handed over once instead of with each task
     _worker = (calibration, settings)
 

@@ -13,19 +13,27 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
-from stereoservo.control.laws import CLASSICAL, LAWS
-from stereoservo.control.points import euclidean_points
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.goals.resolve import goal_pose
+from stereoservo.core.prediction import ModelArrays
 from stereoservo.kinematics.kernels import triangulate
-from stereoservo.runtime.estimate import ModelArrays
-from stereoservo.runtime.goal_pose import goal_pose
+from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.tasks.arms import Arm, ArmName, FreeArm, SerialArm, rx90_reach
-from stereoservo_sim.tasks.calibrations import Calibration, CalibrationName, Knowledge, known_at_start
-from stereoservo_sim.tasks.estimate import Estimate, PointsName
-from stereoservo_sim.tasks.judge import Sight, error_px, in_images, line_deviations, noise_floor_px, sight
-from stereoservo_sim.tasks.planned_way import LOOK_S, PlannedWay, RefusedError, planned_way
+from stereoservo_sim.tasks.calibrations import CalibrationName, Knowledge, TaskCalibration, known_at_start
+from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
+from stereoservo_sim.tasks.ground_truth import (
+    PlateView,
+    error_px,
+    in_images,
+    line_deviations,
+    noise_floor_px,
+    sight,
+)
+from stereoservo_sim.tasks.marker_estimate import MarkerEstimate, PointsName
+from stereoservo_sim.tasks.planned_path import LOOK_S, NoPathError, PlannedPath, plan_task_path
 from stereoservo_sim.tasks.setting import (
     DEFAULT_GAIN,
     DEFAULT_RATE_HZ,
@@ -35,8 +43,6 @@ from stereoservo_sim.tasks.setting import (
     SUCCESS_PX,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
-
-FloatArray = npt.NDArray[np.float64]
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
@@ -57,7 +63,7 @@ class LoopSettings:
     of the markers or the number of one.
     """
 
-    law: str = "cartesian3"
+    law: str = DEFAULT_LAW
     arm: ArmName = "free"
     calibration: CalibrationName = "self"
     jacobian: Literal["current", "desired", "mean", "fixed-depth"] = "mean"
@@ -114,7 +120,7 @@ class Trace:
 
 
 def run_task(
-    task: AlignmentTask, calibration: Calibration, settings: LoopSettings
+    task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings
 ) -> tuple[TaskResult, Trace]:
     """Run one task; the same task, calibration and settings give the same result, whatever ran before."""
     reach = None
@@ -144,16 +150,16 @@ class Controller:
             dt_s=0.0 if settings.first_order else self._dt_s,
             jacobian=JacobianChoice[settings.jacobian.upper().replace("-", "_")],
         )
-        self.estimate = Estimate(knowledge, settings.points, self._dt_s)
+        self.estimate = MarkerEstimate(knowledge, settings.points, self._dt_s)
         self._set_points = sight(task.goal).pixels
         self._cameras = cameras_used(settings.law)
         self._wanted = np.ones(self._set_points.shape[:2])
         self._wanted[self._cameras :] = 0.0
         self._middle = np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
         self._task: Task | None = None
-        self._plans = settings.law == "trajectory"
+        self._plans = settings.law in LAWS and LAWS[settings.law].planned
         self._look_steps = round(LOOK_S * settings.rate_hz) if self._plans else 0
-        self._way: PlannedWay | None = None
+        self._way: PlannedPath | None = None
         self._limits = limits
         self._operators = knowledge.basis
 
@@ -178,7 +184,7 @@ class Controller:
         )  # fmt: skip
         if self._plans:
             if self._way is None:
-                self._way = planned_way(scene, task, joints, self._limits)
+                self._way = plan_task_path(scene, task, joints, self._limits)
             task = self._way.task_now(scene, task, joints, self._dt_s)
         step = self._law(scene, task, self._options)
         self.task_error = step.error
@@ -228,7 +234,7 @@ def _law(name: str, knowledge: Knowledge) -> Callable[[Scene, Task, Options], La
 
 def cameras_used(law: str) -> int:
     """How many cameras a law looks through."""
-    return 1 if law == "image" else 2
+    return 1 if law in LAWS and LAWS[law].one_camera == "suffices" else 2
 
 
 def _arrays(knowledge: Knowledge) -> ModelArrays:
@@ -286,7 +292,7 @@ def _run(
         seen = _seen(truth, settings, k * dt_s)
         try:
             velocity = controller.step(frame, seen, arm.joints)
-        except RefusedError as error:
+        except NoPathError as error:
             reason, refused = "REFUSED", error.reason
             break
         task_errors[k] = controller.task_error
@@ -306,7 +312,7 @@ def _run(
     return _judged(task, settings, trace, flags, margin, (reason, refused), window), trace
 
 
-def _seen(truth: Sight, settings: LoopSettings, time_s: float) -> FloatArray:
+def _seen(truth: PlateView, settings: LoopSettings, time_s: float) -> FloatArray:
     """(c, m): 1 for markers that lie in the image of a camera that is not dropped, else 0."""
     seen = in_images(truth.pixels).astype(np.float64)
     if settings.drop_camera is not None:

@@ -11,14 +11,12 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from stereoservo_sim.tasks.judge import Sight, sight
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.tasks.ground_truth import PlateView, sight
 from stereoservo_sim.tasks.setting import MIN_DEPTH
 from stereoservo_sim.tasks.task_file import AlignmentTask, tasks_text
-
-FloatArray = npt.NDArray[np.float64]
 
 SEED = 20_010_801
 COUNT = 120
@@ -128,7 +126,7 @@ def _pose(rng: np.random.Generator) -> FloatArray:
 
 def _visible(pose: FloatArray) -> bool:
     """Whether both cameras see the plate's front, no nearer to a border than allowed."""
-    seen: Sight = sight(pose)
+    seen: PlateView = sight(pose)
     return (
         seen.in_view
         and seen.margin_px >= BORDER_PX

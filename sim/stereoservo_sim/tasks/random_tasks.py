@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from stereoservo_sim.tasks.judge import sight
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.tasks.ground_truth import sight
 from stereoservo_sim.tasks.task_file import AlignmentTask
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_ANGLE_DEG, MAX_DISTANCE_M = 150.0, 0.4
 BORDER_PX, MAX_VIEW_ANGLE_DEG = 20.0, 75.0

@@ -7,11 +7,9 @@ along -z.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo_sim.synthetic import rotation, translation
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.synthetic import rotation, translation
 
 FOCAL, CENTRE_U, CENTRE_V = 800.0, 320.0, 240.0
 """[px]"""

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.tasks.setting import CENTRE_U, CENTRE_V, FOCAL, HEIGHT, MARKERS, WIDTH, camera_poses
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_BYTES = 64 * 2**20
 MAX_TASKS = 100_000

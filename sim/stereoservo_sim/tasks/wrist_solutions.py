@@ -5,11 +5,9 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo_sim.synthetic import RX90_ROWS, dh_link, rotation
-
-FloatArray = npt.NDArray[np.float64]
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.synthetic import RX90_ROWS, dh_link, rotation
 
 UPPER, FOREARM, HAND = RX90_ROWS[1][0], RX90_ROWS[3][2], RX90_ROWS[5][2]
 """Lengths [m]: shoulder to elbow, elbow to wrist, wrist to flange."""

@@ -8,7 +8,7 @@ import can
 import pytest
 import serial
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can import socketcan
 from stereoservo_drivers.can.bus_errors import BusError, bus_error
 from stereoservo_drivers.can.channel import BATCH, Channel, ChannelSettings

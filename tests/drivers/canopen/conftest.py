@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import FloatArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
 from stereoservo_drivers.canopen.master import Master, MasterSettings

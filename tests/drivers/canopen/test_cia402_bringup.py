@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.cia402 import Cia402Codec
 from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_sim.drives.building import DrivesSettings, make_rack
-from stereoservo_sim.drives.cia402_node import Cia402Node
-from stereoservo_sim.drives.rack import Rack
-from stereoservo_sim.drives.virtual_host import VirtualHost
+from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
+from stereoservo_sim.emulators.nodes.cia402_node import Cia402Node
 
 COUNTS, GEAR = 4096, 100.0
 COUNTS_PER_RAD = COUNTS * GEAR / (2 * math.pi)
@@ -56,7 +56,7 @@ class Bench:
     """A rack and a host that is not connected yet."""
 
     options: CanOptions
-    rack: Rack
+    rack: BusEmulator
     cell_dir: Path
 
     def __post_init__(self) -> None:

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import MonotonicClock, VirtualClock
-from stereoservo.runtime.ports import Clock, DriverContext, DriverError, ExaminableJointDriver
+from stereoservo.ports.clock import MonotonicClock, VirtualClock
+from stereoservo.ports.devices import Clock, DriverContext, DriverError, ExaminableJointDriver
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.drives.building import DrivesSettings, make_rack
-from stereoservo_sim.drives.endpoints import SlcanTcp
-from stereoservo_sim.drives.serving import RackServer
+from stereoservo_sim.emulators.bus.bus_server import RackServer
+from stereoservo_sim.emulators.bus.endpoints import SlcanTcp
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
 
 OPTIONS: dict[str, Any] = {
     "interface": "stereoservo_slcan",

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.ports import DriverContext, Finding
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverContext, Finding
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.examination import (
@@ -23,9 +23,9 @@ from stereoservo_drivers.canopen.examination import (
 )
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.drives.building import DrivesSettings, make_rack
-from stereoservo_sim.drives.endpoints import SlcanTcp
-from stereoservo_sim.drives.serving import RackServer
+from stereoservo_sim.emulators.bus.bus_server import RackServer
+from stereoservo_sim.emulators.bus.endpoints import SlcanTcp
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
 
 OPTIONS: dict[str, Any] = {
     "interface": "stereoservo_slcan",
@@ -110,23 +110,23 @@ def test_nothing_moves_without_leave(examine: Examine) -> None:
 def test_drives_that_are_missing_doubled_or_others(examine: Examine) -> None:
     found = examine(OPTIONS, "silence 2")
     assert found["node 2 (j2)"].message == "no answer"
-    assert "powered" in found["node 2 (j2)"].cure
+    assert "powered" in found["node 2 (j2)"].remedy
     assert found["drives"].ok is False  # it cannot be configured
     found = examine(OPTIONS, "duplicate 1 running")
     assert found["node 1 (j1)"].message == "2 drives answer as node 1"
     moved = changed(node_id=9)
     found = examine(moved, drives=OPTIONS)
-    assert "Nodes 1 answer" in found["node 9 (j1)"].cure
+    assert "Nodes 1 answer" in found["node 9 (j1)"].remedy
     found = examine(changed(vendor_id=0xFB), drives=OPTIONS)
     assert found["node 1 (j1)"].ok is False
-    assert "vendor_id = 0x53455256" in found["node 1 (j1)"].cure
+    assert "vendor_id = 0x53455256" in found["node 1 (j1)"].remedy
 
 
 def test_a_drive_in_fault_is_told_in_words_and_nothing_is_jogged(examine: Examine) -> None:
     found = examine(OPTIONS, "fault 2 0x3210", allow=True)
     assert found["node 2 (j2) state"].ok is False
     assert "0x3210 DC link over-voltage" in found["node 2 (j2) state"].message
-    assert found["node 2 (j2) state"].cure
+    assert found["node 2 (j2) state"].remedy
     assert found["fault"].ok is False
     assert "j1 jog" not in found
 
@@ -134,7 +134,7 @@ def test_a_drive_in_fault_is_told_in_words_and_nothing_is_jogged(examine: Examin
 def test_a_drive_that_speaks_rpm_is_found_by_the_jog(examine: Examine) -> None:
     found = examine(drives=changed(velocity_units_per_rev_s=60.0), allow=True)
     assert found["j1 jog"].ok is False
-    assert "60 (rpm)" in found["j1 jog"].cure, found["j1 jog"]
+    assert "60 (rpm)" in found["j1 jog"].remedy, found["j1 jog"]
 
 
 def test_a_bus_that_is_not_there(tmp_path: Path) -> None:

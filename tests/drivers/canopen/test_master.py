@@ -142,10 +142,10 @@ def test_what_a_reset_itself_provoked_does_not_latch_again(bus) -> None:
     assert bus.master.fault is None
 
 
-def test_a_quick_stop_that_is_asked_for_latches(bus) -> None:
+def test_a_fault_latched_from_outside_stops_quickly_and_lasts(bus) -> None:
     bus.enable()
     bus.run(0.5, 0.5, cycles=2)
-    bus.master.request_quick_stop()
+    bus.master.latch(MasterFault("quick_stop", "a quick stop was asked for"))
     bus.run(0.5, 0.5, cycles=2)
     assert bus.orders[-1][0] == "quick stop"
     assert bus.master.fault.code == "quick_stop"

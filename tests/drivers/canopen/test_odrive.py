@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC
 from stereoservo_drivers.canopen.odrive import OdriveCodec

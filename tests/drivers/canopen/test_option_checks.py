@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.canopen.option_checks import bus_load, check_options, parse_sdo_key
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.options import decode_options

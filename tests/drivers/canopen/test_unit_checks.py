@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import Finding
+from stereoservo.ports.devices import Finding
 from stereoservo_drivers.canopen.options import CanJoint
 from stereoservo_drivers.canopen.unit_checks import (
     JOG,
@@ -85,7 +85,7 @@ def test_other_units_are_named_and_stopped_early(configured: float | None, true:
     joint = msgspec.structs.replace(JOINT, velocity_units_per_rev_s=configured)
     finding, farthest = jogged(joint, (configured or joint.counts_per_rev) / true)
     assert finding.ok is False
-    assert said in finding.cure, finding
+    assert said in finding.remedy, finding
     assert math.degrees(farthest) < 3.0
 
 
@@ -96,7 +96,7 @@ def test_an_encoder_against_the_motor_and_a_joint_that_stands() -> None:
     finding, _ = jogged(JOINT, 0.0)
     assert finding.ok is False
     assert "stands" in finding.message
-    assert "brake" in finding.cure
+    assert "brake" in finding.remedy
 
 
 def test_a_reported_velocity_in_other_units_and_a_slow_loop() -> None:
@@ -105,7 +105,7 @@ def test_a_reported_velocity_in_other_units_and_a_slow_loop() -> None:
     assert "0x606C" in finding.message
     finding, _ = jogged(JOINT, 1.0, lag_s=0.3)
     assert finding.ok is None
-    assert "velocity loop" in finding.cure
+    assert "velocity loop" in finding.remedy
 
 
 def test_positions_outside_the_limits_name_the_offset_that_would_call_them_zero() -> None:
@@ -114,8 +114,8 @@ def test_positions_outside_the_limits_name_the_offset_that_would_call_them_zero(
     finding = position_finding(joint, 2.25)
     assert finding.ok is False
     assert "0.25 rad outside" in finding.message
-    assert "offset_rad = 2.75" in finding.cure
-    assert "counts_per_rev" in position_finding(JOINT, 40.0).cure
+    assert "offset_rad = 2.75" in finding.remedy
+    assert "counts_per_rev" in position_finding(JOINT, 40.0).remedy
 
 
 def test_encoders_at_rest() -> None:
@@ -124,14 +124,14 @@ def test_encoders_at_rest() -> None:
     assert noise_finding(JOINT, 0.1 + rng.integers(-2, 3, 250) * count).ok is True
     noisy = noise_finding(JOINT, 0.1 + rng.uniform(-1e-3, 1e-3, 250))
     assert noisy.ok is False
-    assert "encoder cable" in noisy.cure
+    assert "encoder cable" in noisy.remedy
     sinking = noise_finding(JOINT, 0.1 - np.linspace(0.0, 0.01, 250))
     assert sinking.ok is False
-    assert "brake" in sinking.cure
+    assert "brake" in sinking.remedy
 
 
 def test_a_coarse_velocity_unit_is_told() -> None:
     assert resolution_finding(JOINT).ok is True
     coarse = resolution_finding(msgspec.structs.replace(JOINT, velocity_units_per_rev_s=60.0))
     assert coarse.ok is None
-    assert "0x60A9" in coarse.cure
+    assert "0x60A9" in coarse.remedy

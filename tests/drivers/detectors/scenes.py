@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoservo.runtime.ports import CameraObservation, DriverContext, Frame, Prior
+from stereoservo.ports.devices import CameraObservation, DriverContext, Frame, Prior
+from stereoservo.ports.dot_plates import DEFAULT_BODY
 from stereoservo_drivers.detectors.dots import DotDetector
-from stereoservo_drivers.detectors.plates import DEFAULT_BODY
 
 from .rendering import Scene, circle, look, project
 

@@ -1,14 +1,15 @@
 """The tag detector on whole pictures: identity, accuracy, covariances, windows, refusal."""
 
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import DriverContext, DriverError, Prior
+from stereoservo.ports.devices import DriverContext, DriverError, Prior
 from stereoservo_drivers.detectors.aruco import TagDetector
-from stereoservo_drivers.detectors.tags import DICTIONARIES, mirror_twins, size_of, tag_cells
+from stereoservo_drivers.detectors.tag_registration import DICTIONARIES, size_of, tag_cells
 
 from .rendering import project
 from .scenes import Still, as_frame, normalised, rms
@@ -20,6 +21,15 @@ FAMILIES = {
     "16h5": cv2.aruco.DICT_APRILTAG_16h5,
     "4x4_50": cv2.aruco.DICT_4X4_50,
 }
+
+
+@cache
+def mirror_twins(name):
+    """Tags of a dictionary that, printed mirrored, read as a tag of it: which ones, and as which."""
+    cells = [tag_cells(name, tag) for tag in range(size_of(name))]
+    reads = {np.rot90(c, k).tobytes(): tag for tag, c in enumerate(cells) for k in range(4)}
+    mirrored = {tag: np.ascontiguousarray(c[:, ::-1]).tobytes() for tag, c in enumerate(cells)}
+    return {tag: reads[key] for tag, key in mirrored.items() if key in reads}
 
 
 def make_detector(**options) -> TagDetector:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stereoservo_drivers.detectors import centroids, measurements
+from stereoservo_drivers.detectors import centroids, components
 from stereoservo_drivers.detectors.components import scratch
-from stereoservo_drivers.detectors.tracking import whole
+from stereoservo_drivers.detectors.face_tracking import whole
 
 from .rendering import Scene, conic_of_circle, digitise
 from .scenes import normalised, rms
@@ -29,7 +29,7 @@ def tilted_circle(rng, radius, tilt):
 
 
 def measure(image, dark=False, half=20):
-    out = np.zeros(measurements.FIELDS)
+    out = np.zeros(components.FIELDS)
     window = 32 - half, 32 - half, 33 + half, 33 + half
     status = centroids.measure(image, dark, *window, 32.0, 32.0, 30, 5, LABELS, STACK, out)
     return status, out
@@ -42,10 +42,10 @@ def sample(seed, n, radius=4.0, tilt=0.0, **scene):
     for k in range(n):
         conic, centre = tilted_circle(rng, radius, tilt)
         status, out = measure(Scene(size=SIZE, clutter=[conic], **scene).render(rng))
-        assert status == measurements.OK
+        assert status == components.OK
         errors[k] = out[:2] - centre
-        unit = out[[measurements.CXX, measurements.CXY, measurements.CXY, measurements.CYY]].reshape(2, 2)
-        covariances[k] = max(out[measurements.NOISE], 1 / 12) * unit
+        unit = out[[components.CXX, components.CXY, components.CXY, components.CYY]].reshape(2, 2)
+        covariances[k] = max(out[components.NOISE], 1 / 12) * unit
     return errors, covariances
 
 
@@ -94,7 +94,7 @@ def test_noise_level_is_found():
     rng = np.random.default_rng(6)
     conic, _ = tilted_circle(rng, 6.0, 0.0)
     clean = Scene(size=SIZE, clutter=[conic]).clean() + 0.3 * np.arange(64)
-    levels = [measure(digitise(clean, 4.0, rng))[1][measurements.NOISE] for _ in range(60)]
+    levels = [measure(digitise(clean, 4.0, rng))[1][components.NOISE] for _ in range(60)]
     # white noise and rounding; the gradient of 0.3 levels a pixel does not count
     assert np.mean(levels) == pytest.approx(16.0 + 1 / 12, rel=0.05)
 
@@ -105,7 +105,7 @@ def test_dark_dots_are_light_dots_of_the_negative():
         conic, _ = tilted_circle(rng, 5.0, 40.0)
         image = Scene(size=SIZE, clutter=[conic], noise=2.0).render(rng)
         light, dark = measure(image), measure(255 - image, dark=True)
-        assert light[0] == dark[0] == measurements.OK
+        assert light[0] == dark[0] == components.OK
         np.testing.assert_array_equal(light[1], dark[1])
 
 
@@ -122,11 +122,11 @@ def test_a_straight_cut_shows():
             angle = rng.uniform(0, 2 * np.pi)
             depth = (u - centre[0]) * np.cos(angle) + (v - centre[1]) * np.sin(angle) - radius
             status, out = measure(digitise(clean, rng.choice([1.0, 5.0, 10.0]), rng))
-            assert status == measurements.OK
+            assert status == components.OK
             assert whole(out, 0.02)
             cut = np.where(depth > -rng.uniform(1.0, radius), 30.0, clean)
             status, out = measure(digitise(cut, 2.0, rng))
-            assert status != measurements.OK or not whole(out, 0.02)
+            assert status != components.OK or not whole(out, 0.02)
 
 
 @pytest.mark.parametrize("gap", [1.5, 2.0, 2.5, 4.0, 8.0])
@@ -143,9 +143,9 @@ def test_a_neighbour_hides_a_dot_or_leaves_it_alone(gap):
         beside[:2, 2] = -thin * (gap + 2 * 5.0 * np.cos(np.radians(70.0)))
         neighbour = beside.T @ conic @ beside
         status, out = measure(Scene(size=SIZE, clutter=[conic, neighbour], noise=1.0).render(rng))
-        if status == measurements.OK and whole(out, 0.02):
+        if status == components.OK and whole(out, 0.02):
             to_either = [np.hypot(*(out[:2] - centre + k * beside[:2, 2])) for k in (0, 1)]
-            assert min(to_either) < max(0.06, 3.0 * np.sqrt(out[measurements.EXX]))
+            assert min(to_either) < max(0.06, 3.0 * np.sqrt(out[components.EXX]))
         else:
             assert gap <= 4.0
 
@@ -155,11 +155,11 @@ def test_dots_at_the_border_are_refused():
     for offset in (-6.0, -2.0, 0.0, 3.0, 6.0):
         conic = conic_of_circle(np.eye(3), np.array([offset, 32.0]), 6.0)
         image = Scene(size=SIZE, clutter=[conic]).render(rng)
-        out = np.zeros(measurements.FIELDS)
+        out = np.zeros(components.FIELDS)
         status = centroids.measure(image, False, -20, 12, 21, 53, offset, 32.0, 30, 5, LABELS, STACK, out)
-        assert status != measurements.OK
+        assert status != components.OK
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_empty_windows_are_no_contrast(level):
-    assert measure(np.full((64, 64), level, np.uint8))[0] == measurements.NO_CONTRAST
+    assert measure(np.full((64, 64), level, np.uint8))[0] == components.NO_CONTRAST

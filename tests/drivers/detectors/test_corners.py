@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import DriverContext, DriverError, Frame, Prior
+from stereoservo.ports.devices import DriverContext, DriverError, Frame, Prior
 from stereoservo_drivers.contracts import DetectorContract
 from stereoservo_drivers.detectors.corners import CornerDetector
 from stereoservo_drivers.detectors.landmark_learning import LearningSettings, learn_landmarks

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stereoservo.runtime.ports import DriverError, Prior
-from stereoservo_drivers.detectors.plates import DEFAULT_BODY
+from stereoservo.ports.devices import DriverError, Prior
+from stereoservo.ports.dot_plates import DEFAULT_BODY
 
 from .rendering import Scene, circle, digitise
 from .scenes import IDS, as_frame, make_detector, normalised, random_shot, rms

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoservo_drivers.detectors.plates import DEFAULT_BODY
+from stereoservo.ports.dot_plates import DEFAULT_BODY
 
 from .rendering import Scene, digitise, look, project
 from .scenes import IDS, Shot, as_frame, make_detector, normalised, random_shot, rms

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stereoservo_sim.rendering import Renderer, RenderSettings
-from stereoservo_sim.world import demo_cell
+from stereoservo_sim.world.rendering import Renderer, RenderSettings
+from stereoservo_sim.world.simulated_cell import demo_cell
 
 from .scenes import as_frame, make_detector, normalised, rms
 

@@ -5,7 +5,7 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 
-from stereoservo_drivers.detectors.plates import CORNERS, FACES, MORE
+from stereoservo.ports.dot_plates import CORNERS, FACES, MORE
 
 from .rendering import Scene, look, project
 from .scenes import as_frame, make_detector

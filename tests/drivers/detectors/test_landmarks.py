@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from stereoservo.cli.main import invoke
 from stereoservo.geometry.fundamental import fundamental_robust, sampson_distances
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.detectors.landmark_learning import LearningSettings, learn_landmarks
 from stereoservo_drivers.detectors.landmarks import (
     CameraReference,

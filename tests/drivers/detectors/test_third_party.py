@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoservo.runtime import plugins
-from stereoservo.runtime.ports import Detector, DriverContext
+from stereoservo.ports import plugins
+from stereoservo.ports.devices import Detector, DriverContext
 
 from .scenes import Still, as_frame
 

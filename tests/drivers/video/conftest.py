@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.ports import DriverContext
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverContext
 from stereoservo_drivers.video.driver import VideoCameraDriver
 
 WIDTH, HEIGHT = 64, 48

@@ -9,13 +9,13 @@ from urllib.parse import urlsplit
 import cv2
 import pytest
 
-from stereoservo.runtime.clock import MonotonicClock
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video import sources
 from stereoservo_drivers.video.options import Place, VideoOptions
 from stereoservo_drivers.video.reader import Reader
-from stereoservo_drivers.video.sources import CaptureSource, Picture
-from stereoservo_drivers.video.watch import Watch
+from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
+from stereoservo_drivers.video.stream_monitor import Watch
 
 from .conftest import HEIGHT, WIDTH, number_of, picture
 
@@ -173,7 +173,7 @@ class Hanging:
         self.number += 1
         if self.number > 1:
             self.let_go.wait(30.0)
-        return Picture(picture(self.number), time.monotonic_ns())
+        return SourcePicture(picture(self.number), time.monotonic_ns())
 
     def interrupt(self):
         """Cannot."""
@@ -209,7 +209,9 @@ def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered
 def test_pictures_of_one_time_stay_in_order():
     source = Hanging()
     step = threading.Semaphore(0)
-    reads = iter([Picture(picture(1), 500), Picture(picture(2), 500), Picture(picture(3), 499)])
+    reads = iter(
+        [SourcePicture(picture(1), 500), SourcePicture(picture(2), 500), SourcePicture(picture(3), 499)]
+    )
 
     def read():
         step.acquire(timeout=10.0)

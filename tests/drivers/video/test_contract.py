@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import pytest
 
-from stereoservo.runtime.ports import CameraDriver, DriverContext
+from stereoservo.ports.devices import CameraDriver, DriverContext
 from stereoservo_drivers.contracts import CameraDriverContract
 from stereoservo_drivers.video.driver import VideoCameraDriver
 

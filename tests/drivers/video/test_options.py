@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.runtime.ports import DriverError
+from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video.options import decode_video_options, frozen_frames
 
 SIZE = {"width": 640, "height": 480}

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoservo.runtime.clock import VirtualClock
-from stereoservo.runtime.image_files import ImageWriter, sidecar_of
-from stereoservo.runtime.ports import DriverContext, DriverError, Frame
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import DriverContext, DriverError, Frame
+from stereoservo.ports.image_files import ImageWriter, sidecar_of
 from stereoservo_drivers.video.driver import VideoCameraDriver
 
 from .conftest import HEIGHT, WIDTH, number_of, picture

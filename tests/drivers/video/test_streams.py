@@ -12,9 +12,9 @@ import time
 import numpy as np
 import pytest
 
-from stereoservo.runtime.handover import SlotReader, SlotWriter
-from stereoservo.runtime.ports import CameraObservation, CountingCameraDriver, DriverError
-from stereoservo.runtime.vision import CameraPipeline, run_pipeline
+from stereoservo.daemon.lockstep import MemoryVisionLinks
+from stereoservo.daemon.vision import CameraPipeline, camera_loop, run_camera
+from stereoservo.ports.devices import CameraObservation, CountingCameraDriver, DriverError
 from stereoservo_drivers.video.driver import VideoCameraDriver
 
 from .conftest import HEIGHT, WIDTH, MjpegServer, jpeg, number_of, picture, poll_until
@@ -456,7 +456,7 @@ class Seen:
         )
 
 
-def test_the_vision_process_loses_a_camera_and_gets_it_back(camera, server, context, tmp_path):
+def test_the_vision_process_loses_a_camera_and_gets_it_back(camera, server, context):
     driver = camera(server.url)
     detector = Seen()
     reports = []
@@ -471,21 +471,18 @@ def test_the_vision_process_loses_a_camera_and_gets_it_back(camera, server, cont
             server.close()
 
     end = time.monotonic() + 30.0
-    with (
-        SlotWriter(tmp_path / "seen", 65536, "seen") as slot,
-        SlotWriter(tmp_path / "none", 65536, "none"),
-        SlotReader(tmp_path / "none", "none") as priors,
-    ):
-        run_pipeline(
-            CameraPipeline(driver, detector, slot, priors, context.clock),
+    run_camera(
+        camera_loop(
+            CameraPipeline(driver, detector, MemoryVisionLinks(), context.clock),
             report,
-            lambda: len(detector.frames) >= 10 or time.monotonic() > end,
+            time.monotonic_ns,
             camera="left",
             poll_s=0.001,
-            now=time.monotonic_ns,
-            sleep=time.sleep,
-            flush=flush,
-        )
+        ),
+        lambda: len(detector.frames) >= 10 or time.monotonic() > end,
+        sleep=time.sleep,
+        between=flush,
+    )
     assert [kind for kind, _ in reports] == ["camera_lost", "camera_back"]
     assert server.url in reports[0][1]
     numbers = [frame.seq for frame in detector.frames]

@@ -10,12 +10,12 @@ from stereoservo.kinematics.inverse.goals import fixed_planes
 from stereoservo.kinematics.inverse.recognition import chain_of, recognise
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo_sim import synthetic
-from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.experiments import arm_families
-from stereoservo_sim.experiments.arm_families import PUMA_ROWS, aligned_wrist, from_rows
-from stereoservo_sim.experiments.inverse_kinematics import differences, hide
-from stereoservo_sim.synthetic import SEVEN_ROWS
+from stereoservo_sim.experiments.arms import arm_families
+from stereoservo_sim.experiments.arms.arm_families import PUMA_ROWS, aligned_wrist, from_rows
+from stereoservo_sim.experiments.arms.inverse_kinematics import differences, hide
+from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
+from stereoservo_sim.world.synthetic import SEVEN_ROWS
 
 TURN = 2 * np.pi
 WIDE = np.tile([-TURN, TURN], (6, 1))

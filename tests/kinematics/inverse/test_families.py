@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stereoservo_sim.commands.reproduce import EXPERIMENTS
-from stereoservo_sim.experiments import euclidean_inverse as metric
-from stereoservo_sim.experiments import euclidean_search
-from stereoservo_sim.experiments.arm_families import FAMILIES, PUMA_ROWS, from_rows, offset
-from stereoservo_sim.experiments.inverse_kinematics import (
+from stereoservo_sim.experiments.arms import euclidean_inverse as metric
+from stereoservo_sim.experiments.arms import euclidean_search
+from stereoservo_sim.experiments.arms.arm_families import FAMILIES, PUMA_ROWS, from_rows, offset
+from stereoservo_sim.experiments.arms.inverse_kinematics import (
     differences,
     draw_inverse_kinematics,
     family_row,
     hide,
 )
-from stereoservo_sim.synthetic import OFFSET_ROWS, RX90_ROWS
+from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.world.synthetic import OFFSET_ROWS, RX90_ROWS
 
 SEARCHED = ("offset wrist", "six revolute, general", "seven revolute")
 FULL = {"PUMA": 8.0, "wrist, square": 2.0, "gantry with wrist": 2.0, "two revolute, parallel": 2.0}

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.kinematics.calibration.fit import fit_model
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.inverse.recognition import chain_of, examined, recognise
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo_sim import synthetic
-from stereoservo_sim.exact_model import exact_model
-from stereoservo_sim.experiments import arm_families
-from stereoservo_sim.experiments.inverse_kinematics import hide
+from stereoservo_sim.experiments.arms import arm_families
+from stereoservo_sim.experiments.arms.inverse_kinematics import hide
+from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
 
 CASES = {
     "rx90": ("metric", "arm_with_wrist", False),

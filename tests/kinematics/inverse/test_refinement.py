@@ -8,9 +8,9 @@ from stereoservo.geometry.cameras import triangulate
 from stereoservo.kinematics.inverse.recognition import recognise
 from stereoservo.kinematics.inverse.refinement import refined_on_images
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo.kinematics.joint_sights import JointAnglesError, predicted_pixels, seen_chain
-from stereoservo_sim import synthetic
-from stereoservo_sim.exact_model import exact_model
+from stereoservo.kinematics.joint_reprojection import JointAnglesError, predicted_pixels, seen_chain
+from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
 
 SIGMA = 0.2
 

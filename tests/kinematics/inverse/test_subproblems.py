@@ -6,19 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereoservo.geometry.displacements import exp_rotation
-from stereoservo.kinematics.inverse.arm import arm
-from stereoservo.kinematics.inverse.prismatic import prismatic_joints
-from stereoservo.kinematics.inverse.revolute import (
+from stereoservo.kinematics.inverse.closed_forms import (
+    arm,
     axis_points,
     circle_meets_plane,
     common_point,
     plane_across,
+    prismatic_joints,
     turn_between,
+    two_general,
+    two_parallel,
+    wrist,
 )
-from stereoservo.kinematics.inverse.two_revolute import two_general, two_parallel
-from stereoservo.kinematics.inverse.wrist import wrist
-from stereoservo_sim.experiments import arm_families
-from stereoservo_sim.experiments.inverse_kinematics import hide
+from stereoservo_sim.experiments.arms import arm_families
+from stereoservo_sim.experiments.arms.inverse_kinematics import hide
 
 SEEDS = st.integers(0, 10**6)
 COUNT = settings(max_examples=25, deadline=None)

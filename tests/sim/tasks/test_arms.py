@@ -17,7 +17,7 @@ from stereoservo_sim.tasks.arms import (
     rx90_reach,
 )
 from stereoservo_sim.tasks.calibrations import calibrate, known_at_start, with_trial_ranges
-from stereoservo_sim.tasks.judge import sight
+from stereoservo_sim.tasks.ground_truth import sight
 from stereoservo_sim.tasks.setting import HOMOGENEOUS_MARKERS, camera_matrices, cartesian_twists
 from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
 

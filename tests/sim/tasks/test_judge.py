@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo_sim.tasks.judge import error_px, line_deviations, noise_floor_px, sight
+from stereoservo_sim.tasks.ground_truth import error_px, line_deviations, noise_floor_px, sight
 
 
 def independent(pose):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stereoservo_sim.tasks import task_file
+from stereoservo_sim.tasks.ground_truth import sight
 from stereoservo_sim.tasks.hard_tasks import hard_tasks, shipped_tasks_path, straight_way
-from stereoservo_sim.tasks.judge import sight
 from stereoservo_sim.tasks.task_file import COLUMNS, TaskFileError, read_tasks, tasks_text
 
 HEADER_LINE = 9

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.geometry.errors import GeometryError
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.screws import exp_twist
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
+from stereoservo.numerics.arrays import FloatArray
 
 PLANE_TOLERANCE = 1e-12
 """Share of its norm below which a point's height counts as none."""

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import propagated
 from stereoservo.kinematics.inverse.solutions import Case
 from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray
 
 TAIL = 1e-4
 """Probability with which chance alone makes a condition fail that holds."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.inverse.solutions import InverseSolutions, distinct, nearest_turns
 from stereoservo.kinematics.joint_angles import JointAngles, measured_joints
-from stereoservo.kinematics.joint_sights import JointAnglesError, SeenChain, joint_problem
+from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, joint_problem
+from stereoservo.numerics.arrays import FloatArray
 
 MERGED = 1e-5
 """Largest difference of joints [rad or m] of two refinements that ended in one minimum."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.inverse.descent import linearised
+from stereoservo.kinematics.inverse.numerical import linearised
+from stereoservo.numerics.arrays import FloatArray
 
 NO_MOTION = 1e-6
 """Singular value of the joints' Jacobian, as a share of the largest, below which a direction moves nothing."""

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
+from stereoservo.numerics.arrays import FloatArray
 
 Case = Literal[
     "prismatic",

@@ -10,22 +10,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoservo.geometry.homogeneous import FloatArray
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.inverse import goals, numerical
-from stereoservo.kinematics.inverse.arm import arm
-from stereoservo.kinematics.inverse.branches import Branches, together
-from stereoservo.kinematics.inverse.descent import descended, linearised
-from stereoservo.kinematics.inverse.prismatic import prismatic_joints
+from stereoservo.kinematics.inverse.closed_forms import (
+    Branches,
+    arm,
+    arm_with_wrist,
+    gantry_with_wrist,
+    prismatic_joints,
+    together,
+    turn_between,
+    two_general,
+    two_parallel,
+    wrist,
+)
+from stereoservo.kinematics.inverse.numerical import descended, linearised
 from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
-from stereoservo.kinematics.inverse.revolute import turn_between
 from stereoservo.kinematics.inverse.self_motion import (
     NO_MOTION,
     nearest_by_self_motion,
     self_motions,
     slid_inside,
 )
-from stereoservo.kinematics.inverse.six_axis import arm_with_wrist, gantry_with_wrist
 from stereoservo.kinematics.inverse.solutions import (
     Case,
     InverseKinematicsError,
@@ -34,9 +40,8 @@ from stereoservo.kinematics.inverse.solutions import (
     distinct,
     within_limits,
 )
-from stereoservo.kinematics.inverse.two_revolute import two_general, two_parallel
-from stereoservo.kinematics.inverse.wrist import wrist
 from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray
 
 TOLERANCE = 1e-8
 """Residual up to which a goal counts as reached: rounding, for goals that are exact."""

@@ -1,0 +1,34 @@
+"""Compilation of the detectors' kernels ahead of their first call, for given argument types."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from numba import types
+
+# Read-only arrays: a kernel compiled for them takes writable ones too. Anything else would be compiled anew
+# in the middle of the work.
+IMAGE = types.Array(types.uint8, 2, "C", readonly=True)
+BOOL = types.boolean
+INT = types.int64
+INT32 = types.int32
+FLOAT = types.float64
+
+
+def given(dtype: Any, dimensions: int) -> Any:
+    """Type of an input array, C order."""
+    return types.Array(dtype, dimensions, "C", readonly=True)
+
+
+def written(dtype: Any, dimensions: int) -> Any:
+    """Type of an output array, C order."""
+    return types.Array(dtype, dimensions, "C")
+
+
+def compile_for(function: Callable[..., Any], *arguments: Any) -> None:
+    """Compile a kernel for these argument types, now, and for no others, ever. Idempotent."""
+    dispatcher = cast(Any, function)
+    if not dispatcher.signatures:
+        dispatcher.compile(arguments)
+        dispatcher.disable_compile()

@@ -1,0 +1,183 @@
+"""Bundle adjustment of generators, cameras, lenses and markers in any stratum (5.53, 5.55-5.57).
+
+The model and its residuals are in `rig_model`, its normal equations in `normal_equations`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from stereoservo.calibration.normal_equations import (
+    Weights,
+    by_stop,
+    chunks,
+    normal_equations,
+    prior_rows,
+    triangle_of,
+)
+from stereoservo.calibration.rig_model import (
+    Charts,
+    Measurements,
+    RigModel,
+    full_charts,
+    residuals,
+    rig_at,
+)
+from stereoservo.kinematics.model import Stratum
+from stereoservo.kinematics.parameterization import LensModel, conjugation
+from stereoservo.numerics.arrays import FloatArray
+
+Loss = Literal["linear", "soft_l1", "cauchy"]
+
+GRADIENT = 1e-6
+"""Largest entry of the gradient on unit columns at which a bundle has converged: it moves no parameter by a notable
+part of its deviation."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-14, 1e10
+"""Levenberg-Marquardt: added to the diagonal of ones."""
+FREE_DAMPING = 1e-2
+"""Damping up to which a step's predicted decrease estimates the distance to the minimum."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A solved bundle of ``data``, and the minimal ``charts`` at its ``rig``.
+
+    ``cost``: sum of squared weighted residuals, those of lens priors included; ``residuals`` (2 k,) without them.
+    """
+
+    rig: RigModel
+    data: Measurements
+    charts: Charts
+    stratum: Stratum
+    lenses: LensModel
+    cost: float
+    residuals: FloatArray
+    rows: int
+    converged: bool
+    evaluations: int
+
+    @cached_property
+    def triangle(self) -> FloatArray:
+        """Triangle (p, p) of the Jacobian: ``triangleᵀ triangle = Jᵀ J``, to the accuracy of QR."""
+        return triangle_of(self.rig, self.charts, self.data)[:-1, :-1]
+
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Lengths (p,) of the Jacobian's columns; 1 where a column is zero."""
+        sizes = np.linalg.norm(self.triangle, axis=0)
+        return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def jacobian(rig: RigModel, charts: Charts, x: FloatArray, data: Measurements) -> FloatArray:
+    """Derivative (2 k, p) of ``residuals(moved(rig, charts, x), data)`` by ``x``, dense, all at once."""
+    motions, at = [], 0
+    for basis in charts.generators:
+        motions.append(conjugation(basis, x[at : at + len(basis)])[1])
+        at += len(basis)
+    here = replace(charts, generators=tuple(motions))
+    ordered, order = by_stop(data)
+    out = np.empty((len(order), 2, charts.size))
+    for part, rows in chunks(rig_at(rig, charts, x), here, ordered):
+        out[order[part]] = rows.dense(len(rig.points))[:, :-1].reshape(-1, 2, charts.size)
+    return out.reshape(2 * len(order), charts.size)
+
+
+def solve(
+    rig: RigModel,
+    data: Measurements,
+    stratum: Stratum,
+    *,
+    cameras: bool = True,
+    points: bool = True,
+    lenses: LensModel = "none",
+    loss: Loss = "linear",
+    loss_scale: float = 1.0,
+    max_evaluations: int = 100,
+    tolerance: float = 1e-10,
+) -> Solution:
+    """Least squares over the minimal charts of ``stratum`` by Levenberg and Marquardt, re-centred at every step.
+
+    Columns are scaled to unit length. ``loss_scale`` [sigmas] for the robust losses, which are re-weighted
+    iteratively. ``tolerance``: decrease, relative to the cost, below which nothing is left to gain. Raises
+    LinAlgError where the start has no finite residuals. Never raises on a bad fit: look at ``converged`` and
+    ``cost``.
+    """
+    ordered, _ = by_stop(data)
+    weights = _weights(loss, loss_scale)
+
+    def charts_at(rig: RigModel) -> Charts:
+        return full_charts(rig, stratum, cameras=cameras, points=points, lenses=lenses)
+
+    def cost_at(rig: RigModel, charts: Charts) -> float:
+        pixels = _loss(residuals(rig, ordered), loss, loss_scale)
+        return pixels + float((prior_rows(rig, charts, data)[:, -1] ** 2).sum())
+
+    charts = charts_at(rig)
+    cost = cost_at(rig, charts)
+    if not np.isfinite(cost):
+        raise np.linalg.LinAlgError("points at infinity or in a focal plane at the start of a bundle")
+    damping, evaluations, converged, exhausted = FIRST_DAMPING, 1, False, False
+    while not (converged or exhausted):
+        equations = normal_equations(rig, charts, ordered, weights)
+        if float(np.abs(equations.gradient).max(initial=0.0)) <= GRADIENT:
+            converged = True
+            break
+        while True:
+            if evaluations >= max_evaluations or damping > MOST_DAMPING:
+                exhausted = True
+                break
+            try:
+                x, expected = equations.step(damping)
+            except np.linalg.LinAlgError:
+                damping = max(10.0 * damping, 1e-12)
+                continue
+            trial = rig_at(rig, charts, x)
+            evaluations += 1
+            least = cost_at(trial, charts)
+            gain = (cost - least) / expected if expected > 0.0 else 0.0
+            converged = damping <= FREE_DAMPING and expected <= tolerance * cost
+            if gain > 1e-3:
+                rig, cost = trial, least
+                charts = charts_at(rig)
+                damping = max(damping * (0.03 if gain > 0.75 else 0.3 if gain > 0.25 else 2.0), LEAST_DAMPING)
+                break
+            if converged:
+                break
+            damping = 10.0 * max(damping, 1e-12)
+    error = residuals(rig, data)
+    prior = prior_rows(rig, charts, data)[:, -1]
+    return Solution(
+        rig,
+        data,
+        charts,
+        stratum,
+        lenses,
+        float(error @ error + prior @ prior),
+        error,
+        len(error) + len(prior),
+        converged,
+        evaluations,
+    )
+
+
+def _loss(error: FloatArray, loss: Loss, scale: float) -> float:
+    """``Σ s² ρ(e²/s²)`` of residuals (2 k,)."""
+    if loss == "linear":
+        return float(error @ error)
+    square = (error / scale) ** 2
+    if loss == "soft_l1":
+        return float(2.0 * scale**2 * (np.sqrt(1.0 + square) - 1.0).sum())
+    return float(scale**2 * np.log1p(square).sum())
+
+
+def _weights(loss: Loss, scale: float) -> Weights | None:
+    """``ρ'(e²/s²)`` of squared residuals; None for plain least squares."""
+    if loss == "linear":
+        return None
+    if loss == "soft_l1":
+        return lambda square: np.asarray(1.0 / np.sqrt(1.0 + square / scale**2))
+    return lambda square: np.asarray(1.0 / (1.0 + square / scale**2))

@@ -1,0 +1,320 @@
+"""Assembly of a cell's model, its covariance and the statistics of its fit from a solved bundle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.bundle_adjustment import Solution
+from stereoservo.calibration.bundle_statistics import (
+    GroupRms,
+    chi2_within,
+    degrees_of_freedom,
+    group_rms,
+    noise_factor,
+    parameter_covariance,
+    prediction_variances,
+    variance_factor,
+)
+from stereoservo.calibration.lens_estimation import lens_test
+from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
+from stereoservo.calibration.trial_data import TrialData
+from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
+from stereoservo.kinematics.axes import camera_intrinsics
+from stereoservo.kinematics.model import (
+    MODEL_SCHEMA,
+    CameraModel,
+    CellModel,
+    FitStatistics,
+    JointStatistics,
+    ModelCovariance,
+    Stratum,
+    check_model,
+)
+from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+
+class CameraReport(msgspec.Struct, frozen=True):
+    """Fit of one camera: residual rms [px], pixels used, pixels left out; intrinsics [px] in the metric
+    stratum.
+
+    ``expected_px``, ``standard_error_px``: of the rms, as in the model's joint statistics. ``intrinsics``: fx, skew,
+    fy, u0, v0. ``lens``: k, cu, cv (`geometry.distortion`) and ``lens_std`` their deviations, None for a pinhole.
+    """
+
+    name: str
+    rms_px: float
+    pixels: int
+    outliers: int
+    intrinsics: tuple[float, float, float, float, float] | None
+    expected_px: float
+    standard_error_px: float
+    lens: tuple[float, float, float] | None
+    lens_std: tuple[float, ...] | None
+
+
+class LensReport(msgspec.Struct, frozen=True):
+    """The lens model that was selected, ``none`` or ``radial_centre``, and the test of it.
+
+    ``chi2``: what the radial parameters of all cameras (``freedom`` of them) are worth against zero: the gain that
+    freeing them would bring (score test) where they are not free, their own significance (Wald) where they are.
+    Above ``limit`` a lens distorts; pinholes get there once in ten thousand fits.
+    """
+
+    model: LensModel
+    chi2: float
+    freedom: int
+    limit: float
+
+
+class Outlier(msgspec.Struct, frozen=True):
+    """A pixel that was left out, and how far it lies from the model [px]."""
+
+    camera: str
+    stop: int
+    marker: int
+    distance_px: float
+
+
+class CalibrationReport(msgspec.Struct, frozen=True):
+    """Statistics of a fit beside those that the model itself carries.
+
+    ``sigma_factor``: estimated over stated standard deviation of the pixels (square root of the variance
+    factor). ``prediction_rms_px``, ``prediction_max_px``: standard deviation of the predicted pixels a
+    coordinate, ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of
+    fx, skew, fy, u0, v0 [px]. ``projective_chi2``, ``projective_degrees_of_freedom``: of the projective
+    bundle, which the stratum's is nested in. ``lens``: the lens model and its test.
+    ``untested``: what the model takes as stated because the trials do not determine it.
+    """
+
+    stratum: Stratum
+    rms_px: float
+    chi2: float
+    degrees_of_freedom: int
+    chi2_ok: bool
+    sigma_factor: float
+    projective_chi2: float
+    projective_degrees_of_freedom: int
+    prediction_rms_px: float
+    prediction_max_px: float
+    cameras: tuple[CameraReport, ...]
+    outliers: tuple[Outlier, ...]
+    left_intrinsics_std: tuple[float, ...] | None
+    markers_left_out: tuple[int, ...]
+    notes: tuple[str, ...]
+    lens: LensReport
+    untested: tuple[str, ...] = ()
+
+
+class CalibrationFit(msgspec.Struct, frozen=True, eq=False):
+    """A fitted model and its report."""
+
+    model: CellModel
+    report: CalibrationReport
+
+
+def build_fit(
+    trials: TrialData,
+    solution: Solution,
+    every: Measurements,
+    inliers: BoolArray,
+    zero: FloatArray,
+    plane: FloatArray,
+    normaliser: FloatArray,
+    *,
+    epoch: int,
+    created: str,
+    notes: tuple[str, ...],
+    projective: tuple[float, int],
+    markers_left_out: tuple[int, ...],
+) -> CalibrationFit:
+    """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame."""
+    data = every.select(inliers)
+    errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
+    squares = (errors**2).sum(axis=1) / 2
+    freedom = degrees_of_freedom(solution)
+    variances = prediction_variances(solution, every.offsets)
+    own = variances[data.camera, data.stop, data.marker]
+
+    def group(members: BoolArray) -> GroupRms:
+        return group_rms(squares[members], data.sigmas[members], own[members])
+
+    statistics = FitStatistics(
+        rms_px=float(np.sqrt(squares.mean())),
+        chi2=solution.cost,
+        degrees_of_freedom=freedom,
+        chi2_ok=chi2_within(solution.cost, freedom),
+        measurements=solution.rows,
+        parameters=solution.charts.size,
+        outliers=int((~inliers).sum()),
+        joints=tuple(_joint_statistics(trials, j, group, data) for j in range(len(trials.joint_names))),
+        images=trials.images,
+    )
+    model = build_model(trials, solution, zero, plane, normaliser, statistics, epoch, created)
+    shown = variances[np.isfinite(variances)] / 2 * noise_factor(solution)
+    tested = lens_test(solution)
+    report = CalibrationReport(
+        stratum=solution.stratum,
+        rms_px=statistics.rms_px,
+        chi2=statistics.chi2,
+        degrees_of_freedom=freedom,
+        chi2_ok=statistics.chi2_ok,
+        sigma_factor=float(np.sqrt(variance_factor(solution))),
+        projective_chi2=projective[0],
+        projective_degrees_of_freedom=projective[1],
+        prediction_rms_px=float(np.sqrt(shown.mean())),
+        prediction_max_px=float(np.sqrt(shown.max())),
+        cameras=tuple(
+            _camera_report(trials, c, solution, group(data.camera == c), every, inliers)
+            for c in range(len(trials.cameras))
+        ),
+        outliers=_outliers(trials, solution.rig, every, inliers),
+        left_intrinsics_std=_left_intrinsics_std(solution) if solution.stratum == "metric" else None,
+        markers_left_out=markers_left_out,
+        notes=notes,
+        lens=LensReport(solution.lenses, tested.chi2, tested.freedom, tested.limit),
+    )
+    return CalibrationFit(model, report)
+
+
+def _camera_report(
+    trials: TrialData, c: int, solution: Solution, fit: GroupRms, every: Measurements, inliers: BoolArray
+) -> CameraReport:
+    lens, lens_std = None, None
+    if solution.lenses != "none":
+        k, cu, cv, _ = (float(value) for value in solution.rig.lenses[c])
+        basis = solution.charts.lenses[c]
+        at = solution.charts.start(2) + sum(len(other) for other in solution.charts.lenses[:c])
+        covariance = parameter_covariance(solution)[at : at + len(basis), at : at + len(basis)]
+        lens = k, cu, cv
+        lens_std = tuple(float(value) for value in np.sqrt(np.diag(basis.T @ covariance @ basis))[:3])
+    mine = every.camera == c
+    return CameraReport(
+        trials.cameras[c].name,
+        fit.rms_px,
+        int((mine & inliers).sum()),
+        int((mine & ~inliers).sum()),
+        intrinsics(solution.rig.cameras[c]) if solution.stratum == "metric" else None,
+        fit.expected_px,
+        fit.standard_error_px,
+        lens,
+        lens_std,
+    )
+
+
+def build_model(
+    trials: TrialData,
+    solution: Solution,
+    zero: FloatArray,
+    plane: FloatArray,
+    normaliser: FloatArray,
+    statistics: FitStatistics,
+    epoch: int,
+    created: str,
+) -> CellModel:
+    """The model in the canonical projective frame: ``P_left = [N⁻¹ | 0]``, heights 1 by the plane at
+    infinity.
+    """
+    rig, stratum = solution.rig, solution.stratum
+    if stratum == "projective":
+        frame: FloatArray = np.eye(4)
+    elif stratum == "affine":
+        frame = affine_to_projective(plane)
+    else:
+        frame = euclidean_to_projective(plane, normaliser @ rig.cameras[0][:, :3])
+    back: FloatArray = np.asarray(np.linalg.inv(frame), dtype=np.float64)
+    points = rig.points @ frame.T
+    points = points / (points @ plane)[:, None]
+    cameras = rig.cameras @ back
+    cameras[0] = np.hstack([np.linalg.inv(normaliser), np.zeros((3, 1))])
+    for c in range(1, len(cameras)):
+        cameras[c] /= np.mean(points @ cameras[c, 2]) / np.mean(points[:, 2])
+    model = CellModel(
+        schema=MODEL_SCHEMA,
+        epoch=epoch,
+        joint_names=trials.joint_names,
+        joint_kinds=trials.joint_kinds,
+        zero=zero,
+        generators=frame @ rig.generators @ back,
+        cameras=tuple(
+            CameraModel(camera.name, matrix, camera.width, camera.height, lens)
+            for camera, matrix, lens in zip(trials.cameras, cameras, rig.lenses, strict=True)
+        ),
+        marker_ids=trials.marker_ids,
+        marker_points=points,
+        plane_at_infinity=plane,
+        stratum=stratum,
+        projective_to_euclidean=back if stratum == "metric" else None,
+        statistics=statistics,
+        created=created,
+        source="trial motions",
+        covariance=_covariance(solution, frame, back, cameras, points),
+    )
+    check_model(model)
+    return model
+
+
+def _covariance(
+    solution: Solution, frame: FloatArray, back: FloatArray, cameras: FloatArray, points: FloatArray
+) -> ModelCovariance:
+    """The bundle's covariance with its directions brought into the model's ``frame`` (4, 4), whose ``cameras`` and
+    ``points`` are scaled as they are there.
+    """
+    rig, charts = solution.rig, solution.charts
+    # Matrices and points are scaled as a whole: their directions with them.
+    matrices = rig.cameras @ back
+    camera_scales = (cameras * matrices).sum(axis=(1, 2)) / (matrices**2).sum(axis=(1, 2))
+    brought = rig.points @ frame.T
+    point_scales = (points * brought).sum(axis=1) / (brought**2).sum(axis=1)
+    return ModelCovariance(
+        tuple(frame @ basis @ back for basis in charts.generators),
+        tuple(scale * (basis @ back) for scale, basis in zip(camera_scales, charts.cameras, strict=True)),
+        charts.lenses,
+        tuple(scale * (basis @ frame.T) for scale, basis in zip(point_scales, charts.points, strict=True)),
+        parameter_covariance(solution),
+    )
+
+
+def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
+    """fx, skew, fy, u0, v0 [px] of a camera (3, 4) in a Euclidean frame."""
+    fx, skew, fy, u0, v0 = (float(value) for value in camera_intrinsics(matrix))
+    return fx, skew, fy, u0, v0
+
+
+def _left_intrinsics_std(solution: Solution) -> tuple[float, ...]:
+    at = solution.charts.start(1)
+    deviations = np.sqrt(np.diag(parameter_covariance(solution))[at : at + 5])
+    fx, skew, u0, fy, v0 = (float(value) for value in deviations)
+    return fx, skew, fy, u0, v0
+
+
+def _joint_statistics(
+    trials: TrialData, joint: int, group: Callable[[BoolArray], GroupRms], data: Measurements
+) -> JointStatistics:
+    own = np.flatnonzero(trials.trials == joint)
+    positions = trials.positions[own, joint]
+    fit = group(np.isin(data.stop, own))
+    return JointStatistics(
+        trials.joint_names[joint],
+        fit.rms_px,
+        len(own),
+        float(np.ptp(positions)) if len(own) else 0.0,
+        fit.expected_px,
+        fit.standard_error_px,
+    )
+
+
+def _outliers(
+    trials: TrialData, rig: RigModel, every: Measurements, inliers: BoolArray
+) -> tuple[Outlier, ...]:
+    lost = every.select(~inliers)
+    if not len(lost.pixels):
+        return ()
+    distances = np.linalg.norm(predicted(rig, lost) - lost.pixels, axis=1)
+    return tuple(
+        Outlier(trials.cameras[c].name, int(s), trials.marker_ids[m], float(distance))
+        for c, s, m, distance in zip(lost.camera, lost.stop, lost.marker, distances, strict=True)
+    )

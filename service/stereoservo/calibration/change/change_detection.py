@@ -1,0 +1,131 @@
+"""Detection of a changed camera, marker or joint zero from the innovations of one moment; the core's interface to it.
+
+Innovations are observed less predicted pixels. Hypotheses, each a change of few parameters:
+
+    nothing                0
+    camera k moved         6, a displacement; 8, a homography of its image, where the model is not metric; 2, a shift of
+                           its image, where it sees too few points for that
+    all cameras together   6, one displacement (metric)
+    marker i slipped       3, its point; 2 where one camera sees it
+    the zero of joint j    1
+    all joints             n: their zeros, or what looks the same: another tool, an arm that was pushed
+
+Static points move with cameras only. Each hypothesis is estimated by Gauss-Newton iteration, and decided among by
+`hypothesis_test`. Of two that are nearly as good both are returned: with one pose and no static point a displaced rig
+cannot be distinguished from a displaced arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stereoservo.calibration.change import change_detection_kernel
+from stereoservo.calibration.change.hypothesis_test import Thresholds
+from stereoservo.numerics.arrays import FloatArray
+
+ChangeKind = Literal["nothing", "camera", "cameras", "marker", "joint", "joints", "unexplained"]
+KINDS: tuple[ChangeKind, ...] = ("nothing", "camera", "cameras", "marker", "joint", "joints", "unexplained")
+
+
+@dataclass(frozen=True)
+class IsolatedChange:
+    """An estimated change: its ``kind`` and ``index`` (of the camera, marker or joint; -1 for all), its ``size`` in
+    parameters and the ``chi2`` that it leaves.
+
+    ``amount``: angle [rad] of a displaced camera, offset [rad or m] of a joint's zero (of all joints: the largest), NaN
+    where the image alone was moved, 0 of a marker. ``effect_px``: rms displacement of the pixels that it concerns.
+    """
+
+    kind: ChangeKind
+    index: int
+    size: int
+    chi2: float
+    amount: float
+    effect_px: float
+
+
+@dataclass(frozen=True)
+class ChangeDiagnosis:
+    """The change that explains the innovations of one moment. ``measurements``: coordinates seen; ``chi2`` of nothing
+    changed.
+
+    ``kind`` ``unexplained``: no noise, and no single hypothesis explains it; ``cause`` is then the best, or None.
+    ``runner_up``: a cause that explains nearly as well, so that the two are indistinguishable; else None.
+    """
+
+    kind: ChangeKind
+    cause: IsolatedChange | None
+    runner_up: IsolatedChange | None
+    chi2: float
+    measurements: int
+
+    @property
+    def clear(self) -> bool:
+        """Whether one cause, and no other, explains what is seen."""
+        return self.kind not in ("nothing", "unexplained") and self.runner_up is None
+
+
+def diagnose(
+    matrices: FloatArray,
+    points: FloatArray,
+    innovations: FloatArray,
+    weights: FloatArray,
+    operators: FloatArray,
+    twists: FloatArray | None,
+    thresholds: Thresholds,
+    static_points: FloatArray | None = None,
+    static_innovations: FloatArray | None = None,
+    static_weights: FloatArray | None = None,
+) -> ChangeDiagnosis:
+    """Diagnosis of one moment, by the compiled kernel: deterministic.
+
+    ``matrices`` (c, 3, 4); ``points`` (m, 4) as predicted; ``innovations`` (c, m, 2) of ideal pixels [px] and
+    ``weights`` (c, m) = 1/sigma [1/px], 0 where not seen; ``operators`` (n, 4, 4) at the current joints (5.21);
+    ``twists`` (6, 4, 4) of a metric model, else None; static points (s, 4) likewise with (c, s, 2) and (c, s).
+    """
+    cameras, markers, joints = len(matrices), len(points), len(operators)
+    X, e, w = points, innovations, weights
+    if static_points is not None and static_innovations is not None and static_weights is not None:
+        X = np.concatenate([points, static_points])
+        e = np.concatenate([innovations, static_innovations], axis=1)
+        w = np.concatenate([weights, static_weights], axis=1)
+    count = cameras + 3 + markers + joints
+    sizes, answer = np.zeros(count, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    chi2, amounts, effects = np.zeros(count), np.zeros(count), np.zeros(count)
+    change_detection_kernel.explain_innovations(
+        np.ascontiguousarray(matrices), np.ascontiguousarray(X), markers, np.ascontiguousarray(e),
+        np.ascontiguousarray(w), np.ascontiguousarray(operators), np.zeros((0, 4, 4)) if twists is None else twists,
+        thresholds.ratios, thresholds.log_alpha, thresholds.least_px, sizes, chi2, amounts, effects, answer,
+    )  # fmt: skip
+
+    def cause(h: int) -> IsolatedChange | None:
+        if h < 1:
+            return None
+        kind, index = hypothesis_subject(h, cameras, markers, joints)
+        return IsolatedChange(
+            kind, index, int(sizes[h]), float(chi2[h]), float(amounts[h]), float(effects[h])
+        )
+
+    return ChangeDiagnosis(
+        KINDS[int(answer[0])],
+        cause(int(answer[1])),
+        cause(int(answer[2])),
+        float(chi2[0]),
+        2 * int((w > 0.0).sum()),
+    )
+
+
+def hypothesis_subject(h: int, cameras: int, markers: int, joints: int) -> tuple[ChangeKind, int]:
+    """Kind and index of hypothesis ``h`` >= 1."""
+    if h <= cameras:
+        return "camera", h - 1
+    if h == cameras + 1:
+        return "cameras", -1
+    if h < cameras + 2 + markers:
+        return "marker", h - cameras - 2
+    if h < cameras + 2 + markers + joints:
+        return "joint", h - cameras - 2 - markers
+    return "joints", -1

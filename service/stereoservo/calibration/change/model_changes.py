@@ -1,0 +1,376 @@
+"""Hypothetical changes of a calibrated cell, and their least-squares estimates from the pixels of a check motion.
+
+A camera moved, the cameras moved together, the marker body moved, one marker slipped, the zero of a joint drifted:
+each is a change of few parameters. Its estimate takes the pixels of many poses and the covariance of the model itself
+into account, and several changes may be estimated together; which of them is significant is decided in `model_check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.calibration.bundle_adjustment import jacobian
+from stereoservo.calibration.normal_equations import triangle_of
+from stereoservo.calibration.rig_model import (
+    Charts,
+    Measurements,
+    RigModel,
+    acting_order,
+    acting_rig,
+    full_charts,
+    residuals,
+)
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.kinematics.model import CellModel, ModelCovariance
+from stereoservo.messages.check_report import CauseKind
+from stereoservo.numerics.arrays import FloatArray
+
+STEP = 1e-6
+"""Step of the finite differences, relative to the size of the scene."""
+ROUNDS = 10
+SETTLED = 1e-3
+"""Last step [sigmas] at which an estimate has converged."""
+
+State = tuple[RigModel, FloatArray]
+"""A model under estimation and the drift (n,) of its joints' zeros, in the model's order."""
+
+
+@dataclass(frozen=True)
+class ModelChange:
+    """A hypothetical change of ``size`` parameters; ``apply`` returns a state with it at given parameters (size,)."""
+
+    kind: CauseKind
+    subject: str
+    size: int
+    apply: Callable[[State, FloatArray], State]
+
+
+@dataclass(frozen=True)
+class LinearisedProblem:
+    """Model and pixels of a check: ``rig`` in its Euclidean frame where it has one, its ``data``, and ``uncertainty``
+    B (2 k, p) of the covariance that the model's own uncertainty adds to the residuals (see ``_bound``).
+    """
+
+    rig: RigModel
+    data: Measurements
+    uncertainty: FloatArray
+    order: tuple[int, ...]
+    """Joints in the order of the rig's factors."""
+
+    def residuals_at(self, state: State) -> FloatArray:
+        """Weighted residuals (2 k,) of a changed model."""
+        rig, drift = state
+        return residuals(rig, replace(self.data, offsets=self.data.offsets + drift))
+
+    def whitened(self, rows: FloatArray) -> FloatArray:
+        """``W rows`` with ``W = (I + A Aᵀ)⁻¹``, ``A`` the model's own uncertainty; ``rows`` (2 k,) or (2 k, q)."""
+        found: FloatArray = rows - self.uncertainty @ (self.uncertainty.T @ rows)
+        return found
+
+    def select(self, keep: npt.NDArray[np.bool_]) -> LinearisedProblem:
+        """The problem with only the pixels where ``keep`` (k,) holds."""
+        root = _unbound(self.uncertainty)
+        return replace(self, data=self.data.select(keep), uncertainty=_bound(root[np.repeat(keep, 2)]))
+
+
+def _bound(A: FloatArray) -> FloatArray:
+    """``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``."""
+    if not A.shape[1]:
+        return A
+    triangle = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
+    bound: FloatArray = np.linalg.solve(triangle, A.T).T
+    return bound
+
+
+def _unbound(B: FloatArray) -> FloatArray:
+    """Inverse of :func:`_bound`, up to a rotation: ``A Aᵀ = B (I - Bᵀ B)⁻¹ Bᵀ``."""
+    if not B.shape[1]:
+        return B
+    triangle = np.linalg.cholesky(np.eye(B.shape[1]) - B.T @ B)
+    root: FloatArray = np.linalg.solve(triangle, B.T).T
+    return root
+
+
+def known_measurements(model: CellModel, trials: TrialData, order: tuple[int, ...]) -> Measurements:
+    """Pixels of those markers and cameras that are part of the model.
+
+    Raises CalibrationError (``bad_data``) where joints or cameras are not the model's.
+    """
+    of_model = [camera.name for camera in model.cameras]
+    if trials.joint_names != model.joint_names or [camera.name for camera in trials.cameras] != of_model:
+        raise CalibrationError(
+            "bad_data",
+            f"the check is of joints {', '.join(trials.joint_names)} and cameras "
+            f"{', '.join(camera.name for camera in trials.cameras)}; the model has {', '.join(model.joint_names)} "
+            f"and {', '.join(of_model)}",
+        )
+    known = np.array([marker in model.marker_ids for marker in trials.marker_ids], dtype=bool)
+    camera, stop, marker = np.nonzero(trials.visible & known)
+    index = np.array([model.marker_ids.index(i) if i in model.marker_ids else -1 for i in trials.marker_ids])
+    return Measurements(
+        (trials.positions - model.zero)[:, list(order)],
+        camera, stop, index[marker], trials.pixels[camera, stop, marker], trials.sigmas[camera, stop, marker],
+    )  # fmt: skip
+
+
+def linearised_problem(
+    model: CellModel, check: TrialData, made_from: TrialData | None, noise_factor: float
+) -> LinearisedProblem:
+    """The problem of a check; ``noise_factor`` >= 1 multiplies every sigma.
+
+    The model's uncertainty is its own covariance; without one it follows from the trials of its calibration,
+    ``made_from``; without those the model is taken as exact.
+    """
+    rig, order = acting_rig(model), acting_order(model)
+    data = known_measurements(model, check, order)
+    data = replace(data, sigmas=data.sigmas * noise_factor)
+    if model.covariance is not None:
+        uncertainty = _stated_uncertainty(model, model.covariance, data, order)
+    elif made_from is not None:
+        past = known_measurements(model, made_from, order)
+        uncertainty = _curvature_uncertainty(
+            model, rig, replace(past, sigmas=past.sigmas * noise_factor), data
+        )
+    else:
+        uncertainty = np.zeros((2 * len(data.camera), 0))
+    return LinearisedProblem(rig, data, _bound(uncertainty), order)
+
+
+def with_corrected_zeros(
+    problem: LinearisedProblem, model: CellModel, drift: FloatArray
+) -> LinearisedProblem:
+    """The problem with the joints' readings corrected by ``drift`` (n,), in the rig's order."""
+    data = replace(problem.data, offsets=problem.data.offsets + drift)
+    if model.covariance is None:
+        return replace(problem, data=data)
+    return replace(
+        problem,
+        data=data,
+        uncertainty=_bound(_stated_uncertainty(model, model.covariance, data, problem.order)),
+    )
+
+
+def _stated_uncertainty(
+    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
+) -> FloatArray:
+    """Root (2 k, p) of what the model's covariance does to the pixels of ``data`` [sigmas²]."""
+    slopes, columns = covariance_jacobian(model, stated, data, order)
+    values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
+    root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return root
+
+
+def covariance_jacobian(
+    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and which of them (p,) each
+    column belongs to.
+    """
+    rig = RigModel(
+        tuple(model.joint_kinds[j] for j in order),
+        model.generators[list(order)],
+        np.array([camera.matrix for camera in model.cameras]),
+        model.marker_points,
+        np.array([camera.lens for camera in model.cameras]),
+    )
+    charts = Charts(tuple(stated.generators[j] for j in order), stated.cameras, stated.lenses, stated.markers)
+    sizes = [len(basis) for basis in stated.generators]
+    starts = np.cumsum([0, *sizes])
+    columns = np.concatenate([np.arange(starts[j], starts[j + 1]) for j in order])
+    columns = np.append(columns, np.arange(starts[-1], charts.size))
+    return jacobian(rig, charts, np.zeros(charts.size), data), columns
+
+
+def _curvature_uncertainty(
+    model: CellModel, rig: RigModel, past: Measurements, data: Measurements
+) -> FloatArray:
+    """The same from the curvature of the calibration's own least squares at the model."""
+    bent = bool((rig.lenses[:, 0] != 0.0).any())
+    charts = full_charts(rig, model.stratum, lenses="radial_centre" if bent else "none")
+    triangle = triangle_of(rig, charts, past)[:-1, :-1]
+    sizes = np.linalg.norm(triangle, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    # A direction that the calibration left open has a large finite deviation here instead of none.
+    bounded = np.linalg.qr(np.vstack([triangle / sizes, 1e-7 * np.eye(charts.size)]), mode="r")
+    slopes = jacobian(rig, charts, np.zeros(charts.size), data) / sizes
+    uncertainty: FloatArray = slopes @ np.linalg.inv(np.asarray(bounded))
+    return uncertainty
+
+
+# -- the hypotheses -----------------------------------------------------------------------------------------
+
+
+def possible_changes(model: CellModel, problem: LinearisedProblem) -> list[ModelChange]:
+    """All changes that are tested: rigid motions in a Euclidean frame, free camera matrices without one."""
+    rig = problem.rig
+    metric = model.stratum == "metric"
+    found: list[ModelChange] = []
+    for c, camera in enumerate(model.cameras):
+        found.append(ModelChange("camera", camera.name, 6 if metric else 11, _camera(rig, (c,), metric)))
+    if metric:
+        if len(model.cameras) > 1:
+            found.append(ModelChange("cameras", "", 6, _camera(rig, tuple(range(len(model.cameras))), True)))
+        found.append(ModelChange("body", "", 6, _body(rig)))
+    seen = set(problem.data.marker.tolist())
+    found += [
+        ModelChange("marker", str(i), 3, _marker(k)) for k, i in enumerate(model.marker_ids) if k in seen
+    ]
+    found += [ModelChange("joint", model.joint_names[j], 1, _joint(k)) for k, j in enumerate(problem.order)]
+    return found
+
+
+def rigid_motion(x: FloatArray, centre: FloatArray, scale: float) -> FloatArray:
+    """Rigid motion (4, 4): rotation by ``x[:3]`` [rad] about ``centre`` (3,), then translation by ``scale x[3:]``."""
+    angle = float(np.linalg.norm(x[:3]))
+    K = np.array([(0.0, -x[2], x[1]), (x[2], 0.0, -x[0]), (-x[1], x[0], 0.0)])
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    R = np.eye(3) + a * K + b * (K @ K)
+    motion = np.eye(4)
+    motion[:3, :3] = R
+    motion[:3, 3] = centre - R @ centre + scale * x[3:]
+    return motion
+
+
+def _scene(rig: RigModel) -> tuple[FloatArray, float]:
+    middle = rig.points[:, :3].mean(axis=0)
+    return middle, float(np.linalg.norm(middle)) or 1.0
+
+
+def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[State, FloatArray], State]:
+    middle, scale = _scene(rig)
+    bases = {}
+    for c in which:
+        matrix = rig.cameras[c].ravel() / np.linalg.norm(rig.cameras[c])
+        bases[c] = np.linalg.svd(matrix[None])[2][1:].reshape(11, 3, 4) * np.linalg.norm(rig.cameras[c])
+
+    def apply(state: State, x: FloatArray) -> State:
+        cameras = state[0].cameras.copy()
+        for c in which:
+            if metric:
+                cameras[c] = cameras[c] @ rigid_motion(x, middle, scale)
+            else:
+                cameras[c] = cameras[c] + np.einsum("p,pij->ij", x, bases[c])
+        return replace(state[0], cameras=cameras), state[1]
+
+    return apply
+
+
+def _body(rig: RigModel) -> Callable[[State, FloatArray], State]:
+    middle, scale = _scene(rig)
+
+    def apply(state: State, x: FloatArray) -> State:
+        return replace(state[0], points=state[0].points @ rigid_motion(x, middle, scale).T), state[1]
+
+    return apply
+
+
+def _marker(k: int) -> Callable[[State, FloatArray], State]:
+    def apply(state: State, x: FloatArray) -> State:
+        points = state[0].points.copy()
+        size = float(np.linalg.norm(points[k, :3])) or 1.0
+        points[k, :3] += size * x
+        return replace(state[0], points=points), state[1]
+
+    return apply
+
+
+def _joint(k: int) -> Callable[[State, FloatArray], State]:
+    def apply(state: State, x: FloatArray) -> State:
+        drift = state[1].copy()
+        drift[k] += x[0]
+        return state[0], drift
+
+    return apply
+
+
+# -- estimates ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ChangeEstimate:
+    """Changes estimated together: ``x`` (q,), its ``information`` (q, q), ``chi2`` that is left, and the change of the
+    pixels that each cause makes alone, ``effects_px`` (rms over all pixels of the check).
+    """
+
+    changes: tuple[ModelChange, ...]
+    x: FloatArray
+    information: FloatArray
+    chi2: float
+    left: FloatArray
+    effects_px: tuple[float, ...]
+
+
+def start_state(problem: LinearisedProblem) -> State:
+    """The unchanged model."""
+    return problem.rig, np.zeros(len(problem.order))
+
+
+def changed_state(problem: LinearisedProblem, found: tuple[ModelChange, ...], x: FloatArray) -> State:
+    """The model with changes ``found`` at parameters ``x`` (q,)."""
+    state, at = start_state(problem), 0
+    for cause in found:
+        state = cause.apply(state, x[at : at + cause.size])
+        at += cause.size
+    return state
+
+
+def change_jacobian(
+    problem: LinearisedProblem, found: tuple[ModelChange, ...], x: FloatArray, here: FloatArray
+) -> FloatArray:
+    """Derivative (2 k, q) of the residuals by the changes' parameters, by finite differences."""
+    columns = []
+    for i in range(x.size):
+        step = np.zeros(x.size)
+        step[i] = STEP
+        columns.append((problem.residuals_at(changed_state(problem, found, x + step)) - here) / STEP)
+    return np.array(columns).T.reshape(here.size, x.size)
+
+
+def first_order_gain(problem: LinearisedProblem, cause: ModelChange, here: FloatArray) -> float:
+    """Reduction of chi-square by one change, to first order."""
+    slopes = change_jacobian(problem, (cause,), np.zeros(cause.size), here)
+    whitened = problem.whitened(slopes)
+    moment = whitened.T @ here
+    information = slopes.T @ whitened
+    return float(moment @ np.linalg.lstsq(information, moment, rcond=None)[0])
+
+
+def estimate_changes(
+    problem: LinearisedProblem, found: tuple[ModelChange, ...], start: FloatArray | None = None
+) -> ChangeEstimate:
+    """Least-squares estimate of changes from ``start`` (q,) on, default nothing changed, with the model's
+    own uncertainty in the weights.
+    """
+    x = np.zeros(sum(cause.size for cause in found)) if start is None else start
+    here = problem.residuals_at(changed_state(problem, found, x))
+    chi2 = float(here @ problem.whitened(here))
+    slopes = change_jacobian(problem, found, x, here)
+    for _ in range(ROUNDS):
+        whitened = problem.whitened(slopes)
+        information = slopes.T @ whitened
+        step = -np.linalg.lstsq(information, whitened.T @ here, rcond=None)[0]
+        for _ in range(6):
+            trial = problem.residuals_at(changed_state(problem, found, x + step))
+            cost = float(trial @ problem.whitened(trial))
+            if cost <= chi2:
+                break
+            step = 0.5 * step
+        else:
+            break
+        x, here, chi2 = x + step, trial, cost
+        slopes = change_jacobian(problem, found, x, here)
+        if float(step @ information @ step) < SETTLED**2:
+            break
+    before = problem.residuals_at(start_state(problem))
+    effects, at = [], 0
+    for cause in found:
+        alone = problem.residuals_at(cause.apply(start_state(problem), x[at : at + cause.size]))
+        change = (alone - before).reshape(-1, 2) * problem.data.sigmas[:, None]
+        effects.append(float(np.sqrt((change**2).mean())))
+        at += cause.size
+    return ChangeEstimate(found, x, slopes.T @ problem.whitened(slopes), chi2, here, tuple(effects))

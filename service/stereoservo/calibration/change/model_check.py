@@ -1,0 +1,437 @@
+"""Chi-square test of a model against a short check motion; names and measures what has changed.
+
+Under a valid model the residuals are Gaussian with the stated noise and the model's own uncertainty. A chi-square test
+rejects the model; likelihood ratios, by the decision that the on-line monitor uses too (`hypothesis_test`), name what
+has changed: camera, cameras together, marker body, marker or joint zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.calibration.change.hypothesis_test import (
+    Thresholds,
+    check_thresholds,
+    is_unexplained,
+    noise_level,
+    penalised_chi2,
+    select_candidates,
+    two_best,
+)
+from stereoservo.calibration.change.model_changes import (
+    ChangeEstimate,
+    LinearisedProblem,
+    ModelChange,
+    estimate_changes,
+    first_order_gain,
+    linearised_problem,
+    possible_changes,
+    start_state,
+)
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.kinematics.joint_angles import joint_zeros
+from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.check_report import CheckReport, Drift, FoundCause, Status
+from stereoservo.numerics.arrays import FloatArray
+
+ALPHA = 0.003
+"""Probability that a check of an unchanged cell reports any change, over all hypotheses."""
+MAX_CHANGES = 3
+NOISE_MARGIN = 1.2
+"""Residuals, in expected sigmas rms, above which a model is rejected that no change explains."""
+GROSS = 6.0, 12.0
+"""A pixel is left out that differs from its marker's median over the stops by more than so many sigmas, and so many
+times what that marker's other pixels do in that camera."""
+ALONE = 0.3
+"""Share of an image's pixels up to which they are wrong by themselves; where more are, something is wrong there."""
+MIN_MEASUREMENTS = 40
+SEARCHED = 3
+"""Stops over which far joint zeros are searched for."""
+
+
+@dataclass(frozen=True)
+class ModelExamination:
+    """A ``model`` examined with the pixels of a ``check``: the ``hypotheses`` that were tested, the ``explanation``
+    that was found, and the number of isolated outliers ``left_out``.
+    """
+
+    model: CellModel
+    check: TrialData
+    problem: LinearisedProblem
+    hypotheses: list[ModelChange]
+    explanation: ChangeEstimate
+    left_out: int
+
+
+def check_model_holds(
+    model: CellModel,
+    check: TrialData,
+    *,
+    made_from: TrialData | None = None,
+    limit_px: float = 0.25,
+    created: str = "",
+) -> CheckReport:
+    """Report of a model against the pixels of a check motion: `examine_model`, then `make_check_report`.
+
+    A significant change below ``limit_px`` is reported as ``drifting``, above as ``recalibrate``. Raises
+    CalibrationError (``bad_data``, ``too_few_stops``).
+    """
+    return make_check_report(
+        examine_model(model, check, made_from=made_from), limit_px=limit_px, created=created
+    )
+
+
+def examine_model(
+    model: CellModel, check: TrialData, *, made_from: TrialData | None = None
+) -> ModelExamination:
+    """Examination of a model with the pixels of a check motion.
+
+    ``made_from``: the trial data of its calibration, for the uncertainty of a model that carries no covariance.
+    Raises CalibrationError (``bad_data``, ``too_few_stops``).
+    """
+    factor = 1.0
+    if model.statistics is not None and model.statistics.degrees_of_freedom > 0:
+        factor = float(np.sqrt(max(1.0, model.statistics.chi2 / model.statistics.degrees_of_freedom)))
+    problem = linearised_problem(model, check, made_from, factor)
+    if 2 * len(problem.data.camera) < MIN_MEASUREMENTS or len(np.unique(problem.data.stop)) < 3:
+        raise CalibrationError(
+            "too_few_stops",
+            f"the check shows {len(problem.data.camera)} pixels of known markers at "
+            f"{len(np.unique(problem.data.stop))} stops; at least {MIN_MEASUREMENTS // 2} at 3 stops are needed",
+            pixels=len(problem.data.camera),
+        )
+    gross = isolated_outliers(problem)
+    if gross.any():
+        problem = problem.select(~gross)
+    hypotheses = possible_changes(model, problem)
+    found = explain_residuals(problem, hypotheses)
+    if found.changes and (len(found.changes) > 1 or not _explains(problem, found)):
+        lost = estimate_joint_zeros(model, problem, hypotheses)
+        if lost is not None and _schwarz(problem, lost, found) < _schwarz(problem, found, lost):
+            found = lost
+    return ModelExamination(model, check, problem, hypotheses, found, int(gross.sum()))
+
+
+def _explains(problem: LinearisedProblem, found: ChangeEstimate) -> bool:
+    """Whether the residuals that an explanation leaves are noise."""
+    return not is_unexplained(found.chi2, 2 * len(problem.data.camera) - found.x.size, math.log(ALPHA), 0.0)
+
+
+def _schwarz(problem: LinearisedProblem, found: ChangeEstimate, other: ChangeEstimate) -> float:
+    """Penalised chi-square of an explanation, in the noise that the better one of two leaves."""
+    count = 2 * len(problem.data.camera)
+    both = np.array([found.chi2, other.chi2])
+    sizes = np.array([found.x.size, other.x.size], dtype=np.int64)
+    noise = noise_level(both, sizes, np.ones(2, dtype=np.bool_), count)
+    return penalised_chi2(found.chi2, found.x.size, noise, math.log(count))
+
+
+def estimate_joint_zeros(
+    model: CellModel, problem: LinearisedProblem, hypotheses: list[ModelChange]
+) -> ChangeEstimate | None:
+    """Drifts of all joints' zeros estimated at once, insignificant ones left out: an arm that was switched on again, or
+    whose encoders were replaced, may have lost several by far.
+
+    None where the images do not determine the joints, or no drift is significant.
+    """
+    by_name = {cause.subject: cause for cause in hypotheses if cause.kind == "joint"}
+    named = tuple(by_name[name] for name in model.joint_names)
+    found = estimate_changes(problem, named)
+    if not _explains(problem, found):
+        start = _zeros_anywhere(model, problem)
+        if start is None:
+            return None
+        found = estimate_changes(problem, named, start=start)
+    kept = _best_subset(found, float(_thresholds(problem, hypotheses).ratios[1]))
+    return estimate_changes(problem, tuple(named[k] for k in kept), start=found.x[kept]) if kept else None
+
+
+def _best_subset(found: ChangeEstimate, price: float) -> list[int]:
+    """Indices of the parameters that explain best when each one costs ``price``, to first order around an estimate; all
+    subsets are compared, since joints with similar axes replace each other one at a time.
+    """
+    information, q = found.information, found.x.size
+    best: tuple[float, list[int]] = (np.inf, [])
+    for kept in (list(s) for size in range(q + 1) for s in combinations(range(q), size)):
+        idle = [k for k in range(q) if k not in kept]
+        across = information[np.ix_(kept, idle)]
+        inner = np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True)
+        lost = information[np.ix_(idle, idle)] - across.T @ inner @ across
+        best = min(best, (float(found.x[idle] @ lost @ found.x[idle]) + price * len(kept), kept))
+    return best[1]
+
+
+def _zeros_anywhere(model: CellModel, problem: LinearisedProblem) -> FloatArray | None:
+    """Drifts (n,) of all joints' zeros by a search without a start (4.45) over a few stops; None where those do not
+    determine them.
+    """
+    data = problem.data
+    stops = np.unique(data.stop)[:SEARCHED]
+    pixels = np.full((len(data.offsets), len(model.cameras), len(model.marker_ids), 2), np.nan)
+    sigmas = np.full(pixels.shape[:3], np.nan)
+    where = data.stop, data.camera, data.marker
+    pixels[where], sigmas[where] = data.pixels, data.sigmas
+    encoders = np.empty_like(data.offsets)
+    encoders[:, list(problem.order)] = data.offsets
+    encoders += model.zero
+    seen = seen_chain(model)
+    try:
+        return joint_zeros(seen, model.marker_points, pixels[stops], sigmas[stops], encoders[stops]).offset
+    except JointAnglesError:
+        return None
+
+
+def _thresholds(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> Thresholds:
+    return check_thresholds(ALPHA, len(hypotheses), 2 * len(problem.data.camera))
+
+
+def explain_residuals(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> ChangeEstimate:
+    """The changes that explain the pixels, the most significant first; none where none is significant.
+
+    One after the other, each beside those found before, by the decision of `hypothesis_test`: Schwarz's penalty keeps a
+    drifted joint from being taken for a moved camera, which could do the same and more.
+    """
+    found = estimate_changes(problem, ())
+    thresholds = _thresholds(problem, hypotheses)
+    while len(found.changes) < MAX_CHANGES:
+        more = _with_one_more(
+            problem, found, [cause for cause in hypotheses if cause not in found.changes], thresholds
+        )
+        if more is None:
+            break
+        found = more
+    return found
+
+
+def _with_one_more(
+    problem: LinearisedProblem, found: ChangeEstimate, others: list[ModelChange], thresholds: Thresholds
+) -> ChangeEstimate | None:
+    """The estimate with that one of ``others`` added which explains best; None where none is significant."""
+    count = 2 * len(problem.data.camera)
+    penalty = math.log(count)
+    sizes = np.array([cause.size for cause in others], dtype=np.int64)
+    gains = np.array(
+        [first_order_gain(problem, cause, found.left) - cause.size * penalty for cause in others]
+    )
+    candidates = np.zeros(len(others), dtype=np.bool_)
+    select_candidates(gains, sizes, candidates)
+    estimates = {
+        int(h): estimate_changes(problem, (*found.changes, others[h])) for h in np.flatnonzero(candidates)
+    }
+    chi2 = np.array([estimates[h].chi2 if h in estimates else np.inf for h in range(len(others))])
+    noise = noise_level(chi2, sizes, candidates, count - found.x.size)
+    best, _ = two_best(
+        found.chi2, chi2, sizes, np.zeros(len(others)), candidates, noise, penalty, thresholds.ratios,
+        thresholds.least_px,
+    )  # fmt: skip
+    return estimates.get(best)
+
+
+def isolated_outliers(problem: LinearisedProblem) -> npt.NDArray[np.bool_]:
+    """Mask (k,) of isolated outliers: pixels far from where the same marker is seen at the other stops.
+
+    Whatever moved in the cell shows in a marker's pixels at all stops alike, or changes from stop to stop. What shows
+    in many markers of one image, as joints in a wrong order do, is no wrong pixel.
+    """
+    here = problem.residuals_at(start_state(problem)).reshape(-1, 2)
+    gross = np.zeros(len(here), dtype=bool)
+    series = problem.data.camera * len(problem.rig.points) + problem.data.marker
+    for one in np.unique(series):
+        mine = np.flatnonzero(series == one)
+        if len(mine) < 4:
+            continue
+        away = np.linalg.norm(here[mine] - np.median(here[mine], axis=0), axis=1)
+        gross[mine] = away > GROSS[0] + GROSS[1] * np.median(away)
+    images = problem.data.camera * len(problem.data.offsets) + problem.data.stop
+    share = np.bincount(images, gross) / np.maximum(np.bincount(images), 1)
+    gross &= share[images] <= ALONE
+    return gross
+
+
+def make_check_report(
+    examined: ModelExamination, *, limit_px: float = 0.25, created: str = ""
+) -> CheckReport:
+    """Report of an examination; ``limit_px``: tolerable change of the pixels [px]."""
+    model, check, problem, found = examined.model, examined.check, examined.problem, examined.explanation
+    here = problem.residuals_at(start_state(problem))
+    chi2 = float(here @ problem.whitened(here))
+    count = here.size
+    squares = (here.reshape(-1, 2) ** 2).sum(axis=1) / 2.0
+    # The model's own uncertainty widens what is expected of a pixel.
+    expected = 1.0 + _widening(problem)
+    named = [_found_cause(model, problem, found, i) for i in range(len(found.changes))]
+    freedom = max(1, count - found.x.size)
+    left = float(np.sqrt(found.chi2 / freedom))
+    if is_unexplained(found.chi2, freedom, math.log(ALPHA), NOISE_MARGIN**2 * freedom):
+        named.append(_unexplained(model, problem, found, left, bool(found.changes)))
+    status: Status = "holds"
+    if named:
+        serious = any(cause.effect_px > limit_px or cause.kind == "unexplained" for cause in named)
+        status = "recalibrate" if serious else "drifting"
+    sigmas = float(np.sqrt(chi2 / count))
+
+    def rms(mine: npt.NDArray[np.bool_]) -> float:
+        return float(np.sqrt((squares / expected)[mine].mean())) if mine.any() else 0.0
+
+    offsets = check.positions - np.median(check.positions, axis=0)
+    away = np.abs(offsets) > 0.2 * np.abs(offsets).max(axis=0)
+    return CheckReport(
+        status=status,
+        message=_message(status, named, sigmas, chi2, count, problem, limit_px),
+        model_epoch=model.epoch,
+        stops=len(np.unique(problem.data.stop)),
+        measurements=count,
+        chi2=chi2,
+        explained_chi2=found.chi2,
+        sigmas=sigmas,
+        rms_px=float(np.sqrt((squares * problem.data.sigmas**2).mean())),
+        limit_px=limit_px,
+        per_joint={name: rms(away[problem.data.stop, j]) for j, name in enumerate(model.joint_names)},
+        per_camera={camera.name: rms(problem.data.camera == c) for c, camera in enumerate(model.cameras)},
+        per_marker={str(marker): rms(problem.data.marker == k) for k, marker in enumerate(model.marker_ids)},
+        causes=tuple(named),
+        drifts=tuple(_drift(problem, cause) for cause in examined.hypotheses if cause.kind != "marker"),
+        left_out=examined.left_out,
+        created=created,
+    )
+
+
+def _widening(problem: LinearisedProblem) -> FloatArray:
+    """Variance (k,) that the model's uncertainty adds to each pixel, in units of the pixel's own."""
+    if not problem.uncertainty.shape[1]:
+        return np.zeros(len(problem.data.camera))
+    inner = np.eye(problem.uncertainty.shape[1]) - problem.uncertainty.T @ problem.uncertainty
+    rows = np.linalg.solve(np.linalg.cholesky(inner), problem.uncertainty.T)
+    found: FloatArray = (rows**2).sum(axis=0).reshape(-1, 2).mean(axis=1)
+    return found
+
+
+def _drift(problem: LinearisedProblem, cause: ModelChange) -> Drift:
+    alone = estimate_changes(problem, (cause,))
+    upper = alone.information[np.triu_indices(cause.size)]
+    return Drift(
+        cause.kind, cause.subject, _short(alone.x), _short(upper), float(f"{alone.effects_px[0]:.6g}")
+    )
+
+
+def _short(values: FloatArray) -> tuple[float, ...]:
+    return tuple(float(f"{value:.8g}") for value in values)
+
+
+def _found_cause(model: CellModel, problem: LinearisedProblem, found: ChangeEstimate, i: int) -> FoundCause:
+    cause = found.changes[i]
+    at = sum(other.size for other in found.changes[:i])
+    x = found.x[at : at + cause.size]
+    covariance = np.linalg.pinv(found.information)[at : at + cause.size, at : at + cause.size]
+    others = tuple(other for other in found.changes if other is not cause)
+    ratio = estimate_changes(problem, others).chi2 - found.chi2
+    value = deviation = None
+    if cause.kind == "joint":
+        value, deviation = float(x[0]), float(np.sqrt(covariance[0, 0]))
+    elif cause.kind in ("cameras", "camera", "body") and cause.size == 6:
+        value = float(np.linalg.norm(x[:3]))
+        deviation = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0))
+    effect = found.effects_px[i]
+    text = _SENTENCES[cause.kind](model, cause.subject, value, deviation)
+    return FoundCause(
+        cause.kind, cause.subject, ratio, cause.size, effect, f"{text}, {effect:.3g} px rms in the images", value,
+        deviation,
+    )  # fmt: skip
+
+
+def _turned(value: float | None, deviation: float | None) -> str:
+    if value is None or deviation is None:
+        return ""
+    return f" (turned {np.degrees(value):.3g}° ± {np.degrees(deviation):.2g}°, and shifted)"
+
+
+def _joint_sentence(model: CellModel, subject: str, value: float | None, deviation: float | None) -> str:
+    j = model.joint_names.index(subject)
+    amount = f"{value:+.5g} m ± {deviation:.2g} m"
+    if model.joint_kinds[j] == "revolute" and value is not None and deviation is not None:
+        amount = f"{np.degrees(value):+.4g}° ± {np.degrees(deviation):.2g}°"
+    ends = {0: "what the arm stands on", len(model.joint_names) - 1: "what its flange carries"}
+    also = f", or {ends[j]} turned about its axis" if j in ends else ""
+    return f"zero of joint {subject} drifted by {amount}{also}"
+
+
+_SENTENCES: dict[str, Callable[[CellModel, str, float | None, float | None], str]] = {
+    "camera": lambda model, subject, value, deviation: f"camera {subject} moved{_turned(value, deviation)}",
+    "cameras": lambda model, subject, value, deviation: (
+        f"the cameras moved together, or the arm's base did{_turned(value, deviation)}"
+        if not model.tip_first
+        else f"the cameras moved together on the flange{_turned(value, deviation)}"
+    ),
+    "body": lambda model, subject, value, deviation: (
+        f"the marker body moved on the flange{_turned(value, deviation)}"
+        if not model.tip_first
+        else f"the marker body, or the arm's base, moved{_turned(value, deviation)}"
+    ),
+    "marker": lambda model, subject, value, deviation: f"marker {subject} slipped",
+    "joint": _joint_sentence,
+}
+
+
+def _unexplained(
+    model: CellModel, problem: LinearisedProblem, found: ChangeEstimate, left: float, also: bool
+) -> FoundCause:
+    squares = (found.left.reshape(-1, 2) ** 2).sum(axis=1) / 2.0
+    by_camera = [float(np.sqrt(squares[problem.data.camera == c].mean())) for c in range(len(model.cameras))]
+    by_marker = {
+        marker: float(np.sqrt(squares[problem.data.marker == k].mean()))
+        for k, marker in enumerate(model.marker_ids)
+        if (problem.data.marker == k).any()
+    }
+    by_stop = {
+        int(s): float(np.sqrt(squares[problem.data.stop == s].mean())) for s in np.unique(problem.data.stop)
+    }
+    worst = max(by_marker, key=lambda marker: by_marker[marker])
+    stop = max(by_stop, key=lambda s: by_stop[s])
+    c = int(np.argmax(by_camera))
+    rms_px = float(np.sqrt((squares * problem.data.sigmas**2).mean()))
+    what = "the rest is" if also else "residuals are"
+    return FoundCause(
+        "unexplained", model.cameras[c].name, found.chi2, found.left.size - found.x.size, rms_px,
+        f"{what} {left:.3g} times the expected noise and no single cause explains it: most in camera "
+        f"{model.cameras[c].name} ({by_camera[c]:.3g} times), at marker {worst} ({by_marker[worst]:.3g} times) and "
+        f"{_where(model, problem, stop)} ({by_stop[stop]:.3g} times). Noise of the images (light, focus, dirt), play "
+        "in a joint, joints listed in another order than they follow each other, or several changes at once",
+    )  # fmt: skip
+
+
+def _where(model: CellModel, problem: LinearisedProblem, stop: int) -> str:
+    """Words for a stop: the joints that are away from the base there."""
+    offsets = problem.data.offsets - np.median(problem.data.offsets, axis=0)
+    away = np.abs(offsets[stop]) > 0.2 * np.abs(offsets).max(axis=0)
+    names = sorted(model.joint_names[problem.order[k]] for k in np.flatnonzero(away))
+    return f"with {' and '.join(names)} displaced" if names else "at the base"
+
+
+def _message(
+    status: Status,
+    named: list[FoundCause],
+    sigmas: float,
+    chi2: float,
+    count: int,
+    problem: LinearisedProblem,
+    limit_px: float,
+) -> str:
+    low, high = (float(chi2_distribution.ppf(tail, count)) for tail in (0.0005, 0.9995))
+    said = (
+        f"residuals are {sigmas:.3g} times the expected noise over {count} measurements (chi-square {chi2:.0f}; "
+        f"{low:.0f} to {high:.0f} expected)"
+    )
+    because = "; ".join(cause.message for cause in named)
+    if status == "holds":
+        return f"model holds: {said}"
+    if status == "drifting":
+        return f"model holds, but it drifts: {because}; below the limit of {limit_px:g} px. {said[0].upper()}{said[1:]}"
+    return f"recalibrate because {because}. {said[0].upper()}{said[1:]}"

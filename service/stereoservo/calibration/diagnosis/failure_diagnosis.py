@@ -1,0 +1,250 @@
+"""Diagnosis of a failed calibration: the cause where it can be identified, instead of the stage at which the fit
+failed.
+
+Each cause is a correction of the trials: with the views of some stops exchanged back, two ids exchanged, an angle
+divided by a factor, the fit must succeed, or the cause is not reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.diagnosis.epipolar_faults import (
+    exchanged_ids,
+    plane_or_baseline,
+    views_unrelated,
+)
+from stereoservo.calibration.diagnosis.input_consistency import (
+    SUSPICIOUS_OUTLIERS,
+    residual_trials,
+    scale_error,
+    scaled_positions,
+    underestimated_noise,
+)
+from stereoservo.calibration.diagnosis.input_corrections import (
+    Refit,
+    exchange_hypotheses,
+    fit_of_correction,
+    ids_exchanged,
+    kind_hypotheses,
+    order_hypotheses,
+    pinhole_reconstruction,
+    solution_of,
+)
+from stereoservo.calibration.diagnosis.joint_scales import prismatic_ratios
+from stereoservo.calibration.diagnosis.marker_tracks import find_step, path_noise, paths_are_smooth
+from stereoservo.calibration.diagnosis.outlier_causes import (
+    camera_moved,
+    explain_outliers,
+    marker_slipped,
+    moved_together,
+    predictions,
+)
+from stereoservo.calibration.single_joint_fit import MIN_SHOWN
+from stereoservo.calibration.stratum_selection import FitOptions
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.geometry.homogeneous import GeometryError
+
+PLAIN = frozenset(
+    {
+        "bad_data",
+        "too_few_cameras",
+        "mixed_mounts",
+        "joint_did_not_move",
+        "joint_without_effect",
+    }
+)
+"""Codes that name their cause themselves."""
+MISFITS = frozenset(
+    {"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"}
+)
+"""Codes of data that contradict themselves: the misfit may show why."""
+LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
+"""Shares of outliers with which a fit serves to explain them."""
+
+
+def diagnose_failure(
+    trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
+) -> CalibrationError:
+    """The error that names the cause of ``error``, or ``error`` with what is possible.
+
+    ``refit`` fits trial data again. Tries hypotheses until one makes the data fit; costs some fits.
+    """
+    if error.code in PLAIN:
+        return error
+    if error.code == "views_degenerate" and "rms_px" in error.data:
+        return plane_or_baseline(trials, error)
+    try:
+        named = _named(trials, refit, options)
+    except (GeometryError, np.linalg.LinAlgError):
+        named = None  # data on which the search for a cause breaks down, too: the first error is returned
+    if named is not None and named.code == "noise_understated":
+        # What was measured stays worth reading: the residual of each joint.
+        return CalibrationError(named.code, named.message, **{**error.data, **named.data})
+    if named is not None:
+        return named
+    if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
+        return _contradicting(trials, error)
+    return _explained(trials, error, refit, options) if error.code in MISFITS else error
+
+
+def _named(
+    trials: TrialData, refit: Refit, options: FitOptions, left: TrialData | None = None
+) -> CalibrationError | None:
+    """The error of the first cause that holds, cheap ones first. ``left``: what a model leaves of the trials."""
+    for hypothesis in exchange_hypotheses(trials):
+        if fit_of_correction(hypothesis.trials, refit, options) is not None:
+            return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
+    stepped = _stepped(trials if left is None else left)
+    if stepped is not None:
+        return stepped
+    noisier = underestimated_noise(trials, refit, options)
+    if noisier is not None:
+        return noisier
+    if paths_are_smooth(trials):
+        noise = np.maximum(path_noise(trials), 1.0)
+        noisy = msgspec.structs.replace(trials, sigmas=trials.sigmas * noise[:, None])
+        for k in range(1, len(trials.cameras)):
+            if views_unrelated(noisy, k):
+                return _unrelated(trials, k)
+    try:
+        views = pinhole_reconstruction(trials)
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+        return None  # without cameras no joint can be looked at
+    for hypothesis in kind_hypotheses(trials, views):
+        if fit_of_correction(hypothesis.trials, refit, options) is not None:
+            return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
+    scaled = scaled_positions(trials, views, refit, options)
+    if scaled is not None:
+        return scaled
+    for hypothesis in order_hypotheses(trials, refit, options):
+        if fit_of_correction(hypothesis.trials, refit, options) is not None:
+            return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
+    return None
+
+
+def _stepped(trials: TrialData) -> CalibrationError | None:
+    """The error of a step in the markers' paths, if there is one."""
+    step = find_step(trials)
+    if step is None:
+        return None
+    if len(step.cameras) < len(trials.cameras):
+        return camera_moved(trials, step.cameras[0], step.stop)
+    if len(step.markers) < len(trials.marker_ids):
+        return marker_slipped(trials.marker_ids[step.markers[0]], step.stop)
+    return moved_together(step.stop)
+
+
+def _explained(
+    trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
+) -> CalibrationError:
+    """The error with what the outliers of a lenient fit have in common, or with what is possible."""
+    lenient = replace(options, max_outliers=LENIENT_OUTLIERS, max_trial_outliers=LENIENT_TRIAL_OUTLIERS)
+    try:
+        result = refit(trials, lenient)
+        notes = explain_outliers(trials, result)
+    except CalibrationError as other:
+        if other.code in ("camera_moved", "marker_slipped", "moved_together", "markers_disagree"):
+            return other
+        notes = ()
+    except (GeometryError, np.linalg.LinAlgError):
+        notes = ()
+    if notes:
+        return CalibrationError(
+            error.code, f"{error.message}. Found: {'; '.join(notes)}", **error.data, causes=list(notes)
+        )
+    return CalibrationError(
+        error.code,
+        f"{error.message}. Not told apart: positions reported wrongly or at another time than the images, play, "
+        "a camera or marker that moved more than once, many wrong detections",
+        **error.data,
+    )
+
+
+def _unrelated(trials: TrialData, k: int) -> CalibrationError:
+    names = [trials.cameras[0].name, trials.cameras[k].name]
+    return CalibrationError(
+        "views_unrelated",
+        f"cameras {names[0]!r} and {names[1]!r} agree on no epipolar geometry, not even within single trials: they do "
+        "not see the same markers at the same time. Do they look at two arms, are ids mixed up, are images late?",
+        cameras=names,
+    )
+
+
+def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationError:
+    """The error of a joint whose stops are lost because cameras contradict each other, not because they see nothing."""
+    own = trials.trials == trials.joint_names.index(error.data["joint"])
+    seen = int(((trials.visible[:, own].sum(axis=0) >= 2).sum(axis=1) >= MIN_SHOWN).sum())
+    if seen < error.data["minimum"]:
+        return error
+    return CalibrationError(
+        "views_unrelated",
+        f"{error.message}. At {seen} stops two cameras do see {MIN_SHOWN} markers or more, but they fit no epipolar "
+        "geometry with the rest: are images of one camera late, are ids mixed up, did a camera move more than once?",
+        **error.data,
+        markers_seen=seen,
+    )
+
+
+def review_notes(
+    trials: TrialData, result: CalibrationFit, refit: Refit, options: FitOptions
+) -> tuple[str, ...]:
+    """What is to be said of a fit that succeeded: its outliers' causes, scales of prismatic joints that disagree.
+
+    Raises CalibrationError where the model is of a cell that is no more (a camera or marker moved), where two ids are
+    exchanged throughout, or where revolute joints report wrong scales.
+    """
+    statistics = result.model.statistics
+    assert statistics is not None
+    outliers = predictions(trials, result).outliers
+    if result.report.markers_left_out or (outliers.mean(axis=1) > 0.5).any():
+        for k in range(1, len(trials.cameras)):
+            pair = exchanged_ids(trials, k)
+            if pair is not None:
+                found = ids_exchanged(trials, k, pair)
+                raise CalibrationError(found.code, found.message, **found.data)
+    notes = list(explain_outliers(trials, result))
+    if not statistics.chi2_ok:
+        suspicious = float(outliers.mean()) > SUSPICIOUS_OUTLIERS
+        left = residual_trials(trials, result)
+        named = _named(trials, refit, options, left) if suspicious else _stepped(left)
+        if named is not None:
+            raise named
+    nearly = not statistics.chi2_ok or any("follow" in note for note in result.report.notes)
+    # Distortion that was to be left out bends the tracks of revolute joints as a wrong scale would.
+    bent = result.report.lens.model == "none" and result.report.lens.chi2 > result.report.lens.limit
+    if nearly and not bent:
+        wrong = scale_error(trials, trials, result, np.ones(len(trials.joint_names)))
+        if wrong is not None:
+            raise wrong
+    if trials.joint_kinds.count("prismatic") > 1:
+        for ratio in prismatic_ratios(result, solution_of(trials, result)):
+            if ratio.wrong:
+                first = trials.joint_names[trials.joint_kinds.index("prismatic")]
+                notes.append(
+                    f"joint {trials.joint_names[ratio.joint]!r} reports {ratio.factor:.5g} ± {ratio.deviation:.1g} "
+                    f"times what joint {first!r} does for the same way: check the drives' scales. The model absorbs it"
+                )
+    return tuple(notes)
+
+
+def untested(trials: TrialData) -> tuple[str, ...]:
+    """What the trials do not determine: the order of joints that only ever move alone, from one configuration."""
+    n = len(trials.joint_names)
+    free = bool((trials.trials < 0).any())
+    bases = [
+        np.median(trials.positions[trials.trials == j], axis=0)
+        for j in range(n)
+        if (trials.trials == j).any()
+    ]
+    moved = bool(bases) and float(np.ptp(np.array(bases), axis=0).max(initial=0.0)) > 0.02
+    if n < 2 or free or moved:
+        return ()
+    return (
+        "the order of the joints and the mount of the cameras: they move one at a time from one configuration, so the "
+        "model takes what the cell states. Free poses, or trials from different configurations, would test it",
+    )

@@ -1,0 +1,226 @@
+"""Scale factors of joint readings: of a revolute joint from the images, of a prismatic one relative to another.
+
+A revolute joint that reports its angle times a factor (counts, degrees, a wrong gear) is no projective rotation by the
+reported positions: the spectrum of its generator is ±i times the factor. The factor is estimated first from the
+joint's own trial, then with the whole model. Signs and the scale of all prismatic joints together are gauge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from stereoservo.calibration.bundle_adjustment import Solution, jacobian, solve
+from stereoservo.calibration.bundle_statistics import variance_factor
+from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.rig_model import Measurements, RigModel, residuals
+from stereoservo.calibration.single_joint_fit import (
+    VirtualObservations,
+    best_single_joint,
+    trial_stops,
+    virtual_markers,
+)
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
+from stereoservo.geometry.cameras import NOMINAL_FOCAL
+from stereoservo.numerics.arrays import FloatArray
+
+COARSE = tuple(float(2.0 ** (k / 4)) for k in range(-5, 6))
+"""Factors about the rigid estimate that a search begins with: nominal cameras misjudge angles."""
+WORTH = 40.0
+"""Chi-square by which a factor must improve a joint's own trial."""
+ABOVE_FLOOR = 1.25
+"""How far above the residuals of the other joints' trials one may stay with its factor."""
+SIGNIFICANT = 5.0
+"""Deviations from 1 at which a factor is one."""
+LEAST_FACTOR = 2e-3
+"""Relative error of a scale below which it is not worth a refusal."""
+
+
+@dataclass(frozen=True)
+class JointScaleEstimate:
+    """Reported over true motion of a joint, and its standard deviation."""
+
+    joint: int
+    factor: float
+    deviation: float
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the factor is not 1, by its own deviation."""
+        off = abs(self.factor - 1.0)
+        return off > SIGNIFICANT * self.deviation and off > LEAST_FACTOR
+
+
+def trial_scales(
+    trials: TrialData, cameras: FloatArray, points: FloatArray, usable: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """Factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where the trial
+    shows no other, for prismatic joints, where the trial is of no use, and where it does not reach with its factor
+    what the other joints' trials do: something else is wrong then.
+    """
+    factors, residual = np.ones(len(trials.joint_names)), np.full(len(trials.joint_names), np.nan)
+    for joint, kind in enumerate(trials.joint_kinds):
+        try:
+            stops, groups, base = trial_stops(trials, points, joint)
+        except CalibrationError:
+            continue  # too few stops to estimate a scale
+        sights = virtual_markers(trials, points, usable, stops, groups)
+        way = trials.positions[stops, joint] - base[joint]
+        if kind == "revolute":
+            factors[joint], residual[joint] = _best_factor(cameras, sights, way)
+        else:
+            residual[joint] = best_single_joint(kind, cameras, sights, way)[1]
+    known = np.isfinite(residual)
+    if known.any():
+        factors[known & (residual > ABOVE_FLOOR * np.median(residual[known]))] = 1.0
+    return factors
+
+
+def with_scales_removed(trials: TrialData, factors: FloatArray) -> TrialData:
+    """The trials with positions divided by ``factors`` (n,) about their medians."""
+    middle = np.median(trials.positions, axis=0)
+    return msgspec.structs.replace(trials, positions=middle + (trials.positions - middle) / factors)
+
+
+def _best_factor(
+    cameras: FloatArray, sights: VirtualObservations, reported: FloatArray
+) -> tuple[float, float]:
+    """The factor of one joint's ``reported`` angles (k,), 1 where none is worth more, and the median residual
+    [sigmas] with it; NaN where no joint fits at all.
+    """
+    rough = _rigid_factor(sights, reported)
+    rigs: dict[float, tuple[RigModel, float]] = {}
+    for factor in {1.0, *(rough * step for step in COARSE)}:
+        # As reported, the joint must have had every chance before another factor is believed.
+        rig, typical = best_single_joint(
+            "revolute", cameras, sights, reported / factor, thorough=factor == 1.0
+        )
+        if rig is not None and np.isfinite(typical):
+            rigs[factor] = rig, typical
+    if not rigs:
+        return 1.0, np.nan
+    start = min(rigs, key=lambda factor: rigs[factor][1])
+    camera, stop, marker = np.nonzero(sights.usable)
+    noise = max(1.0, min(typical for _, typical in rigs.values()))
+
+    def solved(log_factor: float, rig: RigModel) -> FloatArray:
+        """Residuals [noise]."""
+        data = Measurements(
+            reported[:, None] / np.exp(log_factor),
+            camera,
+            stop,
+            marker,
+            sights.pixels[sights.usable].reshape(-1, 2),
+            noise * sights.sigmas[sights.usable].ravel(),
+        )
+        return solve(
+            rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, max_evaluations=40
+        ).residuals
+
+    def cost(log_factor: float, rig: RigModel) -> float:
+        return float(8.0 * (np.sqrt(1.0 + solved(log_factor, rig) ** 2 / 4.0) - 1.0).sum())
+
+    log = float(np.log(start))
+    found = minimize_scalar(
+        cost,
+        bounds=(log - 0.25, log + 0.25),
+        args=(rigs[start][0],),
+        method="bounded",
+        options={"xatol": 1e-4, "maxiter": 25},
+    )
+    without = cost(0.0, rigs[1.0][0]) if 1.0 in rigs else np.inf
+    if without - found.fun <= WORTH:
+        return 1.0, rigs[1.0][1]
+    squares = (solved(float(found.x), rigs[start][0]).reshape(-1, 2) ** 2).sum(axis=1)
+    return float(np.exp(found.x)), noise * float(np.sqrt(np.median(squares) / np.log(4.0)))
+
+
+def _rigid_factor(sights: VirtualObservations, reported: FloatArray) -> float:
+    """Reported over turned angle between stops far apart, as if the cameras were nominal ones: coarse."""
+    scale = np.array([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        euclidean = sights.points[..., :3] * scale / sights.points[..., 3:]
+    valid = finite_rows(euclidean)
+    far = np.abs(reported[:, None] - reported[None, :]) > 0.4 * np.ptp(reported)
+    ratios = []
+    for k, n in np.argwhere(np.triu(far)):
+        both = valid[k] & valid[n]
+        if int(both.sum()) < 3:
+            continue
+        before, after = euclidean[k, both], euclidean[n, both]
+        turn, _ = Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))
+        angle = float(turn.magnitude())
+        if angle > 0.0:
+            ratios.append(abs(reported[k] - reported[n]) / angle)
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
+    """Factors of all revolute joints' positions and their deviations, estimated together with everything else.
+
+    One Gauss-Newton step from a converged bundle: exact for factors near 1.
+    """
+    joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
+    if not joints:
+        return ()
+    slope = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), solution.data)
+    step = 1e-5
+    columns = []
+    for joint in joints:
+        ends = []
+        for sign in (-1.0, 1.0):
+            offsets = solution.data.offsets.copy()
+            offsets[:, joint] *= np.exp(-sign * step)
+            ends.append(residuals(solution.rig, replace(solution.data, offsets=offsets)))
+        columns.append((ends[1] - ends[0]) / (2.0 * step))
+    moments = np.stack(columns, axis=1)
+    # What the other parameters can imitate of a factor is theirs.
+    q, _ = np.linalg.qr(slope / solution.sizes)
+    moments = moments - q @ (q.T @ moments)
+    rest = solution.residuals - q @ (q.T @ solution.residuals)
+    information = moments.T @ moments
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-10) / np.outer(size, size)
+    logs = -covariance @ (moments.T @ rest)
+    deviations = np.sqrt(np.diag(covariance) * max(1.0, variance_factor(solution)))
+    return tuple(
+        JointScaleEstimate(joint, float(np.exp(log)), float(np.exp(log) * deviation))
+        for joint, log, deviation in zip(joints, logs, deviations, strict=True)
+    )
+
+
+def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointScaleEstimate, ...]:
+    """Reported motion per length of each prismatic joint over that of the first one, with deviations; () below the
+    metric stratum and with fewer than two.
+
+    One scale for all of them is gauge; their ratios are not, and are 1 where every drive states the truth.
+    """
+    joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "prismatic"]
+    if result.model.stratum != "metric" or len(joints) < 2:
+        return ()
+    lengths = np.linalg.norm(solution.rig.generators[:, :3, 3], axis=1)
+    roots = np.linalg.inv(solution.triangle / solution.sizes) / solution.sizes[:, None]
+    roots = roots * np.sqrt(max(1.0, variance_factor(solution)))
+    starts = np.cumsum([0, *(len(basis) for basis in solution.charts.generators)])
+
+    def log_slope(joint: int) -> FloatArray:
+        """Change of the logarithm of a joint's length with the parameters, in their independent directions."""
+        generator, basis = solution.rig.generators[joint], solution.charts.generators[joint]
+        changes = (basis @ generator - generator @ basis)[:, :3, 3]
+        relative = changes @ generator[:3, 3] / lengths[joint] ** 2
+        return np.asarray(relative @ roots[starts[joint] : starts[joint + 1]])
+
+    first = joints[0]
+    return tuple(
+        JointScaleEstimate(
+            joint,
+            float(lengths[first] / lengths[joint]),
+            float(lengths[first] / lengths[joint] * np.linalg.norm(log_slope(joint) - log_slope(first))),
+        )
+        for joint in joints[1:]
+    )

@@ -1,0 +1,331 @@
+"""Lens models of the cameras: start values, and a test whether the data need radial distortion.
+
+The models are nested: none, or a radial parameter with its centre for each camera. The centre is held by a weak prior:
+a small distortion does not determine it, but fixing it would underestimate the uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import msgspec
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.calibration.bundle_adjustment import Solution
+from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
+from stereoservo.calibration.normal_equations import triangle_of
+from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, full_charts
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
+from stereoservo.geometry.cameras import isotropic_normaliser
+from stereoservo.geometry.distortion import LensEstimate, straight_lens, undistort
+from stereoservo.geometry.fundamental import INLIER_SIGMAS, fundamental_robust, sampson_distances
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.numerics.arrays import FloatArray
+
+FREE_LENS: LensModel = "radial_centre"
+"""The lens model of cameras that distort."""
+LENS_TAIL = 1e-4
+"""Probability with which a pinhole is taken for a distorting lens."""
+
+
+@dataclass(frozen=True)
+class LensTest:
+    """Test of the radial parameters: ``chi2`` of ``freedom`` parameters against zero, and the ``limit`` that
+    pinholes stay below but for ``LENS_TAIL`` of cases.
+    """
+
+    chi2: float
+    freedom: int
+    limit: float
+
+    @property
+    def distorted(self) -> bool:
+        """Whether pinholes are rejected."""
+        return self.chi2 > self.limit
+
+
+def starting_lenses(
+    trials: TrialData, asked: Literal["auto"] | LensModel, priors: Mapping[str, LensEstimate]
+) -> tuple[FloatArray, LensModel]:
+    """Lenses (c, 4) to start from and what of them is free in the first bundle.
+
+    Where ``asked`` leaves it to the data, lenses are free at once if priors are given or the epipolar geometry
+    needs them. Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
+    """
+    names = [camera.name for camera in trials.cameras]
+    unknown = sorted(set(priors) - set(names))
+    if unknown:
+        raise CalibrationError(
+            "bad_data",
+            f"lens priors for {unknown}; the cameras are {names}",
+            key="lens_priors",
+            unknown=unknown,
+        )
+    lenses = straight_lenses(trials)
+    if asked == "none":
+        return lenses, "none"
+    if priors:
+        for c, name in enumerate(names):
+            if name in priors:
+                lenses[c] = priors[name].lens
+        return lenses, FREE_LENS if asked == "auto" else asked
+    lenses = epipolar_lenses(trials)
+    bent = bool(lenses[:, 0].any())
+    return lenses, asked if asked != "auto" else FREE_LENS if bent else "none"
+
+
+def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> LensPriors:
+    """Priors of (k, cu, cv): the given estimates, elsewhere the centre near the image's middle.
+
+    ``CENTRE_SHARE`` of the width is its standard deviation there.
+    """
+    straight = straight_lenses(trials)
+    mean, information = straight[:, :3].copy(), np.zeros((len(straight), 3, 3))
+    for c, camera in enumerate(trials.cameras):
+        if camera.name in priors:
+            mean[c] = priors[camera.name].lens[:3]
+            information[c] = np.linalg.inv(priors[camera.name].covariance)
+        else:
+            information[c, [1, 2], [1, 2]] = 1.0 / (CENTRE_SHARE * camera.width) ** 2
+    return LensPriors(mean, information)
+
+
+def straightened(rig: RigModel, data: Measurements) -> RigModel:
+    """The rig with pinholes, centres where the priors of ``data`` have them."""
+    lenses = rig.lenses.copy()
+    lenses[:, 0] = 0.0
+    if data.lens_priors is not None:
+        lenses[:, 1:3] = data.lens_priors.mean[:, 1:]
+    return replace(rig, lenses=lenses)
+
+
+def lens_test(solution: Solution) -> LensTest:
+    """Chi-square of the radial parameters of all cameras against zero.
+
+    With pinholes the score test: what freeing them would gain, to first order. With free lenses Wald's: the
+    estimates against their covariance, centres fixed, for without a radial parameter a centre explains nothing. Both
+    relative to the noise left, where that is above the stated one.
+    """
+    c = len(solution.rig.lenses)
+    charts = replace(
+        solution.charts, lenses=full_charts(solution.rig, solution.stratum, lenses="radial").lenses
+    )
+    whole = triangle_of(solution.rig, charts, solution.data)
+    own = charts.start(2) + np.arange(c)
+    others = np.setdiff1d(np.arange(charts.size), own)
+    last = np.asarray(np.linalg.qr(whole[:, [*others, *own, charts.size]], mode="r"))[
+        len(others) :, len(others) :
+    ]
+    block = last[:c, :c]
+    scores = last[:c, -1] if solution.lenses == "none" else block @ solution.rig.lenses[:, 0]
+    gain = float(scores @ scores)
+    left = solution.cost - (gain if solution.lenses == "none" else 0.0)
+    factor = max(1.0, left / max(1, solution.rows - charts.size))
+    return LensTest(gain / factor, c, float(chi2_distribution.isf(LENS_TAIL, c)))
+
+
+GRID = (-0.30, -0.24, -0.19, -0.15, -0.12, -0.09, -0.06, -0.03, 0.0, 0.03, 0.06, 0.10, 0.15)
+"""Radial parameters at half the image width that the search begins with."""
+PINHOLE_AGREEMENT = 0.95
+"""Share of matches within 3.29 sigmas of one epipolar geometry at which no lens is searched for."""
+COARSE_PX = 1.5
+"""Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
+MOST_BEND = 0.6
+"""Largest radial parameter of a lens to start from, either way."""
+WORTH_SHARE = 0.03
+"""By how much a lens must raise the share of matches that fit: misfit that it does not cure is not the lens's."""
+CENTRE_SHARE = 0.1
+"""Standard deviation of a lens's centre about the middle of the image, beforehand [image widths]."""
+NORMAL_MEDIAN = 0.6745
+"""Median of the absolute value of a standard normal variable."""
+CENTRE_BOUND = 2.0
+"""Largest offset of a centre in the search, in those standard deviations."""
+START_GAIN = 100.0
+"""Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
+
+
+def straight_lenses(trials: TrialData) -> FloatArray:
+    """Lenses (c, 4) without distortion for the cameras of the trials."""
+    return np.array([straight_lens(camera.width, camera.height) for camera in trials.cameras])
+
+
+def undistorted(trials: TrialData, lenses: FloatArray) -> TrialData:
+    """The trials as pinholes would have seen them; sigmas scale with the area that a pixel covers.
+
+    Pixels that no ideal pixel is imaged to are NaN.
+    """
+    if not lenses[:, 0].any():
+        return trials
+    pixels = np.array([undistort(lens, raw) for lens, raw in zip(lenses, trials.pixels, strict=True)])
+    return msgspec.structs.replace(trials, pixels=pixels, sigmas=trials.sigmas * _stretches(lenses, pixels))
+
+
+def _stretches(lenses: FloatArray, pixels: FloatArray) -> FloatArray:
+    """How much larger than raw pixels ideal ones (c, ..., 2) are: (c, ...); 1 where a pixel is missing."""
+    out = np.empty(pixels.shape[:-1])
+    for lens, ideal, stretch in zip(lenses, pixels, out, strict=True):
+        square = lens[0] * ((ideal - lens[1:3]) ** 2).sum(axis=-1) / lens[3] ** 2
+        # The determinant of distortion_jacobian: (1 + k r²)(1 + 3 k r²).
+        stretch[...] = 1.0 / np.sqrt(np.abs((1.0 + square) * (1.0 + 3.0 * square)))
+    return np.where(np.isfinite(out), out, 1.0)
+
+
+def epipolar_lenses(trials: TrialData) -> FloatArray:
+    """Lenses (c, 4) that the matches of the first camera with each other one need; straight where none is needed.
+
+    A lens is believed where it lowers the robust epipolar cost by far more than chance does (``START_GAIN``).
+    """
+    lenses = straight_lenses(trials)
+    for k in range(1, len(trials.cameras)):
+        match = _matches(trials, k)
+        if match is None or _agreement(*match, lenses[[0, k]]) >= PINHOLE_AGREEMENT:
+            continue
+        # The first camera's lens is settled by the first pair that asks for one.
+        free = (0, 1) if not lenses[0, 0] else (1,)
+        found = _pair_lenses(*match, lenses[[0, k]], free)
+        if found is not None:
+            lenses[[0, k]] = found
+    return lenses
+
+
+def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
+    """Raw matches (2, n, 2) of cameras 0 and k over all stops, and their sigmas (2, n); None where too few."""
+    pixels = trials.pixels[[0, k]].reshape(2, -1, 2)
+    seen = np.asarray(finite_rows(pixels).all(axis=0))
+    if int(seen.sum()) < MIN_MATCHES:
+        return None
+    return pixels[:, seen], trials.sigmas[[0, k]].reshape(2, -1)[:, seen]
+
+
+def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float:
+    """Share of matches that one epipolar geometry fits behind ``lenses``; 1 where they lie on one plane, which
+    determines nothing.
+    """
+    ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
+    known = np.asarray(finite_rows(ideal).all(axis=0))
+    if int(known.sum()) < MIN_MATCHES:
+        return 0.0
+    sigma = float(np.sqrt(np.median((sigmas**2).sum(axis=0)) / 2))
+    try:
+        _, inliers = fundamental_robust(ideal[0, known], ideal[1, known], sigma)
+    except GeometryError as error:
+        return float(error.code == "degenerate")
+    return float(inliers.sum()) / len(known)
+
+
+def _pair_lenses(
+    raw: FloatArray, sigmas: FloatArray, lenses: FloatArray, free: tuple[int, ...]
+) -> FloatArray | None:
+    """Lenses (2, 4) of a pair, those of ``free`` fitted; None where distortion does not explain the misfit."""
+    best, least, F = 0.0, np.inf, None
+    for bend in GRID:
+        tried = lenses.copy()
+        tried[list(free), 0] = bend
+        found = _coarse_fundamental(raw, sigmas, tried)
+        if found is not None and found[1] < least:
+            best, (F, least) = bend, found
+    if F is None:
+        return None
+    started = lenses.copy()
+    started[list(free), 0] = best
+    bent, _, typical = _refined(raw, sigmas, started, F, free, bound=max(least, 1.0))
+    straight = _coarse_fundamental(raw, sigmas, lenses)
+    if straight is None:
+        return bent
+    # Detectors misjudge their noise: what is left beside the lens counts as noise.
+    noise = sigmas * max(1.0, typical)
+    _, cost, _ = _refined(raw, noise, bent, F, (), bound=max(least, 1.0))
+    _, without, _ = _refined(raw, noise, lenses, straight[0], (), bound=max(least, 1.0))
+    if not without - cost > START_GAIN or np.abs(bent[:, 0]).max() > MOST_BEND:
+        return None
+    # Wrong matches stay wrong behind any lens.
+    return bent if _agreement(raw, noise, bent) > _agreement(raw, noise, lenses) + WORTH_SHARE else None
+
+
+def _coarse_fundamental(
+    raw: FloatArray, sigmas: FloatArray, lenses: FloatArray
+) -> tuple[FloatArray, float] | None:
+    """F of undistorted matches and the median of their epipolar distances [sigmas]; None where none is found."""
+    ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
+    known = np.asarray(finite_rows(ideal).all(axis=0))
+    # A parameter at which half of the matches have no ideal pixel is out of the question.
+    if known.mean() < 0.5 or int(known.sum()) < MIN_MATCHES:
+        return None
+    parameters = cv2.UsacParams()
+    parameters.confidence = 0.999
+    parameters.maxIterations = 1000
+    parameters.randomGeneratorState = 20010701
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.threshold = COARSE_PX + INLIER_SIGMAS * float(np.median(sigmas))
+    try:
+        F, _ = cv2.findFundamentalMat(ideal[0, known], ideal[1, known], parameters)
+    except cv2.error:
+        return None  # its search asserts on some hopeless inputs: no F at this grid point
+    if F is None or np.shape(F) != (3, 3) or not np.isfinite(F).all():
+        return None
+    distances = np.full(len(known), np.inf)
+    distances[known] = np.abs(sampson_distances(F, ideal[0, known], ideal[1, known]))
+    scale = np.sqrt(((sigmas * _stretches(lenses, ideal)) ** 2).mean(axis=0))
+    return F, float(np.median(distances / scale))
+
+
+def _refined(
+    raw: FloatArray,
+    sigmas: FloatArray,
+    lenses: FloatArray,
+    F: FloatArray,
+    free: tuple[int, ...],
+    bound: float,
+) -> tuple[FloatArray, float, float]:
+    """Lenses of least robust epipolar cost with F free, centres held by a weak prior, that cost [sigmas²], and the
+    noise [sigmas] by the median distance.
+
+    Two passes: Cauchy's loss at ``bound`` sigmas, to get near from where the grid ends, then at three.
+    """
+    normalisers = [isotropic_normaliser(pixels) for pixels in raw]
+    start = np.linalg.inv(normalisers[1]).T @ F @ np.linalg.inv(normalisers[0])
+    start = start / np.linalg.norm(start)
+    tangent = np.linalg.svd(start.reshape(1, 9))[2][1:].reshape(8, 3, 3)
+    middle = lenses[:, 1:3]
+    freedom = 2.0 * CENTRE_SHARE * lenses[:, 3:4]
+
+    def lenses_at(z: FloatArray) -> FloatArray:
+        moved = lenses.copy()
+        for i, camera in enumerate(free):
+            bend = z[8 + 3 * i : 11 + 3 * i]
+            moved[camera, 0] += bend[0]
+            moved[camera, 1:3] += bend[1:] * freedom[camera]
+        return moved
+
+    def errors(z: FloatArray) -> FloatArray:
+        here = lenses_at(z)
+        ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(here, raw, strict=True)])
+        fundamental = normalisers[1].T @ (start + np.tensordot(z[:8], tangent, 1)) @ normalisers[0]
+        scale = np.sqrt(((sigmas * _stretches(here, ideal)) ** 2).mean(axis=0))
+        distances = sampson_distances(fundamental, *ideal) / scale
+        # Matches without ideal pixels count as far off, not as perfect.
+        held = (here[list(free), 1:3] - middle[list(free)]) / freedom[list(free)]
+        return np.append(np.where(np.isfinite(distances), distances, 1e3), held.ravel())
+
+    z, cost = np.zeros(8 + 3 * len(free)), np.inf
+    # A robust loss forgives a centre far off, so that the prior alone would not hold it.
+    limit = np.array([np.inf] * 8 + [np.inf, CENTRE_BOUND, CENTRE_BOUND] * len(free))
+    for scale in (3.0 * bound, 3.0):
+        fit = least_squares(
+            errors,
+            z,
+            loss="cauchy",
+            f_scale=scale,
+            x_scale="jac",
+            bounds=(-limit, limit),
+            max_nfev=60,
+        )
+        z, cost = fit.x, 2.0 * float(fit.cost)
+    distances = np.abs(errors(z)[: raw.shape[1]])
+    return lenses_at(z), cost, float(np.median(distances)) / NORMAL_MEDIAN

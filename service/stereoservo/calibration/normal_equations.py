@@ -1,0 +1,377 @@
+"""Normal equations of the bundle by blocks, for its steps, and its triangular factor by QR, for its statistics.
+
+A pixel depends on the generators, one camera, one lens and one marker. Rows of the Jacobian are made chunk by chunk, so
+that memory stays bounded and cost grows linearly with the images; markers, which no pixel shares, are eliminated from
+the normal equations by blocks (Schur complement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, partial_products
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+
+Weights = Callable[[FloatArray], FloatArray]
+
+CHUNK = 1024
+"""Measurements whose rows are in memory at once."""
+
+
+@kernel
+def _displacement_derivative(
+    before: FloatArray,
+    after: FloatArray,
+    generator_basis: FloatArray,
+    generator_start: IntArray,
+    stop: int,
+    half: FloatArray,
+    change: FloatArray,
+) -> None:
+    """Derivative ``change`` (4, 4, p) of the displacement at a stop by the generators; ``half`` (4, 4, p) is scratch.
+
+    ``d exp(qĤ) = [L, exp(qĤ)]``: the joints before it on the left, those behind on the right.
+    """
+    change[:] = 0.0
+    for side in range(2):
+        sign = 1.0 - 2.0 * side
+        for j in range(len(generator_start) - 1):
+            low, high = generator_start[j], generator_start[j + 1]
+            B = before[j + side, stop]
+            A = after[j + side, stop]
+            for r in range(4):
+                for t in range(4):
+                    for a in range(low, high):
+                        half[r, t, a] = (
+                            B[r, 0] * generator_basis[0, t, a]
+                            + B[r, 1] * generator_basis[1, t, a]
+                            + B[r, 2] * generator_basis[2, t, a]
+                            + B[r, 3] * generator_basis[3, t, a]
+                        ) * sign
+            for r in range(4):
+                for t in range(4):
+                    for a in range(low, high):
+                        change[r, t, a] += (
+                            half[r, 0, a] * A[0, t]
+                            + half[r, 1, a] * A[1, t]
+                            + half[r, 2, a] * A[2, t]
+                            + half[r, 3, a] * A[3, t]
+                        )
+
+
+@kernel
+def _point_derivative(
+    H: FloatArray, change: FloatArray, M: FloatArray, world: FloatArray, shift: FloatArray
+) -> None:
+    """Point ``M`` (4,) displaced by ``H`` (4, 4) into ``world`` (4,), and its derivative by the generators into
+    ``shift`` (4, p).
+    """
+    for r in range(4):
+        world[r] = H[r, 0] * M[0] + H[r, 1] * M[1] + H[r, 2] * M[2] + H[r, 3] * M[3]
+        for a in range(shift.shape[1]):
+            shift[r, a] = (
+                change[r, 0, a] * M[0]
+                + change[r, 1, a] * M[1]
+                + change[r, 2, a] * M[2]
+                + change[r, 3, a] * M[3]
+            )
+
+
+@kernel
+def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: FloatArray) -> None:
+    """Derivative ``own`` (2, q) of a pixel by the coordinates of its marker along ``basis`` (q, 4); ``outer`` (2, 4) is
+    that by the displaced point.
+    """
+    for a in range(own.shape[1]):
+        D4 = basis[a]
+        for row in range(2):
+            total = 0.0
+            for r in range(4):
+                total += outer[row, r] * (
+                    H[r, 0] * D4[0] + H[r, 1] * D4[1] + H[r, 2] * D4[2] + H[r, 3] * D4[3]
+                )
+            own[row, a] = total
+
+
+@kernel
+def _rows_into(
+    before: FloatArray, after: FloatArray, generator_basis: FloatArray, generator_start: IntArray,
+    cameras: FloatArray, camera_basis: FloatArray, camera_start: IntArray,
+    lenses: FloatArray, lens_basis: FloatArray, lens_start: IntArray,
+    points: FloatArray, point_basis: FloatArray,
+    camera: IntArray, stop: IntArray, marker: IntArray, pixels: FloatArray, sigmas: FloatArray,
+    core: FloatArray, own: FloatArray,
+) -> None:  # fmt: skip
+    """Weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's first.
+
+    ``core`` (2 k, p + 1), zero on entry: derivatives by generators, cameras and lenses, then the residual. ``own``
+    (2 k, 3 or 0): by the coordinates of the measurement's own marker. ``generator_basis`` (4, 4, p), the
+    others with the parameter first.
+    """
+    width = generator_basis.shape[2]
+    lens_at = width + camera_basis.shape[0]
+    residual_at = core.shape[1] - 1
+    half = np.zeros((4, 4, width))
+    change = np.zeros((4, 4, width))  # dH of the stop
+    shift = np.zeros((4, width))  # dH M of the marker there
+    world = np.zeros(4)
+    ray = np.zeros(3)
+    outer = np.zeros((2, 4))
+    last_stop, last_marker = -1, -1
+    for k in range(len(camera)):
+        s, i, c = stop[k], marker[k], camera[k]
+        if s != last_stop:
+            _displacement_derivative(before, after, generator_basis, generator_start, s, half, change)
+        H = after[0, s]
+        if s != last_stop or i != last_marker:
+            _point_derivative(H, change, points[i], world, shift)
+            last_stop, last_marker = s, i
+        P = cameras[c]
+        for r in range(3):
+            ray[r] = P[r, 0] * world[0] + P[r, 1] * world[1] + P[r, 2] * world[2] + P[r, 3] * world[3]
+        u, v = ray[0] / ray[2], ray[1] / ray[2]
+        bend, cu, cv, r0 = lenses[c, 0], lenses[c, 1], lenses[c, 2], lenses[c, 3]
+        du, dv = (u - cu) / r0, (v - cv) / r0
+        square = du * du + dv * dv
+        stretch = 1.0 + bend * square
+        weight = 1.0 / sigmas[k]
+        # ∂raw/∂ideal, in sigmas.
+        Duu = (stretch + 2.0 * bend * du * du) * weight
+        Duv = 2.0 * bend * du * dv * weight
+        Dvv = (stretch + 2.0 * bend * dv * dv) * weight
+        core[2 * k, residual_at] = (u + (u - cu) * bend * square - pixels[k, 0]) * weight
+        core[2 * k + 1, residual_at] = (v + (v - cv) * bend * square - pixels[k, 1]) * weight
+        scale = 1.0 / ray[2]
+        for r in range(4):
+            across, down = (P[0, r] - u * P[2, r]) * scale, (P[1, r] - v * P[2, r]) * scale
+            outer[0, r] = Duu * across + Duv * down
+            outer[1, r] = Duv * across + Dvv * down
+        for row in range(2):
+            for a in range(width):
+                core[2 * k + row, a] = (
+                    outer[row, 0] * shift[0, a]
+                    + outer[row, 1] * shift[1, a]
+                    + outer[row, 2] * shift[2, a]
+                    + outer[row, 3] * shift[3, a]
+                )
+        for a in range(camera_start[c], camera_start[c + 1]):
+            D = camera_basis[a]
+            for r in range(3):
+                ray[r] = D[r, 0] * world[0] + D[r, 1] * world[1] + D[r, 2] * world[2] + D[r, 3] * world[3]
+            across, down = (ray[0] - u * ray[2]) * scale, (ray[1] - v * ray[2]) * scale
+            core[2 * k, width + a] = Duu * across + Duv * down
+            core[2 * k + 1, width + a] = Duv * across + Dvv * down
+        for a in range(lens_start[c], lens_start[c + 1]):
+            dk, dcu, dcv = lens_basis[a, 0], lens_basis[a, 1], lens_basis[a, 2]
+            core[2 * k, lens_at + a] = ((u - cu) * square * dk + dcu) * weight - Duu * dcu - Duv * dcv
+            core[2 * k + 1, lens_at + a] = ((v - cv) * square * dk + dcv) * weight - Duv * dcu - Dvv * dcv
+        _marker_columns(H, point_basis[i], outer, own[2 * k : 2 * k + 2])
+
+
+@kernel
+def _markers_into(
+    core: FloatArray, own: FloatArray, marker: IntArray, cross: FloatArray, square: FloatArray
+) -> None:
+    """Add the markers' blocks: ``cross`` (m, q, p + 1) by ``core`` (2 k, p + 1), ``square`` (m, q, q)."""
+    q, width = own.shape[1], core.shape[1]
+    for row in range(len(core)):
+        i = marker[row // 2]
+        for a in range(q):
+            value = own[row, a]
+            for b in range(q):
+                square[i, a, b] += value * own[row, b]
+            for b in range(width):
+                cross[i, a, b] += value * core[row, b]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Weighted rows of some measurements: ``core`` (2 k, p_core + 1) with the residuals as its last column,
+    ``own`` (2 k, q) by each row's own ``marker`` (k,).
+    """
+
+    core: FloatArray
+    own: FloatArray
+    marker: IntArray
+
+    def dense(self, markers: int) -> FloatArray:
+        """All columns and the residuals, (2 k, p + 1)."""
+        width, q = self.core.shape[1] - 1, self.own.shape[1]
+        out = np.zeros((len(self.core), width + markers * q + 1))
+        out[:, :width] = self.core[:, :-1]
+        out[:, -1] = self.core[:, -1]
+        rows = np.arange(len(out))[:, None]
+        out[rows, width + np.repeat(self.marker, 2)[:, None] * q + np.arange(q)] = self.own
+        return out
+
+
+def by_stop(data: Measurements) -> tuple[Measurements, IntArray]:
+    """The measurements sorted by stop, marker and camera, as rows need them, and their order (k,)."""
+    order: IntArray = np.lexsort((data.camera, data.marker, data.stop))
+    return data.select(order), order
+
+
+def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[slice, Rows]]:
+    """Rows of ``data``, sorted as by :func:`by_stop`, a chunk at a time, and their slice of ``data``."""
+    generator_basis = np.concatenate([np.zeros((0, 4, 4)), *charts.generators])
+    camera_basis = np.concatenate([np.zeros((0, 3, 4)), *charts.cameras])
+    lens_basis = np.concatenate([np.zeros((0, 4)), *charts.lenses])
+    point_basis = np.array(charts.points)
+    width = len(generator_basis) + len(camera_basis) + len(lens_basis)
+    for first in range(0, len(data.camera), CHUNK):
+        here = slice(first, min(first + CHUNK, len(data.camera)))
+        stop = data.stop[here]
+        before, after = partial_products(rig, data.offsets[stop[0] : stop[-1] + 1])
+        core = np.zeros((2 * len(stop), width + 1))
+        own = np.empty((2 * len(stop), point_basis.shape[1]))
+        _rows_into(
+            before,
+            after,
+            np.ascontiguousarray(generator_basis.transpose(1, 2, 0)),
+            _starts(charts.generators),
+            np.ascontiguousarray(rig.cameras),
+            camera_basis,
+            _starts(charts.cameras),
+            np.ascontiguousarray(rig.lenses),
+            lens_basis,
+            _starts(charts.lenses),
+            np.ascontiguousarray(rig.points),
+            point_basis,
+            data.camera[here],
+            stop - stop[0],
+            data.marker[here],
+            data.pixels[here],
+            data.sigmas[here],
+            core,
+            own,
+        )
+        yield here, Rows(core, own, data.marker[here])
+
+
+def _starts(bases: tuple[FloatArray, ...]) -> IntArray:
+    return np.cumsum([0, *(len(basis) for basis in bases)], dtype=np.int64)
+
+
+def prior_rows(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
+    """Rows (r, p + 1) of the lens priors on those lenses that are free; the last column is the residual."""
+    out = np.zeros((0, charts.size + 1))
+    if data.lens_priors is None:
+        return out
+    at = charts.start(2)
+    for lens, basis, mean, information in zip(
+        rig.lenses, charts.lenses, data.lens_priors.mean, data.lens_priors.information, strict=True
+    ):
+        values, vectors = np.linalg.eigh(information)
+        known = values > 0.0
+        root = np.sqrt(values[known])[:, None] * vectors[:, known].T
+        if len(basis) and len(root):
+            rows = np.zeros((len(root), charts.size + 1))
+            rows[:, at : at + len(basis)] = root @ basis[:, :3].T
+            rows[:, -1] = root @ (lens[:3] - mean)
+            out = np.vstack([out, rows])
+        at += len(basis)
+    return out
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """``Jᵀ W J`` and ``Jᵀ W r`` by blocks: ``core`` (p_core + 1, p_core + 1) with the residuals as its last row and
+    column, ``cross`` (m, q, p_core + 1), ``square`` (m, q, q). Columns are of unit length; ``sizes`` (p,) are
+    their lengths before.
+    """
+
+    core: FloatArray
+    cross: FloatArray
+    square: FloatArray
+    sizes: FloatArray
+
+    @property
+    def gradient(self) -> FloatArray:
+        """``Jᵀ W r`` (p,) on unit columns."""
+        return np.concatenate([self.core[:-1, -1], self.cross[:, :, -1].ravel()])
+
+    def step(self, damping: float) -> tuple[FloatArray, float]:
+        """Damped step ``-(Jᵀ W J + λ I)⁻¹ Jᵀ W r`` (p,), not on unit columns, and the decrease it predicts.
+
+        Raises LinAlgError where rounding leaves the matrix indefinite.
+        """
+        m, q, width = self.cross.shape
+        width -= 1
+        matrix = self.core[:-1, :-1] + damping * np.eye(width)
+        right = -self.core[:-1, -1]
+        if q:
+            inverse = np.linalg.inv(np.linalg.cholesky(self.square + damping * np.eye(q)))
+            half = (inverse @ self.cross).reshape(m * q, width + 1)
+            matrix = matrix - half[:, :-1].T @ half[:, :-1]
+            right = right + half[:, :-1].T @ half[:, -1]
+        root = np.linalg.cholesky(matrix)
+        core = np.linalg.solve(root.T, np.linalg.solve(root, right))
+        x = core
+        if q:
+            back = -(half[:, -1] + half[:, :-1] @ core).reshape(m, q, 1)
+            x = np.append(core, inverse.transpose(0, 2, 1) @ back)
+        return x / self.sizes, float(damping * (x @ x) - self.gradient @ x)
+
+
+def normal_equations(
+    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
+) -> NormalEquations:
+    """Accumulate the normal equations of sorted ``data``; ``weights`` of squared residuals (2 k,) for robust
+    losses. Priors of lenses are never weighted down.
+    """
+    width = charts.start(3)
+    core = np.zeros((width + 1, width + 1))
+    q = len(charts.points[0])
+    cross, square = np.zeros((len(rig.points), q, width + 1)), np.zeros((len(rig.points), q, q))
+    for _, rows in chunks(rig, charts, data):
+        here = rows
+        if weights is not None:
+            root = np.sqrt(weights(rows.core[:, -1] ** 2))[:, None]
+            here = Rows(rows.core * root, rows.own * root, rows.marker)
+        core += here.core.T @ here.core
+        _markers_into(here.core, here.own, here.marker, cross, square)
+    prior = prior_rows(rig, charts, data)[:, [*range(width), -1]]
+    core += prior.T @ prior
+    sizes = np.sqrt(np.append(np.diag(core)[:-1], np.diagonal(square, axis1=1, axis2=2)))
+    sizes[sizes == 0.0] = 1.0
+    across, along = np.append(sizes[:width], 1.0), sizes[width:].reshape(len(rig.points), q)
+    return NormalEquations(
+        core / np.outer(across, across),
+        cross / along[:, :, None] / across,
+        square / along[:, :, None] / along[:, None, :],
+        sizes,
+    )
+
+
+def triangle_of(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
+    """Triangle ``R`` (p + 1, p + 1) with ``Rᵀ R = [J r]ᵀ [J r]`` by QR in chunks, priors of lenses included.
+
+    To the accuracy of QR on the whole Jacobian: no product squares its condition.
+    """
+    sorted_data, _ = by_stop(data)
+    p = charts.size
+    R = _triangle(np.vstack([np.zeros((p + 1, p + 1)), prior_rows(rig, charts, data)]))
+    for _, rows in chunks(rig, charts, sorted_data):
+        R = _triangle(np.vstack([R, rows.dense(len(rig.points))]))
+    return R
+
+
+def _triangle(rows: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def leverages(rig: RigModel, charts: Charts, data: Measurements, root: FloatArray) -> FloatArray:
+    """``trace(J_i C J_iᵀ)`` (k,) of each measurement, in its sigmas: its share of the hat matrix's trace.
+
+    ``root`` (p, p): ``C = root rootᵀ`` is the parameters' covariance.
+    """
+    sorted_data, order = by_stop(data)
+    out = np.empty(len(order))
+    for here, rows in chunks(rig, charts, sorted_data):
+        slopes = rows.dense(len(rig.points))[:, :-1] @ root
+        out[order[here]] = (slopes**2).sum(axis=1).reshape(-1, 2).sum(axis=1)
+    return out

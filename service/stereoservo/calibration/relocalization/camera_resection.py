@@ -1,0 +1,265 @@
+"""Camera matrices from known points by robust damped least squares, over classes of permitted changes.
+
+A class of changes is a displacement of one camera, or of several together, that keeps the intrinsics; a change of
+frame, where the stratum has no displacements (2.19); or one whole matrix. Pixels are raw ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from stereoservo.geometry.distortion import distort, distortion_jacobian
+from stereoservo.kinematics.kernels import exp_twist
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+
+ROUNDS = 60
+SETTLED = 1e-4
+"""Length of a step [standard deviations of the parameters] at which a fit has converged."""
+FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e8
+SUBSETS, OF_SUBSET, SUBSET_ROUNDS = 30, 4, 15
+"""Random starts, ids of each and iterations, that are tried where a fit to everything leaves outliers: of 30 % wrong
+ids one in a thousand searches finds no clean start."""
+NOISY, FEW = 4.0, 0.25
+"""Variance of the pixels over the stated one, and share of outliers, at which a search for better starts ends."""
+OUTSTANDING = 25.0
+"""Squared distance, in the noise of the median, above which a pixel stands out: two degrees of freedom."""
+ROBUST_SIGMAS = 3.0
+"""Scale of Cauchy's loss [sigmas]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Correspondences of known points and their raw pixels in a flat list: ``camera`` (k,) index into the fitted
+    cameras, ``ids`` (k,), ``pose`` (k,) of the arm, -1 for static points; ``points`` (k, 4), ``pixels`` (k, 2) and
+    ``covariances`` (k, 2, 2) [px²].
+    """
+
+    camera: IntArray
+    ids: IntArray
+    pose: IntArray
+    points: FloatArray
+    pixels: FloatArray
+    covariances: FloatArray
+
+    def select(self, keep: BoolArray) -> Correspondences:
+        """The views where ``keep`` (k,) holds."""
+        return Correspondences(
+            self.camera[keep],
+            self.ids[keep],
+            self.pose[keep],
+            self.points[keep],
+            self.pixels[keep],
+            self.covariances[keep],
+        )
+
+
+class MatrixChange(Protocol):
+    """A class of permitted changes of camera matrices (c, 3, 4)."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+
+    def directions(self, matrices: FloatArray) -> FloatArray:
+        """Derivative (c, size, 3, 4) of the matrices by the parameters, at 0."""
+
+    def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
+        """The matrices at parameters ``x`` (size,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """All cameras moved by one element of a group: ``P exp(Σ x_k B_k)``, ``algebra`` B (size, 4, 4)."""
+
+    algebra: FloatArray
+
+    @property
+    def size(self) -> int:
+        return len(self.algebra)
+
+    def directions(self, matrices: FloatArray) -> FloatArray:
+        found: FloatArray = matrices[:, None] @ self.algebra[None]
+        return found
+
+    def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
+        motion: FloatArray = exp_twist(np.tensordot(x, self.algebra, axes=1))
+        moved: FloatArray = matrices @ motion
+        return moved
+
+
+@dataclass(frozen=True)
+class FreeMatrix:
+    """One camera's matrix but for its scale: 11 parameters."""
+
+    size: int = 11
+
+    def directions(self, matrices: FloatArray) -> FloatArray:
+        matrix = matrices[0] / np.linalg.norm(matrices[0])
+        rows = np.linalg.svd(matrix.reshape(1, 12))[2][1:]
+        return np.asarray(rows.reshape(1, 11, 3, 4) * np.linalg.norm(matrices[0]))
+
+    def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
+        return np.asarray(matrices + np.tensordot(x, self.directions(matrices)[0], axes=1))
+
+
+def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
+    """Raw pixels (k, 2); NaN behind a camera and beyond its lens."""
+    images = np.einsum("kij,kj->ki", matrices[views.camera], views.points)
+    ahead = images[:, 2] > 0.0
+    ideal = images[:, :2] / np.where(ahead, images[:, 2], np.nan)[:, None]
+    pixels: FloatArray = np.empty_like(ideal)
+    for c, lens in enumerate(lenses):
+        mine = views.camera == c
+        pixels[mine] = ideal[mine] if lens[0] == 0.0 else distort(lens, ideal[mine])
+    return pixels
+
+
+def entry_jacobian(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
+    """Derivative (k, 2, 12) of the raw pixels by the entries of each one's matrix."""
+    images = np.einsum("kij,kj->ki", matrices[views.camera], views.points)
+    ideal = images[:, :2] / images[:, 2:]
+    bend = np.tile(np.eye(2), (len(ideal), 1, 1))
+    for c, lens in enumerate(lenses):
+        mine = views.camera == c
+        if lens[0] != 0.0:
+            bend[mine] = distortion_jacobian(lens, ideal[mine])
+    by_image = np.zeros((len(ideal), 2, 3))
+    by_image[:, 0, 0] = by_image[:, 1, 1] = 1.0
+    by_image[:, :, 2] = -ideal
+    by_image = bend @ by_image / images[:, 2, None, None]
+    found: FloatArray = (by_image[..., None] * views.points[:, None, None, :]).reshape(-1, 2, 12)
+    return found
+
+
+def parameter_jacobian(
+    family: MatrixChange, matrices: FloatArray, lenses: FloatArray, views: Correspondences
+) -> FloatArray:
+    """Derivative (k, 2, size) of the raw pixels by a family's parameters."""
+    directions = family.directions(matrices).reshape(len(matrices), family.size, 12)
+    found: FloatArray = np.einsum(
+        "kia,kga->kig", entry_jacobian(matrices, lenses, views), directions[views.camera], optimize=True
+    )
+    return found
+
+
+def whitening(covariances: FloatArray) -> FloatArray:
+    """``L⁻¹`` (k, 2, 2) of covariances ``L Lᵀ``."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+def fit_matrices(
+    family: MatrixChange,
+    start: FloatArray,
+    lenses: FloatArray,
+    views: Correspondences,
+    *,
+    robust: bool,
+    rounds: int = ROUNDS,
+) -> tuple[FloatArray, float]:
+    """Matrices (c, 3, 4) of least squared residuals, or of least Cauchy loss, from ``start`` on by Levenberg and
+    Marquardt, and that loss; infinite where points lie behind a camera at the start.
+    """
+    roots = whitening(views.covariances)
+    matrices, damping = start, FIRST_DAMPING
+    error = _whitened(matrices, lenses, views, roots)
+    loss = _loss(error, robust)
+    if not np.isfinite(loss):
+        return start, np.inf
+    for _ in range(rounds):
+        weights = _weights(error, robust)
+        J = (roots @ parameter_jacobian(family, matrices, lenses, views)) * weights[:, None, None]
+        rows, right = J.reshape(-1, family.size), (error * weights[:, None]).ravel()
+        sizes = np.linalg.norm(rows, axis=0)
+        sizes = np.where(sizes > 0.0, sizes, 1.0)
+        rows = rows / sizes
+        settled = False
+        while damping < MOST_DAMPING:
+            padded = np.vstack([rows, np.sqrt(damping) * np.eye(family.size)])
+            x = np.linalg.lstsq(padded, -np.append(right, np.zeros(family.size)), rcond=None)[0]
+            tried = family.step(matrices, x / sizes)
+            there = _whitened(tried, lenses, views, roots)
+            least = _loss(there, robust)
+            settled = float(np.linalg.norm(rows @ x)) < SETTLED
+            if least <= loss:
+                matrices, error, loss = tried, there, least
+                damping = max(0.1 * damping, 1e-12)
+                break
+            if settled:
+                break
+            damping = 10.0 * damping
+        if settled or damping >= MOST_DAMPING:
+            break
+    return matrices, loss
+
+
+def fit_with_outliers(
+    family: MatrixChange, starts: list[FloatArray], lenses: FloatArray, views: Correspondences
+) -> tuple[FloatArray, float]:
+    """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids."""
+    best = min(
+        (fit_matrices(family, start, lenses, views, robust=True) for start in starts), key=lambda one: one[1]
+    )
+    roots = whitening(views.covariances)
+    if _clean(_whitened(best[0], lenses, views, roots)):
+        return best
+    for subset in _subsets(views, family):
+        for start in starts:
+            part, _ = fit_matrices(
+                family, start, lenses, views.select(subset), robust=False, rounds=SUBSET_ROUNDS
+            )
+            found = fit_matrices(family, part, lenses, views, robust=True)
+            if found[1] < best[1]:
+                best = found
+        if _settled(_whitened(best[0], lenses, views, roots)):
+            break
+    return best
+
+
+def _clean(error: FloatArray) -> bool:
+    """Whether no pixel of whitened errors (k, 2) exceeds the noise that the median indicates."""
+    squares = (error**2).sum(axis=1)
+    return bool(squares.max() <= OUTSTANDING * max(1.0, float(np.median(squares)) / np.log(4.0)))
+
+
+def _settled(error: FloatArray) -> bool:
+    """Whether most pixels of whitened errors (k, 2) fit in about the noise that is stated: no start does better."""
+    squares = (error**2).sum(axis=1)
+    factor = max(1.0, float(np.median(squares)) / np.log(4.0))
+    return bool(factor < NOISY and (squares > OUTSTANDING * factor).mean() <= FEW)
+
+
+def _subsets(views: Correspondences, family: MatrixChange) -> Iterator[BoolArray]:
+    """Views of a few ids each, enough for the family's parameters; the same ones for the same views."""
+    rng = np.random.default_rng(views.pixels.shape[0])
+    ids = np.unique(views.ids)
+    for _ in range(SUBSETS):
+        order = rng.permutation(ids)
+        for count in range(OF_SUBSET, len(ids)):
+            keep = np.isin(views.ids, order[:count])
+            if 2 * int(keep.sum()) >= family.size + 2:
+                yield keep
+                break
+
+
+def _whitened(
+    matrices: FloatArray, lenses: FloatArray, views: Correspondences, roots: FloatArray
+) -> FloatArray:
+    error: FloatArray = (roots @ (predicted(matrices, lenses, views) - views.pixels)[..., None])[..., 0]
+    return error
+
+
+def _loss(error: FloatArray, robust: bool) -> float:
+    squares = (error**2).sum(axis=1)
+    loss = float((ROBUST_SIGMAS**2 * np.log1p(squares / ROBUST_SIGMAS**2) if robust else squares).sum())
+    return loss if np.isfinite(loss) else np.inf
+
+
+def _weights(error: FloatArray, robust: bool) -> FloatArray:
+    """Roots (k,) of the weights that make least squares of a loss."""
+    if not robust:
+        return np.ones(len(error))
+    return np.asarray(1.0 / np.sqrt(1.0 + (error**2).sum(axis=1) / ROBUST_SIGMAS**2))

@@ -1,0 +1,267 @@
+"""Relocalization: a cell's model with new matrices of cameras that have moved, without calibration of the arm.
+
+Arm and static points of the model are a known rigid structure in its projective frame: at rest poses the joints
+determine where the arm's markers are. A moved camera is resected in that frame (2.19-2.21), in the metric stratum as a
+displacement of the camera it was, ``P' = P D``: its intrinsics stay. Frame, arm and lenses stay as they are; the
+covariance of the model is extended to the new matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.relocalization.camera_group_fit import CameraGroup, facing, relocalize_group
+from stereoservo.calibration.relocalization.camera_resection import (
+    Correspondences,
+    predicted,
+)
+from stereoservo.calibration.relocalization.moved_camera_covariance import (
+    predicted_deviation,
+    with_moved_cameras,
+)
+from stereoservo.calibration.relocalization.relocalization_words import (
+    MovedCamera,
+    OutlierObservation,
+    describe_moved_camera,
+    too_uncertain,
+)
+from stereoservo.calibration.rig_model import RigModel, acting_order, displacements
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+LIMIT_PX = 1.0
+"""Largest standard deviation of a marker's predicted pixel, over the range of the joints, that is taken by default."""
+WORKSPACE = 40
+"""Random joint positions at which predictions are asked for."""
+
+
+class CameraSample(Protocol):
+    """What one camera saw at rest: `stereoservo.core.cycle.Sample` is one.
+
+    ``ids`` (k,), raw ``pixels`` (k, 2) and ``covariances`` (k, 2, 2) of the mean [px²].
+    """
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+
+    @property
+    def ids(self) -> IntArray:
+        """Markers of the arm and static points alike; ids that the model does not know are left out."""
+
+    @property
+    def pixels(self) -> FloatArray:
+        """Means of raw pixels."""
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances of these means."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestPose:
+    """The arm at rest: its ``joints`` (n,) [rad or m], and what the cameras saw meanwhile."""
+
+    joints: FloatArray
+    sights: tuple[CameraSample, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RestObservations:
+    """Everything that was seen at rest since the cameras moved; more poses of the arm are a larger structure."""
+
+    poses: tuple[RestPose, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RelocalizedModel:
+    """A relocalized ``model``, what moved, how well it fits and how well it is known.
+
+    ``predicted_px``: largest standard deviation, an axis, of a marker's predicted pixel in the moved cameras, over the
+    range of the joints, where the camera sees it; the model's own uncertainty included where it states one.
+    """
+
+    model: CellModel
+    cameras: dict[str, MovedCamera]
+    chi2: float
+    degrees_of_freedom: int
+    predicted_px: float
+    outliers: tuple[OutlierObservation, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+
+def relocalize(
+    model: CellModel,
+    sights: RestObservations,
+    moved: tuple[str, ...],
+    *,
+    rigid_rig: bool = False,
+    epoch: int,
+    created: str = "",
+    limit_px: float = LIMIT_PX,
+    workspace: FloatArray | None = None,
+) -> RelocalizedModel:
+    """The model with new matrices of the cameras ``moved``, in the same frame.
+
+    ``rigid_rig``: they moved as one body. ``workspace`` (w, n): joint positions at which predictions must hold, default
+    the range of the calibration's trials. Raises CalibrationError: ``bad_data``, ``too_few_points``,
+    ``points_coplanar``, ``not_explained``, ``too_uncertain``.
+    """
+    which = _indices(model, moved)
+    everything = _views(model, sights, which)
+    offsets = np.array([pose.joints for pose in sights.poses]).reshape(-1, len(model.zero)) - model.zero
+    groups = [which] if rigid_rig and len(which) > 1 else [(c,) for c in which]
+    found: list[CameraGroup] = []
+    for group in groups:
+        mine = np.isin(everything.camera, group)
+        rig = rigid_rig and len(group) > 1
+        found.append(relocalize_group(model, everything.select(mine), offsets, group, rig))
+    matrices = {c: one.matrices[k] for one in found for k, c in enumerate(one.cameras)}
+    cameras = tuple(
+        msgspec.structs.replace(camera, matrix=matrices[c]) if c in matrices else camera
+        for c, camera in enumerate(model.cameras)
+    )
+    new = msgspec.structs.replace(model, epoch=epoch, created=created, cameras=cameras)
+    errors = [one.errors for one in found]
+    new = msgspec.structs.replace(new, covariance=with_moved_cameras(model, errors, matrices))
+    joints = _workspace(model, sights, workspace)
+    predicted_px = predicted_deviation(new, errors, joints, _arm_points(new, joints))
+    if not predicted_px <= limit_px:
+        raise too_uncertain(list(moved), predicted_px, limit_px, len(sights.poses))
+    return RelocalizedModel(
+        new,
+        {
+            model.cameras[c].name: _moved_camera(model, one, k)
+            for one in found
+            for k, c in enumerate(one.cameras)
+        },
+        sum(one.chi2 for one in found),
+        sum(one.degrees_of_freedom for one in found),
+        predicted_px,
+        tuple(outlier for one in found for outlier in one.outliers),
+        tuple(note for one in found for note in one.notes),
+    )
+
+
+def _indices(model: CellModel, moved: tuple[str, ...]) -> tuple[int, ...]:
+    names = [camera.name for camera in model.cameras]
+    wrong = [name for name in moved if name not in names]
+    if wrong or not moved or len(set(moved)) < len(moved):
+        raise CalibrationError(
+            "bad_data",
+            f"cameras {', '.join(moved) or 'none'} are said to have moved; the model has {', '.join(names)}, each "
+            "may be named once",
+            cameras=list(moved),
+        )
+    return tuple(names.index(name) for name in moved)
+
+
+def _views(model: CellModel, sights: RestObservations, which: tuple[int, ...]) -> Correspondences:
+    """Observations of the model's points by the moved cameras; static points are averaged over the poses."""
+    names = {model.cameras[c].name: c for c in which}
+    n = len(model.joint_names)
+    for k, pose in enumerate(sights.poses):
+        if pose.joints.shape != (n,) or not np.isfinite(pose.joints).all():
+            raise CalibrationError(
+                "bad_data", f"pose {k} has joints {pose.joints.tolist()}; {n} finite ones are needed", pose=k
+            )
+    where = _arm_points(model, np.array([pose.joints for pose in sights.poses]).reshape(-1, n))
+    index = {marker: i for i, marker in enumerate(model.marker_ids)}
+    static = {marker: i for i, marker in enumerate(model.scene_ids)}
+    rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]] = []
+    for k, pose in enumerate(sights.poses):
+        for sight in pose.sights:
+            if sight.camera not in names:
+                continue
+            _check_sight(sight, k)
+            for marker, pixel, covariance in zip(sight.ids, sight.pixels, sight.covariances, strict=True):
+                if not (np.isfinite(pixel).all() and np.isfinite(covariance).all()):
+                    continue
+                if int(marker) in index:
+                    point, of_pose = where[k, index[int(marker)]], k
+                elif int(marker) in static:
+                    point, of_pose = model.scene_points[static[int(marker)]], -1
+                else:
+                    continue
+                rows.append((names[sight.camera], int(marker), of_pose, point, pixel, covariance))
+    return _averaged(rows)
+
+
+def _check_sight(sight: CameraSample, pose: int) -> None:
+    k = len(sight.ids)
+    if sight.pixels.shape != (k, 2) or sight.covariances.shape != (k, 2, 2):
+        raise CalibrationError(
+            "bad_data",
+            f"pose {pose}: camera {sight.camera!r} has {k} ids, pixels {sight.pixels.shape} and covariances "
+            f"{sight.covariances.shape}; {(k, 2)} and {(k, 2, 2)} are needed",
+            pose=pose,
+            camera=sight.camera,
+        )
+
+
+def _averaged(rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]) -> Correspondences:
+    """One row for each static point and camera: of several poses the mean, with the covariance of the best."""
+    kept = [row for row in rows if row[2] >= 0]
+    standing: dict[tuple[int, int], list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]] = {}
+    for row in rows:
+        if row[2] < 0:
+            standing.setdefault((row[0], row[1]), []).append(row)
+    for same in standing.values():
+        pixel = np.median([row[4] for row in same], axis=0)
+        least = min((row[5] for row in same), key=lambda covariance: float(np.trace(covariance)))
+        kept.append((*same[0][:4], pixel, least))
+    return Correspondences(
+        np.array([row[0] for row in kept], dtype=np.int64),
+        np.array([row[1] for row in kept], dtype=np.int64),
+        np.array([row[2] for row in kept], dtype=np.int64),
+        np.array([row[3] for row in kept], dtype=np.float64).reshape(-1, 4),
+        np.array([row[4] for row in kept], dtype=np.float64).reshape(-1, 2),
+        np.array([row[5] for row in kept], dtype=np.float64).reshape(-1, 2, 2),
+    )
+
+
+def _arm_points(model: CellModel, joints: FloatArray) -> FloatArray:
+    """The markers (s, m, 4) at joints (s, n)."""
+    order = list(acting_order(model))
+    rig = RigModel(
+        tuple(model.joint_kinds[j] for j in order),
+        model.generators[order],
+        np.array([camera.matrix for camera in model.cameras]),
+        model.marker_points,
+    )
+    found: FloatArray = model.marker_points @ displacements(rig, (joints - model.zero)[:, order]).transpose(
+        0, 2, 1
+    )
+    return found
+
+
+def _workspace(model: CellModel, sights: RestObservations, given: FloatArray | None) -> FloatArray:
+    """Joint positions (w, n): those of the sights, and the trials' range, one joint at a time and all at random."""
+    here = np.array([pose.joints for pose in sights.poses])
+    if given is not None:
+        return np.asarray(np.concatenate([here, given]))
+    ranges = np.ptp(here, axis=0)
+    if model.statistics is not None:
+        by_name = {joint.name: joint.range for joint in model.statistics.joints}
+        ranges = np.array([by_name.get(name, 0.0) for name in model.joint_names])
+    n = len(model.zero)
+    alone = np.concatenate([np.eye(n), -np.eye(n)]) * 0.5 * ranges
+    random = np.random.default_rng(0).uniform(-0.5, 0.5, (WORKSPACE, n)) * ranges
+    return np.asarray(np.concatenate([here, model.zero + alone, model.zero + random]))
+
+
+def _moved_camera(model: CellModel, one: CameraGroup, k: int) -> MovedCamera:
+    camera = model.cameras[one.cameras[k]]
+    mine = one.views.select(one.views.camera == k)
+    mine = replace(mine, camera=np.zeros_like(mine.camera))
+    old, lens = facing(camera.matrix[None], mine), camera.lens[None]
+    way = predicted(facing(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
+    moved_px = float(np.sqrt(np.nanmean((way**2).sum(axis=1))))
+    return describe_moved_camera(
+        model, camera.name, one.how, camera.matrix, one.matrices[k], mine.points, moved_px
+    )

@@ -1,0 +1,299 @@
+"""Model under estimation (5.53, 5.55-5.57): generators, cameras, lenses, markers in any stratum; its residuals.
+
+Joint readings are exact; raw pixels, behind the lens, carry the noise. Parameters are coordinates of the minimal
+charts of :mod:`stereoservo.kinematics.parameterization`, so that the Jacobian has full rank where the data determine
+the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.axes import stratum_frame
+from stereoservo.kinematics.model import CellModel, ModelCovariance, Stratum, check_model, pinhole
+from stereoservo.kinematics.parameterization import (
+    Kind,
+    LensModel,
+    camera_basis,
+    conjugation,
+    exponentials,
+    generator_basis,
+    lens_basis,
+    point_bases,
+)
+from stereoservo.messages.cell_file import Mount
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class RigModel:
+    """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4) to ideal pixels, ``points`` (m, 4)
+    at joint offset 0, ``lenses`` (c, 4) from ideal to raw pixels; empty for pinholes.
+    """
+
+    kinds: tuple[Kind, ...]
+    generators: FloatArray
+    cameras: FloatArray
+    points: FloatArray
+    lenses: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    def __post_init__(self) -> None:
+        if not len(self.lenses):
+            object.__setattr__(self, "lenses", np.tile(pinhole(), (len(self.cameras), 1)))
+
+
+@dataclass(frozen=True)
+class LensPriors:
+    """Prior estimates of the lenses: ``mean`` (c, 3) of (k, cu, cv) and ``information`` (c, 3, 3), the
+    inverse of its covariance, zero where nothing is known.
+    """
+
+    mean: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Raw pixels in a flat list: camera, stop and marker of each (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px].
+
+    ``offsets`` (s, n): joint positions of each stop minus the zero. ``lens_priors`` count as measurements of
+    those lenses that are free.
+    """
+
+    offsets: FloatArray
+    camera: IntArray
+    stop: IntArray
+    marker: IntArray
+    pixels: FloatArray
+    sigmas: FloatArray
+    lens_priors: LensPriors | None = None
+
+    def select(self, keep: npt.NDArray[np.bool_] | IntArray) -> Measurements:
+        """The measurements where ``keep`` (k,) holds, or those of the indices ``keep``."""
+        return replace(
+            self,
+            camera=self.camera[keep],
+            stop=self.stop[keep],
+            marker=self.marker[keep],
+            pixels=self.pixels[keep],
+            sigmas=self.sigmas[keep],
+        )
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Minimal parameterization: directions of each part in the order of their parameters; an empty basis (0, ...) keeps
+    the part fixed.
+    """
+
+    generators: tuple[FloatArray, ...]
+    cameras: tuple[FloatArray, ...]
+    lenses: tuple[FloatArray, ...]
+    points: tuple[FloatArray, ...]
+
+    @property
+    def parts(self) -> tuple[tuple[FloatArray, ...], ...]:
+        """The four parts in the order of their parameters."""
+        return self.generators, self.cameras, self.lenses, self.points
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(len(basis) for part in self.parts for basis in part)
+
+    def start(self, part: int) -> int:
+        """Index of the first parameter of a part: 0 generators, 1 cameras, 2 lenses, 3 points."""
+        return sum(len(basis) for bases in self.parts[:part] for basis in bases)
+
+
+def full_charts(
+    rig: RigModel, stratum: Stratum, *, cameras: bool = True, points: bool = True, lenses: LensModel = "none"
+) -> Charts:
+    """Minimal charts around ``rig``; cameras or points may be kept fixed, ``lenses`` selects their free parameters.
+
+    With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
+    loses the remaining gauge, further ones are free.
+    """
+    none = np.zeros((0, 3, 4))
+    matrices: tuple[FloatArray, ...] = tuple(none for _ in rig.cameras)
+    if cameras:
+        left = camera_basis(rig.cameras[0], "left_metric", stratum) if stratum == "metric" else none
+        matrices = (
+            left,
+            *(
+                camera_basis(matrix, "right" if c == 0 else "other", stratum)
+                for c, matrix in enumerate(rig.cameras[1:])
+            ),
+        )
+    return Charts(
+        tuple(generator_basis(h, kind, stratum) for h, kind in zip(rig.generators, rig.kinds, strict=True)),
+        matrices,
+        tuple(lens_basis(lenses) for _ in rig.lenses),
+        tuple(point_bases(rig.points, stratum) if points else np.zeros((len(rig.points), 0, 4))),
+    )
+
+
+def rig_at(rig: RigModel, charts: Charts, x: FloatArray) -> RigModel:
+    """The rig at chart coordinates ``x``."""
+    at = 0
+    generators: list[FloatArray] = []
+    for generator, basis in zip(rig.generators, charts.generators, strict=True):
+        frame, _ = conjugation(basis, x[at : at + len(basis)])
+        generators.append(frame @ generator @ np.linalg.inv(frame))
+        at += len(basis)
+    linear = []
+    for part, bases in (
+        (rig.cameras, charts.cameras),
+        (rig.lenses, charts.lenses),
+        (rig.points, charts.points),
+    ):
+        values = part.copy()
+        for value, basis in zip(values, bases, strict=True):
+            if len(basis):
+                value += (x[at : at + len(basis)] @ basis.reshape(len(basis), -1)).reshape(value.shape)
+                at += len(basis)
+        linear.append(values)
+    cameras, lenses, points = linear
+    return RigModel(rig.kinds, np.array(generators), cameras, points, lenses)
+
+
+def partial_products(rig: RigModel, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``E_1 … E_j`` and ``E_{j+1} … E_n``, both (n + 1, s, 4, 4), j = 0 … n, at ``offsets`` (s, n) (5.18)."""
+    steps = exponentials(rig.generators, rig.kinds, offsets)
+    s, n = offsets.shape
+    before = np.empty((n + 1, s, 4, 4))
+    after = np.empty((n + 1, s, 4, 4))
+    before[0] = after[n] = np.eye(4)
+    for j in range(n):
+        before[j + 1] = before[j] @ steps[:, j]
+        after[n - 1 - j] = steps[:, n - 1 - j] @ after[n - j]
+    return before, after
+
+
+def displacements(rig: RigModel, offsets: FloatArray) -> FloatArray:
+    """``E_1 … E_n`` (s, 4, 4) at ``offsets`` (s, n) (5.18)."""
+    steps = exponentials(rig.generators, rig.kinds, offsets)
+    product: FloatArray = steps[:, 0]
+    for j in range(1, steps.shape[1]):
+        product = product @ steps[:, j]
+    return product
+
+
+def predicted(rig: RigModel, data: Measurements) -> FloatArray:
+    """Raw pixels (k, 2) of the rig for each measurement (5.56)."""
+    world = rig.points @ displacements(rig, data.offsets).transpose(0, 2, 1)
+    pixels = np.empty((len(data.camera), 2))
+    for c, (matrix, lens) in enumerate(zip(rig.cameras, rig.lenses, strict=True)):
+        mine = np.flatnonzero(data.camera == c)
+        images = world[data.stop[mine], data.marker[mine]] @ matrix.T
+        ideal = images[:, :2] / images[:, 2:]
+        pixels[mine] = ideal if lens[0] == 0.0 else distort(lens, ideal)
+    return pixels
+
+
+def residuals(rig: RigModel, data: Measurements) -> FloatArray:
+    """Weighted residuals (2 k,): prediction minus measurement in sigmas, u and v of each measurement
+    together; without those of lens priors.
+    """
+    return ((predicted(rig, data) - data.pixels) / data.sigmas[:, None]).ravel()
+
+
+def projective_rig(model: CellModel) -> RigModel:
+    """The model in its own projective frame, joints counted from the base."""
+    return _rig(model, np.eye(4))
+
+
+def stratum_rig(model: CellModel) -> RigModel:
+    """The model in the best frame that its stratum has, joints counted from the base; heights 1 but projective."""
+    return _rig(model, stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean))
+
+
+def acting_order(model: CellModel) -> tuple[int, ...]:
+    """Joints in the order in which a rig composes them: with cameras on the tip the tip's joint first."""
+    order = tuple(range(len(model.joint_names)))
+    return order[::-1] if model.tip_first else order
+
+
+def acting_rig(model: CellModel) -> RigModel:
+    """`stratum_rig` with joints in `acting_order`."""
+    rig, order = stratum_rig(model), list(acting_order(model))
+    return RigModel(
+        tuple(rig.kinds[j] for j in order), rig.generators[order], rig.cameras, rig.points, rig.lenses
+    )
+
+
+def _rig(model: CellModel, frame: FloatArray) -> RigModel:
+    back = np.asarray(np.linalg.inv(frame))
+    points = model.marker_points @ frame.T
+    flat = model.stratum == "projective" or bool((frame == np.eye(4)).all())
+    return RigModel(
+        model.joint_kinds,
+        frame @ model.generators @ back,
+        np.array([camera.matrix for camera in model.cameras]) @ back,
+        points if flat else points / points[:, 3:],
+        np.array([camera.lens for camera in model.cameras]),
+    )
+
+
+def common_mount(trials: TrialData) -> Mount:
+    """The mount that all cameras of the trials share. Raises CalibrationError (``mixed_mounts``)."""
+    mounts = {camera.name: camera.mount for camera in trials.cameras}
+    if len(set(mounts.values())) > 1:
+        told = ", ".join(f"{name!r} {mount}" for name, mount in mounts.items())
+        raise CalibrationError(
+            "mixed_mounts",
+            f"the cameras are mounted differently: {told}. One model needs cameras that see one motion: "
+            "calibrate those that stand and those on the tip each on their own",
+            mounts=mounts,
+        )
+    return trials.cameras[0].mount
+
+
+def reversed_trials(trials: TrialData) -> TrialData:
+    """Trials with the joints counted from the other end: from cameras on the tip, the base's joint is the
+    last before the markers.
+    """
+    last = len(trials.joint_names) - 1
+    return msgspec.structs.replace(
+        trials,
+        joint_names=trials.joint_names[::-1],
+        joint_kinds=trials.joint_kinds[::-1],
+        positions=trials.positions[:, ::-1],
+        trials=np.where(trials.trials >= 0, last - trials.trials, trials.trials),
+    )
+
+
+def with_joints_reversed(model: CellModel) -> CellModel:
+    """The model of reversed trials with its joints in base-first order again, mounted eye-in-hand."""
+    statistics = model.statistics
+    if statistics is not None:
+        statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])
+    whole = msgspec.structs.replace(
+        model,
+        joint_names=model.joint_names[::-1],
+        joint_kinds=model.joint_kinds[::-1],
+        zero=model.zero[::-1].copy(),
+        generators=model.generators[::-1].copy(),
+        statistics=statistics,
+        mount="eye_in_hand",
+        covariance=None if model.covariance is None else _reversed_covariance(model.covariance),
+    )
+    check_model(whole)
+    return whole
+
+
+def _reversed_covariance(given: ModelCovariance) -> ModelCovariance:
+    """The covariance with the joints' blocks in the opposite order."""
+    sizes = [len(basis) for basis in given.generators]
+    starts = np.cumsum([0, *sizes])
+    order = [i for j in reversed(range(len(sizes))) for i in range(starts[j], starts[j + 1])]
+    order += list(range(starts[-1], len(given.covariance)))
+    return msgspec.structs.replace(
+        given, generators=given.generators[::-1], covariance=given.covariance[np.ix_(order, order)]
+    )

@@ -1,0 +1,399 @@
+"""Self-calibration of a cell from its trial data (5.4): from pixels and joint readings to a model.
+
+Stages: initial reconstruction, single-joint fits, linked joints, projective bundle adjustment, stratum selection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_statistics import degrees_of_freedom, rank_of, variance_factor
+from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
+from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
+from stereoservo.calibration.diagnosis.marker_tracks import check_motions
+from stereoservo.calibration.initial_reconstruction import initial_reconstruction
+from stereoservo.calibration.lens_estimation import (
+    FREE_LENS,
+    lens_test,
+    prior_of_lenses,
+    starting_lenses,
+    straightened,
+    undistorted,
+)
+from stereoservo.calibration.rig_model import (
+    Measurements,
+    RigModel,
+    common_mount,
+    residuals,
+    reversed_trials,
+    with_joints_reversed,
+)
+from stereoservo.calibration.single_joint_fit import MIN_MARKERS, JointTrial, fit_single_joint, measurements
+from stereoservo.calibration.static_points import with_static_points
+from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, select_stratum
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
+from stereoservo.geometry.cameras import pixel_normaliser
+from stereoservo.geometry.displacements import exp_generator
+from stereoservo.geometry.distortion import LensEstimate
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.model import Stratum
+from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+Progress = Callable[[str, float], None]
+
+
+VALLEY_VARIANCE = 1.5
+"""Variance factor up to which an unconverged bundle lies in a flat valley of its cost: a direction is undetermined."""
+FEW_OUTLIERS = 0.05
+"""Share of outliers that may still change in a bundle that has not converged."""
+MIN_SIGHTINGS = 2
+"""Stops of joint trials at which two cameras must see a marker for it to enter the model."""
+
+
+def fit_model(
+    trials: TrialData,
+    *,
+    epoch: int,
+    created: str = "",
+    progress: Progress | None = None,
+    options: FitOptions = DEFAULTS,
+    lens_priors: Mapping[str, LensEstimate] | None = None,
+) -> CalibrationFit:
+    """Model of a cell fitted to its trial motions, with a report of the fit.
+
+    Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
+    joints from the base either way. Static markers become the model's static points. ``lens_priors``: by
+    camera name, an estimate of its lens from straight lines
+    (`geometry.distortion_lines`).
+
+    ``progress(stage, fraction)`` is called as the work goes on. Raises CalibrationError with the cause where
+    the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
+    Between that and the noise floor the model's ``chi2_ok`` is false and the report's notes contain what is
+    known.
+    """
+    check_trials(trials)
+    mount = common_mount(trials)
+    chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
+    priors = lens_priors or {}
+
+    def refit(data: TrialData, chosen: FitOptions) -> CalibrationFit:
+        return _fit(data, epoch, created, _silent, chosen, priors)
+
+    check_motions(chain)
+    try:
+        result = _fit(chain, epoch, created, progress or _silent, options, priors)
+    except CalibrationError as error:
+        raise diagnose_failure(chain, error, refit, options) from error
+    except (GeometryError, np.linalg.LinAlgError) as error:
+        broken = CalibrationError(
+            "no_convergence",
+            f"the fit broke down: {error}. Are positions and markers what they are said to be?",
+        )
+        raise diagnose_failure(chain, broken, refit, options) from error
+    model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
+    model, of_scene = with_static_points(model, trials.static)
+    report = msgspec.structs.replace(
+        result.report,
+        notes=(*result.report.notes, *review_notes(chain, result, refit, options), *of_scene),
+        untested=untested(chain),
+    )
+    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+
+
+def _fit(
+    trials: TrialData,
+    epoch: int,
+    created: str,
+    report_progress: Progress,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+) -> CalibrationFit:
+    report_progress("cameras", 0.0)
+    lenses, lens_model = starting_lenses(trials, options.lens, priors)
+    cameras, points, usable = initial_reconstruction(undistorted(trials, lenses))
+    trials, points, usable, left_out = _without_rare_markers(trials, points, usable)
+    ideal = undistorted(trials, lenses)
+    separate = []
+    for j, name in enumerate(trials.joint_names):
+        report_progress(f"joint {name}", 0.1 + 0.4 * j / len(trials.joint_names))
+        separate.append(fit_single_joint(ideal, cameras, points, usable, j))
+    report_progress("linked joints", 0.5)
+    zero = np.median(trials.positions, axis=0)
+    rig = replace(link_joints(trials, cameras, separate, zero), lenses=lenses)
+    every = replace(
+        measurements(trials, trials.visible, trials.positions - zero),
+        lens_priors=prior_of_lenses(trials, priors),
+    )
+    clean = every.select(usable[every.camera, every.stop, every.marker])
+    linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
+    report_progress("rigid bundle", 0.6)
+    decided = options.lens != "auto" or bool(priors)
+    solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
+    _refuse_misfit(trials, solution, every, inliers, options)
+    report_progress("metric bundle", 0.8)
+    raised = select_stratum(solution, every.select(inliers), options)
+    final, inliers = refine_to_convergence(
+        raised.solution.rig, every, raised.solution.stratum, options, solution.lenses
+    )
+    if options.lens == "auto" and final.lenses == "none" and (raised.bent or lens_test(final).distorted):
+        # Only the constraints of the higher stratum have separated distortion from kinematics.
+        solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
+        raised = select_stratum(solution, every.select(inliers), options)
+        final, inliers = refine_to_convergence(
+            raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS
+        )
+    _refuse_misfit(trials, final, every, inliers, options)
+    _refuse_open(final, raised.notes)
+    report_progress("report", 0.95)
+    result = build_fit(
+        trials,
+        final,
+        every,
+        inliers,
+        zero,
+        raised.plane,
+        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
+        epoch=epoch,
+        created=created,
+        notes=raised.notes,
+        projective=(solution.cost, degrees_of_freedom(solution)),
+        markers_left_out=left_out,
+    )
+    report_progress("done", 1.0)
+    return result
+
+
+def _projective(
+    rig: RigModel,
+    clean: Measurements,
+    every: Measurements,
+    lenses: LensModel,
+    options: FitOptions,
+    decided: bool,
+) -> tuple[Solution, BoolArray]:
+    """The projective bundle on its inliers; unless ``decided``, with the lenses that the data ask for."""
+    robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
+    if not decided and lenses == "none":
+        # Before anything is called an outlier: distortion makes many of them.
+        inside = every.select(inlier_mask(robust.rig, every, options))
+        if lens_test(solve(robust.rig, inside, "projective", max_evaluations=1)).distorted:
+            lenses = FREE_LENS
+            robust = solve(
+                robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
+            )
+    # A flat target may leave the projective bundle with open directions that the metric one closes: no need
+    # to walk such a valley to its end here.
+    solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
+    if decided or lens_test(solution).distorted == (lenses == FREE_LENS):
+        return solution, inliers
+    if lenses == "none":
+        return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
+    return refine_to_convergence(
+        straightened(solution.rig, every), every, "projective", options, "none", 1e-6
+    )
+
+
+def _silent(stage: str, fraction: float) -> None:
+    return
+
+
+def _without_rare_markers(
+    trials: TrialData, points: FloatArray, usable: BoolArray
+) -> tuple[TrialData, FloatArray, BoolArray, tuple[int, ...]]:
+    """Leave out markers that two cameras see at fewer than two stops of joint trials. Raises
+    CalibrationError.
+    """
+    often = np.isfinite(points[trials.trials >= 0]).all(axis=2).sum(axis=0) >= MIN_SIGHTINGS
+    if int(often.sum()) < MIN_MARKERS:
+        raise CalibrationError(
+            "too_few_markers",
+            f"two cameras see {int(often.sum())} markers at {MIN_SIGHTINGS} stops or more; at least "
+            f"{MIN_MARKERS} are needed",
+            markers=int(often.sum()),
+            minimum=MIN_MARKERS,
+        )
+    left_out = tuple(i for i, keep in zip(trials.marker_ids, often, strict=True) if not keep)
+    kept = msgspec.structs.replace(
+        trials,
+        marker_ids=tuple(i for i, keep in zip(trials.marker_ids, often, strict=True) if keep),
+        pixels=trials.pixels[:, :, often],
+        sigmas=trials.sigmas[:, :, often],
+    )
+    return kept, points[:, often], usable[:, :, often], left_out
+
+
+def link_joints(
+    trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
+) -> RigModel:
+    """Rig of all joints, base to tip: operators transformed from their trials' bases to one zero (5.21), with one
+    marker structure (5.53).
+
+    Raises CalibrationError (``too_few_markers``) for a marker that no trial shows.
+    """
+    kinds = trials.joint_kinds
+    generators = np.zeros((len(kinds), 4, 4))
+    for j, trial in enumerate(separate):
+        moved = _chain(kinds[:j], generators[:j], trial.base[:j] - zero[:j])
+        generators[j] = np.linalg.inv(moved) @ trial.generator @ moved
+    # Every trial has seen the markers in its own base configuration; take them all to the zero.
+    clouds = np.array(
+        [trial.points @ np.linalg.inv(_chain(kinds, generators, trial.base - zero)).T for trial in separate]
+    )
+    clouds /= clouds[:, :, 2:3]
+    points = np.empty((len(trials.marker_ids), 4))
+    for i, marker in enumerate(trials.marker_ids):
+        seen = clouds[np.isfinite(clouds[:, i]).all(axis=1), i]
+        if not len(seen):
+            raise CalibrationError(
+                "too_few_markers", f"marker {marker} is shown by no joint's usable stops", marker=marker
+            )
+        points[i] = np.median(seen, axis=0)
+    return RigModel(kinds, generators, cameras, points)
+
+
+def _chain(kinds: tuple[str, ...], generators: FloatArray, offsets: FloatArray) -> FloatArray:
+    product = np.eye(4)
+    for kind, generator, offset in zip(kinds, generators, offsets, strict=True):
+        product = product @ exp_generator(kind, generator, offset)
+    return product
+
+
+def refine_to_convergence(
+    rig: RigModel,
+    every: Measurements,
+    stratum: Stratum,
+    options: FitOptions,
+    lenses: LensModel,
+    tolerance: float = 1e-10,
+) -> tuple[Solution, BoolArray]:
+    """Least-squares bundle and its inliers (k,): gate and solve are repeated until the set of inliers is constant.
+
+    Whether the last solution has converged is for the caller to judge. Raises CalibrationError
+    (``no_convergence``).
+    """
+    inliers = inlier_mask(rig, every, options)
+    for _ in range(8):
+        solution = solve(rig, every.select(inliers), stratum, lenses=lenses, tolerance=tolerance)
+        again = inlier_mask(solution.rig, every, options)
+        rig = solution.rig
+        if np.array_equal(again, inliers):
+            break
+        inliers = again
+    else:
+        if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
+            # A projective bundle on its way along an open valley: a higher stratum may close it. Whether the last
+            # solution has converged is asked at the end.
+            return solution, inliers
+        raise CalibrationError(
+            "no_convergence",
+            f"the set of outliers does not settle: {int((~inliers).sum())} of {len(inliers)} pixels in the "
+            "last round. Did a camera move, are positions wrong?",
+            outliers=int((~inliers).sum()),
+            pixels=len(inliers),
+        )
+    return solution, inliers
+
+
+def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> BoolArray:
+    """Mask (k,) of the pixels that fit the rig, by their squared distance, with the noise estimated from the
+    median.
+    """
+    squares = (residuals(rig, every).reshape(-1, 2) ** 2).sum(axis=1)
+    # The median of a chi-square with two degrees of freedom is ln 4.
+    factor = max(1.0, float(np.median(squares)) / np.log(4.0))
+    inside: BoolArray = squares <= options.outlier_chi2 * factor
+    return inside
+
+
+def _refuse_misfit(
+    trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
+) -> None:
+    share = float((~inliers).mean())
+    if share > options.max_outliers:
+        raise CalibrationError(
+            "too_many_outliers",
+            f"{share:.0%} of the pixels do not fit the {solution.stratum} model; at most "
+            f"{options.max_outliers:.0%} may",
+            share=share,
+            maximum=options.max_outliers,
+        )
+    for j, name in enumerate(trials.joint_names):
+        own = trials.trials[every.stop] == j
+        lost = float((~inliers[own]).mean()) if own.any() else 0.0
+        if lost > options.max_trial_outliers:
+            raise CalibrationError(
+                "too_many_outliers",
+                f"{lost:.0%} of the pixels of joint {name!r}'s trial do not fit the {solution.stratum} "
+                f"model; at most {options.max_trial_outliers:.0%} may. Are its positions right, did only "
+                "it move?",
+                joint=name,
+                share=lost,
+                maximum=options.max_trial_outliers,
+            )
+    data = every.select(inliers)
+    if degrees_of_freedom(solution) <= 0:
+        raise CalibrationError(
+            "too_few_stops",
+            f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or "
+            "markers are needed",
+            measurements=solution.rows,
+            parameters=solution.charts.size,
+        )
+    factor = float(np.sqrt(variance_factor(solution)))
+    if factor > options.max_sigma_factor:
+        squares = (solution.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+        of_stop = trials.trials[data.stop]
+        per_joint = {
+            name: float(np.sqrt(squares[of_stop == j].mean() / 2))
+            for j, name in enumerate(trials.joint_names)
+            if (of_stop == j).any()
+        }
+        worst = max(per_joint, key=lambda name: per_joint[name])
+        raise CalibrationError(
+            "residual_above_floor",
+            f"residuals are {factor:.3g} times the stated sigmas; at most {options.max_sigma_factor:g} "
+            f"allowed. Worst is joint {worst!r} ({per_joint[worst]:.3g})",
+            sigma_factor=factor,
+            maximum=options.max_sigma_factor,
+            joints=per_joint,
+        )
+
+
+def _refuse_open(solution: Solution, notes: tuple[str, ...]) -> None:
+    """Refuse a final bundle with directions that the data leave open, or that has not converged."""
+    rank = rank_of(solution)
+    because = f" ({'; '.join(notes)})" if notes else ""
+    if rank < solution.charts.size:
+        raise CalibrationError(
+            "not_identifiable",
+            f"the trials determine {rank} of {solution.charts.size} parameters of the {solution.stratum} "
+            f"model{because}; markers off one plane, more stops or larger motions are needed",
+            rank=rank,
+            parameters=solution.charts.size,
+            notes=notes,
+        )
+    if solution.converged:
+        return
+    factor = variance_factor(solution)
+    if factor < VALLEY_VARIANCE:
+        raise CalibrationError(
+            "not_identifiable",
+            f"the {solution.stratum} model fits, but the trials leave a direction of it open{because}; markers "
+            "off one plane, more stops or larger motions are needed",
+            stratum=solution.stratum,
+            notes=notes,
+        )
+    raise CalibrationError(
+        "no_convergence",
+        f"the {solution.stratum} bundle did not converge in {solution.evaluations} evaluations{because}; "
+        f"residual {np.sqrt(factor):.3g} sigmas",
+        stratum=solution.stratum,
+        evaluations=solution.evaluations,
+        notes=notes,
+    )

@@ -1,0 +1,370 @@
+"""Fit of a single joint's generator to its own trial, at the configuration of that trial (5.52).
+
+A trial may be driven several times over, each with the joints behind the moving one (towards the markers) at other
+fixed positions: every such *distal configuration* shows the markers as a rigid structure of its own, so that four
+dots of a plate become sixteen virtual markers off one plane (5.5, fig. 5.16).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.calibration.bundle_adjustment import solve
+from stereoservo.calibration.generator_initialization import (
+    common_points,
+    linear_generator,
+    nominal_generator,
+    turned_generators,
+)
+from stereoservo.calibration.rig_model import Measurements, RigModel
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
+from stereoservo.kinematics.parameterization import Kind
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+
+MIN_STOPS = 4
+"""Different positions, at which markers are shown, that a joint's trial needs."""
+MIN_SHOWN = 2
+"""Markers that two cameras must see for a stop to count."""
+MIN_MARKERS = 3
+"""Markers that a trial must show."""
+MIN_RANGE = 0.02
+"""Smallest motion of a joint in its trial [rad or m]."""
+MIN_IMAGE_MOTION = 10.0
+"""Smallest motion of the markers over a trial [sigmas]."""
+LOCKED_RANGE = 2e-3
+"""How far other joints may stray during a trial [rad or m] and still count as locked."""
+GOOD_FIT = 1.3
+"""Median residual [sigmas] of a joint's own trial at which no other start is tried."""
+ALIKE = 1e-3
+"""Relative difference of residuals up to which two starts have ended in the same place."""
+FULL, SHORT = 80, 20
+"""Evaluations of a start, and of each of many."""
+WRONG_SQUARE = 100.0
+"""Squared residual [sigmas²] at which the cost of a pixel saturates."""
+MISFIT = 20.0
+"""Median residual [sigmas] of a joint's own trial above which its stated kind is rejected."""
+
+
+@dataclass(frozen=True)
+class JointTrial:
+    """A joint's own trial: ``stops`` (k,), the distal configuration ``groups`` (k,) of each, ``base`` (n,) the
+    configuration of group 0 with the joint in the middle.
+
+    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base, NaN for markers that the trial does not show
+    there.
+    """
+
+    joint: int
+    stops: IntArray
+    groups: IntArray
+    base: FloatArray
+    generator: FloatArray
+    points: FloatArray
+
+
+def measurements(trials: TrialData, usable: BoolArray, offsets: FloatArray) -> Measurements:
+    """The usable pixels (c, s, m) as a flat list."""
+    camera, stop, marker = np.nonzero(usable)
+    return Measurements(
+        offsets, camera, stop, marker, trials.pixels[usable].reshape(-1, 2), trials.sigmas[usable].ravel()
+    )
+
+
+def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Stops (k,) at which only ``joint`` moves, the distal configuration of each (k,), and the base (n,).
+
+    Joints before ``joint`` are as at the base; joints behind it are in one of the configurations in which the
+    trial was driven, counted from 0, the base's own. Stops of other trials that happen to be there belong to it,
+    too. Raises CalibrationError.
+    """
+    name, unit = trials.joint_names[joint], _unit(trials, joint)
+    own = trials.trials == joint
+    positions = trials.positions
+    if not own.any():
+        raise CalibrationError(
+            "too_few_stops",
+            f"joint {name!r} has no trial stops; at least {MIN_STOPS} are needed",
+            joint=name,
+            stops=0,
+            minimum=MIN_STOPS,
+        )
+    moved = float(np.ptp(positions[own, joint]))
+    if moved < MIN_RANGE:
+        raise CalibrationError(
+            "joint_did_not_move",
+            f"joint {name!r} moved {moved:.4g} {unit} in its trial; at least {MIN_RANGE:g} {unit} is needed",
+            joint=name,
+            range=moved,
+            minimum=MIN_RANGE,
+        )
+    base, groups = _distal_groups(positions, own, joint)
+    shown = finite_rows(points).sum(axis=1) >= MIN_SHOWN
+    stops = np.flatnonzero((groups >= 0) & shown)
+    distinct = len(np.unique(np.round(positions[stops, joint] / LOCKED_RANGE)))
+    if distinct < MIN_STOPS:
+        lost, strayed = int((own & ~shown).sum()), int((own & (groups < 0)).sum())
+        raise CalibrationError(
+            "too_few_stops",
+            f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of "
+            f"{int(own.sum())} stops, {lost} show fewer than {MIN_SHOWN} markers that two cameras agree "
+            f"on, and at {strayed} other joints strayed by more than {LOCKED_RANGE:g}",
+            joint=name,
+            stops=distinct,
+            minimum=MIN_STOPS,
+            markers_lost=lost,
+            strayed=strayed,
+        )
+    if float(np.ptp(positions[stops, joint])) < MIN_RANGE:
+        raise CalibrationError(
+            "joint_did_not_move",
+            f"joint {name!r}: the stops that show markers span {np.ptp(positions[stops, joint]):.4g} "
+            f"{unit}; at least {MIN_RANGE:g} {unit} is needed",
+            joint=name,
+            range=float(np.ptp(positions[stops, joint])),
+            minimum=MIN_RANGE,
+        )
+    largest = np.bincount(groups[stops]).argmax()
+    _check_effect(trials, stops[groups[stops] == largest], joint)
+    return stops, groups[stops], base
+
+
+def _distal_groups(positions: FloatArray, own: BoolArray, joint: int) -> tuple[FloatArray, IntArray]:
+    """The base (n,) of the trial ``own`` (s,), and the distal configuration (s,) of each stop, -1 off the trial.
+
+    A configuration counts with two of the trial's stops: one shows no motion.
+    """
+    base = np.median(positions[own], axis=0)
+    still = np.asarray((np.abs(positions[:, :joint] - base[:joint]) <= LOCKED_RANGE).all(axis=1))
+    distal = positions[:, joint + 1 :]
+    groups = np.full(len(positions), -1)
+    count, left = 0, np.asarray(own & still)
+    # The configuration nearest to the middle comes first, and is the base's.
+    order = np.argsort(np.abs(distal - base[joint + 1 :]).sum(axis=1), kind="stable")
+    for k in order[left[order]]:
+        if not left[k]:
+            continue
+        here = np.asarray((np.abs(distal - distal[k]) <= LOCKED_RANGE).all(axis=1) & still)
+        left &= ~here
+        if int((here & own).sum()) >= 2:
+            groups[here] = count
+            if count == 0 and (np.abs(distal[k] - base[joint + 1 :]) > LOCKED_RANGE).any():
+                base[joint + 1 :] = distal[k]
+            count += 1
+    return base, groups
+
+
+def fit_single_joint(
+    trials: TrialData, cameras: FloatArray, points: FloatArray, usable: BoolArray, joint: int
+) -> JointTrial:
+    """Generator of ``joint`` and the markers from its own trial, cameras (c, 3, 4) fixed (5.52).
+
+    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). Starts one after the other until one fits: linear
+    over all pairs of stops; as if the cameras were nominal ones; axes all around. Then least squares with free
+    markers, each of a distal configuration its own. Raises CalibrationError naming the joint.
+    """
+    name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
+    stops, groups, base = trial_stops(trials, points, joint)
+    sights = virtual_markers(trials, points, usable, stops, groups)
+    angles = trials.positions[stops, joint] - base[joint]
+    m = len(trials.marker_ids)
+    seen = np.asarray(sights.usable.any(axis=(0, 1)).reshape(-1, m).any(axis=0), dtype=bool)
+    if int(seen.sum()) < MIN_MARKERS:
+        raise CalibrationError(
+            "too_few_markers",
+            f"joint {name!r}: {int(seen.sum())} markers are seen by two cameras in its trial; at least "
+            f"{MIN_MARKERS} are needed",
+            joint=name,
+            markers=int(seen.sum()),
+            minimum=MIN_MARKERS,
+        )
+    best, least = best_single_joint(kind, cameras, sights, angles, thorough=True)
+    if best is None and (common := _common_markers(sights, angles)) < MIN_MARKERS:
+        raise CalibrationError(
+            "too_few_markers",
+            f"joint {name!r}: any two stops of its trial far apart show {common} markers in common to two cameras; at "
+            f"least {MIN_MARKERS} are needed",
+            joint=name,
+            markers=common,
+            minimum=MIN_MARKERS,
+        )
+    if best is None or not least < MISFIT:
+        raise CalibrationError(
+            "joint_kind",
+            f"joint {name!r}: its trial does not look like a "
+            f"{'rotation' if kind == 'revolute' else 'translation'} by the reported positions: typical "
+            f"residual {least:.3g} sigmas, at most {MISFIT:g} expected. Is the joint {kind}, are its "
+            "positions right, did only it move?",
+            joint=name,
+            residual_sigmas=least,
+            maximum=MISFIT,
+        )
+    shown = np.asarray(sights.usable[:, :, :m].any(axis=(0, 1)))
+    return JointTrial(
+        joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan)
+    )
+
+
+def _common_markers(sights: VirtualObservations, angles: FloatArray) -> int:
+    """Most virtual markers that two stops half of the trial's range apart have in common."""
+    shown = finite_rows(sights.points).astype(np.int64)
+    apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
+    return int((shown @ shown.T)[apart].max(initial=0))
+
+
+@dataclass(frozen=True)
+class VirtualObservations:
+    """Observations of the virtual markers in a joint's trial, those of group g at ``g m`` to ``g m + m - 1``.
+
+    ``points`` (k, v, 4), NaN where not usable; ``usable`` (c, k, v); ``pixels`` (c, k, v, 2) [px]; ``sigmas``
+    (c, k, v) [px].
+    """
+
+    points: FloatArray
+    usable: BoolArray
+    pixels: FloatArray
+    sigmas: FloatArray
+
+
+def virtual_markers(
+    trials: TrialData, points: FloatArray, usable: BoolArray, stops: IntArray, groups: IntArray
+) -> VirtualObservations:
+    """The markers (m) of G distal ``groups`` (k,) at ``stops`` (k,) as G m rigid virtual ones."""
+    c, m, k = len(trials.cameras), len(trials.marker_ids), len(stops)
+    count = int(groups.max()) + 1
+    spread = VirtualObservations(
+        np.full((k, count * m, 4), np.nan),
+        np.zeros((c, k, count * m), dtype=bool),
+        np.full((c, k, count * m, 2), np.nan),
+        np.ones((c, k, count * m)),
+    )
+    here: BoolArray = usable[:, stops] & finite_rows(points[stops])
+    for g in range(count):
+        at, rows = slice(g * m, (g + 1) * m), np.flatnonzero(groups == g)
+        spread.points[rows, at] = points[stops[rows]]
+        spread.usable[:, rows, at] = here[:, rows]
+        spread.pixels[:, rows, at] = trials.pixels[:, stops[rows]]
+        spread.sigmas[:, rows, at] = trials.sigmas[:, stops[rows]]
+    return spread
+
+
+def best_single_joint(
+    kind: Kind,
+    cameras: FloatArray,
+    sights: VirtualObservations,
+    angles: FloatArray,
+    *,
+    thorough: bool = False,
+) -> tuple[RigModel | None, float]:
+    """The single joint of ``kind`` that explains the ``sights`` at ``angles`` (k,) best, with its median residual
+    [sigmas]; starts are tried until one fits. ``thorough``: unless one does, or two end alike, rotations about axes
+    all around are tried, too.
+    """
+    camera, stop, marker = np.nonzero(sights.usable)
+    data = Measurements(
+        angles[:, None],
+        camera,
+        stop,
+        marker,
+        sights.pixels[sights.usable].reshape(-1, 2),
+        sights.sigmas[sights.usable].ravel(),
+    )
+    found: list[_StartResult] = []
+    for start in (linear_generator, nominal_generator):
+        generator = start(kind, cameras, sights.points, sights.usable, sights.pixels, sights.sigmas, angles)
+        if generator is not None:
+            found += _solve_from(kind, generator, cameras, sights, data, FULL)
+            if found and found[-1].fits:
+                break
+    if thorough and kind == "revolute" and not _is_certain(found):
+        turned: list[_StartResult] = []
+        for generator in turned_generators(sights.points, angles):
+            turned += _solve_from(kind, generator, cameras, sights, data, SHORT)
+        if turned:
+            rig = min(turned, key=lambda one: one.score).rig
+            found += _solve_from(kind, rig.generators[0], cameras, sights, data, FULL)
+    best = min(found, key=lambda one: one.score, default=None)
+    return (best.rig, best.typical) if best is not None else (None, np.inf)
+
+
+@dataclass(frozen=True)
+class _StartResult:
+    """Result of a start: ``typical`` median residual and ``score``, that of all pixels, both [sigmas]."""
+
+    rig: RigModel
+    typical: float
+    score: float
+    converged: bool
+
+    @property
+    def fits(self) -> bool:
+        return self.typical < GOOD_FIT and self.score < GOOD_FIT
+
+
+def _is_certain(found: list[_StartResult]) -> bool:
+    """Whether the best result is a minimum that fits, or one that two starts have reached."""
+    if not found:
+        return False
+    best = min(found, key=lambda one: one.score)
+    alike = [one for one in found if one.score < (1.0 + ALIKE) * best.score]
+    return best.converged and (best.fits or len(alike) > 1)
+
+
+def _solve_from(
+    kind: Kind,
+    generator: FloatArray,
+    cameras: FloatArray,
+    sights: VirtualObservations,
+    data: Measurements,
+    evaluations: int,
+) -> list[_StartResult]:
+    """Result of a start with ``generator`` (4, 4) after at most ``evaluations``; empty where it breaks down."""
+    structure = common_points(generator, kind, sights.points, data.offsets[:, 0])
+    structure[~sights.usable.any(axis=(0, 1))] = [0.0, 0.0, 1.0, 1.0]
+    try:
+        fit = solve(
+            RigModel((kind,), generator[None], cameras, structure),
+            data,
+            "projective",
+            cameras=False,
+            loss="soft_l1",
+            loss_scale=3.0,
+            max_evaluations=evaluations,
+        )
+    except np.linalg.LinAlgError:
+        return []  # a point of this start lies in a focal plane; the next one may do
+    # The median of a chi-square with two degrees of freedom is ln 4.
+    squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+    typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
+    # A wrong axis may fit the half of the markers that hardly move.
+    score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE).mean() / 2.0))
+    if not np.isfinite(score):
+        return []
+    return [_StartResult(fit.rig, typical, score, fit.converged)]
+
+
+def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
+    """Raise CalibrationError for a joint whose trial does not change the images."""
+    name = trials.joint_names[joint]
+    visible = trials.visible[:, stops]
+    motions = []
+    for c, i in zip(*np.nonzero(visible.sum(axis=1) >= 2), strict=True):
+        # Inner quantiles of stops and an upper one of markers: single wrong pixels must not look like motion.
+        pixels = trials.pixels[c, stops[visible[c, :, i]], i]
+        sigma = np.median(trials.sigmas[c, stops[visible[c, :, i]], i])
+        motions.append(float(np.linalg.norm(np.ptp(np.quantile(pixels, [0.1, 0.9], axis=0), axis=0)) / sigma))
+    largest = float(np.quantile(motions, 0.8)) if motions else 0.0
+    if largest < MIN_IMAGE_MOTION:
+        raise CalibrationError(
+            "joint_without_effect",
+            f"joint {name!r} reports motion, but the markers moved by {largest:.3g} sigmas only in the "
+            f"images; at least {MIN_IMAGE_MOTION:g} are needed. Does it drive what the cameras see?",
+            joint=name,
+            motion_sigmas=largest,
+            minimum=MIN_IMAGE_MOTION,
+        )
+
+
+def _unit(trials: TrialData, joint: int) -> str:
+    return "rad" if trials.joint_kinds[joint] == "revolute" else "m"

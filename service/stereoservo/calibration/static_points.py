@@ -1,0 +1,214 @@
+"""Static points of a cell: which markers are static, and their triangulation into the model with its covariance."""
+
+from __future__ import annotations
+
+import warnings
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.calibration.relocalization.camera_resection import Correspondences
+from stereoservo.calibration.relocalization.moved_camera_covariance import model_jacobian, parameters_of
+from stereoservo.calibration.trial_data import StaticObservations
+from stereoservo.geometry.cameras import projection_jacobian_many, triangulate
+from stereoservo.geometry.distortion import distort, distortion_jacobian, undistort
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+TAIL = 1e-6
+"""Probability that the views of a static point are taken for those of two points."""
+LEAST_HEIGHT = 1e-3
+"""Height of a point, relative to its size, below which it is as good as at infinity."""
+OPEN = 1e14
+"""Condition of the equations of a point above which it is not determined."""
+ROUNDS = 20
+SETTLED = 1e-3
+"""Length of a step [standard deviations] at which a point has converged."""
+
+
+def with_static_points(
+    model: CellModel, static: StaticObservations | None
+) -> tuple[CellModel, tuple[str, ...]]:
+    """The model with its static points, and notes on those that cannot be reconstructed."""
+    if static is None:
+        return model, ()
+    if model.mount == "eye_in_hand":
+        ids = ", ".join(str(i) for i in static.ids)
+        return model, (f"static markers {ids} are left out: from cameras on the arm nothing is static",)
+    kept: list[tuple[int, FloatArray, FloatArray]] = []
+    notes = []
+    for k, marker in enumerate(static.ids):
+        found = _scene_point(model, static.pixels[:, k], static.sigmas[:, k])
+        if isinstance(found, str):
+            notes.append(f"static marker {marker} is left out: {found}")
+        else:
+            kept.append((marker, *found))
+    if not kept:
+        return model, tuple(notes)
+    return msgspec.structs.replace(
+        model,
+        scene_ids=tuple(one[0] for one in kept),
+        scene_points=np.array([one[1] for one in kept]),
+        scene_covariances=np.array([one[2] for one in kept]),
+    ), tuple(notes)
+
+
+def _scene_point(
+    model: CellModel, pixels: FloatArray, sigmas: FloatArray
+) -> tuple[FloatArray, FloatArray] | str:
+    """A point (4,) of height 1 and its covariance (4, 4), given the cameras, from raw pixels (c, 2), NaN where missing;
+    or why not.
+    """
+    seen = np.flatnonzero(np.isfinite(pixels).all(axis=1))
+    if len(seen) < 2:
+        return f"{len(seen)} camera sees it, two are needed to know where it is"
+    cameras = [model.cameras[c] for c in seen]
+    matrices = np.array([camera.matrix for camera in cameras])
+    ideal = np.array([undistort(camera.lens, pixels[c]) for c, camera in zip(seen, cameras, strict=True)])
+    if not np.isfinite(ideal).all():
+        return "its pixel lies where the lens shows nothing"
+    try:
+        point = triangulate(matrices, ideal[:, None], sigmas[seen][:, None])[0]
+    except GeometryError as broken:
+        return str(broken)
+    height = float(point @ model.plane_at_infinity)
+    if not abs(height) > LEAST_HEIGHT * float(np.linalg.norm(point)) * float(
+        np.linalg.norm(model.plane_at_infinity)
+    ):
+        return "it is as good as at infinity"
+    point = point / height
+    # Three directions that keep the height.
+    chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
+    covariance = _covariance(model, seen, matrices, point, pixels, sigmas)
+    inverse: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    for _ in range(ROUNDS):
+        J, error = _equations(model, seen, matrices, point, pixels, chart)
+        information: FloatArray = J.T @ inverse @ J
+        if not (np.isfinite(error).all() and np.linalg.cond(information) < OPEN):
+            return "its rays do not tell how far away it is"
+        step = -np.linalg.solve(information, J.T @ inverse @ error)
+        point = point + chart @ step
+        if float(step @ information @ step) < SETTLED**2:
+            break
+    _, error = _equations(model, seen, matrices, point, pixels, chart)
+    chi2, freedom = float(error @ inverse @ error), 2 * len(seen) - 3
+    noise = 1.0
+    if model.statistics is not None and model.statistics.degrees_of_freedom > 0:
+        noise = max(1.0, model.statistics.chi2 / model.statistics.degrees_of_freedom)
+    limit = float(chi2_distribution.isf(TAIL, freedom)) * noise
+    if chi2 > limit:
+        return (
+            f"its views do not belong together (chi-square {chi2:.4g}, limit {limit:.4g}): did it move, is its id "
+            "there twice?"
+        )
+    gain = chart @ np.linalg.solve(information, J.T @ inverse)
+    found: FloatArray = gain @ (np.repeat(sigmas[seen] ** 2, 2)[:, None] * gain.T)
+    return point, found
+
+
+def _equations(
+    model: CellModel,
+    seen: IntArray,
+    matrices: FloatArray,
+    point: FloatArray,
+    pixels: FloatArray,
+    chart: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Derivative (2 c, 3) of the raw pixels of a point by its chart, and their errors (2 c,)."""
+    by_point = projection_jacobian_many(matrices, point[None])[:, 0]
+    images = matrices @ point
+    ideal = images[:, :2] / images[:, 2:]
+    rows, errors = [], []
+    for k, c in enumerate(seen):
+        lens = model.cameras[c].lens
+        rows.append(distortion_jacobian(lens, ideal[k]) @ by_point[k] @ chart)
+        errors.append(distort(lens, ideal[k]) - pixels[c])
+    return np.concatenate(rows), np.concatenate(errors)
+
+
+def _covariance(
+    model: CellModel,
+    seen: IntArray,
+    matrices: FloatArray,
+    point: FloatArray,
+    pixels: FloatArray,
+    sigmas: FloatArray,
+) -> FloatArray:
+    """Covariance (2 c, 2 c) of the pixels of a point, with that of the cameras which see it."""
+    covariance = np.diag(np.repeat(sigmas[seen] ** 2, 2))
+    if model.covariance is None:
+        return covariance
+    count = len(seen)
+    views = Correspondences(
+        np.arange(count),
+        np.zeros(count, dtype=np.int64),
+        np.full(count, -1, dtype=np.int64),
+        np.tile(point, (count, 1)),
+        pixels[seen],
+        np.tile(np.eye(2), (count, 1, 1)),
+    )
+    group = tuple(int(c) for c in seen)
+    rows = model_jacobian(model, group, matrices, np.eye(4), views, np.zeros((1, len(model.zero))))
+    rows = rows.reshape(2 * count, parameters_of(model))
+    widened: FloatArray = covariance + rows @ model.covariance.covariance @ rows.T
+    return widened
+
+
+NOISE = 5.0
+"""A static marker strays by no more than so many deviations of its noise ..."""
+LEAST_PX = 0.3
+"""... or than this [px], which a shaking table makes ..."""
+SHARE = 0.1
+"""... and by no more than this share of the way of the marker that moves most."""
+
+STRAYING = 0.25
+"""Share of a camera's stops at which a static marker may be off: behind the arm, say."""
+
+STOPS = 4
+"""Stops at which one camera must have seen a marker to call it static."""
+
+
+def static_markers(pixels: FloatArray, sigmas: FloatArray) -> npt.NDArray[np.bool_]:
+    """Mask (m,) of the markers that are static over all stops. ``pixels`` (c, s, m, 2), NaN where missing.
+
+    ``sigmas`` (c, s, m) [px]. All false where nothing moves.
+    """
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
+    count = seen.sum(axis=1)
+    known = np.where(seen[..., None], pixels, 0.0)
+    middle = known.sum(axis=1) / np.maximum(count, 1)[..., None]
+    squares = np.where(seen, ((known - middle[:, None]) ** 2).sum(axis=-1), 0.0).sum(axis=(0, 1))
+    total = np.maximum(seen.sum(axis=(0, 1)), 1)
+    strayed = np.sqrt(squares / total)
+    noise = np.sqrt(2.0 * np.where(seen, sigmas**2, 0.0).sum(axis=(0, 1)) / total)
+    still = (strayed <= np.maximum(NOISE * noise, LEAST_PX)) & (strayed <= SHARE * strayed.max(initial=0.0))
+    return np.asarray(still & (count.max(axis=0) >= STOPS))
+
+
+def static_observations(
+    ids: tuple[int, ...], pixels: FloatArray, sigmas: FloatArray
+) -> tuple[StaticObservations | None, tuple[int, ...]]:
+    """Mean observations of markers ``ids`` (k,) that are stated to be static, and the ids of those that moved.
+
+    ``pixels`` (c, s, k, 2) of all stops, NaN where missing, and ``sigmas`` (c, s, k) [px]. In each camera it is the
+    median over the stops, so that a stop at which the arm covers half of a marker does no harm; its sigma is that of
+    one stop, since what is systematic does not average. A marker that strays from its median at more than a quarter
+    of the stops of a camera has moved, and is left out.
+    """
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of a marker that a camera never sees: NaN it stays
+        middle = np.nanmedian(pixels, axis=1)
+        sigma = np.nanmedian(np.where(seen, sigmas, np.nan), axis=1)
+    away = np.linalg.norm(pixels - middle[:, None], axis=-1)
+    strays = seen & (away > np.maximum(NOISE * np.sqrt(2.0) * sigma, LEAST_PX)[:, None])
+    moved = (strays.sum(axis=1) > STRAYING * np.maximum(seen.sum(axis=1), 1)).any(axis=0)
+    kept = ~moved & seen.any(axis=(0, 1))
+    named = tuple(marker for marker, one in zip(ids, moved, strict=True) if one)
+    if not kept.any():
+        return None, named
+    left = tuple(marker for marker, one in zip(ids, kept, strict=True) if one)
+    return StaticObservations(left, middle[:, kept], sigma[:, kept]), named

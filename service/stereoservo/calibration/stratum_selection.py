@@ -1,0 +1,354 @@
+"""Selection of the highest stratum that the data identify: metric, affine or projective (5.4.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.calibration import stratum_upgrade
+from stereoservo.calibration.alternative_axes import with_other_axes
+from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_statistics import (
+    covariance_root,
+    generator_noise,
+    rank_of,
+    variance_factor,
+)
+from stereoservo.calibration.lens_estimation import lens_test
+from stereoservo.calibration.rig_model import Measurements, RigModel
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.numerics.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Thresholds of the fit.
+
+    ``outlier_chi2``: a pixel (2 degrees of freedom) farther than this from the model is left out; 25 loses 4
+    in a million good ones. ``max_outliers``, ``max_trial_outliers``: share of pixels that may be left out of
+    all, and of one joint's trial. ``max_sigma_factor``: how many times the stated sigmas the residuals may be
+    before the fit is refused; detectors misjudge their noise, a wrong model misses by far more.
+    ``metric_loss``: how much worse, in variance, the metric bundle may fit than the projective one where it
+    is not certain that the metric is identifiable. ``max_spread``: largest relative standard deviation of
+    focal lengths (metric) and depths (metric, affine) with which a stratum is believed. ``lens``: what of the
+    lenses is free; ``auto`` lets the data decide between nothing and the radial parameter with its centre.
+    """
+
+    outlier_chi2: float = 25.0
+    max_outliers: float = 0.4
+    max_trial_outliers: float = 0.5
+    max_sigma_factor: float = 3.0
+    metric_loss: float = 1.3
+    max_spread: float = 0.1
+    lens: Literal["auto"] | LensModel = "auto"
+
+
+DEFAULTS = FitOptions()
+
+NOMINAL_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
+"""Infinity of the canonical frame's nominal cameras."""
+FINISHED, FINISH_EVALUATIONS = 4, 400
+"""How many of the bundles that have not converged are solved to their end, and how long."""
+LOOSE_SPREAD = 0.75
+"""Relative deviation of depths and focal lengths beyond which linear statistics are meaningless."""
+PLAUSIBLE_TAIL, NESTED_TAIL = 1e-3, 1e-6
+"""Probabilities with which a true constraint costs so much that other starts are tried, and that it is taken for a
+wrong one."""
+
+
+@dataclass
+class StratumSelector:
+    """Accepts or rejects bundles of higher strata against the ``projective`` one; keeps rejected ones by reason.
+
+    A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
+    is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
+    nearly. ``bent``: free lenses would have satisfied them. ``tolerable``: costly
+    ones, taken if no start finds a better; ``unfinished``: bundles that may still converge; ``loose``: good fits
+    that hardly determine the stratum.
+    """
+
+    projective: Solution
+    options: FitOptions
+    notes: list[str] = field(default_factory=list)
+    reserve: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    tolerable: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    unfinished: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    loose: list[tuple[Solution, FloatArray]] = field(default_factory=list)
+    hopeless: bool = False
+    bent: bool = False
+
+    def passes(self, solution: Solution, plane: FloatArray) -> bool:
+        """Whether ``solution`` may be taken as it is. Sets ``hopeless`` where another start will not help."""
+        problem = self._unidentified(solution)
+        if problem:
+            self._note(solution, problem)
+            # A good fit that leaves directions wide open, converged along them or not: so will any other.
+            open_ones = rank_of(solution) < solution.charts.size
+            wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_SPREAD
+            done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
+            self.hopeless = self._close(solution) and (wide or done)
+            kept = self.loose if self.hopeless or solution.converged else self.unfinished
+            kept.append((solution, plane))
+            return False
+        if not solution.converged:
+            self._note(solution, f"no convergence in {solution.evaluations} evaluations")
+            self.unfinished.append((solution, plane))
+            return False
+        if not self._worse(solution, PLAUSIBLE_TAIL):
+            return True
+        if not self._worse(solution, NESTED_TAIL):
+            self.tolerable.append((solution, plane))
+            return False
+        self.bent = self.bent or (solution.lenses == "none" and lens_test(solution).distorted)
+        # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
+        self.hopeless = any(
+            abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve
+        )
+        self.reserve.append((solution, plane))
+        return False
+
+    def finished(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+        """The first of the unfinished bundles, solved to their ends, that passes."""
+        candidates, self.unfinished = sorted(self.unfinished, key=lambda entry: entry[0].cost)[:FINISHED], []
+        for solution, plane in candidates:
+            if self.hopeless:
+                break
+            final = _solve_to_convergence(solution, data)
+            if self.passes(final, plane):
+                return final, plane
+        return None
+
+    def best_tolerable(self) -> tuple[Solution, FloatArray] | None:
+        """The best of those whose constraints cost much, but not too much."""
+        tolerable, self.tolerable = self.tolerable, []
+        return min(tolerable, key=lambda entry: entry[0].cost) if tolerable else None
+
+    def turned(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+        """The best bundle so far with other axes for single joints, if one passes then."""
+        reached = [entry for entry in (*self.reserve, *self.loose, *self.tolerable) if entry[0].converged]
+        if not reached:
+            return None
+        solution, plane = min(reached, key=lambda entry: entry[0].cost)
+        if not self._worse(solution, PLAUSIBLE_TAIL) or not self._close(solution):
+            return None
+        for rig in with_other_axes(solution):
+            try:
+                again = solve(rig, data, "metric", lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS)
+            except np.linalg.LinAlgError:
+                continue  # the new axis takes a marker into a focal plane
+            if self.passes(again, plane):
+                return again, plane
+        return None
+
+    def last_resort(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+        """A good fit that hardly determines its stratum, where the projective bundle has undetermined directions.
+
+        Its covariance is large; predictions are as good as the trials allow.
+        """
+        projective = solve(self.projective.rig, data, "projective", lenses=self.projective.lenses)
+        if projective.converged and rank_of(projective) == projective.charts.size:
+            return None
+        for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
+            final = _solve_to_convergence(solution, data)
+            spread = (
+                max(_relative_deviations(final).values()) if rank_of(final) == final.charts.size else np.inf
+            )
+            if (
+                final.converged
+                and spread <= LOOSE_SPREAD
+                and not self._worse(final, PLAUSIBLE_TAIL, projective)
+            ):
+                self.notes.append(
+                    f"the {final.stratum} stratum is taken because the projective bundle leaves directions open; "
+                    f"{self._unidentified(final) or 'its spread is small'}"
+                )
+                return final, plane
+        return None
+
+    def second_best(self, certain: bool) -> tuple[Solution, FloatArray] | None:
+        """The best of the reserve, with a note of what it costs; None where it must not be taken.
+
+        ``certain``: the data identify the stratum beyond doubt, so that what does not fit it is wrong, not
+        the stratum.
+        """
+        if not self.reserve:
+            return None
+        solution, plane = min(self.reserve, key=lambda entry: entry[0].cost)
+        self.notes.append(
+            f"the {solution.stratum} constraints cost a chi-square of "
+            f"{solution.cost - self.projective.cost:.4g} for "
+            f"{self.projective.charts.size - solution.charts.size} parameters: cameras or joints follow "
+            "the model only nearly (lens distortion, play, positions)"
+        )
+        return (solution, plane) if certain or self._close(solution) else None
+
+    def _worse(self, solution: Solution, tail: float, projective: Solution | None = None) -> bool:
+        """Whether the constraints cost more chi-square than true ones do but for ``tail`` of cases."""
+        beside = projective or self.projective
+        fewer = max(1, beside.charts.size - solution.charts.size)
+        allowed = float(chi2_distribution.isf(tail, fewer)) * max(1.0, variance_factor(beside))
+        return solution.cost - beside.cost > allowed
+
+    def _close(self, solution: Solution) -> bool:
+        beside = max(1.0, variance_factor(self.projective))
+        return variance_factor(solution) <= self.options.metric_loss * beside
+
+    def _unidentified(self, solution: Solution) -> str:
+        rank = rank_of(solution)
+        if rank < solution.charts.size:
+            return f"the trials determine {rank} of {solution.charts.size} parameters"
+        limit = self.options.max_spread
+        return "; ".join(
+            f"{what} known to {spread:.0%} only, {limit:.0%} needed"
+            for what, spread in _relative_deviations(solution).items()
+            if spread > limit
+        )
+
+    def _note(self, solution: Solution, text: str) -> None:
+        note = f"{solution.stratum} stratum refused: {text}"
+        if note not in self.notes:
+            self.notes.append(note)
+
+
+def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:
+    """The bundle solved again with many more evaluations."""
+    return solve(
+        solution.rig, data, solution.stratum, lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS
+    )
+
+
+def _relative_deviations(solution: Solution) -> dict[str, float]:
+    """Relative standard deviations of depths and, in the metric stratum, of focal lengths: the largest each."""
+    factor = max(1.0, variance_factor(solution))
+    deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
+    m = len(solution.rig.points)
+    scale = np.array([basis[2, 2] for basis in solution.charts.points])
+    depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
+    spreads = {"depths are": float(depths.max())}
+    if solution.stratum == "metric":
+        at = solution.charts.start(1)
+        scale = np.array([solution.charts.cameras[0][k, i, i] for k, i in ((0, 0), (3, 1))])
+        focal = deviations[[at, at + 3]] * scale / np.abs(np.diag(solution.rig.cameras[0][:2, :2]))
+        spreads["the focal length is"] = float(focal.max())
+    return spreads
+
+
+class StratumSelection(NamedTuple):
+    """The bundle of the highest stratum that the data identify, its ``plane`` (4,) at infinity in the projective
+    frame, notes, and whether lens distortion prevents a higher stratum (``bent``).
+    """
+
+    solution: Solution
+    plane: FloatArray
+    notes: tuple[str, ...]
+    bent: bool
+
+
+def select_stratum(solution: Solution, data: Measurements, options: FitOptions) -> StratumSelection:
+    """Bundle of the highest stratum that the data identify.
+
+    Metric and affine bundles start from the linear estimates and, where those fail, from nominal cameras;
+    whether they are believed is judged on the constrained bundle itself, which is far better conditioned than
+    the projective.
+    """
+    noise = generator_noise(solution)
+    selector = StratumSelector(solution, options)
+    least, nearest, unique = stratum_upgrade.planes_at_infinity(solution.rig.generators, noise)
+    finite: list[FloatArray] = []
+    for candidate in (nearest, least, NOMINAL_PLANE):
+        scaled = stratum_upgrade.scaled_plane(candidate, solution.rig.points)
+        if scaled is not None and not any(np.allclose(scaled, p, rtol=1e-3, atol=1e-6) for p in finite):
+            finite.append(scaled)
+    if not finite:
+        raise CalibrationError(
+            "views_degenerate", "every candidate for the plane at infinity passes between the markers"
+        )
+    for start, plane in _metric_starts(solution.rig, finite, noise, np.ptp(data.offsets, axis=0)):
+        # Cameras that are not right yet must not be bent to a chain that is not: settle the chain first.
+        try:
+            chain = solve(
+                start,
+                data,
+                "metric",
+                cameras=False,
+                loss="soft_l1",
+                max_evaluations=20,
+                tolerance=1e-2,
+            )
+            metric = solve(chain.rig, data, "metric", lenses=solution.lenses, max_evaluations=80)
+        except np.linalg.LinAlgError as error:
+            selector.notes.append(f"no metric start: {error}")
+            continue
+        if selector.passes(metric, plane):
+            return StratumSelection(metric, plane, (), False)
+        if selector.hopeless:
+            break
+    done = selector.finished(data) or selector.turned(data) or selector.best_tolerable()
+    if done is not None:
+        return StratumSelection(*done, (), False)
+    second = selector.second_best(unique and _several_directions(solution.rig, finite[0], noise))
+    if second is None:
+        selector.hopeless, selector.reserve = False, []
+        for plane in finite:
+            try:
+                affine = solve(
+                    stratum_upgrade.affine_rig(solution.rig, plane),
+                    data,
+                    "affine",
+                    lenses=solution.lenses,
+                    max_evaluations=80,
+                )
+            except (GeometryError, np.linalg.LinAlgError) as error:
+                selector.notes.append(f"no affine start: {error}")
+                continue
+            if selector.passes(affine, plane):
+                return StratumSelection(affine, plane, tuple(selector.notes), selector.bent)
+            if selector.hopeless:
+                break
+        done = selector.finished(data) or selector.best_tolerable()
+        if done is not None:
+            return StratumSelection(*done, tuple(selector.notes), selector.bent)
+        second = selector.second_best(unique) or selector.last_resort(data)
+    best, plane = second or (solution, finite[0])
+    return StratumSelection(best, plane, tuple(selector.notes), selector.bent)
+
+
+def _several_directions(rig: RigModel, plane: FloatArray, noise: FloatArray) -> bool:
+    """Whether rotations about axes of different directions determine the intrinsics beyond doubt."""
+    revolute = np.array([kind == "revolute" for kind in rig.kinds])
+    try:
+        return stratum_upgrade.intrinsics_linear(
+            stratum_upgrade.affine_rig(rig, plane).generators, revolute, noise
+        )[1]
+    except GeometryError:
+        return False
+
+
+def _metric_starts(
+    rig: RigModel, planes: list[FloatArray], noise: FloatArray, spans: FloatArray
+) -> Iterator[tuple[RigModel, FloatArray]]:
+    """Metric rigs to start from and their planes: with the linear estimate of the intrinsics, then nominal
+    ones.
+    """
+    revolute = np.array([kind == "revolute" for kind in rig.kinds])
+    if int(revolute.sum()) < 2:
+        return
+    for plane in planes:
+        try:
+            affine = stratum_upgrade.affine_rig(rig, plane)
+            linear, _ = stratum_upgrade.intrinsics_linear(affine.generators, revolute, noise)
+        except GeometryError:
+            linear = None  # this plane is no start for the linear estimate; nominal cameras follow
+        if linear is not None:
+            yield stratum_upgrade.metric_rig(rig, plane, linear, spans), plane
+        for focal in stratum_upgrade.NOMINAL_FOCALS:
+            yield (
+                stratum_upgrade.metric_rig(rig, plane, stratum_upgrade.nominal_intrinsics(focal), spans),
+                plane,
+            )

@@ -1,0 +1,384 @@
+"""Trial data of a calibration: pixels of the markers at stops of joint-wise motions, checked, in one npz file."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.model import JointLoads, ModelFileError, check_loads, write_atomically
+from stereoservo.messages.cell_file import Mount
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+TRIALS_SCHEMA = 1
+LOADS = "loads_"
+STATIC = "static_"
+MAX_POSITION = 1e6
+"""Largest joint position [rad or m] that is taken for one."""
+MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
+"""Largest sigma and largest pixel coordinate that are taken for such [image sizes]: a wrong detection is nearer."""
+MAX_OUTSIDE = 0.5
+"""Share of a camera's pixels outside its image above which the image size is taken for a wrong one."""
+
+
+class CalibrationError(Exception):
+    """Raised where a calibration gives no model; the text holds the reason, the value and the valid range.
+
+    Attributes:
+        code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
+            ``too_few_stops``,
+            ``joint_did_not_move``, ``joint_without_effect``, ``joint_kind``, ``views_degenerate``,
+            ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``;
+            of the diagnosis ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``, ``joint_order``,
+            ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
+            ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``;
+            of relocalization ``too_few_points``, ``points_coplanar``, ``not_explained``, ``too_uncertain``.
+        data: the values the message speaks of.
+    """
+
+    def __init__(self, code: str, message: str, **data: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.message = message
+        self.data = data
+
+
+def finite_rows(array: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which rows (...) of an array (..., k) are finite in all k entries."""
+    return np.asarray(np.isfinite(array).all(axis=-1), dtype=bool)
+
+
+class TrialCamera(msgspec.Struct, frozen=True):
+    """A camera of the trials and its image size [px].
+
+    ``mount``: ``eye_to_hand`` where it is static and the arm carries the markers, ``eye_in_hand`` the other way round.
+    """
+
+    name: str
+    width: int
+    height: int
+    mount: Mount = "eye_to_hand"
+
+
+class StaticObservations(msgspec.Struct, frozen=True, eq=False):
+    """Observations of static markers, over all stops: ``ids`` (k,), raw ``pixels`` (c, k, 2) [px], NaN where a
+    camera does not see one, and ``sigmas`` (c, k) [px].
+    """
+
+    ids: tuple[int, ...]
+    pixels: FloatArray
+    sigmas: FloatArray
+
+
+class TrialData(msgspec.Struct, frozen=True, eq=False):
+    """Stops of trial motions and what the cameras saw there.
+
+    Joints are in base-first order. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1
+    for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
+    seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
+    one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: what the drives said
+    of their loads on the way, where they did; copied into the model. ``static``: markers that do not move.
+    """
+
+    joint_names: tuple[str, ...]
+    joint_kinds: tuple[Literal["revolute", "prismatic"], ...]
+    cameras: tuple[TrialCamera, ...]
+    marker_ids: tuple[int, ...]
+    positions: FloatArray
+    trials: IntArray
+    pixels: FloatArray
+    sigmas: FloatArray
+    images: int = 0
+    loads: JointLoads | None = None
+    static: StaticObservations | None = None
+
+    @property
+    def visible(self) -> npt.NDArray[np.bool_]:
+        """(c, s, m): which pixels were measured."""
+        return finite_rows(self.pixels)
+
+
+class _Header(msgspec.Struct, forbid_unknown_fields=True):
+    schema: int
+    joint_names: tuple[str, ...]
+    joint_kinds: tuple[Literal["revolute", "prismatic"], ...]
+    cameras: tuple[TrialCamera, ...]
+    marker_ids: tuple[int, ...]
+    images: int
+
+
+def check_trials(trials: TrialData) -> None:
+    """Check shapes and numbers. Raises CalibrationError (``bad_data``, ``too_few_cameras``) with what does
+    not fit.
+    """
+    n, m, c = len(trials.joint_names), len(trials.marker_ids), len(trials.cameras)
+    s = trials.positions.shape[0] if trials.positions.ndim else 0
+    if n < 1 or len(trials.joint_kinds) != n:
+        raise CalibrationError(
+            "bad_data",
+            f"{n} joint names and {len(trials.joint_kinds)} kinds; one kind for each of at least one joint "
+            "is needed",
+        )
+    if trials.images < 0:
+        raise CalibrationError("bad_data", f"images is {trials.images}; 0 or more is needed", key="images")
+    unknown = sorted(set(trials.joint_kinds) - {"revolute", "prismatic"})
+    if unknown:
+        raise CalibrationError(
+            "bad_data",
+            f"joint kinds {unknown} are unknown; revolute and prismatic are taken",
+            key="joint_kinds",
+        )
+    if c < 2:
+        raise CalibrationError(
+            "too_few_cameras",
+            f"{c} camera(s); at least 2 that see the markers at once are needed",
+            cameras=c,
+            minimum=2,
+        )
+    for what, names in (
+        ("joint", trials.joint_names),
+        ("camera", tuple(camera.name for camera in trials.cameras)),
+        ("marker", trials.marker_ids),
+    ):
+        if len(set(names)) < len(names):
+            raise CalibrationError("bad_data", f"{what} names {names} are not all different")
+    expected: list[tuple[str, npt.NDArray[Any], tuple[int, ...]]] = [
+        ("positions", trials.positions, (s, n)),
+        ("trials", trials.trials, (s,)),
+        ("pixels", trials.pixels, (c, s, m, 2)),
+        ("sigmas", trials.sigmas, (c, s, m)),
+    ]
+    for key, array, shape in expected:
+        if array.shape != shape:
+            raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
+    if trials.static is not None:
+        _check_static(trials, trials.static)
+    if trials.loads is not None:
+        try:
+            check_loads(trials.loads, n)
+        except ModelFileError as error:
+            raise CalibrationError("bad_data", str(error), key=error.key) from error
+    if not s:
+        raise CalibrationError("too_few_stops", "the trials hold no stops; each joint needs some", stops=0)
+    if not np.issubdtype(trials.trials.dtype, np.integer):
+        raise CalibrationError(
+            "bad_data",
+            f"trials holds {trials.trials.dtype} numbers; indices of joints, or -1, are needed",
+            key="trials",
+        )
+    if not np.isfinite(trials.positions).all():
+        stop = int(np.argwhere(~np.isfinite(trials.positions))[0, 0])
+        raise CalibrationError(
+            "bad_data", f"positions of stop {stop} are not finite", key="positions", stop=stop
+        )
+    if trials.trials.min() < -1 or trials.trials.max() >= n:
+        raise CalibrationError(
+            "bad_data",
+            f"trial indices reach from {trials.trials.min()} to {trials.trials.max()}; -1 to {n - 1} are "
+            "joints",
+            key="trials",
+        )
+    _check_sizes(trials)
+    _check_pixels(trials)
+
+
+def _check_static(trials: TrialData, static: StaticObservations) -> None:
+    c, k = len(trials.cameras), len(static.ids)
+    twice = sorted({i for i in static.ids if static.ids.count(i) > 1 or i in trials.marker_ids})
+    if twice:
+        raise CalibrationError(
+            "bad_data",
+            f"static ids {twice} stand twice, or are markers of the arm, too",
+            key="static",
+            ids=twice,
+        )
+    if static.pixels.shape != (c, k, 2) or static.sigmas.shape != (c, k):
+        raise CalibrationError(
+            "bad_data",
+            f"static pixels {static.pixels.shape} and sigmas {static.sigmas.shape}; {(c, k, 2)} and {(c, k)} are "
+            "needed",
+            key="static",
+        )
+    seen = finite_rows(static.pixels)
+    if not (np.isfinite(static.sigmas[seen]).all() and (static.sigmas[seen] > 0.0).all()):
+        raise CalibrationError("bad_data", "static sigmas are not all positive numbers", key="static")
+
+
+def _check_sizes(trials: TrialData) -> None:
+    for camera in trials.cameras:
+        if camera.width < 1 or camera.height < 1:
+            raise CalibrationError(
+                "bad_data",
+                f"camera {camera.name!r}: image size {camera.width}x{camera.height} px is not positive",
+                key="cameras",
+                camera=camera.name,
+            )
+    if float(np.abs(trials.positions).max()) > MAX_POSITION:
+        stop, joint = np.unravel_index(int(np.abs(trials.positions).argmax()), trials.positions.shape)
+        raise CalibrationError(
+            "bad_data",
+            f"position of joint {trials.joint_names[int(joint)]!r} at stop {stop} is "
+            f"{trials.positions[stop, joint]:.6g}; at most {MAX_POSITION:g} [rad or m] is taken",
+            key="positions",
+            stop=int(stop),
+        )
+
+
+def _check_pixels(trials: TrialData) -> None:
+    """Refuse sigmas that are none, and measured pixels that no detector finds in an image of that size."""
+    for c, camera in enumerate(trials.cameras):
+        size = max(camera.width, camera.height)
+        seen = trials.visible[c]
+        with np.errstate(invalid="ignore"):
+            good = (trials.sigmas[c] > 0.0) & (trials.sigmas[c] <= MAX_SIGMA * size)
+            inside = (np.abs(trials.pixels[c]) <= MAX_PIXEL * size).all(axis=-1)
+        for key, ok, array, needed in (
+            ("sigmas", good, trials.sigmas[c], f"positive ones up to {MAX_SIGMA * size:g} px are needed"),
+            ("pixels", inside, trials.pixels[c], f"pixels within {MAX_PIXEL * size:g} px are taken"),
+        ):
+            if (ok | ~seen).all():
+                continue
+            stop, marker = (int(i) for i in np.argwhere(seen & ~ok)[0])
+            value = ", ".join(f"{number:.6g}" for number in np.atleast_1d(array[stop, marker]))
+            raise CalibrationError(
+                "bad_data",
+                f"{key}: marker {trials.marker_ids[marker]} at stop {stop} in camera {camera.name!r} "
+                f"({camera.width}x{camera.height} px) has {value} px; {needed}",
+                key=key,
+                camera=camera.name,
+                stop=stop,
+                marker=trials.marker_ids[marker],
+            )
+        with np.errstate(invalid="ignore"):
+            outside = (trials.pixels[c] < -0.5) | (
+                trials.pixels[c] > np.array([camera.width, camera.height]) - 0.5
+            )
+        share = float(outside.any(axis=-1)[seen].mean()) if seen.any() else 0.0
+        if share > MAX_OUTSIDE:
+            raise CalibrationError(
+                "bad_data",
+                f"{share:.0%} of the pixels of camera {camera.name!r} lie outside its image of {camera.width}x"
+                f"{camera.height} px; at most {MAX_OUTSIDE:.0%} are taken. Is its image size the right one?",
+                key="pixels",
+                camera=camera.name,
+                share=share,
+            )
+
+
+def encode_trials(trials: TrialData) -> bytes:
+    """Trial data as npz bytes: a JSON header and four arrays. Raises CalibrationError (``bad_data``)."""
+    check_trials(trials)
+    header = _Header(
+        schema=TRIALS_SCHEMA,
+        joint_names=trials.joint_names,
+        joint_kinds=trials.joint_kinds,
+        cameras=trials.cameras,
+        marker_ids=trials.marker_ids,
+        images=trials.images,
+    )
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        header=np.frombuffer(msgspec.json.encode(header), dtype=np.uint8),
+        positions=np.asarray(trials.positions, dtype=np.float64),
+        trials=np.asarray(trials.trials, dtype=np.int64),
+        pixels=np.asarray(trials.pixels, dtype=np.float64),
+        sigmas=np.asarray(trials.sigmas, dtype=np.float64),
+        **_load_arrays(trials.loads),  # type: ignore[arg-type]
+        **_static_arrays(trials.static),  # type: ignore[arg-type]
+    )
+    return buffer.getvalue()
+
+
+def _load_arrays(loads: JointLoads | None) -> dict[str, FloatArray]:
+    """Loads as arrays of their own: a program that does not know them reads the rest."""
+    if loads is None:
+        return {}
+    given = {field: getattr(loads, field) for field in JointLoads.__struct_fields__}
+    return {LOADS + field: array for field, array in given.items() if array is not None}
+
+
+def _static_arrays(static: StaticObservations | None) -> dict[str, npt.NDArray[Any]]:
+    if static is None:
+        return {}
+    return {
+        STATIC + "ids": np.array(static.ids, dtype=np.int64),
+        STATIC + "pixels": np.asarray(static.pixels, dtype=np.float64),
+        STATIC + "sigmas": np.asarray(static.sigmas, dtype=np.float64),
+    }
+
+
+def _static(arrays: dict[str, npt.NDArray[Any]]) -> StaticObservations | None:
+    if STATIC + "ids" not in arrays:
+        return None
+    return StaticObservations(
+        tuple(int(i) for i in arrays[STATIC + "ids"]),
+        arrays[STATIC + "pixels"].astype(np.float64, casting="same_kind"),
+        arrays[STATIC + "sigmas"].astype(np.float64, casting="same_kind"),
+    )
+
+
+def _loads(arrays: dict[str, npt.NDArray[Any]]) -> JointLoads | None:
+    fields = {
+        key.removeprefix(LOADS): array.astype(np.float64, casting="same_kind")
+        for key, array in arrays.items()
+        if key.startswith(LOADS)
+    }
+    return msgspec.convert(fields, JointLoads) if fields else None
+
+
+def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
+    """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``) naming what does not fit."""
+    try:
+        if not data.startswith(b"PK"):  # numpy would take it for a pickle, and say so
+            raise ValueError("it is no .npz archive")
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+        header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_Header)
+        if header.schema != TRIALS_SCHEMA:
+            raise CalibrationError(
+                "bad_data", f"{path}: schema is {header.schema}; this version reads {TRIALS_SCHEMA}"
+            )
+        trials = TrialData(
+            joint_names=header.joint_names,
+            joint_kinds=header.joint_kinds,
+            cameras=header.cameras,
+            marker_ids=header.marker_ids,
+            positions=arrays["positions"].astype(np.float64, casting="same_kind"),
+            trials=arrays["trials"].astype(np.int64, casting="same_kind"),
+            pixels=arrays["pixels"].astype(np.float64, casting="same_kind"),
+            sigmas=arrays["sigmas"].astype(np.float64, casting="same_kind"),
+            images=header.images,
+            loads=_loads(arrays),
+            static=_static(arrays),
+        )
+    except KeyError as error:
+        raise CalibrationError(
+            "bad_data", f"{path}: is not a file of trial data: array {error} is missing", key=str(error)
+        ) from error
+    except (ValueError, TypeError, EOFError, OSError, zipfile.BadZipFile, msgspec.DecodeError) as error:
+        raise CalibrationError("bad_data", f"{path}: is not a file of trial data: {error}") from error
+    try:
+        check_trials(trials)
+    except CalibrationError as error:
+        raise CalibrationError(error.code, f"{path}: {error.message}", **error.data) from error
+    return trials
+
+
+def save_trials(trials: TrialData, path: Path) -> None:
+    """Write trial data, whole or not at all. Raises CalibrationError, OSError."""
+    write_atomically(path, encode_trials(trials))
+
+
+def load_trials(path: Path) -> TrialData:
+    """Read and check trial data. Raises CalibrationError (``bad_data``)."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CalibrationError("bad_data", f"{path}: cannot be read: {error.strerror}") from error
+    return decode_trials(data, path)

@@ -1,0 +1,251 @@
+"""``stereoservo calibrate``: by the daemon, or one started for it; a model check; a fit of stored trials."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from stereoservo.cli import interruption
+from stereoservo.cli.calibrate.recorded_images import fit_images, table_of_images
+from stereoservo.cli.calibrate.stored_trials import fit_again, table, table_of_stored
+from stereoservo.cli.output import (
+    EXIT_FAILED,
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+    note,
+)
+from stereoservo.client import Client, FailedError
+from stereoservo.daemon.jobs.check_job import load_checks
+from stereoservo.messages.check_report import CheckReport, ZeroReset
+from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.discovery import DaemonProcess, NotRunningError, find_daemon
+from stereoservo.messages.wire import EventMessage
+
+TRIALS_SHARE = 0.9
+SHOWN_CHECKS = 8
+
+CheckOption = Annotated[
+    bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")
+]
+ResetZerosOption = Annotated[
+    bool,
+    typer.Option(
+        "--reset-zeros",
+        help="With --check: where joint zeros have drifted, and nothing else, a new model with moved zeros.",
+    ),
+]
+UnattendedOption = Annotated[
+    bool,
+    typer.Option(
+        "--unattended",
+        help="With --check, for timers: enable nothing, disturb nobody; exit code 1 where the model does not hold.",
+    ),
+]
+TrialsOption = Annotated[
+    Path | None,
+    typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
+]
+ImagesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--images",
+        metavar="DIR",
+        help="Fit trial motions recorded by `record --images`, with the cell file's detectors; nothing moves.",
+    ),
+]
+LinesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--lines",
+        metavar="FILE.csv",
+        help="With --trials: pixels along straight lines (camera,line,u,v) that show the lens.",
+    ),
+]
+LinesSigmaOption = Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", metavar="FILE.json", help="With --trials, --images: where the model goes."),
+]
+
+
+def calibrate(
+    cell: CellArgument,
+    check: CheckOption = False,
+    reset_zeros: ResetZerosOption = False,
+    unattended: UnattendedOption = False,
+    trials: TrialsOption = None,
+    images: ImagesOption = None,
+    lines: LinesOption = None,
+    lines_sigma: LinesSigmaOption = 0.3,
+    output: OutputOption = None,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Move each joint alone, watch the markers, fit the cell's model. Ctrl-C stops the arm.
+
+    With the path of a cell file and no daemon running, one is started for the time of it.
+    """
+    if (reset_zeros or unattended) and not check:
+        raise CommandError("argument", "--reset-zeros and --unattended go with --check")
+    if (trials is not None or images is not None) and check:
+        raise CommandError(
+            "argument", "--check moves the arm, --trials and --images do not: give one of them"
+        )
+    if trials is not None and images is not None:
+        raise CommandError("argument", "--trials and --images: one of them")
+    if images is not None:
+        if lines is not None:
+            raise CommandError("argument", "--lines go with --trials; --images keeps its trial data for that")
+        from_images = fit_images(cell, images, output)
+        emit(from_images, table_of_images(from_images), json)
+        return
+    if trials is not None:
+        result = fit_again(cell, trials, lines, lines_sigma, output)
+        emit(result, table_of_stored(result), json)
+        return
+    if lines is not None or output is not None:
+        raise CommandError(
+            "argument", "--lines and --output go with --trials FILE.npz, --output with --images too"
+        )
+    with ExitStack() as stack:
+        if not unattended and endpoint is None and cell.endswith(".toml"):
+            try:
+                find_daemon(cell)
+            except NotRunningError:
+                note("no daemon runs for this cell: starting one")
+                stack.enter_context(DaemonProcess(Path(cell))).wait_ready()
+        client = stack.enter_context(
+            Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check)
+        )
+        if unattended:
+            _must_be_idle(client)
+        elif client.status().lifecycle == "inactive":
+            client.enable()
+        try:
+            if reset_zeros:
+                _reset_zeros(client, json)
+                return
+            if check:
+                report = _with_bar(client, "check motion", client.check_model)
+                _tell_check(report, client.cell, endpoint, json)
+                if unattended and report.status == "recalibrate":
+                    raise typer.Exit(EXIT_FAILED)
+                return
+            result = _with_bar(
+                client, "trial motions", lambda progress: client.calibrate(progress, report=True)
+            )
+        except KeyboardInterrupt:
+            client.stop()
+            raise
+        except FailedError as error:
+            raise _failure(error) from error
+    emit(result, table(result), json)
+
+
+def _failure(error: FailedError, **said: Any) -> CommandError:
+    """The failure with its cause's own code and, where the motion ended early, the reasons with their values."""
+    if error.event.reasons:
+        said["reasons"] = msgspec.to_builtins(error.event.reasons)
+    return CommandError(error.code, str(error), **said)
+
+
+def _must_be_idle(client: Client) -> None:
+    state = client.status()
+    if state.lifecycle != "active" or state.source != "hold":
+        doing = f"works ({state.source}{f' {state.goal}' if state.goal else ''})"
+        raise CommandError(
+            "not_idle",
+            f"no check: the cell is {state.lifecycle if state.lifecycle != 'active' else doing}; an unattended check "
+            "waits for nothing and enables nothing. Enable the cell, or choose another hour",
+            lifecycle=state.lifecycle, source=state.source,
+        )  # fmt: skip
+
+
+def _with_bar(client: Client, what: str, run: Any) -> Any:
+    console = Console(file=sys.stderr)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=1.0)
+
+        def progress(event: EventMessage) -> None:
+            if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
+                note(event.message)
+            if event.progress is None:
+                return
+            fitting = event.kind.startswith("fit")
+            done = (
+                TRIALS_SHARE + (1 - TRIALS_SHARE) * event.progress
+                if fitting
+                else TRIALS_SHARE * event.progress
+            )
+            bar.update(task, completed=done, description=event.message or what)
+
+        return run(progress)
+
+
+# -- check --------------------------------------------------------------------------------------------------
+
+
+def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
+    """Print the report, with earlier checks where they are stored on this host."""
+    past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
+    history = [
+        {"created": one.created, "epoch": one.model_epoch, "status": one.status, "sigmas": one.sigmas,
+         "rms_px": one.rms_px, "causes": [cause.message for cause in one.causes]}
+        for one in past
+    ]  # fmt: skip
+    tree = {**msgspec.to_builtins(report), "holds": report.status != "recalibrate", "history": history}
+    lines = [report.message]
+    lines += [f"  {report.trend}"] if report.trend else []
+    for what, values in (("joint", report.per_joint), ("camera", report.per_camera)):
+        lines += [f"  {what:6} {name:16} {value:.2f} sigmas" for name, value in values.items()]
+    worst = sorted(report.per_marker.items(), key=lambda item: -item[1])[:3]
+    lines.append(
+        "  markers, worst first: " + ", ".join(f"{name} {value:.2f}" for name, value in worst) + " sigmas"
+    )
+    if len(history) > 1:
+        lines.append("  checks so far:")
+        lines += [
+            f"    {one.created}  epoch {one.model_epoch}  {one.sigmas:6.2f} sigmas  {one.status}"
+            for one in past
+        ]
+    emit(tree, "\n".join(lines), json)
+
+
+def _reset_zeros(client: Client, json: bool) -> None:
+    """Check, and reset joint zeros; prints the check in any case. Raises CommandError with the code of the refusal."""
+    checks: list[CheckReport] = []
+
+    def reset(progress: Callable[[EventMessage], None]) -> ZeroReset:
+        def heard(event: EventMessage) -> None:
+            if event.check is not None:
+                checks.append(event.check)
+            progress(event)
+
+        return client.reset_zeros(heard)
+
+    try:
+        done: ZeroReset = _with_bar(client, "check motion", reset)
+    except FailedError as error:
+        said = {"check": msgspec.to_builtins(checks[-1])} if checks else {}
+        raise _failure(error, **said) from error
+    tree = {"check": msgspec.to_builtins(checks[-1]), "reset": msgspec.to_builtins(done)}
+    emit(tree, f"{checks[-1].message}\n{done.message}\n  model {done.model}", json)

@@ -1,0 +1,243 @@
+"""Findings of ``stereoservo doctor`` on each camera: sharpness of markers, exposure, rate, noise.
+
+Pure: records in, findings out. The arm rests meanwhile, or nearly so. Pixels are raw ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.ports.devices import CameraDescription, CameraObservation, CameraStatistics, Finding, Frame
+
+HELD_RATE = 0.95
+"""Share of the stated rate below which a camera is said not to hold it."""
+STEADY_MARKERS = 0.9
+"""Share of frames that must show enough markers."""
+WINDOW_PX = 10
+"""Half the window around a marker that focus and contrast are judged in."""
+LOW_CONTRAST = 40.0
+"""Grey levels between dark and bright below which noise of 2 levels costs a dot more than 0.03 px."""
+WIDE_EDGE_PX = 2.5
+"""Standard deviation of an edge's blur beyond which dots of 10 px are no longer measured well."""
+SATURATED = 254
+MUCH_SATURATED = 0.05
+EDGE_PX = 20
+"""Markers nearer to the border of the image than this leave it with the next motion."""
+
+
+@dataclass
+class CameraRecord:
+    """Data of one observed camera: observations ``seen``, newest last; the newest ``frame``."""
+
+    description: CameraDescription
+    seen: list[CameraObservation] = field(default_factory=list)
+    frame: Frame | None = None
+    flipped: int = 0
+    """Markers that the detector finds in the mirror image of ``frame``, asked where it finds none in it."""
+    error: str = ""
+    statistics: CameraStatistics | None = None
+    """Counts of the driver over ``watched_s`` [s], where it tells them."""
+    watched_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Of the camera in the cell file."""
+        return self.description.name
+
+    @property
+    def shutters_ns(self) -> npt.NDArray[np.int64]:
+        """Shutter times (k,)."""
+        return np.array([o.t_shutter_ns for o in self.seen], dtype=np.int64)
+
+
+def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Finding]:
+    """Findings on one camera by itself. ``min_markers``: what calibration asks of every stop."""
+    what = f"camera {record.name}"
+    if record.error:
+        yield Finding(what, False, record.error)
+        return
+    if len(record.seen) < 2:
+        yield Finding(
+            what, False, f"{len(record.seen)} frames while it was watched; at least 2 are needed",
+            f"[camera.options] of {record.name!r}: source; is another program using the camera?",
+        )  # fmt: skip
+        return
+    yield _rate(record)
+    yield _latency(record)
+    yield _markers(record, min_markers)
+    if record.frame is not None:
+        yield from _picture_quality(record.name, record.frame.image, record.seen[-1])
+
+
+def _rate(record: CameraRecord) -> Finding:
+    stamps, asked = record.shutters_ns, record.description.rate_hz
+    gaps_ms = np.diff(stamps) * 1e-6
+    rate = 1e9 * (len(stamps) - 1) / float(stamps[-1] - stamps[0]) if stamps[-1] > stamps[0] else 0.0
+    missing = int(record.seen[-1].seq - record.seen[0].seq) - (len(stamps) - 1)
+    counted = record.statistics
+    extra = ""
+    if counted is not None:
+        rate = counted.frames / record.watched_s if record.watched_s > 0 else rate
+        extra = f", {counted.dropped} dropped, {counted.frozen} withheld as frozen, {counted.reconnects} reconnects"
+        differing = [
+            f"{name} asked {want:g}, is {got:g}"
+            for name, (want, got) in counted.settings.items()
+            if want is not None and got is not None and abs(want - got) > 1e-3 * max(abs(want), 1.0)
+        ]
+        extra += "".join(f", {told}" for told in differing)
+    told = (
+        f"{rate:.1f} Hz of {asked:g}, frames {np.median(gaps_ms):.1f} ms apart, at most {gaps_ms.max():.1f}, "
+        f"{max(missing, 0)} not looked at{extra}"
+    )
+    if rate >= HELD_RATE * asked:
+        return Finding(f"{record.name} rate", True, told)
+    return Finding(
+        f"{record.name} rate", None, told,
+        f"more light for a shorter exposure, or rate_hz = {rate:.0f}, which is what it holds",
+    )  # fmt: skip
+
+
+def _latency(record: CameraRecord) -> Finding:
+    ms = np.array([(o.t_received_ns - o.t_shutter_ns) * 1e-6 for o in record.seen])
+    told = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
+    if ms.max() <= 0.0:
+        return Finding(
+            f"{record.name} latency", None, f"{told}: none is stated",
+            "latency_s of its options; `stereoservo status` tells it once the arm has moved",
+        )  # fmt: skip
+    return Finding(f"{record.name} latency", True, told)
+
+
+def _markers(record: CameraRecord, min_markers: int) -> Finding:
+    name = f"{record.name} markers"
+    counts = np.array([o.ids.size for o in record.seen])
+    known = len(record.description.marker_ids)
+    steady = float((counts >= min_markers).mean())
+    told = (
+        f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
+    )
+    if counts.max() == 0 and record.flipped:
+        return Finding(
+            name, False, f"none is seen, but {record.flipped} in the mirror image",
+            "print the plate again, not mirrored; or undo the camera's flip (option flip)",
+        )  # fmt: skip
+    if counts.max() == 0:
+        return Finding(
+            name, False, f"none of {known} is seen; look at the picture",
+            "the plate in view, light on it, lens cap off; polarity, dictionary, landmarks of detector_options",
+        )  # fmt: skip
+    if steady < STEADY_MARKERS:
+        return Finding(
+            name, False, f"{told}; enough in {100 * steady:.0f} % of the frames",
+            "more light, a nearer or larger plate, less tilt; or calibration.min_markers",
+        )  # fmt: skip
+    sigma = float(np.median([np.sqrt(0.5 * np.trace(C)) for C in record.seen[-1].covariances]))
+    return Finding(name, True, f"{told}; standard deviation {sigma:.3f} px{_scatter(record)}")
+
+
+def _scatter(record: CameraRecord) -> str:
+    """Scatter of the markers over the frames, of an arm at rest, beside what the detector states."""
+    seen: dict[int, list[FloatArray]] = {}
+    for observation in record.seen:
+        for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
+            seen.setdefault(marker, []).append(pixel)
+    deviations = [
+        np.var(np.array(pixels), axis=0, ddof=1).mean() for pixels in seen.values() if len(pixels) > 5
+    ]
+    return f", scatter {float(np.sqrt(np.median(deviations))):.3f} px" if deviations else ""
+
+
+def contrast_and_blur(image: ImageArray, pixel: FloatArray) -> tuple[float, float, float] | None:
+    """Contrast [grey levels], blur of the edges (standard deviation [px]) and share of saturated pixels at a marker.
+
+    An edge of contrast c blurred by a Gaussian of s has the largest gradient ``c / (s sqrt(2 pi))``; the central
+    difference widens s² by 1/3. None where the window leaves the image.
+    """
+    u, v = np.rint(pixel).astype(int)
+    window = image[v - WINDOW_PX : v + WINDOW_PX + 1, u - WINDOW_PX : u + WINDOW_PX + 1]
+    if u < WINDOW_PX or v < WINDOW_PX or window.shape != (2 * WINDOW_PX + 1,) * 2:
+        return None
+    grey = window.astype(np.float64)
+    dark, bright = np.percentile(grey, [5.0, 95.0])
+    down, right = np.gradient(grey)
+    steepest = float(np.percentile(np.hypot(down, right), 99.0))
+    blur = (bright - dark) / (np.sqrt(2 * np.pi) * steepest) if steepest > 0 else np.inf
+    return float(bright - dark), float(np.sqrt(max(blur**2 - 1 / 3, 0.0))), float((grey >= SATURATED).mean())
+
+
+def _picture_quality(name: str, image: ImageArray, observation: CameraObservation) -> Iterator[Finding]:
+    found = [contrast_and_blur(image, pixel) for pixel in observation.pixels]
+    measured = np.array([values for values in found if values is not None])
+    if not len(measured):
+        return
+    contrast, blur, saturated = np.median(measured, axis=0)
+    told = f"contrast {contrast:.0f} grey levels (least {measured[:, 0].min():.0f})"
+    if contrast < LOW_CONTRAST:
+        yield Finding(
+            f"{name} contrast",
+            None,
+            f"{told}; {LOW_CONTRAST:g} are wanted",
+            "more light, longer exposure, matt print",
+        )
+    else:
+        yield Finding(f"{name} contrast", True, told)
+    if saturated > MUCH_SATURATED:
+        yield Finding(
+            f"{name} exposure", None,
+            f"{100 * saturated:.0f} % of the pixels around the markers are white to the limit: edges are cut",
+            "shorter exposure, less gain",
+        )  # fmt: skip
+    told = f"edges at the markers are blurred by {blur:.1f} px"
+    sharp = bool(blur <= WIDE_EDGE_PX)
+    cure = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
+    yield Finding(f"{name} focus", True if sharp else None, told, cure)
+
+
+def examine_skew(records: Sequence[CameraRecord]) -> Iterator[Finding]:
+    """Finding on the time between the cameras' shutters. Not a fault: each image counts at its own time."""
+    shown = [record for record in records if len(record.seen) >= 2]
+    for first, second in pairwise(shown):
+        apart = first.shutters_ns[:, None] - second.shutters_ns[None, :]
+        nearest = apart[np.arange(len(apart)), np.abs(apart).argmin(axis=1)] * 1e-6
+        yield Finding(
+            f"skew {first.name}-{second.name}", True,
+            f"{np.median(nearest):+.1f} ms (median; {np.abs(nearest).max():.1f} at most): used, each at its own time",
+        )  # fmt: skip
+
+
+def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+    """Markers seen in most frames: ids (k,), mean raw pixels (k, 2), standard deviations (k,) of one sight."""
+    pixels: dict[int, list[FloatArray]] = {}
+    variances: dict[int, list[float]] = {}
+    for observation in record.seen:
+        for marker, pixel, C in zip(
+            observation.ids.tolist(), observation.pixels, observation.covariances, strict=True
+        ):
+            pixels.setdefault(marker, []).append(pixel)
+            variances.setdefault(marker, []).append(0.5 * float(np.trace(C)))
+    kept = sorted(marker for marker, sights in pixels.items() if 2 * len(sights) >= len(record.seen))
+    return (
+        np.array(kept, dtype=np.int64),
+        np.array([np.mean(pixels[marker], axis=0) for marker in kept]).reshape(-1, 2),
+        np.sqrt(np.array([float(np.mean(variances[marker])) for marker in kept])),
+    )
+
+
+def near_border(record: CameraRecord) -> Finding | None:
+    """Markers that are about to leave the picture."""
+    ids, pixels, _ = mean_sights(record)
+    size = np.array([record.description.width, record.description.height])
+    close = ids[((pixels < EDGE_PX) | (pixels > size - 1 - EDGE_PX)).any(axis=1)]
+    if not close.size:
+        return None
+    return Finding(
+        f"{record.name} view", None,
+        f"markers {close.tolist()} are within {EDGE_PX} px of the picture's border: they leave it with the next motion",
+        "aim the camera so that the plate stands near the middle at calibration.base",
+    )  # fmt: skip

@@ -1,0 +1,187 @@
+"""``stereoservo doctor``: examines a cell before it moves."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from stereoservo.cli.doctor.cameras import examine_cameras
+from stereoservo.cli.doctor.joints import examine_joints, permission
+from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.client import SessionError
+from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
+from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.taught_goals import load_taught
+from stereoservo.gateway.persistence import ModelStore
+from stereoservo.gateway.zenoh_config import gateway_config
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
+from stereoservo.messages.locks import holder
+from stereoservo.ports.devices import Finding
+
+LOW_DISK_BYTES = 500_000_000
+
+
+def doctor(
+    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Path of a cell file.")],
+    jog: Annotated[
+        bool,
+        typer.Option("--jog", help="Also turn each joint by one degree, once allowed: checks its units."),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Allow what --jog asks for.")] = False,
+    seconds: Annotated[
+        float,
+        typer.Option(
+            "--seconds", help="How long the cameras are watched; 0: not at all.", min=0.0, max=600.0
+        ),
+    ] = 2.0,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures", help="Where what each camera sees is saved (default: the cell's state directory)."
+        ),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Check cell file, drivers, drives, cameras, directories, wire, model and scheduling. Nothing moves without
+    ``--jog``; drives and cameras are asked only while no daemon has them.
+    """
+    may_move = permission(jog, yes)
+    loaded = load_cell_file(cell)
+    findings = [Finding("cell file", True, f"{cell} is valid")]
+    directories = cell_directories(loaded.cell.name)
+    create_directories(directories)
+    plan = make_plan(cell.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
+    findings.append(Finding("drivers", True, _drivers(plan)))
+    findings += [check(plan, directories) for check in CHECKS]
+    signal.signal(
+        signal.SIGPIPE, signal.SIG_IGN
+    )  # an adapter that hangs up is a finding, no end without a word
+    findings += examine_joints(plan, may_move)
+    if seconds > 0:
+        settings = plan.settings()
+        model, _ = ModelStore(directories.models).newest_fitting(settings)
+        findings += examine_cameras(plan, settings, model, seconds, pictures or directories.state / "doctor")
+    failed = [finding for finding in findings if finding.ok is False]
+    text = "\n".join(_line(finding) for finding in findings)
+    if failed:
+        if not json:
+            emit(None, text, False)
+        tree = msgspec.to_builtins(findings)
+        raise CommandError(
+            "checks_failed",
+            "; ".join(f"{finding.name}: {finding.message}" for finding in failed),
+            checks=tree,
+        )
+    emit({"checks": findings}, text, json)
+
+
+def _line(finding: Finding) -> str:
+    mark = {True: "ok", False: "FAILED", None: "note"}[finding.ok]
+    remedy = f"\n{'':20}cure: {finding.remedy}" if finding.remedy else ""
+    return f"{mark:6} {finding.name:12} {finding.message}{remedy}"
+
+
+def _drivers(plan: RunPlan) -> str:
+    cameras = ", ".join(
+        f"{c.name} {c.width}x{c.height} at {c.rate_hz:g} Hz, {len(c.marker_ids)} markers"
+        for c in plan.cameras
+    )
+    return f"{plan.joints.driver}: {len(plan.joints.joints)} joints; {cameras}"
+
+
+def _daemon(plan: RunPlan, directories: CellDirectories) -> Finding:
+    pid = holder(directories.daemon_lock)
+    if pid is None:
+        return Finding("daemon", True, "none runs for this cell")
+    return Finding("daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`")
+
+
+def _rates(plan: RunPlan, directories: CellDirectories) -> Finding:
+    servo, joints = plan.cell.servo.rate_hz, plan.joints.rate_hz
+    told = f"loop {servo:g} Hz, joints {joints:g} Hz"
+    if servo <= joints:
+        return Finding("rates", True, told)
+    return Finding(
+        "rates",
+        None,
+        f"{told}: some cycles see no new sample, and their command waits for the next",
+        f"servo.rate_hz = {joints:g}",
+    )
+
+
+def _wire(plan: RunPlan, directories: CellDirectories) -> Finding:
+    try:
+        config = gateway_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
+    except SessionError as error:
+        return Finding("zenoh", False, str(error))
+    return Finding(
+        "zenoh",
+        True,
+        f"{config['mode']}: {', '.join(config['listen']['endpoints'] or config['connect']['endpoints'])}",
+    )
+
+
+def _model(plan: RunPlan, directories: CellDirectories) -> Finding:
+    model, passed = ModelStore(directories.models).newest_fitting(plan.settings())
+    if model is not None and passed:
+        why = "; ".join(passed)
+        return Finding(
+            "model",
+            None,
+            f"epoch {model.epoch} of {model.created} is used, newer ones are passed over: {why}",
+        )
+    if model is not None:
+        return Finding("model", True, f"epoch {model.epoch}, {model.stratum}, of {model.created}")
+    return Finding("model", None, "; ".join(passed) or "none yet: calibrate")
+
+
+def _taught(plan: RunPlan, directories: CellDirectories) -> Finding:
+    goals = load_taught(directories.taught)
+    return Finding("taught", True, ", ".join(sorted(goals)) or "none yet")
+
+
+def _scheduling(plan: RunPlan, directories: CellDirectories) -> Finding:
+    wanted = plan.cell.servo.priority
+    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if wanted == 0 or soft >= wanted or soft == resource.RLIM_INFINITY or _is_root():
+        return Finding(
+            "scheduling",
+            True,
+            f"SCHED_FIFO priority {wanted}" if wanted else "ordinary scheduling was asked for",
+        )
+    return Finding(
+        "scheduling",
+        None,
+        f"SCHED_FIFO priority {wanted} is not allowed here (limit {soft}): `ulimit -r {wanted}`",
+    )
+
+
+def _is_root() -> bool:
+    with open("/proc/self/status", encoding="ascii", errors="replace") as file:
+        capabilities = next(int(line.split()[1], 16) for line in file if line.startswith("CapEff"))
+    return bool(capabilities >> 23 & 1)  # CAP_SYS_NICE
+
+
+def _disk(plan: RunPlan, directories: CellDirectories) -> Finding:
+    free = shutil.disk_usage(directories.state).free
+    ok = True if free > LOW_DISK_BYTES else None
+    return Finding("disk", ok, f"{free / 1e9:.1f} GB free for recordings in {directories.state}")
+
+
+CHECKS: tuple[Callable[[RunPlan, CellDirectories], Finding], ...] = (
+    _daemon,
+    _rates,
+    _wire,
+    _model,
+    _taught,
+    _scheduling,
+    _disk,
+)

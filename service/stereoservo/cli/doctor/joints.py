@@ -1,0 +1,70 @@
+"""Examination of the joint driver for ``stereoservo doctor``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import typer
+
+from stereoservo.cli.output import CommandError
+from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.pacing import realtime_for_a_while
+from stereoservo.daemon.servo import make_driver
+from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path, holder
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import DriverError, ExaminableJointDriver, Finding
+
+MayMove = Callable[[str], bool]
+
+
+def permission(jog: bool, yes: bool) -> MayMove:
+    """The function that allows the examination to move a joint: never, always (``--yes``), or as a person answers.
+
+    Raises CommandError: there is nobody to ask.
+    """
+    if yes and not jog:
+        raise CommandError("argument", "--yes answers what --jog asks; give both")
+    if not jog:
+        return lambda _: False
+    if yes:
+        return lambda _: True
+    if not sys.stdin.isatty():
+        raise CommandError(
+            "argument",
+            "--jog asks on the terminal before anything moves, and there is none; --yes answers for it",
+        )
+    return lambda question: typer.confirm(question, default=False, err=True)
+
+
+def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
+    """Findings on the cell's arm; none where its driver cannot examine it. Nothing is touched while somebody else has
+    the machine.
+    """
+    driver = make_driver(plan, MonotonicClock())
+    if not isinstance(driver, ExaminableJointDriver):
+        return
+    directories = plan.directories
+    pid = holder(directories.daemon_lock)
+    if pid is not None:
+        yield Finding("drives", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`")
+        return
+    hardware = hardware_lock_path(
+        directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options
+    )
+    with ExitStack() as locks:
+        try:
+            locks.enter_context(FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}"))
+            if hardware is not None:
+                locks.enter_context(FileLock(hardware, f"joint driver {plan.cell.joints.driver!r}"))
+        except AlreadyRunningError as error:
+            yield Finding("drives", None, f"not examined: {error}")
+            return
+        # As the servo process is scheduled, so that what is measured is what it would see; where that is not allowed,
+        # the check "scheduling" says so.
+        locks.enter_context(realtime_for_a_while(plan.cell.servo.priority))
+        try:
+            yield from driver.examine(may_move)
+        except DriverError as error:
+            yield Finding("drives", False, str(error))

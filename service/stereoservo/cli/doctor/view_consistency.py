@@ -1,0 +1,151 @@
+"""Consistency of simultaneous views: by the cell's model, or by the epipolar constraint alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, permutations, product
+
+import numpy as np
+
+from stereoservo.cli.doctor.camera_findings import CameraRecord, mean_sights
+from stereoservo.core.settings import TrialSettings
+from stereoservo.geometry.cameras import project_many, triangulate
+from stereoservo.geometry.distortion import distort, undistort
+from stereoservo.geometry.fundamental import epipolar_distances, fundamental_robust
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.model import CameraModel, CellModel
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import Finding
+
+FITS_PX = 0.5
+"""Root mean square that views of one point may leave before the cameras are said not to stand where they stood."""
+MATCHES = 10
+"""Markers seen by two cameras from which the epipolar constraint says anything: 7 are used up."""
+WORKSPACE_SHARE = 0.9
+
+
+def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[Finding]:
+    """Findings on what pairs of cameras see at once."""
+    seen = [record for record in records if len(record.seen) >= 2]
+    if len(seen) < 2:
+        return
+    cameras = [] if model is None else [c for r in seen for c in model.cameras if c.name == r.name]
+    if len(cameras) == len(seen):
+        yield _by_model(seen, cameras)
+        return
+    for first, second in pairwise(seen):
+        yield _by_epipolar(first, second)
+
+
+def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
+    """Markers that all see, and their raw pixels (c, k, 2)."""
+    sights = [mean_sights(record) for record in records]
+    ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in sights)))
+    pixels = [
+        np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in sights
+    ]
+    return ids, np.array(pixels)
+
+
+def reprojection_rms(cameras: Sequence[CameraModel], pixels: FloatArray) -> float:
+    """Root mean square [px] a coordinate that triangulated points leave in raw pixels (c, k, 2); NaN without points."""
+    Ps = np.array([camera.matrix for camera in cameras])
+    ideal = np.array([undistort(camera.lens, p) for camera, p in zip(cameras, pixels, strict=True)])
+    points = triangulate(Ps, ideal)
+    raw = np.array(
+        [distort(camera.lens, m) for camera, m in zip(cameras, project_many(Ps, points), strict=True)]
+    )
+    squares = (raw - pixels) ** 2
+    free = squares[np.isfinite(squares)].size - 3 * int(np.isfinite(points[:, 0]).sum())
+    return float(np.sqrt(np.nansum(squares) / free)) if free > 0 else float("nan")
+
+
+def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -> Finding:
+    ids, pixels = _common(records)
+    name = "views " + "-".join(record.name for record in records)
+    if not ids:
+        return Finding(name, None, "no marker is seen by all of them at once: nothing to compare")
+    rms = reprojection_rms(cameras, pixels)
+    told = f"{len(ids)} markers seen by all leave {rms:.3f} px by the model's cameras"
+    if rms <= FITS_PX:
+        return Finding(name, True, told)
+    for order in permutations(range(len(cameras))):
+        if order == tuple(range(len(cameras))):
+            continue
+        if reprojection_rms([cameras[k] for k in order], pixels) <= FITS_PX:
+            swapped = ", ".join(
+                f"{r.name!r} shows what {cameras[k].name!r} did"
+                for r, k in zip(records, order, strict=True)
+                if r.name != cameras[k].name
+            )
+            return Finding(
+                name, False, f"{told}: {swapped}", "exchange their sources, or their cables; none has moved"
+            )
+    return Finding(
+        name, False,
+        f"{told}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
+        "re-anchor it (the running daemon does, once it sees enough), or `stereoservo calibrate`",
+    )  # fmt: skip
+
+
+def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
+    ids, pixels = _common([first, second])
+    name = f"views {first.name}-{second.name}"
+    if len(ids) < MATCHES:
+        return Finding(
+            name,
+            None,
+            f"{len(ids)} markers are seen by both; the epipolar constraint needs {MATCHES} to say anything",
+        )
+    sigma = float(np.median(np.concatenate([mean_sights(first)[2], mean_sights(second)[2]])))
+    try:
+        F, inliers = fundamental_robust(pixels[0], pixels[1], max(sigma, 0.05))
+    except GeometryError as error:
+        return Finding(name, None, f"no epipolar constraint yet: {error}")
+    distances = epipolar_distances(F, pixels[0], pixels[1])
+    rms = float(np.sqrt(np.mean(distances[inliers] ** 2)))
+    told = f"{int(inliers.sum())} of {len(ids)} markers agree on one epipolar geometry, {rms:.3f} px"
+    if inliers.all():
+        return Finding(name, True, told)
+    off = [marker for marker, inside in zip(ids, inliers, strict=True) if not inside]
+    return Finding(
+        name, False, f"{told}; markers {off} do not",
+        "are they mistaken for others, or is there a second plate in view?",
+    )  # fmt: skip
+
+
+def examine_coverage(
+    model: CellModel, trials: TrialSettings, records: Sequence[CameraRecord]
+) -> Iterator[Finding]:
+    """Findings on the share of the trial motions in each camera's image, by the model, at all corners of two joints."""
+    configurations = _corners(trials)
+    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
+    points = np.array([model.marker_points @ chain.displacement(q).T for q in configurations])
+    for record in records:
+        camera = next((c for c in model.cameras if c.name == record.name), None)
+        if camera is None:
+            continue
+        m = points.reshape(-1, 4) @ camera.matrix.T
+        raw = distort(camera.lens, m[:, :2] / m[:, 2:])
+        inside = (raw >= 0).all(axis=1) & (raw[:, 0] <= camera.width - 1) & (raw[:, 1] <= camera.height - 1)
+        share = float(inside.mean())
+        told = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
+        wide = share >= WORKSPACE_SHARE
+        yield Finding(
+            f"{record.name} coverage", True if wide else None, told,
+            "" if wide else "a shorter lens, more distance, or goals that keep to the middle",
+        )  # fmt: skip
+
+
+def _corners(trials: TrialSettings) -> FloatArray:
+    reach = np.where(np.isfinite(trials.range), trials.range, 0.0)
+    found = [trials.base]
+    for i, j in product(range(reach.size), repeat=2):
+        for a, b in product((-1.0, 1.0), repeat=2):
+            q = trials.base.copy()
+            q[i] += a * reach[i]
+            if i != j:
+                q[j] += b * reach[j]
+            found.append(q)
+    return np.array(found)

@@ -1,0 +1,299 @@
+"""``stereoservo goal``: sends a goal and waits for its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import msgspec
+import typer
+
+from stereoservo.cli import interruption
+from stereoservo.cli.goal.image_set_points import FRAMES, feature_tree, read_images, require_cameras
+from stereoservo.cli.goal.target_options import (
+    adaptive,
+    make_goal,
+    stream_lines,
+    target_tree,
+)
+from stereoservo.cli.output import (
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+    marker_ids,
+    note,
+    read_file,
+)
+from stereoservo.client import Client, ClientError, GoalHandle
+from stereoservo.messages.goals import Approach, Goal, PlanReport, StreamedTarget
+from stereoservo.messages.wire import decode
+from stereoservo.ports import plugins
+
+if TYPE_CHECKING:
+    from stereoservo.daemon.jobs.recorded_set_points import SetPoints
+
+Stream = Iterator[tuple[float | None, StreamedTarget]]
+WAITING_LEASE_S = 2.0
+"""Who waits for a goal stands behind it: when that process dies, the arm stops."""
+
+NameArgument = Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")]
+RelativeToOption = Annotated[
+    str | None,
+    typer.Option(help="Of a taught goal: workpiece (which may have moved) or cameras (which have)."),
+]
+CommonOption = Annotated[
+    str | None,
+    typer.Option(metavar="IDS", help="Markers seen when it was taught and now: 10,11,12 (default: all)."),
+]
+JointOption = Annotated[
+    list[str] | None,
+    typer.Option("--joint", metavar="NAME=RAD", help="Joint position [rad or m]; repeatable."),
+]
+SetPointsOption = Annotated[
+    Path | None,
+    typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
+]
+ImagesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--images",
+        metavar="DIR",
+        help="Set-points out of pictures recorded by `record --images`, at rest.",
+    ),
+]
+AtOption = Annotated[
+    float, typer.Option("--at", help="With --images: seconds from their beginning.", min=0.0)
+]
+FramesOption = Annotated[
+    int, typer.Option("--frames", help="With --images: frames a camera to average.", min=1, max=1000)
+]
+PointsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--points", metavar="FILE", help='JSON: {"points": {"marker": [x, y, z, w]}, "model_epoch": N}.'
+    ),
+]
+DisplacementOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--displacement",
+        metavar="FILE",
+        help='JSON: {"matrix": 4x4, "model_epoch": N or "basis": 5 ids}.',
+    ),
+]
+IncidenceOption = Annotated[
+    Path | None,
+    typer.Option("--incidence", metavar="FILE", help='JSON: {"incidences": […], "secondary": …}.'),
+]
+FollowFileOption = Annotated[
+    str | None,
+    typer.Option(
+        "--follow",
+        metavar="FILE|-",
+        help='A moving target: JSON lines {"stamp_s": …, "set_points" or "points": …}.',
+    ),
+]
+FileOption = Annotated[Path | None, typer.Option("--file", metavar="FILE", help="A whole goal as JSON.")]
+PointSourceOption = Annotated[
+    str | None, typer.Option(help="Where points come from: triangulated or predicted.")
+]
+JacobianOption = Annotated[
+    str | None, typer.Option(help="current, desired, mean or fixed-depth, for laws in images.")
+]
+CentreOption = Annotated[
+    str | None,
+    typer.Option(metavar="IDS", help="Markers whose middle moves on the line (default: all of the goal)."),
+]
+CameraOption = Annotated[
+    list[str] | None, typer.Option("--camera", help="Camera that may be used; repeatable (default: all).")
+]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(help="linear, exponential, translation-first, …, for laws that follow a plan."),
+]
+GainOption = Annotated[float | None, typer.Option(help="Gain [1/s].")]
+AdaptiveGainOption = Annotated[
+    str | None, typer.Option(metavar="NEAR:FAR[:SLOPE]", help="Gain that falls with the error [1/s].")
+]
+ToleranceOption = Annotated[float | None, typer.Option(help="Largest pixel distance at the goal [px].")]
+HoldFramesOption = Annotated[int | None, typer.Option(help="Frames for which the tolerance must hold.")]
+SpeedScaleOption = Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")]
+LeaseOption = Annotated[
+    float | None,
+    typer.Option(
+        help=f"Abort when this client is silent for so long [s] (default: {WAITING_LEASE_S:g} while it waits, "
+        f"none with --no-wait)."
+    ),
+]
+TimeLimitOption = Annotated[float | None, typer.Option(help="Abort after so long [s].")]
+QueueOption = Annotated[bool, typer.Option("--queue", help="After the active goal, not instead of it.")]
+BlendOption = Annotated[
+    float | None,
+    typer.Option(metavar="PX", help="Go on to the next goal below this error, without a stop."),
+]
+AcknowledgeOption = Annotated[
+    float | None,
+    typer.Option(metavar="SECONDS", help="Reached, wait so long for `acknowledge` before going on."),
+]
+CheckOption = Annotated[bool, typer.Option("--check", help="Only say what it would do; nothing moves.")]
+WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait for its end.")]
+
+
+def goal(
+    cell: CellArgument,
+    name: NameArgument = "",
+    relative_to: RelativeToOption = None,
+    common: CommonOption = None,
+    joint: JointOption = None,
+    set_points: SetPointsOption = None,
+    images: ImagesOption = None,
+    at: AtOption = 0.0,
+    frames: FramesOption = FRAMES,
+    points: PointsOption = None,
+    displacement: DisplacementOption = None,
+    incidence: IncidenceOption = None,
+    follow_file: FollowFileOption = None,
+    file: FileOption = None,
+    law: Annotated[
+        str | None,
+        typer.Option(help=f"Installed here: {', '.join(plugins.names(plugins.LAWS))} (default: the cell's)."),
+    ] = None,
+    point_source: PointSourceOption = None,
+    jacobian: JacobianOption = None,
+    centre: CentreOption = None,
+    camera: CameraOption = None,
+    profile: ProfileOption = None,
+    gain: GainOption = None,
+    adaptive_gain: AdaptiveGainOption = None,
+    tolerance: ToleranceOption = None,
+    hold_frames: HoldFramesOption = None,
+    speed_scale: SpeedScaleOption = 1.0,
+    lease: LeaseOption = None,
+    time_limit: TimeLimitOption = None,
+    queue: QueueOption = False,
+    blend: BlendOption = None,
+    acknowledge: AcknowledgeOption = None,
+    check: CheckOption = False,
+    wait: WaitOption = True,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Send a goal and wait for its end. Ctrl-C cancels it."""
+    if images is None and (at or frames != FRAMES):
+        raise CommandError("usage", "--at and --frames go with --images DIR")
+    if gain is not None and adaptive_gain is not None:
+        raise CommandError("usage", "--gain and --adaptive-gain: one of them")
+    stream: Stream | None = None
+    found: tuple[SetPoints, ...] = ()
+    target: dict[str, Any] = {}
+    others = bool(file or name or joint or set_points or points or displacement or incidence)
+    if follow_file is not None:
+        if others or images:
+            raise CommandError("usage", "--follow is a target of its own; its first line is where it begins")
+        target, stream = _followed(follow_file)
+    elif images is not None:
+        if others:
+            raise CommandError("usage", "--images is a target of its own; leave the others out")
+        found = read_images(cell, endpoint, images, at, frames)
+        target = feature_tree(found)
+    elif file is None:
+        files = {"points": points, "displacement": displacement, "incidence": incidence}
+        target = target_tree(name, joint, set_points, files, relative_to, common)
+    if file is not None:
+        wanted = decode(read_file(file), Goal)
+    else:
+        wanted = make_goal(
+            target, law=law, points=point_source, jacobian=jacobian,
+            centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
+            cameras=camera or None, profile=profile, gain=gain if adaptive_gain is None else adaptive(adaptive_gain),
+            tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
+            time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
+        )  # fmt: skip
+    if wait and wanted.lease_s is None:
+        wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
+    with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
+        require_cameras(client, found)
+        if check or wanted.check:
+            reply = client.check(wanted)
+            emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)
+        else:
+            _run(client, wanted, stream, wait, json)
+
+
+def _followed(source: str) -> tuple[dict[str, Any], Stream]:
+    """The target at which a stream begins, as on the wire, and the stream. Raises CommandError for an empty one."""
+    stream = stream_lines(source)
+    first = next(stream, None)
+    if first is None:
+        raise CommandError("stream", f"{source}: holds no set-points; a line at least is needed")
+    target = cast("dict[str, Any]", msgspec.to_builtins(first[1], str_keys=True))
+    return target, chain([first], stream)
+
+
+def _run(
+    client: Client,
+    wanted: Goal,
+    stream: Stream | None,
+    wait: bool,
+    as_json: bool,
+) -> None:
+    try:
+        handle = client.send(wanted)
+        note(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
+        if stream is not None:
+            note(f"{handle.stream(stream)} set-points followed")
+        if wait:
+            follow(handle, as_json)
+            if wanted.acknowledge_s is not None:
+                note(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
+        else:
+            emit({"id": handle.id, "accepted": True}, handle.id, as_json)
+    except KeyboardInterrupt:
+        with suppress(ClientError):  # not accepted yet, or ended already
+            client.cancel(wanted.id)
+        raise
+
+
+def follow(handle: GoalHandle, as_json: bool) -> None:
+    """Wait for a goal's end and print it. Raises CommandError unless it was reached."""
+    result = handle.wait()
+    if result.outcome != "reached":
+        tree = cast("dict[str, Any]", msgspec.to_builtins(result))
+        raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.why}", goal=tree)
+    error = "" if result.error_px is None else f", error {result.error_px:.3f} px"
+    emit(result, f"reached in {result.seconds:.2f} s{error}", as_json)
+
+
+def plan_table(plan: PlanReport) -> str:
+    """Way, time, and the closest approach to every limit."""
+    lines = [f"law {plan.law}, way {plan.way}, {plan.seconds:.2f} s"]
+    if not plan.approaches:
+        return lines[0]
+    rows: list[tuple[str, ...]] = [("limit", "of", "nearest", "limit at", "room", "on the way")]
+    rows += [_row(approach) for approach in plan.approaches]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines += [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def _row(approach: Approach) -> tuple[str, ...]:
+    unit = approach.unit
+    of = approach.subject if approach.marker is None else f"{approach.subject}, marker {approach.marker}"
+    return (
+        approach.code,
+        of,
+        f"{approach.value:.4g} {unit}",
+        f"{approach.limit:.4g} {unit}",
+        f"{approach.room:.4g} {unit}",
+        f"{100.0 * approach.share:.0f} %",
+    )

@@ -1,0 +1,37 @@
+"""The goal client, for programs that servo an arm: ``from stereoservo.client import Client``.
+
+It needs zenoh and msgspec only. Goals, targets and messages are in `stereoservo.messages`.
+"""
+
+from stereoservo.client.client import Client
+from stereoservo.client.errors import (
+    ClientError,
+    DaemonLostError,
+    FailedError,
+    InvalidReplyError,
+    NoReplyError,
+    RefusedError,
+    TimedOutError,
+)
+from stereoservo.client.events import EventWatch
+from stereoservo.client.goal_handle import GoalHandle, GoalProgress, GoalResult
+from stereoservo.client.session import SessionError
+from stereoservo.client.targets import GoalOptions, as_target
+
+__all__ = [
+    "Client",
+    "ClientError",
+    "DaemonLostError",
+    "EventWatch",
+    "FailedError",
+    "GoalHandle",
+    "GoalOptions",
+    "GoalProgress",
+    "GoalResult",
+    "InvalidReplyError",
+    "NoReplyError",
+    "RefusedError",
+    "SessionError",
+    "TimedOutError",
+    "as_target",
+]

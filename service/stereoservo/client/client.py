@@ -1,0 +1,283 @@
+"""A goal client: commands, goals, calibration and the stream of messages of one cell.
+
+Every call either succeeds or raises; "no reply" means refused.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Unpack
+
+import msgspec
+from zenoh.handlers import RingChannel
+
+from stereoservo.client import calibration_requests
+from stereoservo.client.connection import NEXT_EVENT, Connection, read_message
+from stereoservo.client.errors import ClientError, DaemonLostError, FailedError, TimedOutError
+from stereoservo.client.events import POLL_S, EventWatch
+from stereoservo.client.goal_handle import GoalHandle
+from stereoservo.client.targets import GoalOptions, as_target
+from stereoservo.messages.check_report import CheckReport, ZeroReset
+from stereoservo.messages.goals import (
+    Disable,
+    Enable,
+    Goal,
+    Hold,
+    Home,
+    Jog,
+    JointTarget,
+    Reset,
+    Resume,
+    Target,
+    Teach,
+)
+from stereoservo.messages.wire import (
+    CalibrationResult,
+    CellInfo,
+    EventMessage,
+    FeaturesMessage,
+    Record,
+    Reply,
+    StateMessage,
+    Synthesise,
+    decode,
+    encode,
+)
+
+DRAIN = 32
+GOAL_TIMEOUT_S = 7.0
+"""A goal is planned before it is answered; the daemon itself gives up after five seconds."""
+RESET_TIMEOUT_S = 12.0
+"""Drives are connected and configured again; the daemon itself gives up after ten seconds."""
+
+
+class Client(Connection):
+    """A goal client of one cell: what an operator or a program may ask of its daemon.
+
+    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
+    host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
+    ``while_waiting``: called again and again while an event is waited for; what it raises ends the wait.
+
+    Raises NotRunningError, SessionError.
+    """
+
+    def info(self) -> CellInfo:
+        """Joints, cameras, laws, model and taught goals."""
+        return self.fetch(self.keys.info, CellInfo)
+
+    def schema(self, name: str) -> bytes:
+        """The JSON Schema of a message."""
+        return self.query(self.keys.schema(name))
+
+    def stop(self) -> Reply:
+        """Stop the arm. Raises RefusedError where the servo process did not acknowledge it, NoReplyError."""
+        return self.request("stop", self.keys.stop, b"{}")
+
+    def enable(self, timeout_s: float = 10.0) -> None:
+        """Let the arm move; returns once it is ACTIVE. Raises RefusedError, TimedOutError."""
+        self.command("enable", Enable())
+        self.wait_state(lambda state: state.lifecycle in ("active", "fault"), "active", timeout_s)
+        if self.status().lifecycle == "fault":
+            raise ClientError(
+                "the joint driver failed while it was enabled: "
+                + "; ".join(r.hint for r in self.status().reasons)
+            )
+
+    def disable(self) -> Reply:
+        """Stop the arm and switch its drives off."""
+        return self.command("disable", Disable())
+
+    def hold(self) -> Reply:
+        """Decelerate and hold; the goal is kept."""
+        return self.command("hold", Hold())
+
+    def resume(self) -> Reply:
+        """Continue after hold or stop."""
+        return self.command("resume", Resume())
+
+    def reset(self, timeout_s: float = RESET_TIMEOUT_S) -> None:
+        """Leave FAULT; returns once the cell is INACTIVE. Raises RefusedError, TimedOutError, ClientError (failed)."""
+        number = self.events(NEXT_EVENT).next
+        self.request("reset", self.keys.command("reset", self.operator), encode(Reset()), timeout_s)
+        until = time.monotonic() + timeout_s
+        while time.monotonic() < until:
+            news = self.events(number)
+            for event in news.events:
+                if event.kind == "fault":
+                    raise ClientError(f"the reset failed: {event.message}")
+                if event.kind == "lifecycle" and event.name == "inactive":
+                    self.wait_state(lambda state: state.lifecycle != "fault", "out of the fault", timeout_s)
+                    return
+            number = news.next
+            time.sleep(0.02)
+        raise TimedOutError(f"the cell is {self.status().lifecycle} {timeout_s:g} s after the reset")
+
+    def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
+        """Joint velocities for ``lease_s``; call again within it to go on (a dead man's switch)."""
+        return self.command("jog", Jog(dict(velocities), lease_s))
+
+    def record(self, on: bool = True, images: bool = False) -> Reply:
+        """Begin or end a flight recording; the reply's message is its file on the daemon's host.
+
+        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is told by the event
+        ``images_recorded``. Raises RefusedError.
+        """
+        return self.request("record", self.keys.command("record", self.operator), encode(Record(on, images)))
+
+    def wait_state(self, wanted: Callable[[StateMessage], bool], what: str, timeout_s: float) -> StateMessage:
+        """Ask for the state until it is as ``wanted``. Raises TimedOutError."""
+        until = time.monotonic() + timeout_s
+        while True:
+            state = self.status()
+            if wanted(state):
+                return state
+            if time.monotonic() > until:
+                raise TimedOutError(f"the cell is {state.lifecycle} and not {what} after {timeout_s:g} s")
+            time.sleep(0.02)
+
+    # -- goals ----------------------------------------------------------------------------------------------
+
+    def goal(
+        self,
+        target: Target | str | Mapping[str, Any],
+        **options: Unpack[GoalOptions],
+    ) -> GoalHandle:
+        """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
+
+        ``lease_s`` is 5 unless given. The lease is renewed by a thread of this client until the goal has ended or the
+        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal goes on without the client.
+        Raises RefusedError with every problem, NoReplyError, MessageError.
+        """
+        options.setdefault("lease_s", 5.0)
+        return self.send(self.make_goal(target, **options))
+
+    @staticmethod
+    def make_goal(target: Target | str | Mapping[str, Any], **options: Unpack[GoalOptions]) -> Goal:
+        """A goal with an id of its own; for :meth:`check` and :meth:`send`. Raises MessageError for bad fields."""
+        return decode(encode({"id": str(uuid.uuid4()), "target": as_target(target), **options}), Goal)
+
+    def check(self, goal: Goal) -> Reply:
+        """Plan a goal without a motion: the reply's ``plan`` has path, time and approaches to limits.
+
+        Raises RefusedError.
+        """
+        return self.request(
+            "goal", self.goal_key, encode(msgspec.structs.replace(goal, check=True)), GOAL_TIMEOUT_S
+        )
+
+    def send(self, goal: Goal) -> GoalHandle:
+        """Send a goal made by the caller; returns when it was planned and accepted."""
+        watch = EventWatch(self)
+        try:
+            reply = self.request("goal", self.goal_key, encode(goal), GOAL_TIMEOUT_S)
+        except BaseException:
+            watch.close()
+            raise
+        return GoalHandle(self, goal, watch, reply)
+
+    def home(self, speed_scale: float = 1.0, lease_s: float | None = 5.0) -> GoalHandle:
+        """Move every joint to the cell's home position; the lease is renewed as for goals."""
+        command = Home(str(uuid.uuid4()), speed_scale, lease_s)
+        watch = EventWatch(self)
+        try:
+            reply = self.command("home", command)
+        except BaseException:
+            watch.close()
+            raise
+        return GoalHandle(self, Goal(command.id, JointTarget({}), lease_s=lease_s), watch, reply)
+
+    def teach(
+        self, name: str, frames: int = 20, timeout_s: float = 30.0, *, tool: tuple[int, ...] = ()
+    ) -> EventMessage:
+        """Store what the cameras see now as goal ``name``; ``tool``: the markers by which it is meant.
+
+        Raises RefusedError, FailedError.
+        """
+        with EventWatch(self) as watch:
+            reply = self.command("teach", Teach(name, frames, tool))
+            event = watch.wait(
+                lambda e: e.request == reply.request and e.kind in ("taught", "warning"),
+                f"teaching {name!r}",
+                timeout_s,
+            )
+        if event.kind != "taught":
+            raise FailedError(f"teaching {name!r}", event)
+        return event
+
+    def synthesise(self, wanted: Synthesise) -> Reply:
+        """Make a goal from drawings; the workpiece's markers are seen now. Raises RefusedError."""
+        return self.request("synthesise", self.keys.command("synthesise", self.operator), encode(wanted))
+
+    def calibrate(
+        self,
+        progress: Callable[[EventMessage], None] | None = None,
+        timeout_s: float = 3600.0,
+        *,
+        report: bool = False,
+        lease_s: float | None = 5.0,
+    ) -> CalibrationResult:
+        """Calibrate the cell. ``progress`` is called with every event of it. ``report``: wait for the report, too.
+
+        The motion has a lease that this client renews (``lease_s=None``: none): a client that dies stops it.
+        Raises RefusedError, FailedError (``code``: of the fit that failed, or of the reason that ended the motion).
+        """
+        return calibration_requests.calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
+
+    def check_model(
+        self,
+        progress: Callable[[EventMessage], None] | None = None,
+        timeout_s: float = 600.0,
+        *,
+        lease_s: float | None = 5.0,
+    ) -> CheckReport:
+        """A short check motion, and whether the model in use still holds. Raises RefusedError, FailedError."""
+        return calibration_requests.check_model(self, progress, timeout_s, lease_s)
+
+    def reset_zeros(
+        self,
+        progress: Callable[[EventMessage], None] | None = None,
+        timeout_s: float = 600.0,
+        *,
+        lease_s: float | None = 5.0,
+    ) -> ZeroReset:
+        """A check motion; where joint zeros have drifted, and nothing else, a new model with moved zeros.
+
+        ``progress`` is called with the ``checked`` event, too. Raises RefusedError, FailedError (its event's ``name``:
+        ``check_holds``, ``other_cause``, ``not_observable`` or the code of a check that failed).
+        """
+        return calibration_requests.reset_zeros(self, progress, timeout_s, lease_s)
+
+    # -- watching -------------------------------------------------------------------------------------------
+
+    def watch(self, *, features: bool = False) -> Iterator[StateMessage | EventMessage | FeaturesMessage]:
+        """Everything the cell publishes, without end; raises DaemonLostError when it goes away, InvalidReplyError."""
+        kinds: list[tuple[str, type[Any], int]] = [
+            (self.keys.event, EventMessage, 1024),
+            (self.keys.state, StateMessage, 16),
+        ]
+        if features:
+            kinds.append((f"{self.keys.prefix}/features/*", FeaturesMessage, 256))
+        subscribers = [
+            (self._session.declare_subscriber(key, RingChannel(size)), kind) for key, kind, size in kinds
+        ]
+        heard = time.monotonic()
+        try:
+            while True:
+                idle = True
+                for subscriber, kind in subscribers:
+                    for _ in range(DRAIN):  # bounded: a caller that causes events must not starve the others
+                        sample = subscriber.try_recv()
+                        if sample is None:
+                            break
+                        idle = False
+                        heard = time.monotonic()
+                        yield read_message(str(sample.key_expr), sample.payload.to_bytes(), kind)
+                if idle:
+                    if time.monotonic() - heard > 2.0:
+                        raise DaemonLostError(f"cell {self.cell!r} has been silent for 2 s")
+                    time.sleep(POLL_S)
+        finally:
+            for subscriber, _ in subscribers:
+                subscriber.undeclare()

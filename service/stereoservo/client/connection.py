@@ -1,0 +1,182 @@
+"""One session with the daemon of a cell: queries with decoded replies, and the puts that keep a goal alive."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from stereoservo.client.errors import InvalidReplyError, NoReplyError, RefusedError
+from stereoservo.client.session import client_config, close_session, open_session
+from stereoservo.messages.discovery import find_daemon
+from stereoservo.messages.goals import (
+    AcknowledgeGoal,
+    CancelGoal,
+    Command,
+    RenewGoal,
+    StreamedTarget,
+    UpdateGoal,
+)
+from stereoservo.messages.keys import KeySpace
+from stereoservo.messages.wire import (
+    ENCODING,
+    EventList,
+    MessageError,
+    Reply,
+    StateMessage,
+    encode,
+    read,
+)
+
+TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
+NEXT_EVENT = 2**53
+"""Above every event's number: a query from it on returns no event, only the number of the next one."""
+
+_T = TypeVar("_T")
+
+
+class Connection:
+    """A zenoh session with the daemon of one cell.
+
+    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
+    host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
+    ``while_waiting``: called again and again while an event is waited for; what it raises ends the wait.
+
+    Raises NotRunningError, SessionError.
+    """
+
+    def __init__(
+        self,
+        cell: str,
+        *,
+        endpoint: str | None = None,
+        operator: str | None = None,
+        timeout_s: float = 2.0,
+        tls: Path | None = None,
+        while_waiting: Callable[[], None] = lambda: None,
+    ) -> None:
+        if endpoint is None:
+            info = find_daemon(cell)
+            cell, endpoint = info.cell, info.endpoint
+        self.cell = cell
+        self.operator = _default_operator() if operator is None else operator
+        self.keys = KeySpace(cell)
+        self.goal_key = self.keys.goal(self.operator)
+        self.while_waiting = while_waiting
+        self._timeout_s = timeout_s
+        self._session = open_session(client_config(endpoint, _tls_directory() if tls is None else tls))
+        self._closed = False
+
+    @property
+    def session(self) -> Any:
+        """The zenoh session, for what this class does not do."""
+        return self._session
+
+    def query(self, key: str, payload: bytes = b"", timeout_s: float | None = None) -> bytes:
+        """The payload of the first reply on ``key``. Raises NoReplyError."""
+        timeout = self._timeout_s if timeout_s is None else timeout_s
+        for reply in self._session.get(key, payload=payload, encoding=ENCODING, timeout=timeout):
+            if reply.ok is not None:
+                return bytes(reply.ok.payload.to_bytes())
+        raise NoReplyError(key, timeout)
+
+    def request(self, what: str, key: str, payload: bytes, timeout_s: float | None = None) -> Reply:
+        """The reply that accepts a goal or command, ``what`` in messages. Raises RefusedError, NoReplyError."""
+        reply = read_message(key, self.query(key, payload, timeout_s), Reply)
+        if not reply.accepted:
+            raise RefusedError(what, reply)
+        return reply
+
+    def fetch(self, key: str, kind: type[_T]) -> _T:
+        """A message of type ``kind`` queried on ``key``. Raises RefusedError, NoReplyError, InvalidReplyError."""
+        data = self.query(key)
+        try:
+            return read_message(key, data, kind)
+        except InvalidReplyError as error:
+            reply = _refusal(data)
+            if reply is None:
+                raise
+            raise RefusedError(key.rpartition("/")[2], reply) from error
+
+    def command(self, verb: str, command: Command) -> Reply:
+        """The reply that accepts a command. Raises RefusedError, NoReplyError."""
+        return self.request(verb, self.keys.command(verb, self.operator), encode(command))
+
+    def status(self) -> StateMessage:
+        """The newest state."""
+        return self.fetch(self.keys.state, StateMessage)
+
+    def events(self, first: int = 1) -> EventList:
+        """Events from number ``first`` on (a page of them)."""
+        return self.fetch(f"{self.keys.event}?from={first}", EventList)
+
+    def cancel(self, goal_id: str) -> Reply:
+        """Cancel a goal."""
+        return self.command("cancel", CancelGoal(goal_id))
+
+    def update(
+        self, goal_id: str, target: StreamedTarget, stamp_s: float | None = None, *, answered: bool = False
+    ) -> None:
+        """Move the set-points of the active goal, which renews its lease, too. ``stamp_s``: this client's time of them.
+
+        A put, for streams of 30 to 200 Hz: what is refused is reported by ``goal_refused`` events, at most one a
+        second. ``answered``: a query instead; raises RefusedError.
+        """
+        command = UpdateGoal(goal_id, target, stamp_s)
+        if answered:
+            self.command("update", command)
+        else:
+            self._session.put(self.goal_key, encode(command), encoding=ENCODING)
+
+    def acknowledge(self, goal_id: str) -> Reply:
+        """A reached goal with ``acknowledge_s`` may be left. Raises RefusedError."""
+        return self.command("acknowledge", AcknowledgeGoal(goal_id))
+
+    def renew(self, goal_id: str) -> None:
+        """Renew the lease of a goal (a put: no reply)."""
+        self._session.put(self.goal_key, encode(RenewGoal(goal_id)), encoding=ENCODING)
+
+    def close(self) -> None:
+        """Close the session. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            close_session(self._session, [])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def read_message(key: str, data: bytes, kind: type[_T]) -> _T:
+    """A message that came on ``key``. Raises InvalidReplyError where it is none of ``kind``."""
+    try:
+        return read(data, kind)
+    except MessageError as error:
+        raise InvalidReplyError(key, error) from error
+
+
+def _refusal(data: bytes) -> Reply | None:
+    """The reply that refuses to answer, None where ``data`` is none."""
+    try:
+        reply = read(data, Reply)
+    except MessageError:
+        return None
+    return None if reply.accepted else reply
+
+
+def _tls_directory() -> Path | None:
+    given = os.environ.get(TLS_VARIABLE)
+    return Path(given) if given else None
+
+
+def _default_operator() -> str:
+    name = re.sub(r"[^A-Za-z0-9_-]", "", getpass.getuser())[:40] or "user"
+    return f"{name}-{os.getpid()}"

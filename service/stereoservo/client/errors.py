@@ -1,0 +1,63 @@
+"""Exceptions that the goal client raises; each carries its data."""
+
+from __future__ import annotations
+
+from stereoservo.messages.wire import EventMessage, MessageError, Reply
+
+
+class ClientError(Exception):
+    """Base of all errors of the client."""
+
+
+class NoReplyError(ClientError):
+    """Nobody answered: the daemon is gone, hangs, or does not let this client ask. Means refused."""
+
+    def __init__(self, key: str, timeout_s: float) -> None:
+        super().__init__(
+            f"no reply on {key} within {timeout_s:g} s: the daemon is gone, hangs, or refuses this client"
+        )
+        self.key = key
+        self.timeout_s = timeout_s
+
+
+class InvalidReplyError(ClientError):
+    """A message on ``key`` does not decode: another version, or somebody else."""
+
+    def __init__(self, key: str, error: MessageError) -> None:
+        super().__init__(
+            f"what came on {key} is not of this version's daemon: {error}; compare `stereoservo --version` on both "
+            "sides, and see that nobody else answers there"
+        )
+        self.key = key
+
+
+class RefusedError(ClientError):
+    """The daemon refused; ``reply`` has the reasons."""
+
+    def __init__(self, what: str, reply: Reply) -> None:
+        why = "; ".join(
+            reply.problems or tuple(reason.hint for reason in reply.reasons if reason.hint != reply.message)
+        )
+        super().__init__(f"{what} refused: {reply.message}" + (f": {why}" if why else ""))
+        self.reply = reply
+
+
+class FailedError(ClientError):
+    """An accepted command failed; ``event`` has the cause."""
+
+    def __init__(self, what: str, event: EventMessage) -> None:
+        super().__init__(f"{what}: {event.kind.replace('_', ' ')}: {event.message}")
+        self.event = event
+
+    @property
+    def code(self) -> str:
+        """Its cause's own: the event's ``name`` (a fit's code), else that of its first reason, else ``failed``."""
+        return self.event.name or next((reason.code for reason in self.event.reasons), "failed")
+
+
+class TimedOutError(ClientError):
+    """An event or state did not come in time."""
+
+
+class DaemonLostError(ClientError):
+    """The daemon went away, or another one took its place, while this client waited."""

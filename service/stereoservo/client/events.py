@@ -1,0 +1,100 @@
+"""A cell's events as a client receives them: in order and without gaps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from zenoh.handlers import RingChannel
+
+from stereoservo.client.connection import NEXT_EVENT, Connection, read_message
+from stereoservo.client.errors import DaemonLostError, NoReplyError, TimedOutError
+from stereoservo.messages.wire import EventMessage
+
+POLL_S = 0.01
+ALIVE_EVERY_S = 1.0
+
+
+class EventWatch:
+    """Events from now on, in order and without gaps: what a subscription lost is asked for."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._subscriber = connection.session.declare_subscriber(connection.keys.event, RingChannel(1024))
+        state = connection.status()
+        self._boot = state.boot
+        self._next = connection.events(NEXT_EVENT).next
+        self._alive = time.monotonic()
+
+    def poll(self) -> list[EventMessage]:
+        """Events since the last poll. Raises DaemonLostError, InvalidReplyError."""
+        found: list[EventMessage] = []
+        while (sample := self._subscriber.try_recv()) is not None:
+            event = read_message(str(sample.key_expr), sample.payload.to_bytes(), EventMessage)
+            if event.boot != self._boot:
+                raise DaemonLostError(
+                    f"the gateway of cell {self._connection.cell!r} was started anew; ask for the state"
+                )
+            if event.seq > self._next:
+                self._fill(found, event.seq)
+            if event.seq == self._next:
+                found.append(event)
+                self._next += 1
+        if found:
+            self._alive = time.monotonic()
+        elif time.monotonic() - self._alive > ALIVE_EVERY_S:
+            self._check()
+            self._fill(found, NEXT_EVENT)
+        return found
+
+    def _fill(self, found: list[EventMessage], before: int) -> None:
+        while self._next < before:
+            page = self._connection.events(self._next)
+            if page.first > self._next:
+                raise DaemonLostError(f"events {self._next} to {page.first - 1} are no longer kept")
+            some = [event for event in page.events if event.seq < before]
+            if not some:
+                return
+            found.extend(some)
+            self._next = some[-1].seq + 1
+
+    def _check(self) -> None:
+        try:
+            boot = self._connection.status().boot
+        except NoReplyError as error:
+            raise DaemonLostError(
+                f"the daemon of cell {self._connection.cell!r} no longer answers"
+            ) from error
+        if boot != self._boot:
+            raise DaemonLostError(
+                f"the gateway of cell {self._connection.cell!r} was started anew; ask for the state"
+            )
+        self._alive = time.monotonic()
+
+    def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:
+        """Wait for an event. Raises TimedOutError, DaemonLostError."""
+        until = time.monotonic() + timeout_s
+        while True:
+            for event in self.poll():
+                if wanted(event):
+                    return event
+            self._connection.while_waiting()
+            if time.monotonic() > until:
+                raise TimedOutError(f"{what}: nothing within {timeout_s:g} s")
+            time.sleep(POLL_S)
+
+    def close(self) -> None:
+        """End the subscription. Idempotent."""
+        if self._subscriber is not None:
+            self._subscriber.undeclare()
+            self._subscriber = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

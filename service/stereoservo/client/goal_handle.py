@@ -1,0 +1,181 @@
+"""A goal that was accepted: its lease, its progress, its end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import msgspec
+import zenoh
+
+from stereoservo.client.connection import Connection
+from stereoservo.client.errors import ClientError
+from stereoservo.client.events import EventWatch
+from stereoservo.messages.goals import Goal, StreamedTarget
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.wire import EventMessage, Reply
+
+TERMINAL = {
+    "goal_reached": "reached",
+    "goal_aborted": "aborted",
+    "goal_cancelled": "cancelled",
+    "goal_preempted": "preempted",
+}
+
+
+class GoalResult(msgspec.Struct, frozen=True):
+    """Outcome of a goal."""
+
+    id: str
+    outcome: Literal["reached", "aborted", "cancelled", "preempted"]
+    message: str
+    error_px: float | None
+    reasons: tuple[Any, ...]
+    seconds: float
+
+    @property
+    def why(self) -> str:
+        """The message, and the fault where one ended the goal."""
+        faults = [reason.hint for reason in self.reasons if reason.level == "fault"]
+        return ": ".join([self.message, *faults])
+
+
+class GoalProgress(msgspec.Struct, frozen=True):
+    """Progress of a goal: path parameter ``progress`` [0, 1], ``seconds_left`` where known, ``reasons``.
+
+    ``active``: False while it is queued and once it has ended.
+    """
+
+    active: bool
+    progress: float | None
+    seconds_left: float | None
+    error_px: float | None
+    reasons: tuple[Reason, ...]
+
+
+class Lease:
+    """Renews the lease of something that moves the arm, from a thread of this client, until it is ended."""
+
+    def __init__(self, connection: Connection, goal_id: str, lease_s: float | None) -> None:
+        self._connection = connection
+        self._id = goal_id
+        self._ended = threading.Event()
+        if lease_s is not None:
+            threading.Thread(
+                target=self._renew, args=(lease_s / 3.0,), name=f"lease {goal_id}", daemon=True
+            ).start()
+
+    def _renew(self, every_s: float) -> None:
+        while not self._ended.wait(every_s):
+            try:
+                self._connection.renew(self._id)
+            except zenoh.ZError:  # the session is closed: the lease runs out, as it should
+                return
+
+    def end(self) -> None:
+        """Renew no more. Idempotent."""
+        self._ended.set()
+
+
+class GoalHandle:
+    """A goal that was accepted. As a context manager it cancels the goal when left before its end."""
+
+    def __init__(self, connection: Connection, goal: Goal, watch: EventWatch, reply: Reply) -> None:
+        self.id = goal.id
+        self.plan = reply.plan
+        self.message = reply.message
+        self._connection = connection
+        self._watch = watch
+        self._started = time.monotonic()
+        self._result: GoalResult | None = None
+        self._ended = False
+        self._lease = Lease(connection, goal.id, goal.lease_s)
+
+    def wait(self, timeout_s: float = 600.0) -> GoalResult:
+        """Wait for its terminal event. Raises TimedOutError (the goal goes on), DaemonLostError."""
+        if self._result is None:
+            event = self._watch.wait(
+                lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
+            )
+            self._finish(event)
+        assert self._result is not None
+        return self._result
+
+    def reached(self, timeout_s: float = 600.0) -> GoalResult:
+        """Like :meth:`wait`, and raises ClientError unless the goal was reached."""
+        result = self.wait(timeout_s)
+        if result.outcome != "reached":
+            raise ClientError(f"goal {self.id} was {result.outcome}: {result.why}")
+        return result
+
+    @property
+    def ended(self) -> bool:
+        """Whether its terminal event was seen, by :meth:`wait` or while streaming."""
+        return self._result is not None
+
+    def progress(self) -> GoalProgress:
+        """Its progress, and the reasons why it is slow or held. Raises NoReplyError."""
+        state = self._connection.status()
+        if state.goal != self.id:
+            return GoalProgress(False, None, None, None, ())
+        return GoalProgress(True, state.progress, state.seconds_left, state.error_px, state.reasons)
+
+    def update(self, target: StreamedTarget, stamp_s: float | None = None) -> None:
+        """Move its set-points; see `Client.update`."""
+        self._connection.update(self.id, target, stamp_s)
+
+    def stream(self, set_points: Iterable[tuple[float | None, StreamedTarget]]) -> int:
+        """Put (stamp [s], target) as they come, until they, or the goal, end; gives how many were put.
+
+        The iterable sets the pace. Raises DaemonLostError.
+        """
+        count = 0
+        for stamp_s, target in set_points:
+            self._poll_end()
+            if self._result is not None:
+                break
+            self.update(target, stamp_s)
+            count += 1
+        return count
+
+    def acknowledge(self) -> None:
+        """Reached, it may be left: the queue goes on. Raises RefusedError."""
+        self._connection.acknowledge(self.id)
+
+    def _poll_end(self) -> None:
+        for event in self._watch.poll():
+            if event.id == self.id and event.kind in TERMINAL:
+                self._finish(event)
+                return
+
+    def _finish(self, event: EventMessage) -> None:
+        self._end()
+        outcome: Any = TERMINAL[event.kind]
+        seconds = time.monotonic() - self._started
+        self._result = GoalResult(self.id, outcome, event.message, event.error_px, event.reasons, seconds)
+
+    def cancel(self) -> None:
+        """Cancel it."""
+        self._connection.cancel(self.id)
+
+    def abandon(self) -> None:
+        """Stop renewing and watching; the goal goes on until its lease or time limit ends."""
+        self._end()
+
+    def _end(self) -> None:
+        self._ended = True
+        self._lease.end()
+        self._watch.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._result is None and not self._ended:
+            self._end()
+            self.cancel()

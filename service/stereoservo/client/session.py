@@ -1,0 +1,112 @@
+"""zenoh sessions: their configuration as a client, opening, and closing within a time limit.
+
+Bounded, local, without discovery, and never blocking.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zenoh
+
+MAX_MESSAGE_BYTES = 1 << 18
+MAX_SESSIONS = 64
+CLOSE_TIMEOUT_S = 2.0
+
+
+class SessionError(Exception):
+    """A zenoh session cannot be opened; names the endpoint and the cause."""
+
+
+def base_config() -> dict[str, Any]:
+    """Settings common to every session: no discovery, no shared memory, bounded queues and messages."""
+    return {
+        # Discovery would announce the arm to every host of the network and bring in peers that no access rule
+        # sees.
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "shared_memory": {"enabled": False},  # leaves segments behind and has watchdog drops
+            "unicast": {"max_sessions": MAX_SESSIONS, "accept_timeout": 1000},
+            "link": {
+                "tx": {
+                    "lease": 2000,
+                    # A subscriber that hangs must cost its messages, not this process's time.
+                    "queue": {
+                        "congestion_control": {
+                            "drop": {"wait_before_drop": 0},
+                            "block": {"wait_before_close": 20000},
+                        }
+                    },
+                },
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+            },
+        },
+    }
+
+
+def client_mode(endpoints: list[str]) -> dict[str, Any]:
+    """Settings of a session that connects to a router at ``endpoints`` and listens nowhere."""
+    return {
+        "mode": "client",
+        "listen": {"endpoints": []},
+        "connect": {
+            "endpoints": endpoints,
+            "timeout_ms": 2000,
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 100, "period_max_ms": 500},
+        },
+    }
+
+
+def client_config(endpoint: str, tls: Path | None = None) -> dict[str, Any]:
+    """A client of the daemon at ``endpoint``; ``tls``: directory with ``ca.pem``, ``cert.pem`` and ``key.pem``.
+
+    Raises SessionError for a file that is missing.
+    """
+    config = base_config()
+    if tls is not None:
+        files = {
+            "root_ca_certificate": tls / "ca.pem",
+            "connect_certificate": tls / "cert.pem",
+            "connect_private_key": tls / "key.pem",
+        }
+        for path in files.values():
+            if not path.is_file():
+                raise SessionError(
+                    f"{path}: no such file; a TLS directory holds ca.pem, cert.pem and key.pem"
+                )
+        config["transport"]["link"]["tls"] = {key: str(path) for key, path in files.items()} | {
+            "enable_mtls": True
+        }
+    return config | client_mode([endpoint])
+
+
+def open_session(config: dict[str, Any]) -> Any:
+    """Open a session. Raises SessionError."""
+    zenoh.init_log_from_env_or("error")
+    where = ", ".join(config["listen"]["endpoints"] or config["connect"]["endpoints"])
+    try:
+        return zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(config).decode()))
+    except zenoh.ZError as error:
+        verb = "listen on" if config["mode"] == "router" else "connect to"
+        raise SessionError(f"cannot {verb} {where}: {error}") from error
+
+
+def close_session(session: Any, declared: list[Any]) -> bool:
+    """Undeclare, then close, in a side thread: a hung client would hold ``close`` for 10 s.
+
+    Returns whether that was done within `CLOSE_TIMEOUT_S`; the process may end without it.
+    """
+
+    def work() -> None:
+        for entity in declared:
+            entity.undeclare()
+        session.close()
+
+    thread = threading.Thread(target=work, name="zenoh-close", daemon=True)
+    thread.start()
+    thread.join(CLOSE_TIMEOUT_S)
+    return not thread.is_alive()

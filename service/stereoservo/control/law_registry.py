@@ -1,0 +1,122 @@
+"""The installed control laws by name, found by entry point: what the loop, predictions and experiments run.
+
+A law's name is its entry point's name in the group ``stereoservo.laws``; the object is a `control.law.Law`. Laws are
+imported together on first use, so that none is imported while an arm moves. A law that does not import, or is not a
+`Law`, is listed in ``errors`` and takes no other with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import pathlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from stereoservo.control.law import Law, Path
+from stereoservo.ports import plugins
+
+OPTIONS = ("centre", "jacobian", "profile")
+"""Fields of a goal that belong to some laws only."""
+
+
+class UnknownLawError(KeyError):
+    """No usable law has this name; the message lists those that there are, and a broken one's error."""
+
+    def __init__(self, name: str, known: tuple[str, ...], error: str = "") -> None:
+        super().__init__(name)
+        self.name = name
+        broken = f"; it is installed but broken: {error}" if error else ""
+        self.message = f"no law {name!r}; valid: {', '.join(known)}{broken}"
+
+    def __str__(self) -> str:
+        return self.message
+
+
+class LawRegistry(Mapping[str, Law]):
+    """The usable laws of an entry point group by name, ordered by rank, then by name."""
+
+    def __init__(self, group: str = plugins.LAWS) -> None:
+        self._group = group
+        self._laws: dict[str, Law] | None = None
+        self._errors: dict[str, str] = {}
+
+    def __getitem__(self, name: str) -> Law:
+        laws = self._loaded()
+        if name not in laws:
+            raise UnknownLawError(name, tuple(laws), self._errors.get(name, ""))
+        return laws[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._loaded())
+
+    def __len__(self) -> int:
+        return len(self._loaded())
+
+    @property
+    def errors(self) -> Mapping[str, str]:
+        """Of the laws that are installed and cannot be used, by name."""
+        self._loaded()
+        return self._errors
+
+    def disable(self, name: str, error: str) -> None:
+        """Take a law out of use in this process, for the reason ``error``."""
+        if self._loaded().pop(name, None) is not None:
+            self._errors[name] = error
+
+    def having(self, option: str) -> tuple[str, ...]:
+        """Names of the laws that take ``option`` of a goal."""
+        return tuple(name for name, law in self.items() if option in law.options)
+
+    def on_path(self, path: Path) -> tuple[str, ...]:
+        """Names of the laws that lead the body on such a path."""
+        return tuple(name for name, law in self.items() if law.path == path)
+
+    def surest_first(self) -> tuple[str, ...]:
+        """All names, by how surely a law arrives: on a straight line, by the goal's pose, by its pixels."""
+        return tuple(
+            sorted(self, key=lambda name: (self[name].path != "straight", not self[name].needs_pose))
+        )
+
+    def sources(self) -> dict[str, str]:
+        """Of every law: the distribution that it comes from with its version, and a hash of its source file."""
+        found = {}
+        for plugin in plugins.list_plugins(self._group):
+            if plugin.name in self:
+                found[plugin.name] = f"{plugin.distribution} {source_hash(self[plugin.name])}"
+        return found
+
+    def _loaded(self) -> dict[str, Law]:
+        if self._laws is None:
+            laws = {}
+            for name in plugins.names(self._group):
+                try:
+                    laws[name] = _checked(plugins.load(self._group, name))
+                except (plugins.PluginError, TypeError, ValueError) as error:
+                    self._errors[name] = str(error)
+            self._laws = dict(sorted(laws.items(), key=lambda item: (item[1].rank, item[0])))
+        return self._laws
+
+
+def source_hash(law: Law) -> str:
+    """Sixteen hexadecimal digits of the SHA-256 of the file that defines the law's step."""
+    return hashlib.sha256(pathlib.Path(inspect.getfile(inspect.unwrap(law.step))).read_bytes()).hexdigest()[
+        :16
+    ]
+
+
+def _checked(law: Any) -> Law:
+    """The law itself. Raises TypeError or ValueError for what cannot be one."""
+    if not isinstance(law, Law):
+        raise TypeError(f"is a {type(law).__name__}; an instance of stereoservo.control.law.Law is needed")
+    unknown = [option for option in law.options if option not in OPTIONS]
+    if unknown:
+        raise ValueError(f"takes the option {unknown[0]!r}; there are: {', '.join(OPTIONS)}")
+    if len(law.components) != len(law.units):
+        raise ValueError(
+            f"names {len(law.components)} components and {len(law.units)} units; each component needs one"
+        )
+    return law
+
+
+LAWS = LawRegistry()

@@ -1,0 +1,59 @@
+"""Cartesian control in two components (thesis 8.55): translation of the centre, and one rotation about it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.control.cartesian import (
+    ROTATION,
+    cartesian_reasons,
+    cartesian_step,
+)
+from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.messages.reasons import Reason
+from stereoservo.planning.primitives import TRANSLATION
+
+COMPONENTS, UNITS = (TRANSLATION, ROTATION), ("", "rad")
+
+
+def cartesian2(scene: Scene, task: Task, options: Options) -> LawStep:
+    """``q̇ = [q̂_t q̂_s] Λ e``, ``e = (τ, θ_s)`` the motion still to be made (8.55).
+
+    The rotation takes the short way round, or the long one where only that keeps the face in sight; where neither
+    does, the hinge of the law in three components goes first, and the status says WAITS.
+    """
+    return LawStep(
+        *cartesian_step(
+            scene.operators, scene.composition, scene.points[task.face], task.target_points[task.face], task.centre,
+            task.centre_target, scene.camera_centres, np.full(2, options.gain), options.dt_s, options.rotation_rate,
+            options.translation_rate, True,
+        ),
+        1.0,
+    )  # fmt: skip
+
+
+def cartesian2_reasons(step: LawStep) -> tuple[Reason, ...]:
+    """Components that the arm cannot make, or that wait; empty when all move."""
+    return cartesian_reasons(COMPONENTS, UNITS, step.error, step.allowed, step.status)
+
+
+LAW = Law(
+    cartesian2,
+    "straight line; one rotation about the centre, the face kept in view",
+    needs_pose=True,
+    path="straight",
+    options=("centre",),
+    components=COMPONENTS,
+    units=UNITS,
+    reasons=cartesian2_reasons,
+    properties=LawProperties(
+        centre="straight",
+        face="kept likewise",
+        works_on="pose; translation, one rotation about the centre",
+        noise_at_rest="low",
+        one_camera="goes on",
+        fails_when="the same; its markers swing less or more than those of `cartesian3`: check both",
+    ),
+    colour="#e69f00",
+    rank=50,
+)

@@ -1,0 +1,36 @@
+"""Image-based servoing in the cameras that see (thesis 8.26): one camera is enough.
+
+The Jacobian is developed around points that the kinematics carry along (8.29, 8.30), so that control goes on where
+a camera drops out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.control.image_servoing import image_reasons, image_velocity_step
+from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+
+
+def image(scene: Scene, task: Task, options: Options) -> LawStep:
+    """``q̇ = gain·J⁺(s* − s)`` over the markers that are seen and wanted, in any number of cameras (8.26)."""
+    return image_velocity_step(scene, task, options, options.jacobian, np.zeros_like(task.rates))
+
+
+LAW = Law(
+    image,
+    "image-based, in the cameras that see: for one camera",
+    one_camera="suffices",
+    options=("jacobian",),
+    reasons=image_reasons,
+    properties=LawProperties(
+        centre="far aside",
+        face="not kept",
+        works_on="pixels of the cameras that see",
+        noise_at_rest="higher, along the ray",
+        one_camera="made for it",
+        fails_when="large turns: often",
+    ),
+    colour="#cc79a7",
+    rank=20,
+)

@@ -1,0 +1,136 @@
+"""The law on points in space (8.13 to 8.17, 8.34): their differences from the goal's, measured in pixels.
+
+A projective frame has no lengths of its own: a displacement of a point counts as what it moves in the images of all
+cameras. The command then does not depend on the frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.control.image_servoing import (
+    DESIRED,
+    MEAN,
+    held_gain,
+    image_reasons,
+    limited,
+    pixel_gradients,
+    velocities_into,
+)
+from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import add_equation, damped_solve
+
+
+@kernel
+def pixel_metrics(matrices: FloatArray, points: FloatArray) -> FloatArray:
+    """``J_G P`` of all cameras (m, 2c, 4): what a displacement of a point (m, 4) is worth in pixels; NaN at depth 0."""
+    out = np.empty((points.shape[0], 2 * matrices.shape[0], 4))
+    for p in range(points.shape[0]):
+        out[p] = pixel_gradients(matrices, points[p])
+    return out
+
+
+@kernel
+def points_step(
+    operators: FloatArray,
+    points: FloatArray,
+    target_points: FloatArray,
+    weights: FloatArray,
+    metrics: FloatArray,
+    gain: float,
+    choice: int,
+    damping: float,
+) -> tuple[FloatArray, float]:
+    """`points.points_velocity` as a kernel: joint velocity (n,) and conditioning."""
+    n, markers, rows = operators.shape[0], points.shape[0], metrics.shape[1]
+    N = np.zeros((n, n))
+    b = np.zeros(n)
+    x = np.zeros(n)
+    around = np.empty(4)
+    velocity = np.empty((n, 4))
+    row = np.empty(n)
+    for p in range(markers):
+        w = weights[p]
+        if not w > 0.0:
+            continue
+        for i in range(4):
+            if choice == MEAN:
+                around[i] = 0.5 * (points[p, i] + target_points[p, i])
+            elif choice == DESIRED:
+                around[i] = target_points[p, i]
+            else:
+                around[i] = points[p, i]
+        velocities_into(operators, around, velocity)
+        for r in range(rows):
+            g = metrics[p, r]
+            error = 0.0
+            for i in range(4):
+                error += g[i] * (target_points[p, i] - points[p, i])
+            for j in range(n):
+                row[j] = (
+                    g[0] * velocity[j, 0]
+                    + g[1] * velocity[j, 1]
+                    + g[2] * velocity[j, 2]
+                    + g[3] * velocity[j, 3]
+                )
+            add_equation(row, error, w * w, N, b)
+    conditioning = damped_solve(N, b, damping, x)
+    if choice == MEAN:
+        # The mean finds a turn by θ as 2 tan(θ/2): back to the angle.
+        square = 0.0
+        for i in range(4):
+            for k in range(4):
+                ik, ki = 0.0, 0.0
+                for j in range(n):
+                    ik += x[j] * operators[j, i, k]
+                    ki += x[j] * operators[j, k, i]
+                square -= 0.5 * ik * ki
+        if square > 0.0:
+            half = 0.5 * math.sqrt(square)
+            gain *= math.atan(half) / half
+    for i in range(n):
+        x[i] *= gain
+    return x, conditioning
+
+
+def points(scene: Scene, task: Task, options: Options) -> LawStep:
+    """``q̇ = gain·J⁺(M* − M)`` over the markers that any camera sees and whose goal is known, in pixels.
+
+    With the mean Jacobian ``Ĥ_j (M + M*)/2`` the motion is the screw from here to the goal, from anywhere short of
+    half a turn. There is no fixed depth in space: that choice is the present points.
+    """
+    velocity, conditioning = points_step(
+        scene.operators, scene.points, task.target_points, _seen(scene, task),
+        pixel_metrics(scene.matrices, scene.points), held_gain(options), int(options.jacobian), options.damping,
+    )  # fmt: skip
+    return limited(scene, task, options, velocity, conditioning)
+
+
+def _seen(scene: Scene, task: Task) -> FloatArray:
+    """Weights (m,) of the markers: of the camera that sees each best, 0 where the goal's point is not known."""
+    found: FloatArray = scene.weights.max(axis=0, initial=0.0) * (task.target_known > 0.0)
+    return found
+
+
+LAW = Law(
+    points,
+    "on points in space, their errors measured in pixels",
+    needs_pose=True,
+    one_camera="refused",
+    options=("jacobian",),
+    reasons=image_reasons,
+    properties=LawProperties(
+        centre="aside, less",
+        face="not kept",
+        works_on="points, measured in pixels",
+        noise_at_rest="low",
+        one_camera="goes on",
+        fails_when="as `stereo`",
+    ),
+    colour="#1b7837",
+    rank=30,
+)

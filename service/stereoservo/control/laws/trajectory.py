@@ -1,0 +1,169 @@
+"""Tracking of set-points that move along a planned path, in the images of all cameras that see (thesis 8, 9.3)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.control.image_servoing import image_equations_into, image_reasons, limited
+from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, step_into
+from stereoservo.kinematics.kernels import project_points, transform_points_into
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import cholesky_solve, damped_solve
+
+JOINT_SHARE = 1e-4
+"""Squared weight of a planned joint, relative to the images' in the same joint.
+
+Above it: arm and plan disagree on lengths by some share of the arm's reach R. Where an elbow of depth ``c δ²``,
+``c`` about R/4, is stretched, images and joints have one solution, the plan's side, if ``share·R² > 2 c ε``: 1e-4 is
+right for ``ε`` up to 2e-4 of the reach, more than a calibration leaves. Below it: what the joints would
+bias a well determined direction by is 1e-4 of their disagreement, below image noise.
+"""
+
+
+@kernel
+def trajectory_step(
+    operators: FloatArray,
+    composition: int,
+    matrices: FloatArray,
+    camera_centres: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    set_points: FloatArray,
+    rates: FloatArray,
+    weights: FloatArray,
+    wanted: FloatArray,
+    gain: float,
+    dt_s: float,
+    damping: float,
+    joint_rates: FloatArray,
+    joint_error: FloatArray,
+    joint_weight: float,
+) -> tuple[FloatArray, float]:
+    """Joint velocity (n,) and conditioning; for ``dt_s`` > 0 refined by Newton's method on the images."""
+    n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
+    x, pull, meant = np.zeros(n), np.zeros(n), np.zeros(n)
+    known = np.zeros(markers)
+    held = -math.expm1(-gain * dt_s) / dt_s if dt_s > 0.0 else gain
+    N, b = np.empty((n, n)), np.empty(n)
+    image_equations_into(
+        operators, matrices, camera_centres, points, points, known, pixels, set_points, rates, weights, wanted,
+        held, 0, N, b,
+    )  # fmt: skip
+    planned = joint_rates.shape[0] == n
+    if planned:
+        largest = 0.0
+        for j in range(n):
+            largest = max(largest, N[j, j])
+        for j in range(n):
+            pull[j] = damping * largest + joint_weight * JOINT_SHARE * N[j, j]
+            meant[j] = joint_rates[j] + joint_weight * held * joint_error[j]
+            if not math.isfinite(pull[j] * meant[j]):
+                return x, 0.0
+            N[j, j] += pull[j]
+            b[j] += pull[j] * meant[j]
+        conditioning = cholesky_solve(N, b, x)
+    else:
+        conditioning = damped_solve(N, b, damping, x)
+    if not dt_s > 0.0 or conditioning == 0.0:
+        return x, conditioning
+    goal, _ = project_points(matrices, points)
+    for c in range(cameras):
+        for p in range(markers):
+            if weights[c, p] * wanted[c, p] > 0.0:
+                for r in range(2):
+                    goal[c, p, r] += dt_s * (rates[c, p, r] + held * (set_points[c, p, r] - pixels[c, p, r]))
+    found, best = np.empty(n), np.empty(n)
+    for j in range(n):
+        found[j] = x[j] * dt_s
+        best[j] = found[j]
+    H, turned, work = np.empty((4, 4)), np.empty((n, 4, 4)), np.empty((5, 4, 4))
+    change, moved = np.empty(n), np.empty((markers, 4))
+    no_rates = np.zeros((cameras, markers, 2))
+    before = math.inf
+    for _ in range(ITERATIONS):
+        step_into(operators, composition, found, H, turned, work)
+        transform_points_into(H, points, moved)
+        seen, _ = project_points(matrices, moved)
+        error = 0.0
+        for c in range(cameras):
+            for p in range(markers):
+                w = weights[c, p] * wanted[c, p]
+                if w > 0.0:
+                    for r in range(2):
+                        error += (w * (goal[c, p, r] - seen[c, p, r])) ** 2
+        for j in range(n):
+            error += pull[j] * (dt_s * meant[j] - found[j]) ** 2
+        if not error <= SLACK * before:
+            break
+        before = error
+        for j in range(n):
+            best[j] = found[j]
+        image_equations_into(
+            turned, matrices, camera_centres, moved, moved, known, seen, goal, no_rates, weights, wanted, 1.0, 0,
+            N, b,
+        )  # fmt: skip
+        if planned:
+            for j in range(n):
+                N[j, j] += pull[j]
+                b[j] += pull[j] * (dt_s * meant[j] - found[j])
+            cholesky_solve(N, b, change)
+        else:
+            damped_solve(N, b, damping, change)
+        most = 0.0
+        for j in range(n):
+            found[j] += change[j]
+            most = max(most, abs(change[j]))
+        if most < CONVERGED:
+            break
+    for j in range(n):
+        x[j] = best[j] / dt_s
+    return x, conditioning
+
+
+def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
+    """``q̇ = J⁺(ṡ* + gain (s* − s))``: feed-forward along the way, feedback on the deviation from it.
+
+    Where the images say little (near singular postures, self-motions) the joints go as they are planned, if they are:
+    ``Σ p_j |q̇_j − (q̇*_j + gain (q*_j − q_j))|²`` is added to what is least, with `JOINT_SHARE` of the images' weight.
+
+    The set-points are near, so the Jacobian is the present one whatever ``options`` say. One camera is enough. With
+    ``dt_s`` the velocity, held so long, moves the images as meant to all orders; ``task.rates`` are then best the mean
+    rates of the set-points over the step that begins. Rests, with conditioning 0, where the planned joints are not
+    finite. Raises ValueError for planned joints of another arm.
+    """
+    n = len(scene.operators)
+    if len(task.joint_rates) not in (0, n) or len(task.joint_error) != len(task.joint_rates):
+        raise ValueError(
+            f"an arm of {n} joints takes {n} planned rates and errors, or none of both; got "
+            f"{len(task.joint_rates)} and {len(task.joint_error)}"
+        )
+    velocity, conditioning = trajectory_step(
+        scene.operators, scene.composition, scene.matrices, scene.camera_centres, scene.points, scene.pixels,
+        task.set_points, task.rates, scene.weights, task.wanted, options.gain, options.dt_s, options.damping,
+        task.joint_rates, task.joint_error, task.joint_weight,
+    )  # fmt: skip
+    return limited(scene, task, options, velocity, conditioning)
+
+
+LAW = Law(
+    trajectory,
+    "along a plan that keeps view and limits, timed to the arm",
+    path="planned",
+    follows_streams=False,
+    options=("centre", "profile"),
+    reasons=image_reasons,
+    properties=LawProperties(
+        centre="along its plan, straight unless bent",
+        face="planned",
+        works_on="pixels along the plan, velocity fed forward",
+        noise_at_rest="low",
+        one_camera="goes on",
+        fails_when="no way is found: refused before; a goal that moves",
+    ),
+    colour="#000000",
+    rank=60,
+)

@@ -1,0 +1,137 @@
+"""What one step of the core hands from stage to stage: the inputs, the present, findings and the source's output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from stereoservo.core.cycle import StepInputs
+from stereoservo.core.prediction import ModelArrays, Prediction
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import CoreState
+from stereoservo.messages.goals import PlanReport
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, JointState
+
+Emit = Callable[..., None]
+"""Appends an event to the step's outputs: its kind, and the event's other fields by keyword."""
+
+
+@dataclass
+class Derived:
+    """Values that follow from the settings and the model in use: kept from step to step, but no part of the state.
+
+    ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
+    ``frame_timeout_s``: age from which on a frame is refused. ``prior_every``: steps between priors. ``load_limits``:
+    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
+    """
+
+    nominal_period_ns: int
+    longest_gap_s: float
+    frame_timeout_s: float
+    prior_every: int
+    arrays: ModelArrays | None = None
+    load_limits: tuple[FloatArray, FloatArray] | None = None
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What passed the gate in one step, and why the rest did not.
+
+    ``joints``: the sample, if it is new. ``observations``: new ones, each with the index of its camera. ``elapsed_s``:
+    since the last step. ``refused_joints`` and ``refused_frames`` (index of the camera, reason): of refused samples;
+    ``gap``: of a loop that stood still for too long. ``stops``: those of these reasons that stop the arm.
+    """
+
+    joints: JointState | None
+    observations: tuple[tuple[int, CameraObservation], ...]
+    elapsed_s: float
+    refused_joints: Reason | None
+    refused_frames: tuple[tuple[int, Reason], ...]
+    gap: Reason | None
+    stops: tuple[Reason, ...]
+
+
+@dataclass(eq=False)
+class StepContext:
+    """One step as its stages and the motion sources see it.
+
+    `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
+    ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) need a model. `move` sets ``paused``: the active source had
+    to wait. ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
+    """
+
+    inputs: StepInputs
+    now_ns: int
+    dt_s: float
+    state: CoreState
+    settings: CoreSettings
+    derived: Derived
+    emit: Emit
+    q: FloatArray
+    ingested: Ingested
+    observations: tuple[CameraObservation, ...] = ()
+    arrays: ModelArrays | None = None
+    prediction: Prediction | None = None
+    weights: FloatArray | None = None
+    pixels: FloatArray | None = None
+    paused: bool = False
+    goals_read: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a monitor has found, as the stage `monitor` acts on it.
+
+    ``stop``: the arm brakes and holds, every goal ends; ``fault``: likewise, and the drives go off until a reset;
+    ``abort``: the active goal ends. ``ended``: message of the goals that end; ``message``: of the event of the stop or
+    fault. ``latched``: whether ``reason`` is shown until the cell is resumed.
+    """
+
+    effect: Literal["stop", "fault", "abort"]
+    reason: Reason
+    ended: str
+    message: str = ""
+    latched: bool = True
+
+
+@dataclass(frozen=True)
+class SourceOutput:
+    """The output of a motion source: joint velocity (n,), whether it may not go on without features, whether it has
+    finished, and whether because its goal is ``reached``.
+    """
+
+    velocity: FloatArray
+    needs_features: bool = False
+    speed_scale: float = 1.0
+    finished: bool = False
+    reached: bool = False
+    error_px: float | None = None
+    task_error: FloatArray = field(default_factory=partial(np.zeros, 0))
+    reasons: tuple[Reason, ...] = ()
+
+
+class RefusalError(Exception):
+    """A request is refused: the reason, ``further`` ones, and of a goal without a path the ``plan`` that was tried."""
+
+    def __init__(
+        self,
+        code: str,
+        hint: str,
+        *,
+        subject: str = "",
+        value: float | None = None,
+        threshold: float | None = None,
+        unit: str = "",
+        further: tuple[Reason, ...] = (),
+        plan: PlanReport | None = None,
+    ) -> None:
+        super().__init__(hint)
+        self.reason = Reason(code, "info", subject, value, threshold, unit, hint)
+        self.reasons = (self.reason, *further)
+        self.plan = plan

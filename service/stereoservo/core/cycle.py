@@ -1,0 +1,188 @@
+"""Inputs and outputs of one core step: `StepInputs`, `StepOutputs`, status, events, and their array encoding."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.kinematics.model import CellModel, JointLoads
+from stereoservo.messages.goals import PlanReport, Request
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Health
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.ports.devices import CameraObservation, JointState, Prior
+
+
+class DriverFault(msgspec.Struct, frozen=True):
+    """A joint driver failed in this cycle."""
+
+    code: str
+    message: str
+
+
+class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
+    """A model enters the core: only at rest, with an epoch.
+
+    ``reanchored``: cameras whose matrices alone are new, in the same frame as before: a suspended goal goes on.
+    """
+
+    model: CellModel
+    reanchored: tuple[str, ...] = ()
+
+
+class StepInputs(msgspec.Struct, frozen=True, eq=False):
+    """Everything that one step may depend on. ``stop``: the stop slot was raised since the last step.
+
+    ``driver_active``: what the servo process did with the driver (it owns enable and disable); the core's lifecycle
+    follows ``driver_active`` and asks for transitions through ``StepOutputs.driver_request``.
+    """
+
+    now_ns: int
+    period_ns: int
+    joints: JointState | None
+    observations: tuple[CameraObservation, ...] = ()
+    requests: tuple[Request, ...] = ()
+    model_update: ModelUpdate | None = None
+    stop: bool = False
+    driver_configured: bool = True
+    driver_active: bool = False
+    driver_fault: DriverFault | None = None
+    parameter_epoch: int = 0
+
+
+EventKind = Literal[
+    "reply",  # answer to a request: accepted or refused
+    "lifecycle",
+    "model",
+    "goal_started",
+    "goal_face",  # the law works on another face of the body from here on
+    "goal_acknowledged",
+    "goal_reached",
+    "goal_aborted",
+    "goal_cancelled",
+    "goal_preempted",
+    "held",
+    "resumed",
+    "stopped",
+    "fault",
+    "calibration_progress",
+    "calibration_sample",
+    "calibration_finished",
+    "calibration_aborted",
+    "check_finished",
+    "health",  # the watch over the model has come to another verdict
+    "reanchor",  # cameras have moved, the arm rests, and these are the sights to re-anchor them by
+    "reanchored",  # the cameras are known again; a goal that was suspended goes on
+    "camera_adjusted",  # a mobile camera stands again, and its matrix is the one found while it moved
+    "reanchor_failed",  # they are not: what is suspended stays so
+    "taught",
+    "warning",
+]
+
+
+class Sample(msgspec.Struct, frozen=True, eq=False):
+    """Markers averaged at rest in one camera: ``ids`` (k,), ``pixels`` (k, 2), ``covariances`` (k, 2, 2) of the mean.
+
+    The covariances are the detector's: its noise over the number of sights, plus its systematic part. ``sights`` (k,)
+    and ``scatter`` (k,) [px²], the variance of a coordinate over these sights, tell how far its noise is as stated.
+    """
+
+    camera: str
+    ids: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
+    frames: int
+    sights: FloatArray
+    scatter: FloatArray
+
+
+class Event(msgspec.Struct, frozen=True, eq=False):
+    """Something a client may not miss. ``seq`` counts from the core's start; ``t_ns`` monotonic."""
+
+    seq: int
+    t_ns: int
+    kind: EventKind
+    message: str = ""
+    id: str = ""
+    request: int = -1
+    accepted: bool | None = None
+    reasons: tuple[Reason, ...] = ()
+    joints: FloatArray | None = None
+    samples: tuple[Sample, ...] = ()
+    trial: int = -1
+    name: str = ""
+    error_px: float | None = None
+    progress: float | None = None
+    plan: PlanReport | None = None
+    """Of a reply to a goal that was planned."""
+    loads: JointLoads | None = None
+    """Of finished trial motions, where the drives tell."""
+    cameras: tuple[str, ...] = ()
+    """Of ``reanchor`` and what follows it: cameras that have moved; ``rigid``: as one body."""
+    rigid: bool = False
+    matrix: FloatArray | None = None
+    """Of ``camera_adjusted``: where the camera ``name`` stands now (3, 4), in the frame of model ``epoch``."""
+    epoch: int = 0
+
+
+class Status(msgspec.Struct, frozen=True, eq=False):
+    """The state of the core after a step."""
+
+    t_ns: int
+    step: int
+    lifecycle: str
+    model: str
+    model_epoch: int
+    source: str
+    goal: str
+    law: str
+    level: str
+    reasons: tuple[Reason, ...]
+    positions: FloatArray
+    velocities: FloatArray
+    command_raw: FloatArray
+    command: FloatArray
+    error_px: float | None
+    task_error: FloatArray
+    """Of the components of the law, `control.law.Law.components`; empty where it has none."""
+    innovation_px: dict[str, float]
+    visible: dict[str, int]
+    progress: float | None = None
+    """Share [0, 1] of the goal's way that is done."""
+    seconds_left: float | None = None
+    efforts: FloatArray | None = None
+    """As the driver tells them (n,)."""
+    following_errors: FloatArray | None = None
+    effort_limits: FloatArray | None = None
+    """How far an effort may go from its moving mean (n,), infinite where nobody knows; None: no watch at all."""
+    following_limits: FloatArray | None = None
+    """Likewise of the following errors, from zero."""
+    health: Health = Health()
+
+
+class StepOutputs(msgspec.Struct, frozen=True, eq=False):
+    """``command`` (n,) to write, or None where nothing may be written in this lifecycle state."""
+
+    command: FloatArray | None
+    status: Status
+    priors: tuple[Prior, ...] = ()
+    events: tuple[Event, ...] = ()
+    driver_request: Literal["", "activate", "deactivate", "reset"] = ""
+
+
+def encode_array(value: object) -> object:
+    """msgspec ``enc_hook``: an array as (dtype, shape, bytes), bit for bit."""
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, list(value.shape), np.ascontiguousarray(value).tobytes())
+    raise NotImplementedError(f"cannot encode {type(value).__name__}")
+
+
+def decode_array(kind: type, value: object) -> object:
+    """msgspec ``dec_hook``, inverse of :func:`encode_array`."""
+    parts: Any = value
+    dtype, shape, data = parts
+    array: npt.NDArray[np.generic] = np.frombuffer(data, dtype=np.dtype(dtype)).reshape(shape).copy()
+    return array

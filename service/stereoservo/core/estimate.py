@@ -1,0 +1,177 @@
+"""Stage 2, estimate: a new model where the arm rests, frames folded in at their own stamps, the present predicted.
+
+What each camera shows is compared with the prediction at its shutter; what is left is filtered and carried to the
+present by the kinematics (`core.prediction`), so that control goes on between frames and through a lost camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.core.context import StepContext
+from stereoservo.core.cycle import ModelUpdate
+from stereoservo.core.monitors import camera_relocalization, moving_camera
+from stereoservo.core.monitors.joints import collision_thresholds
+from stereoservo.core.monitors.model import fold_residuals, masked_ids, start_model_monitor
+from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.prediction import (
+    accept_sights,
+    frame_sights,
+    ideal_observation,
+    joint_correction,
+    joints_at,
+    marker_weights,
+    model_arrays,
+    motion_at,
+    pixels_now,
+    predict,
+)
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import CoreState, camera_estimate
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.status import ModelReadiness
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation
+
+AT_REST = 1e-3
+"""[rad/s or m/s]"""
+
+
+def estimate(context: StepContext) -> StepContext:
+    """The context with the present in it: model, prediction, weights and pixels of the markers."""
+    _take_model(context)
+    for camera, observation in _new_frames(context):
+        _fold_frame(camera, observation, context)
+    arrays, state = context.derived.arrays, context.state
+    if arrays is None or state.history.count == 0:
+        return context
+    context.arrays = arrays
+    context.prediction = predict(arrays, context.q)
+    context.weights = marker_weights(state.cameras, context.now_ns, context.settings.limits.coast_s)
+    state.correction = joint_correction(context.prediction, state.cameras, context.weights)
+    context.pixels = pixels_now(context.prediction, state.cameras)
+    if any(state.mobile):
+        context = moving_camera.step(context)
+        context.derived.arrays = context.arrays
+    return context
+
+
+# -- the model ----------------------------------------------------------------------------------------------
+
+
+def _take_model(context: StepContext) -> None:
+    """A new model waits until the arm rests and no law runs; then every estimate starts again."""
+    state, update = context.state, context.inputs.model_update
+    if update is not None:
+        try:
+            model_arrays(update.model, context.settings)
+        except ValueError as error:
+            context.emit("warning", message=f"model refused: {error}")
+        else:
+            _await_model(update, context)
+    if state.pending_model is None:
+        return
+    run = state.reanchoring
+    if state.pending_reanchored:
+        if run is None or run.phase != "take":
+            return
+        use_model(state.pending_model, context, masked=masked_ids(state))
+        camera_relocalization.taken(run, state, context.now_ns)
+    elif (
+        MOTION_SOURCES[type(state.source)].runs_law
+        or state.planning is not None
+        or bool((np.abs(state.command) > AT_REST).any())
+    ):
+        return
+    else:
+        use_model(state.pending_model, context)
+        state.reanchoring = None
+    arrays, model = context.derived.arrays, state.model
+    assert arrays is not None
+    assert model is not None
+    moving_camera.start(state, context.settings, arrays, state.pending_reanchored, context.emit)
+    state.pending_model, state.pending_reanchored = None, ()
+    context.emit(
+        "model", message=f"model epoch {model.epoch} is {state.readiness}", name=str(state.readiness)
+    )
+
+
+def _await_model(update: ModelUpdate, context: StepContext) -> None:
+    """Keep a model until it may be used; a re-anchored one must be the one that is waited for."""
+    state = context.state
+    if update.reanchored:
+        refusal = camera_relocalization.misfit(state, update)
+        if refusal:
+            context.emit("warning", message=f"re-anchored model refused: {refusal}")
+            return
+    state.pending_model = moving_camera.with_adjusted(state, update.model, update.reanchored)
+    state.pending_reanchored = update.reanchored
+
+
+def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = ()) -> None:
+    """Put a model in use. ``masked``: markers that have slipped and stay unused."""
+    state, settings = context.state, context.settings
+    arrays = context.derived.arrays = model_arrays(model, settings)
+    start_model_monitor(state, arrays, settings, masked)
+    state.model = model
+    context.derived.load_limits = load_limits(settings, model)
+    state.readiness = fitted_readiness(model)
+    state.cameras = [camera_estimate(len(model.marker_ids)) for _ in settings.cameras]
+
+
+def fitted_readiness(model: CellModel) -> ModelReadiness:
+    """The readiness of a model before the images have confirmed or contradicted it."""
+    good = model.statistics is not None and model.statistics.chi2_ok
+    return ModelReadiness.VALID if good else ModelReadiness.CANDIDATE
+
+
+def load_limits(settings: CoreSettings, model: CellModel | None) -> tuple[FloatArray, FloatArray] | None:
+    """Collision thresholds (n,), (n,) by cell file and model; None: collisions are not monitored."""
+    if not settings.watch_following:
+        return None
+    return collision_thresholds(settings, None if model is None else model.loads)
+
+
+# -- frames -------------------------------------------------------------------------------------------------
+
+
+def _new_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], ...]:
+    """The frames of this step; the model monitor's cameras await them."""
+    for sighting in context.state.watching.sightings:
+        sighting.fresh = False
+    found = context.ingested.observations
+    context.observations = tuple(observation for _, observation in found)
+    return found
+
+
+def _fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
+    """Compare a frame with the prediction at its shutter, and fold it into its camera's estimate."""
+    state, settings, arrays = context.state, context.settings, context.derived.arrays
+    estimate = state.cameras[camera]
+    estimate.last_seq = observation.seq
+    estimate.last_visible = int(observation.ids.size)
+    at_shutter = joints_at(state.history, observation.t_shutter_ns)
+    if arrays is None or at_shutter is None:
+        return
+    prediction = predict(arrays, at_shutter)
+    motion = motion_at(state.history, observation.t_shutter_ns)
+    speed = state.velocities if motion is None else motion
+    sights = frame_sights(arrays, camera, ideal_observation(arrays, camera, observation), prediction, speed)
+    if motion is not None:  # where the arm was is known, and not only expected
+        if state.mobile[camera] is not None:
+            sights = moving_camera.see(
+                state, settings, arrays, camera, sights, prediction, at_shutter, context.emit
+            )
+        fold_residuals(state.watching, camera, sights, at_shutter)
+    if not _unknown(camera, state, settings):
+        accept_sights(estimate, sights, state.watching.masked == 0.0, settings)
+
+
+def _unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
+    """Whether the place of a camera is not known: it is being found again, or it moves now."""
+    mobile = state.mobile[camera]
+    if mobile is not None and mobile.moving:
+        return True
+    if state.reanchoring is None:
+        return False
+    return settings.cameras[camera].name in camera_relocalization.unknown_cameras(state)

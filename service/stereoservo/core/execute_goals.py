@@ -1,0 +1,252 @@
+"""Stage 4, execute_goals: goals planned a slice at a time, begun, blended into the next; leases and the lifecycle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.accept import accept, answer_waiting, prepare, report_without_plan, trusted_model
+from stereoservo.core.goals.execute import (
+    begin,
+    cancel_queue,
+    end_followers,
+    end_queue,
+    end_source,
+    require_motion_allowed,
+)
+from stereoservo.core.goals.plan import begin_plan, go_on_planning, plan_report
+from stereoservo.core.goals.servo_goal import place_now
+from stereoservo.core.goals.target_checks import BodyState
+from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.sources.law import awaits_plan
+from stereoservo.core.state import (
+    AwaitingAcknowledgement,
+    Holding,
+    PlanJob,
+    ServoGoal,
+    Source,
+)
+from stereoservo.messages.goals import Goal
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle
+
+AT_REST = 1e-3
+"""[rad/s or m/s]"""
+MOVED_SINCE = 0.01
+"""Joint motion [rad or m] since a plan was begun from which on a way that is followed is planned anew."""
+
+
+def execute_goals(context: StepContext) -> Source:
+    """The source that is active from here on: one step's share of planning, the next goal, leases, the lifecycle."""
+    state = context.state
+    if (
+        state.planning is not None
+        or state.queue
+        or state.queued_until_ns
+        or state.ahead is not None
+        or state.waiting
+        or MOTION_SOURCES[type(state.source)].waits(state.source)
+    ):
+        _advance(context)
+        answer_waiting(context)
+    if state.lifecycle != Lifecycle.ACTIVE:
+        if not isinstance(state.source, Holding):
+            _end_inactive(context)
+    elif MOTION_SOURCES[type(state.source)].leased:
+        _watch_lease(state.source, context)
+    return state.source
+
+
+def _end_inactive(context: StepContext) -> None:
+    """Nothing moves, and nothing waits to move, outside ACTIVE."""
+    state = context.state
+    reason = Reason("NOT_ACTIVE", "hold", hint=f"the cell became {state.lifecycle}")
+    end_source(context, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}")
+    end_queue(context, (reason,), f"the cell became {state.lifecycle}")
+
+
+def _watch_lease(source: Any, context: StepContext) -> None:
+    """End a source whose client was silent for too long."""
+    if source.lease_s is None or context.now_ns <= source.lease_until_ns:
+        return
+    hint = "the client did not renew its lease: is it alive?"
+    reason = Reason("LEASE_EXPIRED", "hold", "", source.lease_s, source.lease_s, "s", hint)
+    end_source(context, "goal_aborted", (reason,), reason.hint)
+
+
+def _advance(context: StepContext) -> None:
+    """One step's share of planning, and what follows from it: replies, the next goal, a blend into it."""
+    state = context.state
+    if isinstance(state.source, AwaitingAcknowledgement) and context.now_ns > state.source.until_ns:
+        _not_acknowledged(state.source, context)
+    _watch_leases(context)
+    if state.planning is not None:
+        _plan_on(state.planning, context)
+    if state.planning is None:
+        _next_plan(context)
+    _blend_into_next(context)
+
+
+def _not_acknowledged(source: AwaitingAcknowledgement, context: StepContext) -> None:
+    hint = f"goal {source.id} was reached and not acknowledged in {source.acknowledge_s:g} s: is its client alive?"
+    reason = Reason(
+        "NOT_ACKNOWLEDGED", "hold", source.id, source.acknowledge_s, source.acknowledge_s, "s", hint
+    )
+    context.state.source = Holding()
+    context.emit("warning", id=source.id, message=hint, reasons=(reason,))
+    cancel_queue(context, (reason,), hint)
+
+
+def _watch_leases(context: StepContext) -> None:
+    """A goal whose client dies while it is queued does not begin."""
+    state = context.state
+    expired = [i for i, until_ns in state.queued_until_ns.items() if context.now_ns > until_ns]
+    for goal in [goal for goal in state.queue if goal.id in expired]:
+        state.queue.remove(goal)
+        del state.queued_until_ns[goal.id]
+        hint = "the client did not renew its lease while the goal was queued: is it alive?"
+        reason = Reason("LEASE_EXPIRED", "hold", goal.id, goal.lease_s, goal.lease_s, "s", hint)
+        if state.ahead is not None and state.ahead.goal.id == goal.id:
+            state.ahead = None
+        context.emit("goal_aborted", id=goal.id, message=hint, reasons=(reason,))
+        if goal.acknowledge_s is not None:
+            end_followers(context, goal.id, (reason,))
+            return
+
+
+def _plan_on(job: PlanJob, context: StepContext) -> None:
+    state = context.state
+    if not go_on_planning(job):
+        return
+    state.planning = None
+    goal = job.source.goal
+    try:
+        trusted_model(context)
+        report = plan_report(job, context)
+        if job.purpose == "reply":
+            _fresh(job, context)
+            message, _ = accept(goal, job.source, report, context)
+            context.emit(
+                "reply", request=job.request, accepted=True, id=goal.id, message=message, plan=report
+            )
+        elif job.purpose == "queue":
+            begin(job.source, context)  # in hold, too: it waits to be resumed
+        elif job.purpose == "ahead":
+            state.ahead = job.source
+    except RefusalError as refusal:
+        _refused(job, refusal, context)
+
+
+def _fresh(job: PlanJob, context: StepContext) -> None:
+    """A way that is followed begins where the arm rests: one that has moved since plans anew when it rests."""
+    if job.source.plan is not None and bool((np.abs(context.q - job.joints) > MOVED_SINCE).any()):
+        job.source.plan = None
+
+
+def _refused(job: PlanJob, refusal: RefusalError, context: StepContext) -> None:
+    goal, state = job.source.goal, context.state
+    if job.purpose == "reply":
+        context.emit(
+            "reply", request=job.request, accepted=False, id=goal.id, message=str(refusal), reasons=refusal.reasons,
+            plan=refusal.plan,
+        )  # fmt: skip
+    elif job.purpose == "queue":
+        _not_begun(goal, refusal, context)
+    elif job.purpose == "again" and state.source is job.source:
+        end_source(context, "goal_aborted", refusal.reasons, str(refusal))
+    elif job.purpose == "ahead":
+        state.not_ahead = goal.id  # planned again from where the arm comes to rest, and told then
+
+
+def _next_plan(context: StepContext) -> None:
+    """Plan what is to be planned without being asked: a way anew, the next goal, the one after this."""
+    state = context.state
+    source = state.source
+    if state.reanchoring is not None:
+        return
+    if isinstance(source, ServoGoal) and awaits_plan(source):
+        if bool((np.abs(state.command) < AT_REST).all()) and bool(
+            (np.abs(state.velocities) < 10 * AT_REST).all()
+        ):
+            state.planning = begin_plan(source, context, place_now(context), context.q, "again", -1)
+        return
+    if state.held:
+        return
+    if state.queue and isinstance(source, Holding):
+        goal = state.queue.pop(0)
+        state.queued_until_ns.pop(goal.id, None)
+        try:
+            require_motion_allowed(context)
+            prepared, place = prepare(goal, context)
+            if isinstance(prepared, ServoGoal) and prepared.pose_known and place is not None:
+                state.planning = begin_plan(prepared, context, place, context.q, "queue", -1)
+            else:
+                report_without_plan(prepared, context)
+                begin(prepared, context)
+        except RefusalError as refusal:
+            _not_begun(goal, refusal, context)
+        return
+    if state.queue and _blends(source) and state.ahead is None and state.not_ahead != state.queue[0].id:
+        _plan_ahead(state.queue[0], source, context)
+
+
+def _not_begun(goal: Goal, refusal: RefusalError, context: StepContext) -> None:
+    """A queued goal cannot be driven from where the arm is now."""
+    context.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
+    if goal.acknowledge_s is not None:
+        end_followers(context, goal.id, refusal.reasons)
+
+
+def _blends(source: Source) -> bool:
+    return (
+        isinstance(source, ServoGoal)
+        and source.goal.blend_px is not None
+        and source.goal.acknowledge_s is None
+        and source.pose_known
+        and source.stream is None
+    )
+
+
+def _plan_ahead(goal: Goal, source: Source, context: StepContext) -> None:
+    """Plan the next goal from where this one ends, while the arm is still on its way there."""
+    state = context.state
+    assert isinstance(source, ServoGoal)
+    if source.goal_joints is None:
+        state.not_ahead = goal.id
+        return
+    now = place_now(context)
+    place = BodyState(now.settings, now.arrays, source.target_points, now.operators, now.faces)
+    try:
+        prepared, _ = prepare(goal, context, place)
+    except RefusalError:
+        state.not_ahead = goal.id  # told when its turn comes
+        return
+    if isinstance(prepared, ServoGoal) and prepared.pose_known:
+        state.planning = begin_plan(prepared, context, place, source.goal_joints, "ahead", -1)
+    else:
+        state.not_ahead = goal.id
+
+
+def _blend_into_next(context: StepContext) -> None:
+    """Leave a goal that blends into the next, near enough and with its way planned, without a stop."""
+    state = context.state
+    source, following = state.source, state.ahead
+    if following is None or not isinstance(source, ServoGoal) or source.goal.blend_px is None:
+        return
+    if not state.queue or state.queue[0].id != following.goal.id:
+        state.ahead = None
+        return
+    if (
+        state.held
+        or state.reanchoring is not None
+        or source.error_px is None
+        or source.error_px > source.goal.blend_px
+    ):
+        return
+    state.queue.pop(0)
+    state.queued_until_ns.pop(following.goal.id, None)
+    message = f"handed over to goal {following.goal.id} at {source.error_px:.2f} px"
+    context.emit("goal_reached", id=source.goal.id, message=message, error_px=source.error_px)
+    begin(following, context)

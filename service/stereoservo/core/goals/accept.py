@@ -1,0 +1,596 @@
+"""What clients ask of goals: run, check, queue, renew, move, cancel, acknowledge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any, cast
+
+import numpy as np
+
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.execute import (
+    begin,
+    drop_lookahead_plan,
+    drop_plan,
+    end_queue,
+    end_source,
+    preempt,
+    require_motion_allowed,
+)
+from stereoservo.core.goals.plan import begin_plan
+from stereoservo.core.goals.resolve import joint_index
+from stereoservo.core.goals.servo_goal import place_now, start_servoing
+from stereoservo.core.goals.target_checks import BodyState
+from stereoservo.core.monitors import camera_relocalization
+from stereoservo.core.monitors.camera_relocalization import refuse_while_moved
+from stereoservo.core.monitors.moving_camera import refuse_pixels
+from stereoservo.core.move import MOTION_SOURCES, goal_of
+from stereoservo.core.sources.calibration import start_trials
+from stereoservo.core.sources.check import start_check
+from stereoservo.core.sources.incidence import start_incidence
+from stereoservo.core.sources.joint_move import joint_goal, joint_move_to
+from stereoservo.core.sources.streaming import update
+from stereoservo.core.sources.teaching import start_teaching
+from stereoservo.core.state import (
+    AwaitingAcknowledgement,
+    CalibrationMotion,
+    CheckMotion,
+    Holding,
+    IncidenceGoal,
+    Jogging,
+    JointMove,
+    Leased,
+    ServoGoal,
+    Source,
+)
+from stereoservo.messages.goals import (
+    AcknowledgeGoal,
+    Calibrate,
+    CancelGoal,
+    Command,
+    Disable,
+    DisplacementTarget,
+    Enable,
+    FeatureTarget,
+    Goal,
+    Hold,
+    Home,
+    IncidenceTarget,
+    Jog,
+    JointTarget,
+    PlanReport,
+    PointTarget,
+    ReanchorRefused,
+    RenewGoal,
+    Request,
+    Reset,
+    Resume,
+    RunGoal,
+    TaughtTarget,
+    Teach,
+    UpdateGoal,
+)
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle, ModelReadiness
+
+QUEUE_LENGTH = 16
+
+Accepted = tuple[str, PlanReport | None]
+"""The message of an accepted request, and the report of its plan."""
+
+_IDS: dict[type[Any], Callable[[Any], str]] = {
+    RunGoal: attrgetter("goal.id"),
+    **dict.fromkeys((RenewGoal, CancelGoal, UpdateGoal, AcknowledgeGoal, Home, Calibrate), attrgetter("id")),
+}
+"""Where a command has the id of the goal that it is about."""
+
+
+def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | None:
+    """Accept or refuse a goal: at once, or (None) once it is planned. Raises RefusalError."""
+    state = context.state
+    if not goal.check:
+        require_motion_allowed(context)
+        if _known(goal.id, context):
+            return "already accepted", None  # a client's retry
+        refuse_pixels(goal.target, state, context.settings)
+        busy = MOTION_SOURCES[type(state.source)].subject(state.source) or state.queue
+        if goal.mode == "queue" and busy:
+            return _enqueue(goal, context), None
+    source, place = prepare(goal, context)
+    if isinstance(source, ServoGoal) and source.pose_known and place is not None:
+        state.planning = begin_plan(source, context, place, context.q, "reply", request.request)
+        return None
+    return accept(goal, source, report_without_plan(source, context), context)
+
+
+def report_without_plan(source: Source, context: StepContext) -> PlanReport | None:
+    """The report of a source for which no path is planned. Raises RefusalError where it meets a keep-out."""
+    report = MOTION_SOURCES[type(source)].report
+    return None if report is None else report(source, context)
+
+
+def planning_pending(context: StepContext) -> bool:
+    """Whether a goal is being planned that a client waits for, or that has been accepted already."""
+    job = context.state.planning
+    return job is not None and job.purpose != "ahead"
+
+
+def _known(goal_id: str, context: StepContext) -> bool:
+    state = context.state
+    job, source = state.planning, state.source
+    planned = job is not None and not job.source.goal.check and job.source.goal.id == goal_id
+    active = MOTION_SOURCES[type(source)].subject(source) == goal_id
+    return active or planned or any(goal.id == goal_id for goal in state.queue)
+
+
+def new_id(goal_id: str, context: StepContext) -> None:
+    """Raises RefusalError for an id that another goal has: each ends in one event of its own."""
+    if _known(goal_id, context):
+        raise RefusalError(
+            "ID_IN_USE", f"a goal {goal_id} is active or queued; give an id of its own", subject=goal_id
+        )
+
+
+def _enqueue(goal: Goal, context: StepContext) -> str:
+    state = context.state
+    if len(state.queue) >= QUEUE_LENGTH:
+        raise RefusalError(
+            "QUEUE_FULL",
+            f"{QUEUE_LENGTH} goals are queued: wait until one has ended, or cancel one",
+            value=float(len(state.queue)),
+            threshold=float(QUEUE_LENGTH),
+            unit="goals",
+        )
+    prepare(goal, context)  # what cannot be at all is refused now; its way is planned when its turn comes
+    state.queue.append(goal)
+    _renew_queued(goal, context)
+    return f"queued as number {len(state.queue)}; it is planned when its turn comes"
+
+
+def _renew_queued(goal: Goal, context: StepContext) -> None:
+    if goal.lease_s is not None:
+        context.state.queued_until_ns[goal.id] = context.now_ns + int(goal.lease_s * 1e9)
+
+
+def accept(goal: Goal, source: Source, report: PlanReport | None, context: StepContext) -> Accepted:
+    """Begin a goal in place of the active one, or answer its check. Raises RefusalError where none may move."""
+    if goal.check:
+        try:
+            require_motion_allowed(context)
+        except RefusalError as error:
+            return f"the goal would be accepted, but now {error}", report
+        return "the goal would be accepted", report
+    require_motion_allowed(context)
+    preempt(context, f"goal {goal.id}")
+    begin(source, context)
+    return "accepted", report
+
+
+def prepare(
+    goal: Goal, context: StepContext, place: BodyState | None = None
+) -> tuple[JointMove | ServoGoal | IncidenceGoal, BodyState | None]:
+    """The source that a goal comes to, and the place that it sets out from, where that counts.
+
+    ``place``: of the body, None: where it is. Raises RefusalError.
+    """
+    return _PREPARE[type(goal.target)](goal, goal.target, context, place)
+
+
+Prepared = tuple[JointMove | ServoGoal | IncidenceGoal, BodyState | None]
+
+
+def _prepare_joints(
+    goal: Goal, target: JointTarget, context: StepContext, place: BodyState | None
+) -> Prepared:
+    return joint_goal(goal, target, context), None
+
+
+def _prepare_taught(
+    goal: Goal, target: TaughtTarget, context: StepContext, place: BodyState | None
+) -> Prepared:
+    raise RefusalError(
+        "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
+    )
+
+
+def _prepare_incidences(
+    goal: Goal, target: IncidenceTarget, context: StepContext, place: BodyState | None
+) -> Prepared:
+    place = _trusted_place(context, place)
+    return start_incidence(goal, target, context, place), place
+
+
+def _prepare_servoing(
+    goal: Goal,
+    target: FeatureTarget | PointTarget | DisplacementTarget,
+    context: StepContext,
+    place: BodyState | None,
+) -> Prepared:
+    place = _trusted_place(context, place)
+    return start_servoing(goal, target, context, place), place
+
+
+def _trusted_place(context: StepContext, place: BodyState | None) -> BodyState:
+    """The body at ``place``, or where it is. Raises RefusalError without a model that holds."""
+    trusted_model(context)
+    refuse_while_moved(context.state)
+    return place_now(context) if place is None else place
+
+
+_PREPARE: dict[type[Any], Callable[[Goal, Any, StepContext, BodyState | None], Prepared]] = {
+    JointTarget: _prepare_joints,
+    TaughtTarget: _prepare_taught,
+    IncidenceTarget: _prepare_incidences,
+    FeatureTarget: _prepare_servoing,
+    PointTarget: _prepare_servoing,
+    DisplacementTarget: _prepare_servoing,
+}
+"""How the source of a goal is made, by the kind of its target."""
+
+
+def trusted_model(context: StepContext) -> int:
+    """Epoch of the model in use. Raises RefusalError where there is none, or none that holds."""
+    state = context.state
+    if state.model is None or context.arrays is None or state.readiness == ModelReadiness.NONE:
+        raise RefusalError("NO_MODEL", "the cell has no model yet: calibrate first")
+    if state.readiness == ModelReadiness.SUSPECT:
+        raise RefusalError(
+            "MODEL_SUSPECT",
+            "the model no longer explains the images: check the cameras and the markers, then calibrate",
+        )
+    return state.model.epoch
+
+
+def renew(command: RenewGoal, context: StepContext) -> str:
+    """Renew a goal's lease. Raises RefusalError."""
+    source = context.state.source
+    if MOTION_SOURCES[type(source)].leased and goal_of(source) == command.id:
+        cast(Leased, source).renew_lease(context.now_ns)
+        return "renewed"
+    for goal in context.state.queue:
+        if goal.id == command.id:
+            _renew_queued(goal, context)
+    if _known(command.id, context) or any(id_of(r.command) == command.id for r in context.state.waiting):
+        return "renewed"
+    raise RefusalError(
+        "NO_SUCH_GOAL",
+        f"goal {command.id} is not active; active: {goal_of(source) or 'none'}",
+        subject=command.id,
+    )
+
+
+def move_goal(command: UpdateGoal, context: StepContext) -> str:
+    """Move the set-points of the active goal. Raises RefusalError."""
+    source = context.state.source
+    if goal_of(source) != command.id:
+        raise RefusalError(
+            "NO_SUCH_GOAL",
+            f"goal {command.id} is not active; active: {goal_of(source) or 'none'}",
+            subject=command.id,
+        )
+    if not isinstance(source, ServoGoal):
+        raise RefusalError(
+            "TARGET_CANNOT_MOVE",
+            "only goals in set-points, points or displacements may be moved",
+            subject=command.id,
+        )
+    refuse_while_moved(context.state)
+    refuse_pixels(command.target, context.state, context.settings)
+    return update(command, source, context, place_now(context), trusted_model(context))
+
+
+def cancel(command: CancelGoal, context: StepContext) -> str:
+    """Cancel a goal, active, planned or queued. Raises RefusalError."""
+    state = context.state
+    if goal_of(state.source) == command.id:
+        end_source(context, "goal_cancelled", (), "cancelled by its client")
+        return "cancelled"
+    if isinstance(state.source, AwaitingAcknowledgement) and state.source.id == command.id:
+        end_source(context, "goal_cancelled", (), "cancelled by its client")
+        return "cancelled: it is not waited for any more, and the queue is empty"
+    job = state.planning
+    if job is not None and job.source.goal.id == command.id and job.purpose != "ahead":
+        drop_plan(context, (), "cancelled by its client")
+        return "cancelled while it was planned"
+    if _cancel_waiting(command.id, context):
+        return "cancelled while it waited to be looked at"
+    kept = [goal for goal in state.queue if goal.id != command.id]
+    if len(kept) == len(state.queue):
+        raise RefusalError(
+            "NO_SUCH_GOAL",
+            f"goal {command.id} is neither active nor queued; active: {goal_of(state.source) or 'none'}",
+            subject=command.id,
+        )
+    state.queue = kept
+    state.queued_until_ns.pop(command.id, None)
+    if (job is not None and job.source.goal.id == command.id) or (
+        state.ahead is not None and state.ahead.goal.id == command.id
+    ):
+        drop_lookahead_plan(context)
+    context.emit("goal_cancelled", id=command.id, message="cancelled while queued")
+    return "cancelled"
+
+
+def _cancel_waiting(goal_id: str, context: StepContext) -> bool:
+    """Refuse what waits behind a goal that is being planned; whether there was such a request."""
+    state = context.state
+    found = [r for r in state.waiting if id_of(r.command) == goal_id]
+    state.waiting = [r for r in state.waiting if id_of(r.command) != goal_id]
+    hint = "cancelled before it was looked at"
+    refuse(found, (Reason("CANCELLED", "info", goal_id, hint=hint),), context)
+    return bool(found)
+
+
+def refuse(requests: list[Request], reasons: tuple[Reason, ...], context: StepContext) -> None:
+    """Answer requests that are not carried out any more."""
+    for request in requests:
+        context.emit(
+            "reply", request=request.request, accepted=False, id=id_of(request.command), message=reasons[0].hint,
+            reasons=reasons,
+        )  # fmt: skip
+
+
+def refuse_waiting(reasons: tuple[Reason, ...], context: StepContext) -> None:
+    """What waits to move the arm was asked for before it was told not to."""
+    state = context.state
+    moves = [
+        r for r in state.waiting
+        if isinstance(r.command, Home | Calibrate) or (isinstance(r.command, RunGoal) and not r.command.goal.check)
+    ]  # fmt: skip
+    state.waiting = [r for r in state.waiting if r not in moves]
+    refuse(moves, reasons, context)
+
+
+def id_of(command: Command) -> str:
+    """Id of the goal that a command is about, or ''."""
+    return _IDS[type(command)](command) if type(command) in _IDS else ""
+
+
+def acknowledge(command: AcknowledgeGoal, context: StepContext) -> str:
+    """A client says that a reached goal may be left. Raises RefusalError."""
+    source = context.state.source
+    if not isinstance(source, AwaitingAcknowledgement) or source.id != command.id:
+        waited_for = source.id if isinstance(source, AwaitingAcknowledgement) else "none"
+        raise RefusalError(
+            "NOT_AWAITED",
+            f"goal {command.id} does not wait to be acknowledged; waiting: {waited_for}",
+            subject=command.id,
+        )
+    context.state.source = Holding()
+    context.emit("goal_acknowledged", id=command.id, message="acknowledged")
+    return "acknowledged"
+
+
+HOME_SPEED = 0.5
+
+
+IN_ORDER = (RunGoal, Home, Calibrate, Teach)
+"""Requests that wait while a goal is planned, so that they are answered in the order in which they came."""
+
+
+def answer_all(requests: tuple[Request, ...], context: StepContext) -> None:
+    """Answer a step's requests in order. Of several set-points for one goal the newest counts: each is work."""
+    newest = {r.command.id: r.request for r in requests if isinstance(r.command, UpdateGoal)}
+    for request in requests:
+        command = request.command
+        if isinstance(command, UpdateGoal) and newest[command.id] != request.request:
+            message = "overtaken by newer set-points in the same cycle"
+            context.emit("reply", request=request.request, accepted=True, id=command.id, message=message)
+        else:
+            answer(request, context)
+
+
+def answer(request: Request, context: StepContext) -> None:
+    """Carry out one request and emit its reply: at once, or once what it asks for is planned."""
+    if not isinstance(request.command, IN_ORDER):
+        _answer(request, context)
+        return
+    waiting = context.state.waiting
+    if not waiting and _free(context):
+        _answer(request, context)
+    elif len(waiting) < QUEUE_LENGTH:
+        waiting.append(request)
+    else:
+        hint = f"{QUEUE_LENGTH} requests wait while a goal is planned: send it again after a reply"
+        limit = float(QUEUE_LENGTH)
+        refusal = RefusalError("BUSY", hint, value=float(len(waiting)), threshold=limit, unit="requests")
+        _reply_refused(request, refusal, context)
+
+
+def answer_waiting(context: StepContext) -> None:
+    """Answer what has waited for a plan."""
+    waiting = context.state.waiting
+    while waiting and _free(context):
+        _answer(waiting.pop(0), context)
+
+
+def _free(context: StepContext) -> bool:
+    """Whether the next request may be looked at: no goal is planned before it, and no other was read in this step."""
+    return not planning_pending(context) and not context.goals_read
+
+
+def _answer(request: Request, context: StepContext) -> None:
+    try:
+        accepted = _carry_out(request, request.command, context)
+    except RefusalError as refusal:
+        _reply_refused(request, refusal, context)
+        return
+    if accepted is not None:
+        message, plan = accepted
+        context.emit(
+            "reply",
+            request=request.request,
+            accepted=True,
+            message=message,
+            id=id_of(request.command),
+            plan=plan,
+        )
+
+
+def _reply_refused(request: Request, refusal: RefusalError, context: StepContext) -> None:
+    context.emit(
+        "reply", request=request.request, accepted=False, message=str(refusal), reasons=refusal.reasons,
+        id=id_of(request.command),
+    )  # fmt: skip
+
+
+def _carry_out(request: Request, command: Command, context: StepContext) -> Accepted | None:
+    done = _HANDLERS[type(command)](command, request, context)
+    return (done, None) if isinstance(done, str) else done
+
+
+def _run(command: RunGoal, request: Request, context: StepContext) -> Accepted | None:
+    context.goals_read.append(command.goal.id)
+    return run_goal(command.goal, request, context)
+
+
+def _disable(command: Disable, request: Request, context: StepContext) -> str:
+    reason = Reason("DISABLED", "hold", hint="enable, then send the goal again")
+    end_source(context, "goal_aborted", (reason,), "disabled")
+    end_queue(context, (reason,), "disabled")
+    refuse_waiting((reason,), context)
+    context.state.driver_request = "deactivate"
+    return "the arm is stopped and its drives go off"
+
+
+def _reset(command: Reset, request: Request, context: StepContext) -> str:
+    state = context.state
+    if state.lifecycle != Lifecycle.FAULT:
+        raise RefusalError("NOT_IN_FAULT", f"the cell is {state.lifecycle}; there is nothing to reset")
+    state.fault = []  # latched until here; a cause that is still there latches it again
+    state.driver_request = "reset"
+    return "resetting"
+
+
+def _hold(command: Hold, request: Request, context: StepContext) -> str:
+    context.state.held = True
+    context.emit("held", message=f"held by {request.operator}", id=goal_of(context.state.source))
+    return "holding"
+
+
+def _resume(command: Resume, request: Request, context: StepContext) -> str:
+    state = context.state
+    state.held = state.stopped = False
+    camera_relocalization.try_again(context)
+    context.emit("resumed", message=f"resumed by {request.operator}", id=goal_of(state.source))
+    return "resumed from the measured state"
+
+
+def _home(command: Home, request: Request, context: StepContext) -> str:
+    require_motion_allowed(context)
+    home = context.settings.home
+    if home is None:
+        raise RefusalError("NO_HOME", "the cell file states neither [joints] home nor [calibration] base")
+    if isinstance(context.state.source, JointMove) and goal_of(context.state.source) == command.id:
+        return "already accepted"  # a client's retry
+    new_id(command.id, context)
+    preempt(context, "home")
+    speed = HOME_SPEED * command.speed_scale
+    context.state.source = joint_move_to(command.id, home, speed, context, lease_s=command.lease_s)
+    return "moving home"
+
+
+def _calibrate(command: Calibrate, request: Request, context: StepContext) -> str:
+    require_motion_allowed(context)
+    state = context.state
+    if context.settings.trials is None:
+        raise RefusalError("NO_TRIALS", "the cell file has no [calibration] section")
+    if command.reset_zeros and not command.check:
+        raise RefusalError(
+            "RESET_WITHOUT_CHECK", "joint zeros are reset by a check: give check as well as reset_zeros"
+        )
+    if MOTION_SOURCES[type(state.source)].measures and goal_of(state.source) == command.id:
+        return "already accepted"  # a client's retry
+    new_id(command.id, context)
+    visiting: CheckMotion | CalibrationMotion
+    if not command.check:
+        visiting, what = (
+            start_trials(command.id, context.q, context.now_ns, context.settings),
+            "trial motions begin",
+        )
+    elif state.model is None:
+        raise RefusalError("NO_MODEL", "the cell has no model to check: calibrate first")
+    else:
+        visiting = start_check(command.id, context, state.model, command.reset_zeros)
+        what = "check motion begins"
+    preempt(context, "calibrate")
+    state.source = visiting
+    state.source.lease_s = command.lease_s
+    state.source.renew_lease(context.now_ns)
+    context.emit("calibration_progress", id=command.id, progress=0.0, message=what)
+    return "checking" if command.check else "calibrating"
+
+
+def _enable(command: Enable, request: Request, context: StepContext) -> str:
+    state = context.state
+    if state.lifecycle == Lifecycle.FAULT:
+        raise RefusalError(
+            "IN_FAULT",
+            "the cell is in fault: "
+            + "; ".join(r.hint for r in state.fault)
+            + ". Clear the cause, then reset",
+        )
+    if state.lifecycle == Lifecycle.UNCONFIGURED:
+        raise RefusalError("NOT_CONFIGURED", "the joint driver is not configured yet")
+    state.held = state.stopped = False
+    if state.lifecycle == Lifecycle.INACTIVE:
+        state.driver_request = "activate"
+        return "enabling"
+    return "already enabled"
+
+
+def _jog(command: Jog, request: Request, context: StepContext) -> str:
+    require_motion_allowed(context)
+    state = context.state
+    if not isinstance(state.source, Holding | Jogging):
+        active = goal_of(state.source)
+        waits = f"a goal is active ({active})" if active else "a reached goal waits to be acknowledged"
+        raise RefusalError("BUSY", f"{waits}: cancel it before jogging", subject=active)
+    if state.planning is not None and not state.planning.source.goal.check:
+        planned = state.planning.source.goal.id
+        raise RefusalError(
+            "BUSY", f"goal {planned} is being planned: cancel it before jogging", subject=planned
+        )
+    velocity = np.zeros_like(context.q)
+    for name, speed in command.velocities.items():
+        if not math.isfinite(speed):
+            raise RefusalError(
+                "NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name
+            )
+        velocity[joint_index(name, context.settings)] = speed
+    state.source = Jogging(velocity, context.now_ns + int(command.lease_s * 1e9))
+    return f"jogging for {command.lease_s} s"
+
+
+def _teach(command: Teach, request: Request, context: StepContext) -> str:
+    return start_teaching(command, request, context)
+
+
+def _of_command(carry_out: Callable[[Any, StepContext], str]) -> Callable[[Any, Request, StepContext], str]:
+    """A handler that needs nothing of the request but its command."""
+    return lambda command, request, context: carry_out(command, context)
+
+
+_HANDLERS: dict[type[Any], Callable[[Any, Request, StepContext], str | Accepted | None]] = {
+    RunGoal: _run,
+    Enable: _enable,
+    Disable: _disable,
+    Reset: _reset,
+    Hold: _hold,
+    Resume: _resume,
+    RenewGoal: _of_command(renew),
+    UpdateGoal: _of_command(move_goal),
+    AcknowledgeGoal: _of_command(acknowledge),
+    CancelGoal: _of_command(cancel),
+    ReanchorRefused: _of_command(camera_relocalization.refused),
+    Teach: _teach,
+    Jog: _jog,
+    Home: _home,
+    Calibrate: _calibrate,
+}
+"""What carries out a request, by its command: the message of an accepted one, with a plan, or None until it is planned.
+
+Each raises RefusalError.
+"""

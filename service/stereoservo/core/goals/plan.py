@@ -1,0 +1,258 @@
+"""Goals are planned before anything moves: a slice of work a step, while the arm goes on with what it does.
+
+What comes out is told with the reply. Planned laws follow the plan; straight ones drive the straight way that was
+planned; free ones go their own way, so that only the goal itself can be refused.
+"""
+
+from __future__ import annotations
+
+from math import log
+
+import numpy as np
+
+from stereoservo.control.faces import kept_faces
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.target_checks import BodyState, in_view
+from stereoservo.core.prediction import ModelArrays, chain_at
+from stereoservo.core.sources.law import centre_of, composition_of
+from stereoservo.core.state import PlanJob, Purpose, ServoGoal
+from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points
+from stereoservo.messages import goals
+from stereoservo.messages.goals import PlanReport
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanRequest
+from stereoservo.planning.planner import (
+    MISSING_FREEDOMS,
+    PlanRequestError,
+    plan_on,
+    start_planning,
+)
+
+SLICE = 8
+"""Samples of the arm's way that a step works on."""
+VIEW_MARGIN_PX = 5.0
+PLANNED_SPEED, PLANNED_ACCELERATION = 0.9, 0.7
+"""Shares of the limits that a way is planned with: the rest is feedback's."""
+REPORTED = 17
+"""Samples of a way that a report holds."""
+
+
+def begin_plan(
+    source: ServoGoal,
+    context: StepContext,
+    place: BodyState,
+    joints: FloatArray,
+    purpose: Purpose,
+    request: int,
+) -> PlanJob:
+    """Begin to plan the way of ``source`` from the body at ``place`` with the arm at ``joints`` (n,).
+
+    Raises RefusalError where the request makes no sense.
+    """
+    try:
+        planning = start_planning(_plan_request(source, context, place, joints))
+    except PlanRequestError as error:
+        raise RefusalError("NOT_PLANNED", str(error)) from error
+    return PlanJob(
+        request=request, purpose=purpose, source=source, planning=planning, joints=joints.copy(),
+        points=place.points.copy(),
+    )  # fmt: skip
+
+
+def _plan_request(
+    source: ServoGoal, context: StepContext, place: BodyState, joints: FloatArray
+) -> PlanRequest:
+    arrays, settings = place.arrays, context.settings
+    limits, goal = settings.limits, source.goal
+    used = np.flatnonzero(source.used > 0.0)
+    margin = limits.position_margin
+    keep_outs = limits.keep_outs.copy()
+    keep_outs[:, :, 0] -= margin
+    keep_outs[:, :, 1] += margin
+    pixels, _ = project_points(arrays.matrices, place.points)
+    kept = (in_view(place, pixels)[used] * source.wanted[used]).min(axis=0)
+    return PlanRequest(
+        operators=chain_at(arrays, joints)[1],
+        composition=composition_of(arrays),
+        joints=joints.copy(),
+        matrices=np.ascontiguousarray(arrays.matrices[used]),
+        camera_centres=np.ascontiguousarray(arrays.camera_centres[used]),
+        points=place.points.copy(),
+        targets=source.target_points.copy(),
+        kept=kept,
+        centre=centre_of(source, joints + context.state.correction, arrays, place.points),
+        centre_target=source.centre_target.copy(),
+        faces=kept_faces(source.faces, place.points, source.target_points, arrays.camera_centres[used]),
+        limits=PlanLimits(
+            position_min=limits.position_min + margin,
+            position_max=limits.position_max - margin,
+            velocity_max=limits.velocity_max * (PLANNED_SPEED * limits.speed_scale),
+            acceleration_max=limits.acceleration_max * PLANNED_ACCELERATION,
+            keep_outs=keep_outs,
+            sizes=np.array(
+                [(settings.cameras[c].width, settings.cameras[c].height) for c in used], dtype=np.float64
+            ),
+            lenses=np.ascontiguousarray(arrays.lenses[used]),
+            view_margin_px=VIEW_MARGIN_PX,
+        ),
+        profile=goal.profile or "linear",
+        bend=LAWS[source.law].planned,
+        speed_scale=goal.speed_scale,
+    )
+
+
+def go_on_planning(job: PlanJob) -> bool:
+    """A step's share of the work; whether it is done."""
+    if not job.planning.finished:
+        plan_on(job.planning, SLICE)
+    return job.planning.finished
+
+
+def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
+    """What came out, and the plan into the job's source. Raises RefusalError where the goal is not to be driven."""
+    source, plan = job.source, job.planning.plan
+    if plan is not None:
+        source.goal_joints = plan.joints[-1].copy()
+        if LAWS[source.law].planned:
+            source.plan, source.plan_s, source.start_points = plan, 0.0, job.points.copy()
+        return _planned(job, plan, context)
+    failures = job.planning.failure
+    approaches = tuple(_approach(failure, job, context) for failure in failures)
+    texts = tuple(_text(failure, context) for failure in approaches)
+    report = PlanReport(
+        law=source.law, way=f"not guaranteed: {texts[0]}", seconds=_exponential_s(job, context), approaches=approaches,
+        shares=(), joints={}, pixels={},
+    )  # fmt: skip
+    at_goal = failures[0].share >= 1.0
+    path = LAWS[source.law].path
+    if path == "free" and not at_goal:
+        return report
+    hint = ""
+    planned = LAWS.on_path("planned")
+    if not at_goal:
+        hint = (
+            f"; law {planned[0]!r} looks for another way" if path == "straight" and planned
+            else "; no other way was found either: go by another goal between"
+        )  # fmt: skip
+    reasons = tuple(
+        Reason(a.code, "info", a.subject, a.value, a.limit, a.unit, text + (hint if k == 0 else ""))
+        for k, (a, text) in enumerate(zip(approaches, texts, strict=True))
+    )
+    first = reasons[0]
+    raise RefusalError(
+        first.code, first.hint, subject=first.subject, value=first.value, threshold=first.threshold, unit=first.unit,
+        further=reasons[1:], plan=report,
+    )  # fmt: skip
+
+
+def planning_reason(job: PlanJob) -> Reason:
+    """That a goal is being planned."""
+    done = job.planning.followed
+    hint = (
+        f"goal {job.source.goal.id} is being planned ({done} ways tried); cancel it, hold or stop at any time"
+    )
+    return Reason("PLANNING", "info", job.source.goal.id, float(done), None, "ways", hint)
+
+
+def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
+    arrays = context.arrays
+    assert arrays is not None
+    source, settings = job.source, context.settings
+    count = min(REPORTED, len(plan.times))
+    at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
+    seconds = float(plan.times[-1])
+    way = plan.way
+    path = LAWS[source.law].path
+    if path != "planned":
+        seconds = max(seconds, _exponential_s(job, context))
+        if path == "free":
+            way = f"not guaranteed: law {source.law!r} goes its own way; the straight one is free"
+    return PlanReport(
+        law=source.law,
+        way=way,
+        seconds=seconds,
+        approaches=tuple(_approach(approach, job, context) for approach in plan.approaches),
+        shares=tuple(float(plan.shares[k]) for k in at),
+        joints={
+            name: tuple(float(plan.joints[k, j]) for k in at) for j, name in enumerate(settings.joint_names)
+        },
+        pixels=_pixels(job, plan, at, arrays, context),
+    )
+
+
+def _pixels(
+    job: PlanJob, plan: Plan, at: list[int], arrays: ModelArrays, context: StepContext
+) -> dict[str, dict[int, tuple[tuple[float, float], ...]]]:
+    """Raw pixels along the way, by camera and marker; a marker that a lens does not image is left out."""
+    found: dict[str, dict[int, tuple[tuple[float, float], ...]]] = {}
+    ways = np.array(
+        [
+            project_points(
+                arrays.matrices, transform_points(np.ascontiguousarray(plan.displacements[k]), job.points)
+            )[0]
+            for k in at
+        ]
+    )
+    for c, camera in enumerate(context.settings.cameras):
+        if job.source.used[c] == 0.0:
+            continue
+        found[camera.name] = {}
+        for i, marker in enumerate(arrays.marker_ids):
+            way = tuple(distort_pixel(arrays.lenses[c], float(u), float(v)) for u, v in ways[:, c, i])
+            if bool(np.isfinite(np.array(way)).all()):
+                found[camera.name][marker] = way
+    return found
+
+
+def _exponential_s(job: PlanJob, context: StepContext) -> float:
+    """Time in which the error decays to its tolerance at the goal's gain."""
+    source, arrays = job.source, context.arrays
+    assert arrays is not None
+    pixels, _ = project_points(arrays.matrices, job.points)
+    distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
+    error = float((distance * source.wanted * source.used[:, None]).max())
+    return log(max(error / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+
+
+def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> goals.Approach:
+    """An approach with names instead of numbers."""
+    settings, arrays = context.settings, context.arrays
+    assert arrays is not None
+    index = approach.index
+    if approach.what == "JOINT_LIMIT":
+        subject = settings.joint_names[index]
+    elif approach.what == "KEEP_OUT":
+        subject = settings.limits.keep_out_names[index]
+    elif approach.what == "NOT_REACHABLE":
+        subject = MISSING_FREEDOMS[index] if 0 <= index < len(MISSING_FREEDOMS) else ""
+    else:
+        subject = settings.cameras[int(np.flatnonzero(job.source.used > 0.0)[index])].name
+    return goals.Approach(
+        approach.what, subject, approach.value, approach.limit, approach.room, approach.unit, approach.share,
+        arrays.marker_ids[approach.marker] if approach.marker >= 0 else None,
+    )  # fmt: skip
+
+
+def _text(failure: goals.Approach, context: StepContext) -> str:
+    """In words where and on what a way fails."""
+    where = "at the goal" if failure.share >= 1.0 else f"at {100.0 * failure.share:.0f} % of the way"
+    value, limit, unit = f"{failure.value:.4g}", f"{failure.limit:.4g}", failure.unit
+    if failure.code == "JOINT_LIMIT":
+        return f"{where} joint {failure.subject} would be at {value} {unit}, {limit} {unit} is its limit"
+    if failure.code == "KEEP_OUT":
+        return f"{where} the arm would enter keep-out {failure.subject!r} by {abs(failure.room):.4g} {unit}"
+    if failure.code == "FIELD_OF_VIEW":
+        return (
+            f"{where} marker {failure.marker} would be {value} px from the border of camera {failure.subject!r}; "
+            f"{limit} px are kept"
+        )
+    if failure.code == "FACE_HIDDEN":
+        return f"{where} camera {failure.subject!r} would see the face under {value} {unit}; {limit} {unit} are needed"
+    if failure.code == "BEHIND_CAMERA":
+        return f"{where} marker {failure.marker} would pass camera {failure.subject!r}: {value} {unit}"
+    return (
+        f"{where} the arm cannot follow: it lacks the freedom {failure.subject or 'that is needed'} there, and stays "
+        f"{value} {unit} away"
+    )

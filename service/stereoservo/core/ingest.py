@@ -1,0 +1,237 @@
+"""Stage 1, ingest: the gate for samples and frames, the history of the joints, the lifecycle of the driver.
+
+Stamps and ``now_ns`` are of one clock, and the servo process takes ``now_ns`` after it has read everything: a sample
+of the future is wrong, however little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.core.context import Ingested, StepContext
+from stereoservo.core.cycle import StepInputs
+from stereoservo.core.monitors.joints import forget_travel
+from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import HISTORY, CoreState, JointHistory, Refused
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, JointState
+
+VELOCITY_FILTER_S = 0.01
+LONGEST_GAP_S = 0.5
+"""Without a step for so long the arm stops, however patient its drives are: it moves unwatched meanwhile."""
+LEAST_GAP_PERIODS = 2
+"""A step that comes one period late is no gap, however impatient the drives are."""
+FRESH_S = 0.15
+FRESH_FRAMES = 2.5  # without a frame for so many periods a law is said to coast
+
+
+def ingest(context: StepContext) -> Ingested:
+    """Pass what is new and stamped within [now - time-out, now]; keep the joints and follow the driver's state.
+
+    Of what is refused nothing is kept but the count and the reason. After a gap the drives were left alone, and the
+    last command is not what they do: commands begin from rest.
+    """
+    ingested = context.ingested = _passed(context)
+    _count_refused(ingested, context)
+    if ingested.gap is not None:
+        context.state.command = np.zeros_like(context.state.command)
+        forget_travel(context.state)
+    context.q = _append_joints(ingested.joints, context.state)
+    _follow_driver(context)
+    return ingested
+
+
+def _passed(context: StepContext) -> Ingested:
+    """What passes the gate, and why the rest does not; changes nothing."""
+    inputs, state = context.inputs, context.state
+    elapsed_ns = (
+        inputs.now_ns - state.last_step_ns if state.last_step_ns else context.derived.nominal_period_ns
+    )
+    gap = _gap(elapsed_ns * 1e-9, context)
+    joints, refused_joints = _joints(inputs, state, context.settings)
+    observations, refused_frames = _observations(context)
+    stops = [reason for reason in (gap, refused_joints) if reason is not None]
+    if MOTION_SOURCES[type(state.source)].by_images:
+        stops.extend(reason for _, reason in refused_frames if reason.code == "CAMERA_STAMP")
+    return Ingested(
+        joints=joints,
+        observations=observations,
+        elapsed_s=elapsed_ns * 1e-9,
+        refused_joints=refused_joints,
+        refused_frames=refused_frames,
+        gap=gap,
+        stops=tuple(stops),
+    )
+
+
+def _count_refused(ingested: Ingested, context: StepContext) -> None:
+    """Keep the time of the step, and of each source what was refused since its last good sample."""
+    state = context.state
+    state.last_step_ns = context.now_ns
+    if ingested.joints is not None:
+        state.refused_joints.reason = None
+    if ingested.refused_joints is not None:
+        _count(state.refused_joints, ingested.refused_joints)
+    for camera, _ in ingested.observations:
+        state.refused_frames[camera].reason = None
+    for camera, reason in ingested.refused_frames:
+        _count(state.refused_frames[camera], reason)
+
+
+def _append_joints(sample: JointState | None, state: CoreState) -> FloatArray:
+    """Append a new joint sample to the history; return the newest positions (zero before the first)."""
+    history = state.history
+    if sample is not None:
+        if history.count > 0:
+            elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
+            previous = history.positions[(history.count - 1) % HISTORY]
+            share = elapsed_s / (elapsed_s + VELOCITY_FILTER_S)
+            state.velocities = state.velocities + share * (
+                (sample.positions - previous) / elapsed_s - state.velocities
+            )
+        remember_joints(history, sample)
+        state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
+    if history.count == 0:
+        return np.zeros_like(state.command)
+    newest: FloatArray = history.positions[(history.count - 1) % HISTORY].copy()
+    return newest
+
+
+def remember_joints(history: JointHistory, sample: JointState) -> None:
+    """Append a joint sample to the ring."""
+    slot = history.count % HISTORY
+    history.t_ns[slot] = sample.t_ns
+    history.positions[slot] = sample.positions
+    history.count += 1
+
+
+def _follow_driver(context: StepContext) -> None:
+    """The lifecycle follows what the servo process did with the driver; a fault is latched."""
+    state, inputs = context.state, context.inputs
+    before = state.lifecycle
+    if inputs.driver_fault is not None and (before != Lifecycle.FAULT or not state.fault):
+        reason = Reason(
+            "DRIVER_FAULT",
+            "fault",
+            hint=f"{inputs.driver_fault.code}: {inputs.driver_fault.message}; clear the cause, then reset",
+        )
+        state.fault = [reason]
+        state.lifecycle = Lifecycle.FAULT
+        state.driver_request = "deactivate"
+        context.emit("fault", message=reason.hint, reasons=(reason,))
+    elif before == Lifecycle.FAULT:
+        if inputs.driver_fault is None and not state.fault:
+            state.lifecycle = Lifecycle.INACTIVE
+    elif not inputs.driver_configured:
+        state.lifecycle = Lifecycle.UNCONFIGURED
+    else:
+        state.lifecycle = Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE
+    if state.lifecycle != before:
+        context.emit("lifecycle", message=f"{before} -> {state.lifecycle}", name=str(state.lifecycle))
+
+
+def nominal_period_ns(settings: CoreSettings) -> int:
+    """The period that the loop is to keep [ns]."""
+    return round(1e9 / settings.rate_hz)
+
+
+def longest_gap_s(settings: CoreSettings) -> float:
+    """Time between two steps [s] after which the arm's motion is no longer the core's.
+
+    Drives come to rest by themselves after their ``command_timeout_s``: they no longer do what they were last sent.
+    """
+    patience_s = min(LONGEST_GAP_S, settings.limits.command_timeout_s)
+    return max(patience_s, LEAST_GAP_PERIODS * nominal_period_ns(settings) * 1e-9)
+
+
+def features_fresh_s(settings: CoreSettings) -> float:
+    """Age of features [s] up to which a law does not coast at all: a frame or two of the slowest camera."""
+    return max(FRESH_S, FRESH_FRAMES / min((c.rate_hz for c in settings.cameras), default=30.0))
+
+
+def frame_timeout_s(settings: CoreSettings) -> float:
+    """Age of a frame [s] from which on no law may move by it."""
+    return max(settings.limits.coast_s, features_fresh_s(settings))
+
+
+def _count(refused: Refused, reason: Reason) -> None:
+    refused.count += 1
+    refused.reason = reason
+
+
+def _gap(gap_s: float, context: StepContext) -> Reason | None:
+    """The reason where the loop stood still while the drives were on."""
+    state, limit_s = context.state, context.derived.longest_gap_s
+    if not state.last_step_ns or state.lifecycle != Lifecycle.ACTIVE or 0.0 <= gap_s <= limit_s:
+        return None
+    return Reason(
+        "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
+        f"the servo loop did not run for {gap_s:.3f} s, {limit_s:.3f} s is allowed, and the drives were left alone: "
+        "resume, then send the goal again; if it comes again, take load off this computer or give the loop priority "
+        "(servo.priority)",
+    )  # fmt: skip
+
+
+def _joints(
+    inputs: StepInputs, state: CoreState, settings: CoreSettings
+) -> tuple[JointState | None, Reason | None]:
+    """The joint sample, or why it is refused; neither where there is none or it was here before."""
+    sample = inputs.joints
+    if sample is None or sample.seq == state.last_joints_seq or sample.t_ns <= state.last_joints_ns:
+        return None, None
+    age_s = (inputs.now_ns - sample.t_ns) * 1e-9
+    timeout_s = settings.limits.joint_timeout_s
+    if 0.0 <= age_s <= timeout_s:
+        return sample, None
+    what = (
+        f"{age_s:.3f} s old, {timeout_s:g} s is allowed" if age_s > 0.0 else f"{-age_s:.6g} s in the future"
+    )
+    return None, Reason(
+        "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
+        f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then resume",
+    )  # fmt: skip
+
+
+def _observations(
+    context: StepContext,
+) -> tuple[tuple[tuple[int, CameraObservation], ...], tuple[tuple[int, Reason], ...]]:
+    """New observations with the index of their camera, and the reasons of refused ones.
+
+    A frame that is too old stops nothing: the law coasts as if it had been lost, and brakes in time.
+    """
+    inputs = context.inputs
+    cameras = {camera.name: k for k, camera in enumerate(context.settings.cameras)}
+    newest = [estimate.last_seq for estimate in context.state.cameras]
+    timeout_s = context.derived.frame_timeout_s
+    passed: list[tuple[int, CameraObservation]] = []
+    refused: list[tuple[int, Reason]] = []
+    for observation in inputs.observations:
+        camera = cameras.get(observation.camera)
+        if camera is None or observation.seq <= newest[camera]:
+            continue
+        age_s = (inputs.now_ns - observation.t_shutter_ns) * 1e-9
+        if 0.0 <= age_s <= timeout_s:
+            newest[camera] = observation.seq
+            passed.append((camera, observation))
+        else:
+            refused.append((camera, _refused_frame(observation, age_s, timeout_s)))
+    return tuple(passed), tuple(refused)
+
+
+def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: float) -> Reason:
+    name = observation.camera
+    if age_s < 0.0:
+        return Reason(
+            "CAMERA_STAMP", "hold", name, age_s, 0.0, "s",
+            f"the stamp of frame {observation.seq} of camera {name} is {-age_s:.6g} s in the future: check the "
+            "camera's clock and its latency_s; then resume",
+        )  # fmt: skip
+    return Reason(
+        "CAMERA_LATE", "info", name, age_s, timeout_s, "s",
+        f"frame {observation.seq} of camera {name} came {age_s:.3f} s after its shutter, {timeout_s:g} s is allowed: "
+        "not used; check the camera's connection and this computer's load; a camera that is always so late needs a "
+        "larger safety.coast_s",
+    )  # fmt: skip

@@ -1,0 +1,566 @@
+"""Stage 6, limit: the safety stage, one, last, always on. Nothing runs between it and the drive.
+
+In this order: finite check, stale-input policy (coast on prediction, then brake), uniform velocity scale,
+braking-aware position margins and joint-space keep-outs, uniform acceleration limit. It is not a safety
+function in the sense of the standards: it limits commands, it does not watch the machine.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.settings import CoreSettings
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+
+NON_FINITE_COMMAND = "NON_FINITE_COMMAND"
+JOINTS_STALE = "JOINTS_STALE"
+FEATURES_STALE = "FEATURES_STALE"
+COASTING = "COASTING"
+JOINT_LIMIT = "JOINT_LIMIT"
+KEEP_OUT = "KEEP_OUT"
+VELOCITY_SCALED = "VELOCITY_SCALED"
+ACCELERATION_LIMITED = "ACCELERATION_LIMITED"
+BRAKING = "BRAKING"
+
+TOUCHED = 1e-9
+"""Relative change of a command that is worth a reason."""
+
+
+class SafetyConfigurationError(ValueError):
+    """Limits or a step that the stage cannot work with; ``data`` holds the values the message speaks of."""
+
+    def __init__(self, message: str, **data: object) -> None:
+        super().__init__(message)
+        self.data = data
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyLimits:
+    """What may never be exceeded; all arrays in joint order, [rad] or [m] and seconds.
+
+    ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box. The
+    boxes and the position range are kept away from by ``position_margin``. ``coast_s``: how long a law may
+    run on prediction; ``features_fresh_s``: the age of the newest features up to which a law does not coast
+    at all (a frame or two); the arm brakes when they are older than both. Raises
+    SafetyConfigurationError.
+    """
+
+    joint_names: tuple[str, ...]
+    position_min: FloatArray
+    position_max: FloatArray
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    position_margin: float
+    keep_outs: FloatArray
+    keep_out_names: tuple[str, ...]
+    joint_timeout_s: float
+    coast_s: float
+    features_fresh_s: float = 0.15
+
+    def __post_init__(self) -> None:
+        n = len(self.joint_names)
+        for name in ("position_min", "position_max", "velocity_max", "acceleration_max"):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if array.shape != (n,) or np.isnan(array).any():
+                raise SafetyConfigurationError(
+                    f"{name} is {array.tolist()}; {n} numbers, one a joint, are needed",
+                    name=name,
+                    value=array.tolist(),
+                )
+            object.__setattr__(self, name, array)
+        boxes = np.ascontiguousarray(self.keep_outs, dtype=np.float64).reshape(-1, n, 2)
+        object.__setattr__(self, "keep_outs", boxes)
+        for j, joint in enumerate(self.joint_names):
+            if not self.position_min[j] + self.position_margin <= self.position_max[j] - self.position_margin:
+                raise SafetyConfigurationError(
+                    f"joint {joint!r}: {self.position_min[j]} to {self.position_max[j]} leaves "
+                    f"nothing inside the margin {self.position_margin}",
+                    joint=joint,
+                )
+            for name in ("velocity_max", "acceleration_max"):
+                value = float(getattr(self, name)[j])
+                if not 0.0 < value < math.inf:
+                    raise SafetyConfigurationError(
+                        f"joint {joint!r}: {name} is {value}; a positive finite number is needed",
+                        joint=joint,
+                        value=value,
+                    )
+        if len(self.keep_out_names) != boxes.shape[0]:
+            raise SafetyConfigurationError(
+                f"{boxes.shape[0]} keep-outs have {len(self.keep_out_names)} names; one each is needed"
+            )
+        for k, name in enumerate(self.keep_out_names):
+            if np.isnan(boxes[k]).any() or not (boxes[k, :, 0] < boxes[k, :, 1]).all():
+                raise SafetyConfigurationError(
+                    f"keep-out {name!r}: every low must be below its high, got {boxes[k].tolist()}"
+                )
+            if not np.isfinite(boxes[k]).any():
+                raise SafetyConfigurationError(
+                    f"keep-out {name!r} bounds no joint: the arm would have nowhere to be"
+                )
+        for name in ("position_margin", "joint_timeout_s", "coast_s", "features_fresh_s"):
+            if not getattr(self, name) >= 0.0:
+                raise SafetyConfigurationError(
+                    f"{name} is {getattr(self, name)}; zero or more is needed", name=name
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyInputs:
+    """One step: ``raw`` (n,) what the motion source wants, ``positions`` (n,) as measured, ``previous`` (n,)
+    command.
+
+    ``joint_age_s``, ``feature_age_s``: ages of the newest joint sample and of the newest accepted features
+    [s]; negative and not finite ones are stale. ``needs_features``: whether the source may not go on without.
+    ``speed_scale`` in [0, 1]. ``brake``: stop or hold.
+    """
+
+    raw: FloatArray
+    positions: FloatArray
+    previous: FloatArray
+    dt_s: float
+    joint_age_s: float = 0.0
+    feature_age_s: float = 0.0
+    needs_features: bool = False
+    speed_scale: float = 1.0
+    brake: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyResult:
+    """``raw`` and ``limited`` joint velocities (n,) and why they differ; ``braking``: the stage overrules the
+    source.
+    """
+
+    raw: FloatArray
+    limited: FloatArray
+    reasons: tuple[Reason, ...]
+    braking: bool
+
+
+def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
+    """Limit one command.
+
+    The output is finite and, for any ``raw``, within velocity and acceleration limits, the latter relative to
+    ``previous`` (which, where it was no output of this stage, counts as scaled to the velocity limits;
+    non-finite entries as rest). A joint that started inside its margins at a speed it can brake from never
+    leaves them; one outside moves only inward; keep-out boxes are never entered. The output is a non-negative
+    multiple of ``raw`` unless positions, acceleration or braking acted; then the joint that must brake does
+    so fully, at the cost of direction. Raises SafetyConfigurationError for a period that is not positive or
+    arrays of a wrong length.
+    """
+    raw, positions, previous = inputs.raw, inputs.positions, inputs.previous
+    n = len(limits.joint_names)
+    if raw.shape != (n,) or positions.shape != (n,) or previous.shape != (n,):
+        raise SafetyConfigurationError(
+            f"raw {raw.shape}, positions {positions.shape}, previous {previous.shape}; each must be ({n},)"
+        )
+    if not 0.0 < inputs.dt_s < math.inf:
+        raise SafetyConfigurationError(
+            f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
+        )
+    reasons: list[Reason] = []
+    brake = _stale(inputs, limits, reasons)
+    if not (np.isfinite(raw).all() and np.isfinite(positions).all()):
+        brake = True
+        _tell_non_finite(raw, positions, limits, reasons)
+    if inputs.brake:
+        brake = True
+    age = (
+        inputs.joint_age_s if _within(inputs.joint_age_s, limits.joint_timeout_s) else limits.joint_timeout_s
+    )
+    speed_scale = min(max(inputs.speed_scale, 0.0), 1.0) if math.isfinite(inputs.speed_scale) else 0.0
+    limited, acted, scales = limit_velocity(
+        raw,
+        positions,
+        previous,
+        brake,
+        inputs.dt_s,
+        age,
+        speed_scale,
+        limits.position_min,
+        limits.position_max,
+        limits.velocity_max,
+        limits.acceleration_max,
+        limits.position_margin,
+        limits.keep_outs,
+    )
+    if brake:
+        reasons.append(_braking(limited, limits, inputs.brake))
+    if acted.any():
+        _tell_positions(acted, inputs, limits, reasons)
+    if scales[1] >= 0.0 and scales[0] < 1.0 - TOUCHED:
+        j = int(scales[1])
+        reasons.append(
+            Reason(
+                VELOCITY_SCALED,
+                "slow",
+                limits.joint_names[j],
+                float(abs(raw[j])),
+                float(limits.velocity_max[j] * speed_scale),
+                "1/s",
+                "slower, in the same direction; a lower gain or a higher speed scale avoids it",
+            )
+        )
+    if not brake and scales[3] >= 0.0 and scales[2] < 1.0 - TOUCHED:
+        j = int(scales[3])
+        reasons.append(
+            Reason(
+                ACCELERATION_LIMITED,
+                "info",
+                limits.joint_names[j],
+                float(limits.acceleration_max[j] / scales[2]) if scales[2] > 0.0 else None,
+                float(limits.acceleration_max[j]),
+                "1/s²",
+                "passes by itself",
+            )
+        )
+    return SafetyResult(raw, limited, tuple(reasons), brake)
+
+
+def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> SafetyResult:
+    """Stage 6: the source's velocity within all limits; it becomes the command, zero outside ACTIVE."""
+    state = context.state
+    newest_ns = max([estimate.accepted_ns for estimate in state.cameras], default=0)
+    result = safety_stage(
+        SafetyInputs(
+            raw=motion.velocity,
+            positions=context.q,
+            previous=state.command,
+            dt_s=context.dt_s,
+            joint_age_s=(context.now_ns - state.last_joints_ns) * 1e-9,
+            feature_age_s=(context.now_ns - newest_ns) * 1e-9,
+            needs_features=motion.needs_features,
+            speed_scale=motion.speed_scale * context.settings.limits.speed_scale,
+            brake=context.paused,
+        ),
+        limits,
+    )
+    active = state.lifecycle == Lifecycle.ACTIVE
+    state.command = result.limited.copy() if active else np.zeros_like(context.q)
+    return result
+
+
+def safety_limits(settings: CoreSettings, features_fresh_s: float) -> SafetyLimits:
+    """The limits of a cell. Raises SafetyConfigurationError."""
+    limits = settings.limits
+    return SafetyLimits(
+        joint_names=settings.joint_names,
+        position_min=limits.position_min,
+        position_max=limits.position_max,
+        velocity_max=limits.velocity_max,
+        acceleration_max=limits.acceleration_max,
+        position_margin=limits.position_margin,
+        keep_outs=limits.keep_outs,
+        keep_out_names=limits.keep_out_names,
+        joint_timeout_s=limits.joint_timeout_s,
+        coast_s=limits.coast_s,
+        features_fresh_s=features_fresh_s,
+    )
+
+
+def _within(age_s: float, limit_s: float) -> bool:
+    """Whether an age can be trusted: neither NaN nor of the future, and not beyond its limit."""
+    return 0.0 <= age_s <= limit_s
+
+
+def _stale(inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) -> bool:
+    """Whether the inputs are too old, or of no credible age, to move on."""
+    brake = False
+    if not _within(inputs.joint_age_s, limits.joint_timeout_s):
+        brake = True
+        reasons.append(
+            Reason(
+                JOINTS_STALE,
+                "hold",
+                "",
+                _number(inputs.joint_age_s),
+                limits.joint_timeout_s,
+                "s",
+                "the joint driver delivers no samples: check drives and bus",
+            )
+        )
+    if inputs.needs_features and not _within(inputs.feature_age_s, limits.features_fresh_s):
+        if _within(inputs.feature_age_s, limits.coast_s):
+            reasons.append(
+                Reason(
+                    COASTING,
+                    "info",
+                    "",
+                    inputs.feature_age_s,
+                    limits.coast_s,
+                    "s",
+                    "moving on the prediction of the joints; brakes when no camera shows markers in time",
+                )
+            )
+        else:
+            brake = True
+            reasons.append(
+                Reason(
+                    FEATURES_STALE,
+                    "hold",
+                    "",
+                    _number(inputs.feature_age_s),
+                    limits.coast_s,
+                    "s",
+                    "no camera shows enough markers: clear the view, or move the arm back by joints",
+                )
+            )
+    return brake
+
+
+def _tell_non_finite(
+    raw: FloatArray, positions: FloatArray, limits: SafetyLimits, reasons: list[Reason]
+) -> None:
+    for j, name in enumerate(limits.joint_names):
+        for what, value in (("command", raw[j]), ("measured position", positions[j])):
+            if not math.isfinite(value):
+                reasons.append(
+                    Reason(
+                        NON_FINITE_COMMAND,
+                        "hold",
+                        name,
+                        None,
+                        None,
+                        "",
+                        f"{what} of joint {name} is {value}: a fault of the source or the driver",
+                    )
+                )
+
+
+def _tell_positions(
+    acted: IntArray, inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]
+) -> None:
+    margin = limits.position_margin
+    for j, code in enumerate(acted.tolist()):
+        if not code:
+            continue
+        name, position = limits.joint_names[j], float(inputs.positions[j])
+        upward = (
+            inputs.previous[j] if inputs.raw[j] == 0.0 or not math.isfinite(inputs.raw[j]) else inputs.raw[j]
+        ) > 0.0
+        if code == 1:
+            bound = float(limits.position_max[j] - margin if upward else limits.position_min[j] + margin)
+            hint = f"jog {name} {'down' if upward else 'up'}, away from its limit"
+            reasons.append(Reason(JOINT_LIMIT, "slow", name, position, bound, "", hint))
+            continue
+        box = limits.keep_outs[code - 2, j]
+        bound = float(box[0] - margin if upward else box[1] + margin)
+        hint = f"keep-out {limits.keep_out_names[code - 2]!r}: jog {name} {'down' if upward else 'up'}"
+        reasons.append(Reason(KEEP_OUT, "slow", name, position, bound, "", hint))
+
+
+def _braking(limited: FloatArray, limits: SafetyLimits, asked: bool) -> Reason:
+    j = int(np.abs(limited).argmax())
+    hint = "stop or hold was asked for; resume to go on" if asked else "passes with the reason beside it"
+    return Reason(BRAKING, "hold", limits.joint_names[j], float(abs(limited[j])), 0.0, "1/s", hint)
+
+
+def _number(value: float) -> float | None:
+    """JSON carries no NaN or infinity."""
+    return value if math.isfinite(value) else None
+
+
+@kernel
+def stoppable_speed(distance: float, acceleration: float, dt: float) -> float:
+    """Largest speed to hold for ``dt`` and still brake within ``distance``: ``v·dt + v²/2a = d``; 0 for d <=
+    0.
+
+    The discrete braking ``v, v − a·dt, …`` needs no more than that, and each of its steps is stoppable again.
+    """
+    if not distance > 0.0:
+        return 0.0
+    step = acceleration * dt
+    # the root of the quadratic in the form that does not cancel for small distances
+    return 2.0 * acceleration * distance / (step + math.sqrt(step * step + 2.0 * acceleration * distance))
+
+
+@kernel
+def _position_caps(
+    ahead: FloatArray,
+    behind: FloatArray,
+    previous: FloatArray,
+    dt: float,
+    position_min: FloatArray,
+    position_max: FloatArray,
+    velocity_max: FloatArray,
+    acceleration_max: FloatArray,
+    margin: float,
+    keep_outs: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    low_by: IntArray,
+    high_by: IntArray,
+) -> None:
+    """Velocity caps per joint and who set them: -1 the position limit, k >= 0 keep-out box k.
+
+    ``ahead`` and ``behind`` (n,): the joint's extreme positions, given the age of its sample; NaN caps
+    nothing.
+    """
+    n = previous.shape[0]
+    for j in range(n):
+        low_by[j] = -1
+        high_by[j] = -1
+        low[j] = -math.inf
+        high[j] = math.inf
+        if math.isnan(ahead[j]) or math.isnan(behind[j]):
+            continue
+        high[j] = stoppable_speed(position_max[j] - margin - ahead[j], acceleration_max[j], dt)
+        low[j] = -stoppable_speed(behind[j] - (position_min[j] + margin), acceleration_max[j], dt)
+    for k in range(keep_outs.shape[0]):
+        # The joint that keeps the arm out of the box with the most time to spare answers for it: as long as
+        # one joint can always stop outside, the box is never entered.
+        best = -1
+        best_above = False
+        best_slack = -math.inf
+        for j in range(n):
+            if math.isnan(ahead[j]) or math.isnan(behind[j]):
+                continue
+            for above in (False, True):
+                if above:
+                    if math.isinf(keep_outs[k, j, 1]):
+                        continue
+                    room = behind[j] - (keep_outs[k, j, 1] + margin)
+                    speed = max(0.0, -previous[j])
+                else:
+                    if math.isinf(keep_outs[k, j, 0]):
+                        continue
+                    room = keep_outs[k, j, 0] - margin - ahead[j]
+                    speed = max(0.0, previous[j])
+                slack = (room - 0.5 * speed * speed / acceleration_max[j]) / velocity_max[j]
+                if slack > best_slack:
+                    best, best_above, best_slack = j, above, slack
+        if best < 0:
+            continue
+        if best_above:
+            cap = -stoppable_speed(
+                behind[best] - (keep_outs[k, best, 1] + margin), acceleration_max[best], dt
+            )
+            if cap > low[best]:
+                low[best] = cap
+                low_by[best] = k
+        else:
+            cap = stoppable_speed(keep_outs[k, best, 0] - margin - ahead[best], acceleration_max[best], dt)
+            if cap < high[best]:
+                high[best] = cap
+                high_by[best] = k
+
+
+@kernel
+def _within_speed_limits(previous: FloatArray, velocity_max: FloatArray) -> FloatArray:
+    """The previous command (n,) scaled into the speed limits: nothing may continue from beyond them."""
+    before = np.zeros(previous.shape[0])
+    shrink = 1.0
+    for j in range(before.shape[0]):
+        if math.isfinite(previous[j]):
+            before[j] = previous[j]
+            if abs(before[j]) > velocity_max[j]:
+                shrink = min(shrink, velocity_max[j] / abs(before[j]))
+    for j in range(before.shape[0]):
+        before[j] *= shrink
+    return before
+
+
+@kernel
+def _velocity_scale(
+    wanted: FloatArray, low: FloatArray, high: FloatArray, velocity_max: FloatArray, speed_scale: float
+) -> tuple[float, int]:
+    """The factor that brings all joints within their speed limits, and the joint that asks for it, -1 for none.
+
+    A joint that brakes for its position limit is held below its speed limit by its cap: it slows no other joint.
+    """
+    scale, scaled_by = 1.0, -1
+    for j in range(wanted.shape[0]):
+        limit = velocity_max[j] * speed_scale
+        cap = high[j] if wanted[j] > 0.0 else -low[j]
+        if cap > limit and abs(wanted[j]) * scale > limit:
+            scale = limit / abs(wanted[j])
+            scaled_by = j
+    return scale, scaled_by
+
+
+@kernel
+def limit_velocity(
+    raw: FloatArray,
+    positions: FloatArray,
+    previous: FloatArray,
+    brake: bool,
+    dt: float,
+    sample_age: float,
+    speed_scale: float,
+    position_min: FloatArray,
+    position_max: FloatArray,
+    velocity_max: FloatArray,
+    acceleration_max: FloatArray,
+    margin: float,
+    keep_outs: FloatArray,
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """The stages that act on finite numbers: braking, velocity, positions and keep-outs, acceleration.
+
+    ``raw`` must be finite unless ``brake``. Returns the limited velocity (n,), ``acted`` (n,): 0 free, 1
+    position limit, 2 + k keep-out k; and ``scales`` (4,): velocity scale, its joint, acceleration share, its
+    joint.
+    """
+    n = raw.shape[0]
+    limited = np.zeros(n)
+    acted = np.zeros(n, dtype=np.int64)
+    scales = np.empty(4)
+    before = _within_speed_limits(previous, velocity_max)
+    low, high = np.empty(n), np.empty(n)
+    low_by, high_by = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    ahead, behind = np.empty(n), np.empty(n)
+    for j in range(n):
+        # since the sample the joint may have been faster than now, by what it can have braked
+        drift = before[j] * sample_age
+        faster = 0.5 * acceleration_max[j] * sample_age * sample_age
+        position = positions[j] if math.isfinite(positions[j]) else math.nan
+        ahead[j] = position + max(0.0, drift + faster)
+        behind[j] = position + min(0.0, drift - faster)
+    _position_caps(
+        ahead, behind, before, dt, position_min, position_max, velocity_max, acceleration_max, margin,
+        keep_outs, low, high, low_by, high_by,
+    )  # fmt: skip
+
+    for j in range(n):
+        limited[j] = 0.0 if brake else raw[j]
+    scale, scaled_by = _velocity_scale(limited, low, high, velocity_max, speed_scale)
+    for j in range(n):
+        # Scaled before it is compared with its caps: far from its limits no joint is clipped, whatever was asked.
+        limited[j] *= scale
+        if limited[j] > high[j]:
+            limited[j] = high[j]
+            acted[j] = high_by[j] + 2
+        elif limited[j] < low[j]:
+            limited[j] = low[j]
+            acted[j] = low_by[j] + 2
+
+    share, shared_by = 1.0, -1
+    for j in range(n):
+        step = abs(limited[j] - before[j])
+        limit = acceleration_max[j] * dt
+        if step * share > limit:
+            share = limit / step
+            shared_by = j
+    for j in range(n):
+        if share < 1.0:
+            limited[j] = before[j] + share * (limited[j] - before[j])
+        # The share of another joint may leave this one above its cap: then it brakes with all it has.
+        step = acceleration_max[j] * dt
+        if limited[j] > high[j]:
+            limited[j] = min(limited[j], max(high[j], before[j] - step))
+            acted[j] = high_by[j] + 2
+        elif limited[j] < low[j]:
+            limited[j] = max(limited[j], min(low[j], before[j] + step))
+            acted[j] = low_by[j] + 2
+    scales[0] = scale
+    scales[1] = scaled_by
+    scales[2] = share
+    scales[3] = shared_by
+    return limited, acted, scales

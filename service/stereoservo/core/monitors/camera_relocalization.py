@@ -1,0 +1,490 @@
+"""Cameras that have moved are found anew while the goal waits: brake, look at rest, ask for a model, verify, go on.
+
+That it was the cameras, and not the arm, must be proven at rest (`diagnosis.doubt`); else nothing is found anew, no
+goal is carried over, and the goal stays held with what is known.
+
+The core only looks; `kinematics.calibration.reanchoring` makes the model, outside the servo process. What stands at
+rest keeps its innovation: where that changes, a camera was moved again, and all begins anew.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.cycle import ModelUpdate, Sample
+from stereoservo.core.goals.execute import drop_lookahead_plan, end_followers, end_source
+from stereoservo.core.goals.servo_goal import place_now
+from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
+from stereoservo.core.monitors.fault_isolation import LEAST_PX, doubt, named
+from stereoservo.core.monitors.goal_reprojection import carry_goal, carry_run
+from stereoservo.core.monitors.model import bench_now
+from stereoservo.core.move import goal_of
+from stereoservo.core.prediction import ModelArrays, joints_at, model_arrays
+from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
+from stereoservo.core.state import CoreState, LawRun, PoseMeasurement
+from stereoservo.messages.goals import Goal, ReanchorRefused
+from stereoservo.messages.reasons import Reason
+
+AT_REST = 1e-3
+"""Command [rad/s or m/s]."""
+RESTING = 0.01
+"""Measured velocity [rad/s or m/s]."""
+SETTLE_S = 0.15
+FRAMES = 16
+"""That are averaged, of each camera that has moved."""
+COLLECT_S = 3.0
+ANSWER_S = 60.0
+"""How long a model may be waited for."""
+VERIFY_ROUNDS = 3
+VERIFY_S = 3.0
+MOST_TRIES = 4
+MOVED_AGAIN_PX = 3.0
+"""Median change of what stands, at rest, from which a camera has been moved again."""
+SAME_PLACE = 2e-3
+OTHER_PLACE = 0.05
+"""Joint motion [rad or m] after which what could not be found is looked for again."""
+AGAIN_S = 1.0
+FEWEST = 4
+"""Known points that a camera must see before a fit is worth trying."""
+
+
+def begin(verdict: ModelDiagnosis, context: StepContext) -> None:
+    """Cameras have moved, or seem to have, by ``verdict``: no law runs until they are known again."""
+    state, settings = context.state, context.settings
+    names = list(verdict.subjects)
+    state.reanchoring = Relocalization(
+        phase="brake",
+        cameras=tuple(names),
+        together=verdict.kind == "cameras_moved_together",
+        moved_px=verdict.moved_px,
+        since_ns=context.now_ns,
+        phase_ns=context.now_ns,
+        sums=ObservationStatistics(**measurement_buffers(settings)),
+        joint_sum=np.zeros_like(context.q),
+        reference=np.zeros((len(settings.cameras), _rows(state), 2)),
+        referred=np.zeros((len(settings.cameras), _rows(state))),
+        tried_at=context.q.copy(),
+        doubt=verdict.text if verdict.kind == "cameras_or_arm" else "",
+    )
+    _forget(names, context)
+
+
+def _rows(state: CoreState) -> int:
+    return len(state.watching.sightings[0].seen)
+
+
+def _forget(names: list[str], context: StepContext) -> None:
+    """What these cameras said last holds no more."""
+    for camera, estimate in zip(context.settings.cameras, context.state.cameras, strict=True):
+        if camera.name in names:
+            estimate.seen_ns[:] = 0
+            estimate.innovation[:] = 0.0
+
+
+def unknown_cameras(state: CoreState) -> tuple[str, ...]:
+    """Cameras whose pixels mean nothing now."""
+    run = state.reanchoring
+    return () if run is None or run.phase == "verify" else run.cameras
+
+
+def reasons(state: CoreState) -> tuple[Reason, ...]:
+    """Why laws wait."""
+    run = state.reanchoring
+    if run is None:
+        return ()
+    if run.reason is not None:
+        return (run.reason,)
+    doing = {
+        "brake": "the arm comes to rest", "collect": "looking at rest", "wait": "it is being found anew",
+        "take": "its new place is taken over", "verify": "its new place is verified",
+    }[run.phase]  # fmt: skip
+    if run.doubt:
+        return (_doubtful(run, f"{run.doubt}. {doing[0].upper()}{doing[1:]}, to look once more"),)
+    return (
+        Reason(
+            "CAMERA_MOVED", "hold", ", ".join(run.cameras), run.moved_px, None, "px",
+            f"{named(run.cameras)} moved: {doing}; laws go on by themselves. Leave it alone now",
+        ),
+    )  # fmt: skip
+
+
+def _doubtful(run: Relocalization, hint: str) -> Reason:
+    return Reason("CAMERAS_OR_ARM", "hold", ", ".join(run.cameras), run.moved_px, LEAST_PX, "px", hint)
+
+
+def misfit(state: CoreState, update: ModelUpdate) -> str:
+    """Why a re-anchored model is not the one that is waited for; empty where it is."""
+    run, model = state.reanchoring, state.model
+    if run is None or model is None or run.phase != "wait":
+        return "no cameras are being found anew, or they have moved again since"
+    if set(update.reanchored) != set(run.cameras):
+        return f"it is re-anchored for {', '.join(update.reanchored)}; {', '.join(run.cameras)} moved"
+    same = np.array_equal(update.model.plane_at_infinity, model.plane_at_infinity) and np.array_equal(
+        update.model.generators, model.generators
+    )
+    return "" if same else "it is of another frame than the model in use"
+
+
+def refuse_while_moved(state: CoreState) -> None:
+    """Raises RefusalError while cameras are being found anew: pixels of then and now mean different things."""
+    run = state.reanchoring
+    if run is not None and run.doubt:
+        raise RefusalError(
+            "CAMERAS_OR_ARM", run.doubt, subject=", ".join(run.cameras), value=run.moved_px, threshold=LEAST_PX,
+            unit="px",
+        )  # fmt: skip
+    if run is not None:
+        raise RefusalError(
+            "CAMERA_MOVED",
+            f"{named(run.cameras)} moved and is not known again yet: wait for the event reanchored, or calibrate",
+            subject=", ".join(run.cameras),
+        )
+
+
+def step(context: StepContext) -> None:
+    """One step of it."""
+    state = context.state
+    run = state.reanchoring
+    if run is None:
+        return
+    if isinstance(state.source, PoseMeasurement):
+        state.reanchoring = None  # what calibrates, or checks, needs no model of before
+        return
+    resting = bool((np.abs(state.command) < AT_REST).all() and (np.abs(state.velocities) < RESTING).all())
+    if run.phase in ("collect", "wait", "failed") and _moved_again(run, context):
+        return
+    if run.phase == "brake":
+        if not resting:
+            run.phase_ns = context.now_ns
+        elif (context.now_ns - run.phase_ns) * 1e-9 >= SETTLE_S:
+            _begin_to_look(run, context)
+    elif run.phase == "collect":
+        if resting:
+            _look(run, context)
+        else:
+            _enter(run, "brake", context)
+    elif run.phase == "wait":
+        if (
+            state.pending_model is not None
+            and state.pending_reanchored
+            and resting
+            and state.planning is None
+        ):
+            _carry_over(run, context)
+        elif (context.now_ns - run.phase_ns) * 1e-9 > ANSWER_S:
+            _fail(run, context, "no model came: is the gateway alive? See the daemon's log", ANSWER_S, "s")
+    elif run.phase == "verify":
+        _verify(run, context)
+    elif run.phase == "failed" and resting and (context.now_ns - run.phase_ns) * 1e-9 > AGAIN_S:
+        elsewhere = bool((np.abs(context.q - run.tried_at) > OTHER_PLACE).any())
+        if elsewhere or _seen_now(run, context) > run.tried_seen:
+            try_again(context)
+
+
+def try_again(context: StepContext) -> None:
+    """Look again after a failure: more is seen, the arm stands elsewhere, or somebody asks for it."""
+    run = context.state.reanchoring
+    if run is not None and run.phase == "failed":
+        run.reason = None
+        run.tries = 0
+        _enter(run, "brake", context)
+
+
+def refused(command: ReanchorRefused, context: StepContext) -> str:
+    """The fit could not find the cameras. Raises RefusalError where nobody asked for it."""
+    run = context.state.reanchoring
+    if run is None or run.phase != "wait":
+        raise RefusalError("NOT_AWAITED", "no cameras are being found anew")
+    _fail(run, context, command.message, command.value, command.unit, command.threshold)
+    return "the cameras stay unknown"
+
+
+def _enter(run: Relocalization, phase: str, context: StepContext) -> None:
+    run.phase = phase  # type: ignore[assignment]
+    run.phase_ns = context.now_ns
+
+
+def _begin_to_look(run: Relocalization, context: StepContext) -> None:
+    _enter(run, "collect", context)
+    run.sums = ObservationStatistics(**measurement_buffers(context.settings))
+    run.joint_sum = np.zeros_like(context.q)
+    run.joint_frames = 0
+    run.referred[:] = 0.0
+    run.contradicting = 0
+    run.tried_at = context.q.copy()
+
+
+def _moved_again(run: Relocalization, context: StepContext) -> bool:
+    """Whether what stands has moved in some image since the arm rests; then everything begins anew."""
+    if bool((np.abs(context.q - run.tried_at) > SAME_PLACE).any()):
+        return False
+    moved: list[str] = []
+    looked = False
+    for c, camera in enumerate(context.settings.cameras):
+        sighting = context.state.watching.sightings[c]
+        if sighting.t_ns <= run.phase_ns or not sighting.fresh:
+            continue
+        known = run.referred[c] > 0.0
+        both = known & (sighting.seen > 0.0)
+        if int(both.sum()) >= 3:
+            looked = True
+            apart = np.sqrt(((sighting.innovation - run.reference[c])[both] ** 2).sum(axis=-1))
+            if float(np.median(apart)) > MOVED_AGAIN_PX:
+                moved.append(camera.name)
+        fresh = ~known & (sighting.seen > 0.0)
+        run.reference[c][fresh] = sighting.innovation[fresh]
+        run.referred[c][fresh] = 1.0
+    if not moved:
+        run.contradicting = 0 if looked else run.contradicting
+        return False
+    run.contradicting += 1
+    if run.contradicting < 2:
+        return False
+    more = [name for name in moved if name not in run.cameras]
+    run.together = False
+    run.cameras = (*run.cameras, *more)
+    run.poses = 0
+    run.tries = 0
+    run.reason = None
+    context.state.pending_model = None if context.state.pending_reanchored else context.state.pending_model
+    context.state.pending_reanchored = ()
+    _forget(list(run.cameras), context)
+    message = (
+        f"at rest {named(tuple(moved))} shows what stands more than {MOVED_AGAIN_PX:g} px from where it was: looking "
+        "once more"
+    )
+    if not run.doubt and len(run.cameras) == len(context.settings.cameras):
+        run.doubt = f"all cameras ({', '.join(run.cameras)}) show another view at rest"
+    context.emit("health", message=message, name="camera_moved", cameras=run.cameras)
+    _enter(run, "brake", context)
+    return True
+
+
+def _look(run: Relocalization, context: StepContext) -> None:
+    for observation in context.observations:
+        at_shutter = joints_at(context.state.history, observation.t_shutter_ns)
+        if at_shutter is not None and add_observation(
+            run.sums, context.settings, observation, FRAMES, run.phase_ns
+        ):
+            run.joint_sum += at_shutter
+            run.joint_frames += 1
+    wanted = [c for c, camera in enumerate(context.settings.cameras) if camera.name in run.cameras]
+    waited_s = (context.now_ns - run.phase_ns) * 1e-9
+    if not bool((run.sums.frames[wanted] >= FRAMES).all()) and waited_s <= COLLECT_S:
+        return
+    state = context.state
+    if run.poses == 0 and _where_they_were(run, context):
+        return
+    if _unproven(run, context):
+        return
+    samples = tuple(  # the model that is handed in has the adjusted ones where they were
+        sample
+        for sample in averages(run.sums, context.settings)
+        if sample.camera in run.cameras or sample.camera not in state.adjusted
+    )
+    run.tried_seen = sum(len(_known(sample, context)) for sample in samples if sample.camera in run.cameras)
+    for sample in samples:
+        if sample.camera in run.cameras and len(_known(sample, context)) < FEWEST:
+            few, frames = len(_known(sample, context)), sample.frames
+            _fail(
+                run, context,
+                f"camera {sample.camera} sees {few} known markers in {frames} frames, {FEWEST} are needed: turn it "
+                "back to the arm or to the static markers, or move the arm before it by joints",
+                float(few), "markers", float(FEWEST),
+            )  # fmt: skip
+            return
+    context.emit(
+        "reanchor", id=goal_of(context.state.source), joints=run.joint_sum / max(run.joint_frames, 1),
+        samples=samples, trial=run.poses, cameras=run.cameras, rigid=run.together,
+        message=f"{named(run.cameras)} seen at rest: to be found anew",
+    )  # fmt: skip
+    run.poses += 1
+    _enter(run, "wait", context)
+
+
+def _unproven(run: Relocalization, context: StepContext) -> bool:
+    """Whether nothing proves that it was the cameras, and not the arm; then the goal stays held."""
+    state, settings = context.state, context.settings
+    assert context.arrays is not None
+    looked = [c for c, sighting in enumerate(state.watching.sightings) if sighting.t_ns > run.phase_ns]
+    moved = [c for c, camera in enumerate(settings.cameras) if camera.name in run.cameras]
+    usable = [c for c in looked if (mobile := state.mobile[c]) is None or not mobile.moving]
+    run.doubt = (
+        doubt(bench_now(state.watching, usable, context.arrays, settings), moved, run.moved_px)
+        if usable
+        else f"no camera has shown anything at rest, so {named(run.cameras)} may have moved, or the arm"
+    )
+    if not run.doubt:
+        return False
+    run.tried_seen = _seen_now(run, context)
+    hint = (
+        f"{run.doubt}. It is looked at again when more is seen, when the arm rests elsewhere, and on resume"
+    )
+    _give_up(run, context, _doubtful(run, hint))
+    return True
+
+
+def _where_they_were(run: Relocalization, context: StepContext) -> bool:
+    """Whether the cameras, looked at at rest, stand where they stood; then all goes on with the model of before."""
+    state = context.state
+    seen = [
+        sighting
+        for camera, sighting in zip(context.settings.cameras, state.watching.sightings, strict=True)
+        if camera.name in run.cameras
+    ]
+    last = state.watching.last[-VERIFY_ROUNDS:]
+    looked = all(s.t_ns > run.phase_ns and int(s.seen.sum()) >= FEWEST for s in seen)
+    if not looked or len(last) < VERIFY_ROUNDS or any(verdict.kind != "ok" for verdict in last):
+        return False
+    state.reanchoring = None
+    goal = goal_of(state.source)
+    on = f"; goal {goal} goes on" if goal else ""
+    context.emit(
+        "health", id=goal, name="ok",
+        message=f"{named(run.cameras)}, seen at rest, stand where they stood: what was seen in motion was of other "
+        f"moments than stated, or passed by{on}",
+    )  # fmt: skip
+    return True
+
+
+def _known(sample: Sample, context: StepContext) -> list[int]:
+    model = context.state.model
+    assert model is not None
+    points = {*model.marker_ids, *model.scene_ids}
+    return [int(i) for i in sample.ids if int(i) in points]
+
+
+def _seen_now(run: Relocalization, context: StepContext) -> int:
+    """Known points in the newest frames of the cameras that have moved; of all, where it is in doubt that they have."""
+    return sum(
+        int(sighting.seen.sum())
+        for camera, sighting in zip(context.settings.cameras, context.state.watching.sightings, strict=True)
+        if (run.doubt or camera.name in run.cameras) and sighting.t_ns > run.phase_ns
+    )
+
+
+def _fail(
+    run: Relocalization,
+    context: StepContext,
+    why: str,
+    value: float | None,
+    unit: str,
+    limit: float | None = None,
+) -> None:
+    hint = (
+        f"{named(run.cameras)} moved and could not be found anew: {why}. It is tried again when more is seen, when the "
+        "arm rests elsewhere, and on resume; or cancel the goal and calibrate"
+    )
+    reason = Reason("REANCHOR_FAILED", "hold", ", ".join(run.cameras), value, limit, unit, hint)
+    _give_up(run, context, reason)
+
+
+def _give_up(run: Relocalization, context: StepContext, reason: Reason) -> None:
+    run.reason = reason
+    _enter(run, "failed", context)
+    context.emit(
+        "reanchor_failed", id=goal_of(context.state.source), message=reason.hint, reasons=(reason,),
+        cameras=run.cameras,
+    )  # fmt: skip
+
+
+def _carry_over(run: Relocalization, context: StepContext) -> None:
+    """Say the goals in the new cameras' pixels; the model is taken with the next step."""
+    state = context.state
+    old, model = state.model, state.pending_model
+    assert old is not None
+    assert model is not None
+    moved = tuple(
+        c for c, camera in enumerate(context.settings.cameras) if camera.name in state.pending_reanchored
+    )
+    new: ModelArrays = model_arrays(model, context.settings)
+    epochs = (old.epoch, model.epoch)
+    carry_all(new, moved, epochs, context)
+    _enter(run, "take", context)
+
+
+def carry_all(
+    new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int], context: StepContext
+) -> None:
+    """Say the running and the queued goals in the pixels of the cameras ``moved``, as ``new`` has them.
+
+    ``epochs``: of the model before and of the new one. Goals that cannot be said end.
+    """
+    state = context.state
+    place = place_now(context)
+    drop_lookahead_plan(context)
+    kept: list[Goal] = []
+    queued, state.queue = state.queue, []
+    for k, goal in enumerate(queued):
+        carried = carry_goal(goal, place, new, moved, epochs)
+        if isinstance(carried, Reason):
+            state.queued_until_ns.pop(goal.id, None)
+            context.emit("goal_aborted", id=goal.id, message=carried.hint, reasons=(carried,))
+            if goal.acknowledge_s is not None:
+                state.queue = queued[k + 1 :]
+                end_followers(context, goal.id, (carried,))
+                break
+        else:
+            kept.append(carried)
+    state.queue = kept
+    if isinstance(state.source, LawRun):
+        reason = carry_run(state.source, place, new, moved)
+        if reason is not None:
+            end_source(context, "goal_aborted", (reason,), reason.hint)
+
+
+def taken(run: Relocalization, state: CoreState, now_ns: int) -> None:
+    """The new model is in use: laws begin to count frames anew, and fresh frames must agree with it."""
+    run.phase, run.phase_ns = "verify", now_ns
+    if isinstance(state.source, LawRun):
+        state.source.last_frames = sum(estimate.frames for estimate in state.cameras)
+        state.source.held = 0
+
+
+def _verify(run: Relocalization, context: StepContext) -> None:
+    state = context.state
+    watching = state.watching
+    last = watching.last[-VERIFY_ROUNDS:]
+    seen = [
+        sighting
+        for camera, sighting in zip(context.settings.cameras, watching.sightings, strict=True)
+        if camera.name in run.cameras
+    ]
+    looked = all(s.t_ns > run.phase_ns and int(s.seen.sum()) >= 3 for s in seen)
+    if len(last) == VERIFY_ROUNDS and looked and all(verdict.kind == "ok" for verdict in last):
+        _known_again(run, context)
+        return
+    contradicted = len(last) == VERIFY_ROUNDS and all(verdict.kind != "ok" for verdict in last)
+    late = (context.now_ns - run.phase_ns) * 1e-9 > VERIFY_S
+    if not (contradicted or late):
+        return
+    run.tries += 1
+    if run.tries < MOST_TRIES:
+        verdict = last[-1] if last else ModelDiagnosis()
+        more = verdict.subjects if verdict.kind in (*MOVED, "cameras_or_arm") else ()
+        run.doubt = verdict.text if verdict.kind == "cameras_or_arm" else ""
+        run.cameras = (*run.cameras, *(name for name in more if name not in run.cameras))
+        run.poses = 0
+        _forget(list(run.cameras), context)
+        _enter(run, "brake", context)
+        return
+    worst = max(sighting.rms_px for sighting in seen)
+    _fail(run, context, "frames of now contradict each model that was made", worst, "px")
+
+
+def _known_again(run: Relocalization, context: StepContext) -> None:
+    state = context.state
+    state.reanchoring = None
+    px = ", ".join(
+        f"{camera.name} {sighting.rms_px:.2g} px rms"
+        for camera, sighting in zip(context.settings.cameras, state.watching.sightings, strict=True)
+    )
+    seconds = (context.now_ns - run.since_ns) * 1e-9
+    goal = goal_of(state.source)
+    on = f"; goal {goal} goes on" if goal else ""
+    context.emit(
+        "reanchored", id=goal, cameras=run.cameras, rigid=run.together,
+        message=f"{named(run.cameras)} moved by {run.moved_px:.3g} px and is known again after {seconds:.1f} s: now "
+        f"{px}{on}",
+    )  # fmt: skip

@@ -1,0 +1,244 @@
+"""One round of frames that the model does not explain: which change does, in the cell's names and in words.
+
+All cameras moved as one, and an arm that stands elsewhere than its joints say (play, a zero, the marker body), look
+alike in the images of the arm. `doubt` says whether something else tells them apart.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Literal
+
+from stereoservo.calibration.change.change_detection import ChangeDiagnosis, IsolatedChange, diagnose
+from stereoservo.calibration.change.hypothesis_test import Thresholds, alarm_thresholds
+from stereoservo.core.monitor_state import ModelDiagnosis, VerdictKind
+from stereoservo.core.prediction import ModelArrays, chain_at
+from stereoservo.core.settings import CoreSettings
+from stereoservo.kinematics.kernels import image_jacobian, transform_points
+from stereoservo.numerics.arrays import FloatArray
+
+FALSE_ALARMS_PER_HOUR = 1e-3
+"""Of one round, in noise as stated; a verdict needs two of three besides."""
+LEAST_PX = 0.5
+"""Rms change of the pixels below which no cause is told: models are off by as much where nothing has changed."""
+FEWEST_ON_ARM = 4
+"""Markers on the arm by which a camera may confirm that the arm is where its joints say."""
+FEWEST_STATIC = 3
+"""Static points that must have moved in the picture of a camera to prove that the camera has: one or two may have been
+pushed themselves.
+"""
+
+
+@lru_cache(maxsize=64)
+def _thresholds(rate_hz: float, cameras: int, markers: int, joints: int) -> Thresholds:
+    return alarm_thresholds(
+        false_alarms_per_hour=FALSE_ALARMS_PER_HOUR, decisions_per_hour=3600.0 * rate_hz, cameras=cameras,
+        markers=markers, joints=joints, least_px=LEAST_PX,
+    )  # fmt: skip
+
+
+def thresholds_of(settings: CoreSettings, markers: int, cameras: int) -> Thresholds:
+    """Thresholds of the watch over ``markers`` in so many of the cell's cameras."""
+    rate_hz = min((camera.rate_hz for camera in settings.cameras), default=30.0)
+    return _thresholds(rate_hz, cameras, markers, len(settings.joint_names))
+
+
+def diagnosed(bench: Bench) -> ModelDiagnosis:
+    """What explains the innovations of one moment."""
+    found = bench.diagnose()
+    cause, other = found.cause, found.runner_up
+    if found.kind == "nothing":
+        return ModelDiagnosis()
+    if cause is not None and other is not None and {cause.kind, other.kind} == {"cameras", "joints"}:
+        # What stands between arm and cameras has moved: whichever it was, `doubt` asks the static points.
+        cause, other = (cause if cause.kind == "cameras" else other), None
+        words = " moved together"
+    elif cause is not None and other is not None and {cause.kind, other.kind} == {"camera", "joints"}:
+        cause, other = (cause if cause.kind == "camera" else other), None
+        words = ", or the arm before it, moved"
+    else:
+        words = " moved together" if cause is not None and cause.kind == "cameras" else " moved"
+    if found.kind == "unexplained" or cause is None or other is not None:
+        return _each_by_itself(bench) or _unclear(found, other)
+    if cause.kind == "joints" and other is None:
+        return ModelDiagnosis(
+            "unclear", moved_px=cause.effect_px,
+            text=f"the arm, or the marker body on it, stands elsewhere than its joints say ({cause.effect_px:.3g} px "
+            "rms): was the body mounted anew, was the arm pushed? Calibrate anew",
+        )  # fmt: skip
+    return _told(bench, cause, words)
+
+
+class Bench:
+    """One moment, with the arm at ``q`` (n,), as the cameras ``known`` saw it, for several questions.
+
+    ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `estimate.FrameSights`.
+    """
+
+    def __init__(
+        self, arrays: ModelArrays, settings: CoreSettings, known: list[int], q: FloatArray,
+        innovation: FloatArray, weights: FloatArray,
+    ) -> None:  # fmt: skip
+        self.arrays, self.settings, self.known = arrays, settings, known
+        H, self.operators = chain_at(arrays, q)
+        self.points = transform_points(H, arrays.marker_points)
+        self.innovation, self.weights = innovation, weights
+
+    def diagnose(self, row: int | None = None, *, static_alone: bool = False) -> ChangeDiagnosis:
+        """What all cameras show, or the one of a ``row``; ``static_alone``: without the markers on the arm."""
+        arrays, m = self.arrays, len(self.points)
+        rows = list(range(len(self.known))) if row is None else [row]
+        on_arm = self.weights[rows][:, :m] * (0.0 if static_alone else 1.0)
+        cameras = [self.known[r] for r in rows]
+        return diagnose(
+            arrays.matrices[cameras], self.points, self.innovation[rows][:, :m], on_arm,
+            self.operators, arrays.metric_basis, thresholds_of(self.settings, m, len(cameras)),
+            arrays.scene_points, self.innovation[rows][:, m:], self.weights[rows][:, m:],
+        )  # fmt: skip
+
+
+def doubt(bench: Bench, moved: list[int], px: float) -> str:
+    """Why it is not proven that the cameras ``moved``, and not the arm, have moved; empty where it is.
+
+    Proof is another camera that sees the arm where its joints say or, in the picture of each camera, static points that
+    moved as the camera's own displacement moves them together with the arm. ``px``: rms disagreement.
+    """
+    if any(camera not in moved and _confirms_the_arm(bench, row) for row, camera in enumerate(bench.known)):
+        return ""
+    found = [(bench.settings.cameras[camera].name, *_static_evidence(bench, camera)) for camera in moved]
+    wanting = [(name, kind, count) for name, kind, count in found if kind != "moved"]
+    if not wanting:
+        return ""
+    names, some = tuple(name for name, _, _ in found), len(found) > 1
+    disagree = (
+        f"{named(names)} {'disagree' if some else 'disagrees'} with the joints by {px:.3g} px rms (limit "
+        f"{LEAST_PX:g} px)"
+    )
+    arm = "the arm stands elsewhere than its joints say (play, joint zeros, the marker body)"
+    for name, kind, count in wanting:
+        if kind == "stand":
+            return (
+                f"{disagree}, but the {count} static points that camera {name} sees stand where they stood: that "
+                f"camera has not moved, {arm}. Nothing is found anew: run calibrate --check, or calibrate"
+            )
+    name, kind, count = wanting[0]
+    why = (
+        f"camera {name} sees {count} static points, {FEWEST_STATIC} are needed"
+        if kind == "few"
+        else f"no one displacement of camera {name} explains its {count} static points and the arm"
+    )
+    return (
+        f"{disagree}: either {'all of them' if some else 'it'} moved, or {arm}; these cannot be told apart, "
+        f"for no other camera confirms the joints and {why}. Run calibrate --check, or calibrate; static markers in "
+        "view of every camera ([scene] static) tell them apart"
+    )
+
+
+def _confirms_the_arm(bench: Bench, row: int) -> bool:
+    """Whether a camera sees enough of the arm, and all of it where the joints say."""
+    seen = int((bench.weights[row, : len(bench.points)] > 0.0).sum())
+    return seen >= FEWEST_ON_ARM and bench.diagnose(row).kind == "nothing"
+
+
+def _static_evidence(
+    bench: Bench, camera: int
+) -> tuple[Literal["moved", "stand", "few", "unexplained"], int]:
+    """What the static points in the picture of a camera say of it, and how many it sees."""
+    if camera not in bench.known:
+        return "few", 0
+    row = bench.known.index(camera)
+    count = int((bench.weights[row, len(bench.points) :] > 0.0).sum())
+    if count < FEWEST_STATIC:
+        return "few", count
+    if bench.diagnose(row, static_alone=True).kind == "nothing":
+        return "stand", count
+    return ("moved" if bench.diagnose(row).kind == "camera" else "unexplained"), count
+
+
+def named(cameras: tuple[str, ...]) -> str:
+    """Cameras in words."""
+    return f"camera{'s' if len(cameras) > 1 else ''} {', '.join(cameras)}"
+
+
+def _proven(verdict: ModelDiagnosis, bench: Bench) -> ModelDiagnosis:
+    """The verdict that cameras have moved; ``cameras_or_arm`` where the arm explains the same."""
+    moved = [c for c, camera in enumerate(bench.settings.cameras) if camera.name in verdict.subjects]
+    why = doubt(bench, moved, verdict.moved_px)
+    if not why:
+        return verdict
+    return ModelDiagnosis("cameras_or_arm", verdict.subjects, moved_px=verdict.moved_px, text=why)
+
+
+def _each_by_itself(bench: Bench) -> ModelDiagnosis | None:
+    """Two cameras or more may have moved, each in its own way: a displacement of its own explains each one's frame."""
+    moved, effects = [], []
+    for row, camera in enumerate(bench.known):
+        alone = bench.diagnose(row)
+        causes = [cause for cause in (alone.cause, alone.runner_up) if cause is not None]
+        of_camera = [cause for cause in causes if cause.kind == "camera"]
+        if alone.kind == "nothing":
+            continue
+        if alone.kind == "unexplained" or not of_camera:
+            return None
+        moved.append(camera)
+        effects.append(of_camera[0].effect_px)
+    if len(moved) < 2:
+        return None
+    names = tuple(bench.settings.cameras[c].name for c in moved)
+    size = max(effects)
+    text = f"{named(names)} moved, each by itself"
+    return _proven(ModelDiagnosis("camera_moved", names, moved_px=size, text=text), bench)
+
+
+def _unclear(found: ChangeDiagnosis, other: IsolatedChange | None) -> ModelDiagnosis:
+    size = 0.0 if found.cause is None else found.cause.effect_px
+    chi2 = found.chi2 / max(found.measurements, 1)
+    why = (
+        "two causes explain the images equally well"
+        if other is not None
+        else "no single cause explains the images"
+    )
+    return ModelDiagnosis(
+        "unclear", size=chi2, unit="of the expected variance", moved_px=size,
+        text=f"{why} (chi-square {chi2:.3g} times what noise gives): check the cell with calibrate --check",
+    )  # fmt: skip
+
+
+def _told(bench: Bench, cause: IsolatedChange, words: str) -> ModelDiagnosis:
+    arrays, settings, known, px = bench.arrays, bench.settings, bench.known, cause.effect_px
+    by = f"by {px:.3g} px rms"
+    if cause.kind in ("camera", "cameras"):
+        names = tuple(
+            settings.cameras[c].name for c in (known if cause.kind == "cameras" else [known[cause.index]])
+        )
+        degrees = math.degrees(cause.amount) if math.isfinite(cause.amount) else 0.0
+        turned = f", turned by {degrees:.3g} degrees" if math.isfinite(cause.amount) else ""
+        kind: VerdictKind = (
+            "cameras_moved_together" if cause.kind == "cameras" and len(names) > 1 else "camera_moved"
+        )
+        text = f"{named(names)}{words} {by}{turned}"
+        return _proven(ModelDiagnosis(kind, names, degrees, 0.0, "degrees", px, text), bench)
+    if cause.kind == "marker":
+        marker = arrays.marker_ids[cause.index]
+        text = f"marker {marker} has slipped {by}: fix it where it was, or calibrate anew"
+        return ModelDiagnosis("marker_slipped", (str(marker),), px, 0.0, "px", px, text)
+    joint = settings.joint_names[cause.index]
+    deviation = _joint_deviation(bench, cause.index)
+    if settings.joint_kinds[cause.index] == "revolute":
+        size, spread, unit = math.degrees(cause.amount), math.degrees(deviation), "degrees"
+    else:
+        size, spread, unit = 1e3 * cause.amount, 1e3 * deviation, "mm"
+    text = (
+        f"the zero of joint {joint} is off by {size:+.3g} ± {spread:.1g} {unit} ({px:.3g} px rms): calibrate "
+        "--check --reset-zeros"
+    )
+    return ModelDiagnosis("joint_zero", (joint,), size, spread, unit, px, text)
+
+
+def _joint_deviation(bench: Bench, joint: int) -> float:
+    """Standard deviation [rad or m] of a joint's zero, estimated alone."""
+    jacobian = image_jacobian(bench.operators, bench.arrays.matrices[bench.known], bench.points)
+    weights = bench.weights[:, : len(bench.points)]
+    information = float((weights[..., None] ** 2 * jacobian[..., joint] ** 2).sum())
+    return 1.0 / math.sqrt(information) if information > 0.0 else 0.0

@@ -1,0 +1,465 @@
+"""Cameras that move for good, adjusted on-line against the tool that the others see (thesis 9, fig. 9.1).
+
+One that stands is a camera like any other. While it moves, laws go on without it: the model keeps it where it stood
+last, as after a drop-out, and in every frame a displacement of it is fitted to the markers where the joints, corrected
+by the cameras that stand, have them. Once some frames agree, it stands: the model has it at their mean, and what goals
+say in its pixels is said anew; but only where a camera that stands, or static points, prove that it was not the arm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.change.hypothesis_test import chi2_quantile
+from stereoservo.core.context import Emit, RefusalError, StepContext
+from stereoservo.core.monitor_state import MOVED, MobileCamera, ModelDiagnosis, standing_camera
+from stereoservo.core.monitors.camera_relocalization import AT_REST, begin, carry_all, unknown_cameras
+from stereoservo.core.monitors.fault_isolation import (
+    FEWEST_ON_ARM,
+    FEWEST_STATIC,
+    LEAST_PX,
+    named,
+    thresholds_of,
+)
+from stereoservo.core.monitors.model import STALE_PERIODS
+from stereoservo.core.monitors.moving_camera_fit import (
+    FEWEST,
+    FREEDOMS,
+    Adjusted,
+    adjust,
+    angle,
+    apart,
+    late_alone,
+    moved_matrix,
+    pixels_of,
+)
+from stereoservo.core.move import goal_of
+from stereoservo.core.prediction import (
+    MODEL_SIGMA_PX,
+    FrameResiduals,
+    ModelArrays,
+    Prediction,
+    chain_at,
+    gate_threshold,
+    pixels_now,
+    predict,
+    with_unit_height,
+)
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import CameraEstimate, CoreState, Holding, camera_estimate
+from stereoservo.geometry.cameras import camera_centre
+from stereoservo.kinematics.kernels import (
+    exp_twist,
+    multiply4_into,
+    project_points,
+    transform_points,
+)
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.goals import FeatureTarget, IncidenceTarget, Target
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle
+from stereoservo.numerics.arrays import FloatArray
+
+REFUSED_FRAMES = 2
+"""In a row, after which a camera that nothing explains is said to move."""
+STILL_FRAMES = 10
+STILL_PX = 0.1
+"""Besides its own noise, what a camera that stands may seem to move in that time, rms: models are not exact."""
+STILL_CHANCE = 1e-4
+"""Of noise alone looking like motion, of one frame."""
+HAND_OVER_S = 2.0
+"""A camera at rest that nothing explains for so long is found anew like one that was bumped, where no goal runs."""
+
+_STILL_CHI2 = chi2_quantile(STILL_CHANCE, FREEDOMS)
+
+
+def start(
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, reanchored: tuple[str, ...], emit: Emit
+) -> None:
+    """A model is in use from here on: of the cameras ``reanchored`` alone, or (empty) of all."""
+    state.adjusted = tuple(name for name in state.adjusted if reanchored and name not in reanchored)
+    metric = arrays.metric_basis is not None
+    for c, camera in enumerate(settings.cameras):
+        if not camera.mobile or not metric:
+            state.mobile[c] = None
+        elif state.mobile[c] is None or not reanchored or camera.name in reanchored:
+            state.mobile[c] = standing_camera()
+    names = ", ".join(camera.name for camera in settings.cameras if camera.mobile)
+    if names and not metric:
+        emit(
+            "warning", name=names,
+            message=f"mobile: {names} cannot be adjusted while it moves, for the model is not metric: it is treated "
+            "like a camera that stands, and found anew at rest",
+        )  # fmt: skip
+
+
+def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...]) -> CellModel:
+    """A re-anchored model, with mobile cameras that are not among the ``reanchored`` where they stand now."""
+    if state.model is None or not reanchored:
+        return model
+    here = {camera.name: camera for camera in state.model.cameras}
+    cameras = tuple(
+        here[camera.name] if camera.name in state.adjusted and camera.name not in reanchored else camera
+        for camera in model.cameras
+    )
+    return msgspec.structs.replace(model, cameras=cameras)
+
+
+# -- every frame ----------------------------------------------------------------------------------------------
+
+
+def see(
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, sights: FrameResiduals,
+    prediction: Prediction, q: FloatArray, emit: Emit,
+) -> FrameResiduals:  # fmt: skip
+    """One frame of a camera, with the arm at ``q`` (n,) at its shutter; what of it may be compared with the model."""
+    mobile = state.mobile[camera]
+    if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
+        return sights
+    hidden = dataclasses.replace(sights, seen=np.zeros_like(sights.seen))
+    if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+        return (
+            hidden if mobile.moving else sights
+        )  # joints that a faulty drive tells are no measure of cameras
+    points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
+    basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
+    assert basis is not None
+    P = arrays.matrices[camera]
+    found = adjust(moved_matrix(P, mobile.reference), points, observed, weights, basis, gate)
+    if not mobile.moving:
+        late = late_alone(observed - pixels_of(P, points), sights.velocity, weights)
+        if late or not _sets_out(state, settings, arrays, camera, found, int((weights > 0.0).sum())):
+            return sights
+        _set_out(mobile, camera, settings, sights.t_shutter_ns, emit)
+        state.cameras[camera].rejected_frames = 0
+    mobile.seen = int((weights > 0.0).sum())
+    if found is None:
+        mobile.lost += 1
+        mobile.still, mobile.doubtful = 0, False
+    else:
+        _follow(mobile, P, points, sights, found)
+        mobile.static_moved = _static_moved(P, mobile.way, points, found.weights, len(arrays.marker_ids))
+        mobile.lost, mobile.found_ns = 0, sights.t_shutter_ns
+    return hidden
+
+
+def _known(
+    state: CoreState, arrays: ModelArrays, camera: int, sights: FrameResiduals, prediction: Prediction,
+    q: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Points (k, 4) where the joints ``q``, corrected, have them, with the static ones; what the camera saw of them
+    (k, 2) and its weights (k,) [1/px].
+    """
+    H = chain_at(arrays, q + state.correction)[0]
+    points = np.concatenate((transform_points(H, arrays.marker_points), arrays.scene_points))
+    observed = np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])) + sights.innovation
+    variance = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
+    weights = np.where(sights.seen, 1.0 / np.sqrt(variance), 0.0)
+    weights[: len(state.watching.masked)] *= 1.0 - state.watching.masked
+    return points, observed, weights
+
+
+def _follow(
+    mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameResiduals, found: Adjusted
+) -> None:
+    """Where the camera is by a frame that was explained, and whether it has moved since the frames before."""
+    then = moved_matrix(P, mobile.reference)
+    way = np.empty((4, 4))
+    multiply4_into(mobile.reference, found.D, way)
+    used = found.weights > 0.0
+    distance = apart(then, moved_matrix(P, way), points, used)
+    noise = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1])
+    # The pixels of an estimate of six parameters deviate by chi-square of six freedoms in all; of two, by twice that.
+    random = math.sqrt(2.0 * _STILL_CHI2 * float(noise[used].sum())) / float(used.sum())
+    if mobile.still == 0 or distance > STILL_PX + random:
+        mobile.reference = way
+        mobile.twists = np.zeros(FREEDOMS)
+        mobile.still, mobile.doubtful = 1, False
+    else:
+        mobile.twists = mobile.twists + found.twist
+        mobile.still += 1
+    mobile.way = way
+    mobile.moved_px = apart(P, moved_matrix(P, way), points, used)
+
+
+def _static_moved(
+    P: FloatArray, way: FloatArray, points: FloatArray, weights: FloatArray, markers: int
+) -> bool:  # fmt: skip
+    """Whether enough static points, behind the ``markers`` in ``points``, moved in the picture with the camera."""
+    static = weights > 0.0
+    static[:markers] = False
+    return int(static.sum()) >= FEWEST_STATIC and apart(P, moved_matrix(P, way), points, static) >= LEAST_PX
+
+
+def _sets_out(
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, found: Adjusted | None, seen: int
+) -> bool:  # fmt: skip
+    """Whether a frame says that a camera that stood moves: a displacement explains it that is no noise, or nothing
+    does, and the frames before it were refused, too.
+    """
+    if _others_contradict(state, settings):
+        return False
+    if found is None:
+        return seen >= FEWEST and state.cameras[camera].rejected_frames >= REFUSED_FRAMES
+    ratio = thresholds_of(settings, len(arrays.marker_ids), len(settings.cameras)).ratios[FREEDOMS]
+    return bool(found.before - found.chi2 > ratio)
+
+
+def _set_out(mobile: MobileCamera, camera: int, settings: CoreSettings, now_ns: int, emit: Emit) -> None:
+    mobile.moving, mobile.since_ns, mobile.found_ns = True, now_ns, now_ns
+    name = settings.cameras[camera].name
+    message = f"camera {name} moves: it is adjusted in every frame, and used again once it stands"
+    emit("health", message=message, name="camera_moving", cameras=(name,))
+
+
+def _others_contradict(state: CoreState, settings: CoreSettings) -> bool:
+    """Whether cameras that stand for good refuse what they see, too: then it is not this camera."""
+    return any(
+        estimate.rejected_frames > 0
+        for camera, estimate in zip(settings.cameras, state.cameras, strict=True)
+        if not camera.mobile
+    )
+
+
+# -- every step -----------------------------------------------------------------------------------------------
+
+
+def takes(context: StepContext) -> bool:
+    """Whether the watch says that cameras have moved, and all of them are mobile: then they are adjusted."""
+    state = context.state
+    verdict = state.watching.verdict
+    if verdict.kind not in MOVED:
+        return False
+    named = [c for c, camera in enumerate(context.settings.cameras) if camera.name in verdict.subjects]
+    if any(state.mobile[c] is None for c in named) or unknown_cameras(state):
+        return False
+    for c in named:
+        mobile = state.mobile[c]
+        assert mobile is not None
+        if not mobile.moving:
+            _set_out(mobile, c, context.settings, context.now_ns, context.emit)
+    state.watching.verdict, state.watching.last = ModelDiagnosis(), []
+    return True
+
+
+def step(context: StepContext) -> StepContext:
+    """Use cameras that stand again; the present with what is known now."""
+    state, settings = context.state, context.settings
+    if context.arrays is None:
+        return context
+    for c, mobile in enumerate(state.mobile):
+        if mobile is None or not mobile.moving:
+            continue
+        if settings.cameras[c].name in unknown_cameras(state):
+            state.mobile[c] = standing_camera()  # it is found anew at rest
+        elif mobile.still >= STILL_FRAMES and state.planning is None and not state.pending_reanchored:
+            mobile.doubtful = not _proven(c, context)
+            if not mobile.doubtful:
+                context = _stand(c, mobile, context)
+            elif mobile.moved_px < LEAST_PX:
+                _stand_as_before(c, context)
+        elif mobile.lost:
+            _hand_over(c, mobile, context)
+    return context
+
+
+def _proven(c: int, context: StepContext) -> bool:
+    """Whether it was the camera that moved, and not the arm that stands elsewhere than its joints say.
+
+    Another camera that is not on its way sees the arm, a mobile one where the joints say; or static points moved.
+    """
+    state, m = context.state, len(context.state.watching.masked)
+    mobile = state.mobile[c]
+    if mobile is not None and mobile.static_moved:
+        return True
+    for d, camera in enumerate(context.settings.cameras):
+        sighting, other = state.watching.sightings[d], state.mobile[d]
+        age_s = (context.now_ns - sighting.t_ns) * 1e-9
+        recent = not sighting.looked or age_s * camera.rate_hz <= STALE_PERIODS
+        stands = other is None or (not other.moving and state.cameras[d].rejected_frames == 0)
+        if d != c and stands and recent and int(sighting.seen[:m].sum()) >= FEWEST_ON_ARM:
+            return True
+    return False
+
+
+def _stand_as_before(c: int, context: StepContext) -> None:
+    """What looked like a moving camera has passed: the camera stands where the model has it."""
+    name = context.settings.cameras[c].name
+    context.state.mobile[c] = standing_camera()
+    message = f"camera {name} shows what it showed before it seemed to set out: it stands where it stood"
+    context.emit("health", name="ok", message=message, cameras=(name,))
+
+
+def _stand(c: int, mobile: MobileCamera, context: StepContext) -> StepContext:
+    """The camera is where the mean of the frames that agree has it."""
+    state, arrays, model = context.state, context.arrays, context.state.model
+    assert arrays is not None
+    assert model is not None
+    assert context.weights is not None
+    name = context.settings.cameras[c].name
+    way = mean_way(mobile, arrays)
+    matrices = arrays.matrices.copy()
+    matrices[c] = moved_matrix(arrays.matrices[c], way)
+    new = _arrays_with(arrays, matrices)
+    carry_all(new, (c,), (model.epoch, model.epoch), context)
+    state.model = msgspec.structs.replace(
+        model,
+        cameras=tuple(
+            msgspec.structs.replace(camera, matrix=matrices[c].copy()) if camera.name == name else camera
+            for camera in model.cameras
+        ),
+    )
+    state.adjusted = (*state.adjusted, *(() if name in state.adjusted else (name,)))
+    state.mobile[c] = standing_camera()
+    estimate = state.cameras[c]
+    estimate.seen_ns[:] = 0
+    estimate.innovation[:] = 0.0
+    context.emit(
+        "camera_adjusted", id=goal_of(state.source), name=name, cameras=(name,), matrix=matrices[c].copy(),
+        epoch=model.epoch,
+        message=f"camera {name} stands again, {(context.now_ns - mobile.since_ns) * 1e-9:.1f} s after it set out: "
+        f"turned by {math.degrees(angle(way)):.3g} degrees, its picture moved by {mobile.moved_px:.3g} px",
+    )  # fmt: skip
+    prediction = predict(new, context.q)
+    weights = context.weights.copy()
+    weights[c] = 0.0
+    return dataclasses.replace(
+        context, arrays=new, prediction=prediction, weights=weights, pixels=pixels_now(prediction, state.cameras)
+    )  # fmt: skip
+
+
+def mean_way(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:
+    """Displacement (4, 4) from where the camera stood to the mean of the frames that agree."""
+    assert arrays.metric_basis is not None
+    twist = mobile.twists / max(float(mobile.still), 1.0)
+    way = np.empty((4, 4))
+    multiply4_into(mobile.reference, exp_twist((twist[:, None, None] * arrays.metric_basis).sum(axis=0)), way)
+    return way
+
+
+def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
+    """A camera that rests, sees enough and is lost all the same is found anew like one that was bumped."""
+    state, settings = context.state, context.settings
+    waited_s = (context.now_ns - mobile.found_ns) * 1e-9
+    resting = bool((np.abs(state.command) < AT_REST).all())
+    if (
+        waited_s < HAND_OVER_S
+        or mobile.seen < FEWEST
+        or not settings.reanchor
+        or state.reanchoring is not None
+    ):
+        return
+    if resting and isinstance(state.source, Holding) and not state.queue and state.planning is None:
+        name = settings.cameras[c].name
+        text = f"camera {name} moved, and no frame of it was explained for {waited_s:.1f} s"
+        begin(ModelDiagnosis("camera_moved", (name,), moved_px=mobile.moved_px, text=text), context)
+
+
+# -- what others ask ------------------------------------------------------------------------------------------
+
+
+def to_look_from(
+    arrays: ModelArrays, context: StepContext
+) -> tuple[ModelArrays, Prediction, list[CameraEstimate], tuple[str, ...]]:
+    """For the priors: the model and its prediction with moving cameras where they are now, what cameras said, and
+    those of whose place nothing is known.
+    """
+    state, settings = context.state, context.settings
+    assert context.prediction is not None
+    unknown = unknown_cameras(state)
+    moving = [c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving]
+    if not moving:
+        return arrays, context.prediction, state.cameras, unknown
+    matrices, cameras = arrays.matrices.copy(), list(state.cameras)
+    for c in moving:
+        mobile = state.mobile[c]
+        assert mobile is not None
+        matrices[c] = moved_matrix(arrays.matrices[c], mobile.way)
+        cameras[c] = camera_estimate(len(arrays.marker_ids))
+        if mobile.place == "lost":
+            unknown = (*unknown, settings.cameras[c].name)
+    here = _arrays_with(arrays, matrices)
+    corrected = predict(here, context.q + state.correction)
+    pixels, jacobian = context.prediction.pixels.copy(), context.prediction.jacobian.copy()
+    pixels[moving], jacobian[moving] = corrected.pixels[moving], corrected.jacobian[moving]
+    return here, dataclasses.replace(context.prediction, pixels=pixels, jacobian=jacobian), cameras, unknown
+
+
+def moving_cameras(state: CoreState, settings: CoreSettings) -> tuple[str, ...]:
+    """Names of the cameras that move now."""
+    return tuple(
+        camera.name
+        for camera, mobile in zip(settings.cameras, state.mobile, strict=True)
+        if mobile is not None and mobile.moving
+    )
+
+
+def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
+    """What the status says of moving cameras."""
+    names = moving_cameras(state, settings)
+    if not names:
+        return ()
+    doubtful = [mobile for mobile in state.mobile if mobile is not None and mobile.moving and mobile.doubtful]
+    if len(doubtful) == len(names):
+        px = max(mobile.moved_px for mobile in doubtful)
+        hint = (
+            f"{named(names)} shows the arm {px:.3g} px rms from where its joints say: either the camera moved, or the "
+            "arm stands elsewhere than its joints say (play, joint zeros, the marker body); no camera that stands sees "
+            f"the arm, and no {FEWEST_STATIC} static points moved, to tell them apart. Let a camera that stands see "
+            "the arm, run calibrate --check, or calibrate"
+        )
+        return (Reason("CAMERAS_OR_ARM", "hold", ", ".join(names), px, LEAST_PX, "px", hint),)
+    lost = ", ".join(
+        camera.name
+        for camera, mobile in zip(settings.cameras, state.mobile, strict=True)
+        if mobile is not None and mobile.place == "lost"
+    )
+    hint = "laws go on without it until it stands"
+    if lost:
+        hint += f"; {lost}: no displacement explains what it sees, turn it back to the markers"
+    return (Reason("CAMERA_MOVING", "info", ", ".join(names), hint=hint),)
+
+
+def refuse_pixels(target: Target, state: CoreState, settings: CoreSettings) -> None:
+    """Raises RefusalError for a goal in pixels of a camera that moves: they would be those of no one place."""
+    named: set[str] = set()
+    if isinstance(target, IncidenceTarget):
+        for spec in target.incidences:
+            named |= {*spec.moving.pixels, *spec.fixed.pixels}
+        if isinstance(target.secondary, FeatureTarget):
+            named |= set(target.secondary.set_points)
+    elif isinstance(target, FeatureTarget):
+        named |= set(target.set_points)
+    refuse_moving(tuple(name for name in moving_cameras(state, settings) if name in named))
+
+
+def refuse_moving(names: tuple[str, ...]) -> None:
+    """Raises RefusalError where cameras ``names``, whose pixels are wanted, move."""
+    if names:
+        raise RefusalError(
+            "CAMERA_MOVING",
+            f"camera {', '.join(names)} moves: wait for the event camera_adjusted, or leave its pixels out",
+            subject=", ".join(names),
+        )
+
+
+def rehearse() -> None:
+    """Compile the kernels that no frame of a camera that stands needs."""
+    exp_twist(np.zeros((4, 4)))
+
+
+# -- algebra --------------------------------------------------------------------------------------------------
+
+
+def _arrays_with(arrays: ModelArrays, matrices: FloatArray) -> ModelArrays:
+    centres = np.array([camera_centre(P) for P in matrices])
+    return dataclasses.replace(
+        arrays,
+        matrices=matrices,
+        camera_centres=with_unit_height(centres, arrays.plane_at_infinity),
+        scene_pixels=project_points(matrices, arrays.scene_points)[0],
+    )

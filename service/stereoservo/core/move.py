@@ -1,0 +1,168 @@
+"""Stage 5, move: the active motion source's joint velocity, and the table of all motion sources.
+
+A motion source is a kind of state (`core.state.Source`) with what the stages must know of it, a `MotionSource`, found
+by the type of the state in `MOTION_SOURCES`. To add one: a state of its own, a step, and a line in the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.goals.servo_goal import unplanned_report
+from stereoservo.core.sources.calibration import trials_step
+from stereoservo.core.sources.check import check_step
+from stereoservo.core.sources.incidence import incidence_motion, incidence_report
+from stereoservo.core.sources.joint_move import joint_move_progress, joint_move_step, joint_report
+from stereoservo.core.sources.law import (
+    Progress,
+    activate_run,
+    awaits_plan,
+    progress_reasons,
+    run_progress,
+    servo_progress,
+    servo_progress_reasons,
+    servo_step,
+)
+from stereoservo.core.state import (
+    AwaitingAcknowledgement,
+    CalibrationMotion,
+    CheckMotion,
+    CoreState,
+    Holding,
+    IncidenceGoal,
+    Jogging,
+    JointMove,
+    ServoGoal,
+    Source,
+)
+from stereoservo.messages.goals import PlanReport
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle
+
+
+def _rest(source: Source, context: StepContext) -> SourceOutput:
+    """No motion."""
+    return SourceOutput(np.zeros_like(context.q))
+
+
+def _jog(source: Jogging, context: StepContext) -> SourceOutput:
+    """The velocity that is asked for, until the dead man's lease runs out."""
+    if context.now_ns >= source.until_ns:
+        context.state.source = Holding()
+        return SourceOutput(np.zeros_like(context.q))
+    return SourceOutput(source.velocity)
+
+
+def _nothing(source: Source) -> str:
+    return ""
+
+
+def _none(source: Source) -> None:
+    return None
+
+
+def _never(source: Source) -> bool:
+    return False
+
+
+def _always(source: Source) -> bool:
+    return True
+
+
+def _activate_joint_move(source: JointMove, context: StepContext) -> None:
+    source.renew_lease(context.now_ns)
+
+
+@dataclass(frozen=True)
+class MotionSource:
+    """What a kind of motion does, and what the stages of the core must know of it.
+
+    ``name``: in the status. ``step``: its joint velocity. ``goal``: id of the goal it works on, '' where there is none;
+    ``subject``: id that the status shows. ``label``: what ``goal_started`` names it, where it has no ``law``.
+    ``leased``: it ends when its client does not renew the lease in time. ``by_images``: it works by the images, so that
+    a frame with an impossible stamp stops the arm. ``runs_law``: its set-points rest on the model: it pauses while
+    cameras are found again, ends with a model that is suspect, and no new model is taken meanwhile. ``measures``: it
+    measures at poses, and ends with the event ``calibration_aborted``. ``acknowledge_s``: time in which a client has to
+    acknowledge that its goal is reached, None: nobody has to. ``activate``: as it begins.
+    ``waits``: for its plan, or for its client, so that `execute_goals` has to look after it. ``report``: of a goal that
+    has no plan. ``progress``: share that is done and seconds left. ``progress_reasons``: why
+    it is slow or stuck, beside the reasons of this step.
+    """
+
+    name: str
+    step: Callable[[Any, StepContext], SourceOutput]
+    goal: Callable[[Any], str] = _nothing
+    subject: Callable[[Any], str] = _nothing
+    law: Callable[[Any], str] = _nothing
+    label: str = ""
+    leased: bool = False
+    by_images: bool = False
+    runs_law: bool = False
+    measures: bool = False
+    acknowledge_s: Callable[[Any], float | None] = _none
+    activate: Callable[[Any, StepContext], None] | None = None
+    waits: Callable[[Any], bool] = _never
+    report: Callable[[Any, StepContext], PlanReport] | None = None
+    progress: Callable[[Any, StepContext], Progress] | None = None
+    progress_reasons: Callable[[Any, StepContext, tuple[Reason, ...]], tuple[Reason, ...]] | None = None
+
+
+_id, _goal_id = attrgetter("id"), attrgetter("goal.id")
+
+MOTION_SOURCES: dict[type[Any], MotionSource] = {
+    Holding: MotionSource("hold", _rest),
+    AwaitingAcknowledgement: MotionSource(
+        "acknowledge", _rest, subject=_id, acknowledge_s=attrgetter("acknowledge_s"), waits=_always
+    ),
+    Jogging: MotionSource("jog", _jog),
+    JointMove: MotionSource(
+        "joints", joint_move_step, goal=_id, subject=_id, label="joints", leased=True,
+        acknowledge_s=attrgetter("acknowledge_s"), activate=_activate_joint_move, report=joint_report,
+        progress=joint_move_progress,
+    ),
+    ServoGoal: MotionSource(
+        "law", servo_step, goal=_goal_id, subject=_goal_id, law=attrgetter("law"), leased=True, by_images=True,
+        runs_law=True, acknowledge_s=attrgetter("goal.acknowledge_s"), activate=activate_run,
+        waits=awaits_plan, report=unplanned_report, progress=servo_progress, progress_reasons=servo_progress_reasons,
+    ),
+    IncidenceGoal: MotionSource(
+        "law", incidence_motion, goal=_goal_id, subject=_goal_id, label="incidence", leased=True, by_images=True,
+        runs_law=True, acknowledge_s=attrgetter("goal.acknowledge_s"), activate=activate_run, report=incidence_report,
+        progress=run_progress, progress_reasons=progress_reasons,
+    ),
+    CalibrationMotion: MotionSource(
+        "calibrate", trials_step, goal=_id, subject=_id, leased=True, by_images=True, measures=True
+    ),
+    CheckMotion: MotionSource(
+        "check", check_step, goal=_id, subject=_id, leased=True, by_images=True, measures=True
+    ),
+}  # fmt: skip
+
+
+def goal_of(source: Source) -> str:
+    """Id of the goal that a source works on, or ''."""
+    return MOTION_SOURCES[type(source)].goal(source)
+
+
+def paused(state: CoreState) -> bool:
+    """Whether the active source must wait: in hold, after a stop, and a law while cameras are found again."""
+    return (
+        state.held
+        or state.stopped
+        or (state.reanchoring is not None and MOTION_SOURCES[type(state.source)].runs_law)
+    )
+
+
+def move(context: StepContext) -> SourceOutput:
+    """The active source's output; no motion while it is paused, and outside ACTIVE, where `execute_goals` ends it."""
+    state = context.state
+    context.paused = paused(state)
+    if context.paused or state.lifecycle != Lifecycle.ACTIVE:
+        return SourceOutput(np.zeros_like(context.q))
+    return MOTION_SOURCES[type(state.source)].step(state.source, context)

@@ -1,0 +1,145 @@
+"""Stage 7, report: a source that has finished is left, then status, reasons, priors and events of the step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.cycle import Event, Status, StepOutputs
+from stereoservo.core.goals.execute import finish
+from stereoservo.core.goals.plan import planning_reason
+from stereoservo.core.limit import SafetyResult
+from stereoservo.core.monitors import camera_relocalization, moving_camera
+from stereoservo.core.monitors.model import diagnosis_reason, health_status, shown_diagnosis
+from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.prediction import priors
+from stereoservo.core.state import Contact, CoreState
+from stereoservo.messages.reasons import Level, Reason
+from stereoservo.messages.status import Lifecycle, ModelReadiness
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import Prior
+
+LEVELS: tuple[Level, ...] = ("info", "slow", "hold", "fault")
+
+
+def report(
+    context: StepContext, motion: SourceOutput, limited: SafetyResult, events: list[Event]
+) -> StepOutputs:
+    """The outputs of the step: nothing is commanded outside ACTIVE."""
+    state = context.state
+    if motion.finished:
+        finish(motion, context)
+    state.step += 1
+    return StepOutputs(
+        command=state.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
+        status=_status(context, motion, limited),
+        priors=_priors(context),
+        events=tuple(events),
+        driver_request=state.driver_request,  # type: ignore[arg-type]
+    )
+
+
+def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
+    state, settings = context.state, context.settings
+    reasons = _reasons(context, motion, limited)
+    source = MOTION_SOURCES[type(state.source)]
+    done, left_s = (None, None) if source.progress is None else source.progress(state.source, context)
+    innovation_px, visible = {}, {}
+    for camera, estimate in zip(settings.cameras, state.cameras, strict=True):
+        innovation_px[camera.name] = estimate.rms_px
+        visible[camera.name] = estimate.last_visible
+    return Status(
+        t_ns=context.now_ns,
+        step=state.step,
+        lifecycle=str(state.lifecycle),
+        model=str(state.readiness),
+        model_epoch=0 if state.model is None else state.model.epoch,
+        source=source.name,
+        goal=source.subject(state.source),
+        law=source.law(state.source),
+        level=_level(reasons),
+        reasons=reasons,
+        positions=context.q,
+        velocities=state.velocities.copy(),
+        command_raw=motion.velocity,
+        command=state.command.copy(),
+        error_px=motion.error_px,
+        task_error=motion.task_error,
+        innovation_px=innovation_px,
+        visible=visible,
+        progress=done,
+        seconds_left=left_s,
+        health=health_status(state, settings, "" if state.reanchoring is None else state.reanchoring.phase),
+        **_load_status(state.contact, context.derived.load_limits),
+    )
+
+
+def _reasons(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> tuple[Reason, ...]:
+    """Why the arm does not do what its source wants, or may not soon."""
+    state = context.state
+    found = [*state.fault, *limited.reasons, *motion.reasons, *_refused_inputs(state)]
+    if state.reanchoring is not None:
+        found.extend(camera_relocalization.reasons(state))
+    if any(state.mobile):
+        found.extend(moving_camera.reasons(state, context.settings))
+    if state.reanchoring is None:
+        diagnosed = diagnosis_reason(shown_diagnosis(state))
+        if diagnosed is not None:
+            found.append(diagnosed)
+    explain = MOTION_SOURCES[type(state.source)].progress_reasons
+    if explain is not None and not context.paused:
+        found.extend(explain(state.source, context, tuple(found)))
+    if state.planning is not None:
+        found.append(planning_reason(state.planning))
+    if state.stopped:
+        if state.stop_reason is not None:
+            found.append(state.stop_reason)
+        found.append(Reason("STOPPED", "hold", hint="resume to go on"))
+    elif state.held:
+        found.append(Reason("HELD", "hold", hint="resume to go on"))
+    if state.readiness == ModelReadiness.SUSPECT:
+        found.append(Reason("MODEL_SUSPECT", "hold", hint="calibrate again"))
+    return tuple(found)
+
+
+def _refused_inputs(state: CoreState) -> list[Reason]:
+    """Why samples are refused, but for what already stands as the reason of a stop."""
+    latched = state.stop_reason if state.stopped else None
+    found = []
+    for refused in (state.refused_joints, *state.refused_frames):
+        reason = refused.reason
+        if reason is None or (
+            latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
+        ):
+            continue
+        found.append(reason)
+    return found
+
+
+def _priors(context: StepContext) -> tuple[Prior, ...]:
+    """What the detectors are to expect, in steps that send it."""
+    state, arrays, prediction = context.state, context.derived.arrays, context.prediction
+    if prediction is None or arrays is None or state.step % context.derived.prior_every:
+        return ()
+    cameras = state.cameras
+    unknown: tuple[str, ...] = ()
+    if state.reanchoring is not None or any(state.mobile):
+        arrays, prediction, cameras, unknown = moving_camera.to_look_from(arrays, context)
+    return priors(arrays, context.settings, prediction, cameras, state.velocities, context.now_ns, unknown)
+
+
+def _load_status(contact: Contact, limits: tuple[FloatArray, FloatArray] | None) -> dict[str, Any]:
+    """Fields of the status."""
+    effort_limits, following_limits = (None, None) if limits is None else limits
+    return {
+        "efforts": contact.efforts,
+        "following_errors": contact.following_errors,
+        "effort_limits": effort_limits,
+        "following_limits": following_limits,
+    }
+
+
+def _level(reasons: tuple[Reason, ...]) -> str:
+    """The worst level of the reasons; information is none."""
+    worst = max([LEVELS.index(reason.level) for reason in reasons], default=0)
+    return "ok" if worst == 0 else LEVELS[worst]

@@ -1,0 +1,94 @@
+"""ServoCore: one step from inputs to a joint velocity. Pure given its state: no clock, no I/O, no random number.
+
+A step is seven stages, each a module of `core`, in this order:
+
+1. `ingest`: stamps are checked before anything is used; the joints and the driver's lifecycle are those of now.
+2. `estimate`: a model that waited is taken, frames are compared at their own stamps, then the present is predicted:
+   all that follows works on one and the same present.
+3. `monitor`: the stop, then requests, then what the monitors find: before a goal is advanced or anything moves, so that
+   what must stop the arm stops it in this step, and requests are in force for the monitors (see there).
+4. `execute_goals`: plans go on, the next goal begins or is blended into, leases are watched; after the monitors, for
+   what they ended makes room for the next goal, and before the motion, so that a goal moves in the step it begins.
+5. `move`: the active motion source's velocity.
+6. `limit`: the safety stage; nothing changes a command after it.
+7. `report`: what became of it all, after the command is fixed: status, reasons, events, priors of the detectors.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stereoservo.core.context import Derived, Ingested, StepContext
+from stereoservo.core.cycle import Event, StepInputs, StepOutputs
+from stereoservo.core.estimate import estimate, load_limits
+from stereoservo.core.execute_goals import execute_goals
+from stereoservo.core.ingest import (
+    features_fresh_s,
+    frame_timeout_s,
+    ingest,
+    longest_gap_s,
+    nominal_period_ns,
+)
+from stereoservo.core.limit import limit, safety_limits
+from stereoservo.core.monitor import monitor
+from stereoservo.core.move import move
+from stereoservo.core.prediction import model_arrays
+from stereoservo.core.report import report
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import CoreState, initial_state
+
+PRIOR_RATE_HZ = 125.0
+NOTHING = Ingested(None, (), 0.0, None, (), None, ())
+
+
+class ServoCore:
+    """The servo loop's algorithm. ``state`` is all that it remembers."""
+
+    def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
+        self.settings = settings
+        self.state = initial_state(settings) if state is None else state
+        model = self.state.model
+        self._limits = safety_limits(settings, features_fresh_s(settings))
+        self._derived = Derived(
+            nominal_period_ns=nominal_period_ns(settings),
+            longest_gap_s=longest_gap_s(settings),
+            frame_timeout_s=frame_timeout_s(settings),
+            prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
+            arrays=None if model is None else model_arrays(model, settings),
+            load_limits=load_limits(settings, model),
+        )
+
+    def step(self, inputs: StepInputs) -> StepOutputs:
+        """One cycle: the seven stages, in their order."""
+        events: list[Event] = []
+        context = self._context(inputs, events)
+        ingest(context)
+        context = estimate(context)
+        monitor(context)
+        execute_goals(context)
+        motion = move(context)
+        limited = limit(context, motion, self._limits)
+        return report(context, motion, limited, events)
+
+    def _context(self, inputs: StepInputs, events: list[Event]) -> StepContext:
+        """The context before the first stage: nothing is known yet but the inputs and the state."""
+        state = self.state
+        state.driver_request = ""
+
+        def emit(kind: str, **fields: Any) -> None:
+            state.event_seq += 1
+            events.append(Event(state.event_seq, inputs.now_ns, kind, **fields))  # type: ignore[arg-type]
+
+        # Whatever the last period was, a command may change by one step of the next.
+        period_ns = min(inputs.period_ns, self._derived.nominal_period_ns)
+        return StepContext(
+            inputs,
+            inputs.now_ns,
+            period_ns * 1e-9,
+            state,
+            self.settings,
+            self._derived,
+            emit,
+            state.command,
+            NOTHING,
+        )

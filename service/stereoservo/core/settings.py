@@ -1,0 +1,288 @@
+"""What the core is told once: joints, limits, cameras, defaults. Serialisable, and part of every recording."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from stereoservo.control.law_registry import LAWS, UnknownLawError
+from stereoservo.messages.cell_file import CellFile, CellFileError, Mount, check_joints
+from stereoservo.messages.goals import LawName, PointSource
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointKindName
+
+SLACK = 1e-3  # of a cell's limits beyond the drive's, for rounding [rad or m]
+LARGEST_RANGE: dict[JointKindName, float] = {"revolute": 0.6, "prismatic": 0.2}
+"""To either side of the base, where the cell file states no range of its own [rad or m]."""
+
+
+class CameraSettings(msgspec.Struct, frozen=True):
+    """A camera as the core sees it: size [px], rate [Hz], its detector's marker ids and systematic error [px]."""
+
+    name: str
+    width: int
+    height: int
+    rate_hz: float
+    mount: Mount
+    marker_ids: tuple[int, ...]
+    systematic_px: float = 0.0
+    mobile: bool = False
+
+
+class LimitSettings(msgspec.Struct, frozen=True, eq=False):
+    """Limits in joint order: the tighter of drive and cell. ``keep_outs`` (k, n, 2) joint-space boxes.
+
+    ``command_timeout_s``: without a command for so long the drives come to rest by themselves.
+    """
+
+    position_min: FloatArray
+    position_max: FloatArray
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    position_margin: float
+    keep_outs: FloatArray
+    keep_out_names: tuple[str, ...]
+    coast_s: float
+    joint_timeout_s: float
+    speed_scale: float
+    command_timeout_s: float = 0.1
+
+
+class TrialSettings(msgspec.Struct, frozen=True, eq=False):
+    """Trial motions in joint order; see ``cellfile.CalibrationSection``.
+
+    ``range`` (n,): NaN where the programme itself finds out how far the joint may go.
+    """
+
+    base: FloatArray
+    range: FloatArray
+    stops: int
+    frames: int
+    settle_s: float
+    speed_scale: float
+    min_markers: int
+    min_range: float
+    wait_s: float
+    spread_joint: int = -1
+    """Joint that visits ``spread_offsets`` (p,) [rad or m] from its base at the stops of others; -1: none."""
+    spread_offsets: FloatArray = msgspec.field(default_factory=lambda: np.zeros(1))
+
+
+class ContactSettings(msgspec.Struct, frozen=True, eq=False):
+    """The watch on contact, in joint order; see ``cellfile.ContactSection``.
+
+    ``efforts``, ``following_errors`` (n,): stated thresholds, NaN where they are to be learnt. ``effort_units``: for
+    people.
+    """
+
+    enabled: bool
+    efforts: FloatArray
+    following_errors: FloatArray
+    factor: float
+    samples: int
+    effort_units: tuple[str, ...]
+
+
+class CoreSettings(msgspec.Struct, frozen=True, eq=False):
+    """Everything constant that a step may depend on."""
+
+    cell: str
+    joint_names: tuple[str, ...]
+    joint_kinds: tuple[JointKindName, ...]
+    cameras: tuple[CameraSettings, ...]
+    limits: LimitSettings
+    trials: TrialSettings | None
+    home: FloatArray | None
+    rate_hz: float
+    law: LawName
+    points: PointSource
+    gain: float
+    tolerance_px: float
+    hold_frames: int
+    time_limit_s: float
+    filter_s: float
+    gate_sigma: float
+    watch_following: bool = True
+    """Off where commands are computed and never written (dry run)."""
+    contact: ContactSettings | None = None
+    scene_ids: tuple[int, ...] = ()
+    """Ids that stand still for good: ``[scene] static``."""
+    reanchor: bool = True
+    """Whether a camera that was moved is found anew by itself."""
+
+    @property
+    def marker_ids(self) -> tuple[int, ...]:
+        """Every marker id that some camera can report, sorted."""
+        return tuple(sorted({i for camera in self.cameras for i in camera.marker_ids}))
+
+
+def core_settings(
+    cell: CellFile,
+    joints: JointDriverDescription,
+    cameras: tuple[CameraDescription, ...],
+    *,
+    speed_cap: float = 1.0,
+    watch_following: bool = True,
+) -> CoreSettings:
+    """Bring cell file and driver descriptions together.
+
+    ``cameras`` in the cell file's order, each with its detector's marker ids. ``speed_cap`` (0, 1] lowers the cell's
+    speed scale (commissioning). Raises CellFileError where they do not fit.
+    """
+    names = tuple(joint.name for joint in joints.joints)
+    check_joints(cell, names)
+    try:
+        LAWS[cell.servo.law]
+    except UnknownLawError as error:
+        raise CellFileError(cell.cell.name, "servo.law", str(error)) from error
+    limits = {limit.joint: limit for limit in cell.safety.limit}
+    for spec in joints.joints:
+        limit = limits[spec.name]
+        if limit.min < spec.position_min - SLACK or limit.max > spec.position_max + SLACK:
+            raise CellFileError(
+                cell.cell.name,
+                "safety.limit",
+                f"joint {spec.name!r}: {limit.min:g} to {limit.max:g} is wider than the drive's "
+                f"{spec.position_min:.4f} to {spec.position_max:.4f} (are the limits in rad?)",
+            )
+    camera_settings = tuple(
+        CameraSettings(
+            description.name, description.width, description.height, description.rate_hz, section.mount,
+            tuple(sorted(description.marker_ids)), description.systematic_px, section.mobile,
+        )
+        for section, description in zip(cell.camera, cameras, strict=True)
+    )  # fmt: skip
+    trials = None if cell.calibration is None else _trial_settings(cell, joints)
+    home = None
+    if cell.joints.home:
+        base = cell.calibration.base if cell.calibration is not None else {}
+        missing = [name for name in names if name not in cell.joints.home and name not in base]
+        if missing:
+            raise CellFileError(cell.cell.name, "joints.home", f"missing for joint(s) {', '.join(missing)}")
+        home = np.array([cell.joints.home.get(name, base.get(name, 0.0)) for name in names])
+    elif trials is not None:
+        home = trials.base
+    return CoreSettings(
+        cell=cell.cell.name,
+        joint_names=names,
+        joint_kinds=tuple(joint.kind for joint in joints.joints),
+        cameras=camera_settings,
+        limits=_limit_settings(cell, joints, speed_cap),
+        trials=trials,
+        home=home,
+        rate_hz=cell.servo.rate_hz,
+        law=cell.servo.law,
+        points=cell.servo.points,
+        gain=cell.servo.gain,
+        tolerance_px=cell.servo.tolerance_px,
+        hold_frames=cell.servo.hold_frames,
+        time_limit_s=cell.servo.time_limit_s,
+        filter_s=cell.servo.filter_s,
+        gate_sigma=cell.servo.gate_sigma,
+        watch_following=watch_following,
+        contact=_contact_settings(cell, joints),
+        scene_ids=_scene_ids(cell, camera_settings),
+        reanchor=cell.servo.reanchor == "auto",
+    )
+
+
+def _limit_settings(cell: CellFile, joints: JointDriverDescription, speed_cap: float) -> LimitSettings:
+    """The tighter of the drives' and the cell's limits, in joint order."""
+    names = tuple(joint.name for joint in joints.joints)
+    limits = {limit.joint: limit for limit in cell.safety.limit}
+    return LimitSettings(
+        position_min=np.array([max(j.position_min, limits[j.name].min) for j in joints.joints]),
+        position_max=np.array([min(j.position_max, limits[j.name].max) for j in joints.joints]),
+        velocity_max=np.array([min(j.velocity_max, limits[j.name].velocity) for j in joints.joints]),
+        acceleration_max=np.array(
+            [min(j.acceleration_max, limits[j.name].acceleration) for j in joints.joints]
+        ),
+        position_margin=cell.safety.position_margin,
+        keep_outs=np.array(
+            [[k.ranges.get(name, (-np.inf, np.inf)) for name in names] for k in cell.safety.keep_out]
+        ).reshape(len(cell.safety.keep_out), len(names), 2),
+        keep_out_names=tuple(k.name for k in cell.safety.keep_out),
+        coast_s=cell.safety.coast_s,
+        joint_timeout_s=cell.safety.joint_timeout_s,
+        speed_scale=cell.safety.speed_scale * speed_cap,
+        command_timeout_s=joints.command_timeout_s,
+    )
+
+
+def _scene_ids(cell: CellFile, cameras: tuple[CameraSettings, ...]) -> tuple[int, ...]:
+    known = {marker for camera in cameras for marker in camera.marker_ids}
+    unknown = sorted(set(cell.scene.static) - known)
+    if unknown:
+        raise CellFileError(
+            cell.cell.name,
+            "scene.static",
+            f"no camera's detector reports marker(s) {', '.join(str(i) for i in unknown)}; reported: "
+            f"{', '.join(str(i) for i in sorted(known))}",
+        )
+    body = known - set(cell.scene.static)
+    needed = 3 if cell.calibration is None else cell.calibration.min_markers
+    if cell.scene.static and len(body) < needed:
+        raise CellFileError(
+            cell.cell.name,
+            "scene.static",
+            f"leaves {len(body)} of the {len(known)} markers that the detectors report to the body that the arm moves, "
+            f"and calibration needs {needed}: name only what stands still for good",
+        )
+    return tuple(sorted(set(cell.scene.static)))
+
+
+def _contact_settings(cell: CellFile, joints: JointDriverDescription) -> ContactSettings:
+    section = cell.safety.contact
+    for key, what in (("effort", "efforts"), ("following", "following_errors")):
+        if getattr(section, key) and what in joints.lacks:
+            raise CellFileError(
+                cell.cell.name,
+                f"safety.contact.{key}",
+                f"states thresholds, and driver {joints.driver!r} is not set to tell {what.replace('_', ' ')}: nothing "
+                f"would ever stop for them. Let the drives send them ([joints.options] feedback), or leave {key} out",
+            )
+    units = joints.effort_units or tuple("N m" if j.kind == "revolute" else "N" for j in joints.joints)
+    return ContactSettings(
+        enabled=section.enabled,
+        efforts=np.array([section.effort.get(j.name, np.nan) for j in joints.joints]),
+        following_errors=np.array([section.following.get(j.name, np.nan) for j in joints.joints]),
+        factor=section.factor,
+        samples=section.samples,
+        effort_units=units,
+    )
+
+
+def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSettings:
+    section = cell.calibration
+    assert section is not None
+    names = tuple(joint.name for joint in joints.joints)
+    spread_joint, offsets = -1, np.zeros(1)
+    if section.spread is not None:
+        spread = section.spread
+        spread_joint = names.index(spread.joint)
+        limit = next(limit for limit in cell.safety.limit if limit.joint == spread.joint)
+        base, margin = section.base[spread.joint], cell.safety.position_margin + SLACK
+        room = min(limit.max - margin - base, base - limit.min - margin)
+        wanted = spread.range or section.range.get(
+            spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind]
+        )
+        if spread.range is not None and spread.range > room:
+            raise CellFileError(
+                cell.cell.name,
+                "calibration.spread.range",
+                f"is {spread.range:g}; joint {spread.joint!r} has {room:.4g} to either side of its base",
+            )
+        offsets = np.linspace(-1.0, 1.0, spread.positions) * min(wanted, room)
+    return TrialSettings(
+        base=np.array([section.base[name] for name in names]),
+        range=np.array([section.range.get(name, np.nan) for name in names]),
+        stops=section.stops,
+        frames=section.frames,
+        settle_s=section.settle_s,
+        speed_scale=section.speed_scale,
+        min_markers=section.min_markers,
+        min_range=section.min_range,
+        wait_s=section.wait_s,
+        spread_joint=spread_joint,
+        spread_offsets=offsets,
+    )

@@ -1,0 +1,535 @@
+"""The calibration programme as a motion source: each joint alone, stop after stop.
+
+From the base, joint l goes in equal steps to one side, then to the other (thesis 5.4.1, fig. 5.13). How far it goes is
+stated in the cell file, or found out on the way (`trial_planning`): as far as the markers stay in every view. At a stop
+the pixels are averaged at rest; a spread joint, where there is one, visits several positions there (fig. 5.16). A step
+that loses the markers is taken back and that side is closed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.cycle import Sample
+from stereoservo.core.monitors.joints import learnt_loads
+from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
+from stereoservo.core.sources.joint_move import ARRIVED
+from stereoservo.core.sources.measure_at_pose import (
+    at_target,
+    blocked,
+    collect_samples,
+    continue_move,
+    enter,
+    first_visit,
+    markers_lost,
+    mean_joints,
+    too_few_seen,
+    too_slow,
+    trial_settings,
+    unseen_at_base,
+)
+from stereoservo.core.state import CalibrationMotion
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import JointKindName
+
+NO_STEP = 1e-9  # a side that nothing is planned on
+MOST_STOPS = 1.5  # of calibration.stops, where a joint turns out to have more room than planned
+
+
+def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSettings) -> CalibrationMotion:
+    """The programme before its first move: to the base."""
+    trials = trial_settings(settings)
+    n = q.size
+    # One more than the positions of the spread joint: the last is that joint at its base.
+    unseen = np.full(
+        (len(trials.spread_offsets) + 1, len(settings.cameras), len(settings.marker_ids), 2), np.nan
+    )
+    return CalibrationMotion(
+        id=goal_id, lease_s=None, lease_until_ns=0, joint=-1, side=1, k=0, count=0, step=0.0, reach=np.zeros(2),
+        turn=-1, seen_turns=0, base_pixels=unseen, last=unseen.copy(), last_at=0.0, before=unseen.copy(),
+        before_at=0.0, lowest=trials.base.copy(), highest=trials.base.copy(), stops=np.zeros(n, np.int64),
+        motion_sigmas=np.zeros(n), sigma_px=0.0,
+        **first_visit(trials.base, q, now_ns, settings),  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def trials_step(trials: CalibrationMotion, context: StepContext) -> SourceOutput:
+    """One step of the programme."""
+    settings = trial_settings(context.settings)
+    if trials.phase in ("move", "return", "finish"):
+        return _move(trials, context, settings)
+    samples = collect_samples(trials, context, settings)
+    if samples is None:
+        return _rest(context)
+    return _stop_done(trials, context, settings, samples)
+
+
+def _rest(context: StepContext, *, finished: bool = False) -> SourceOutput:
+    return SourceOutput(np.zeros_like(context.q), finished=finished)
+
+
+def _move(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
+    if at_target(trials, context):
+        if trials.phase == "finish":
+            context.emit(
+                "calibration_finished", id=trials.id, message="trial motions done", progress=1.0,
+                loads=learnt_loads(trials.id, context.state.contact),
+            )  # fmt: skip
+            return _rest(context, finished=True)
+        if trials.phase == "return":
+            return _next(trials, context, settings)
+        enter(trials, "settle", context)
+        return _rest(context)
+    reason = too_slow(trials, context, settings)
+    if reason is not None:
+        return _abort(trials, context, reason)
+    if trials.phase == "move" and trials.joint >= 0 and markers_lost(trials, context, settings):
+        return _turn_done(trials, context, settings, "in motion")
+    return continue_move(trials, context, settings)
+
+
+def _stop_done(
+    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, samples: tuple[Sample, ...]
+) -> SourceOutput:
+    poorest = too_few_seen(samples, settings, context.settings.scene_ids)
+    if poorest is not None:
+        if trials.joint < 0 and trials.turn < 0:
+            return _abort(trials, context, unseen_at_base(poorest, settings, context.settings.scene_ids))
+        return _turn_done(trials, context, settings, "at the stop")
+    mean = mean_joints(trials)
+    # The base with the spread joint turned is a stop of that joint's own.
+    trial = settings.spread_joint if trials.joint < 0 and trials.turn >= 0 else trials.joint
+    context.emit(
+        "calibration_sample", id=trials.id, joints=mean, samples=samples, trial=trial,
+        progress=_progress(trials, settings),
+    )  # fmt: skip
+    _remember(trials, context, settings, samples)
+    trials.seen_turns += 1
+    return _turn_done(trials, context, settings, "", mean)
+
+
+def _remember(
+    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, samples: tuple[Sample, ...]
+) -> None:
+    """Keep the pixels for the extrapolation to the next stop, and how far the markers moved."""
+    pixels, sigmas = marker_pixels(samples, context.settings)
+    slot = _slot(trials, context, settings)
+    if trials.joint < 0:
+        trials.base_pixels[slot] = pixels
+        stated = sigmas[np.isfinite(sigmas)]
+        trials.sigma_px = max(trials.sigma_px, float(np.median(stated)))
+        return
+    trials.last[slot] = pixels
+    moved = image_motion(trials.base_pixels[slot], pixels, sigmas)
+    trials.motion_sigmas[trials.joint] = max(trials.motion_sigmas[trials.joint], moved)
+
+
+def _progress(trials: CalibrationMotion, settings: TrialSettings) -> float:
+    done = 0.0
+    if trials.joint >= 0:
+        done = trials.joint + min(1.0, float(trials.stops[trials.joint]) / settings.stops)
+    return min(1.0, done / len(trials.stops))
+
+
+# -- one stop: the positions of the spread joint ------------------------------------------------------------
+
+
+def _turns(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> int:
+    """How many positions the spread joint visits at a stop of the present joint; 0: it stays at its base."""
+    spread = settings.spread_joint
+    if spread < 0 or trials.joint == spread:
+        return 0
+    if trials.joint < 0:
+        return len(settings.spread_offsets)
+    # Only joints on the far side of the spread joint move the turned plate as one body.
+    rides = all(camera.mount == "eye_in_hand" for camera in context.settings.cameras)
+    far = trials.joint > spread if rides else trials.joint < spread
+    return len(settings.spread_offsets) if far else 0
+
+
+def _slot(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> int:
+    """Which position the spread joint has now, counted from its lowest; the last number is its base."""
+    count = len(settings.spread_offsets)
+    if trials.turn < 0 or _turns(trials, context, settings) == 0:
+        return count
+    return trials.turn if trials.k % 2 == 0 else count - 1 - trials.turn
+
+
+def _turn_to(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, turn: int) -> None:
+    """Aim the spread joint: there and back from stop to stop."""
+    trials.turn = turn
+    slot = _slot(trials, context, settings)
+    if slot < len(settings.spread_offsets):
+        spread = settings.spread_joint
+        trials.target[spread] = settings.base[spread] + settings.spread_offsets[slot]
+
+
+def _turn_done(
+    trials: CalibrationMotion,
+    context: StepContext,
+    settings: TrialSettings,
+    lost: str,
+    mean: FloatArray | None = None,
+) -> SourceOutput:
+    """Go on to the next position of the spread joint; after the last, the stop is done."""
+    turns = _turns(trials, context, settings)
+    if lost and turns:
+        name = context.settings.joint_names[settings.spread_joint]
+        context.emit(
+            "warning", id=trials.id,
+            message=f"calibration: position {trials.turn + 1} of joint {name} loses the markers {lost}; left out",
+        )  # fmt: skip
+    if trials.turn + 1 < turns:
+        _turn_to(trials, context, settings, trials.turn + 1)
+        enter(trials, "move", context)
+        return _rest(context)
+    if trials.joint < 0:
+        return _next(trials, context, settings)
+    if trials.seen_turns == 0:
+        return _back_off(trials, context, settings, lost)
+    trials.stops[trials.joint] += 1
+    if mean is not None:
+        trials.lowest = np.minimum(trials.lowest, mean)
+        trials.highest = np.maximum(trials.highest, mean)
+    if trials.step == 0.0:
+        _plan(trials, context, settings)
+    return _next(trials, context, settings)
+
+
+# -- one joint: its two sides -------------------------------------------------------------------------------
+
+
+def _next(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
+    """Choose the next stop: further on this side, the other side, the next joint, or home."""
+    while True:
+        if trials.joint >= 0:
+            if trials.step == 0.0:  # how far it may go is not known yet
+                size = probe_size(context.settings.joint_kinds[trials.joint])
+                if _aim(trials, context, settings, trials.side * size):
+                    return _rest(context)
+                _probe_failed(trials)
+                continue
+            if _further(trials, context, settings):
+                return _rest(context)
+            if trials.side > 0:
+                _other_side(trials, settings)
+                continue
+            poor = _poor(trials, context, settings)
+            if poor is not None:
+                return _abort(trials, context, poor)
+        trials.joint += 1
+        if trials.joint == len(trials.stops):
+            trials.target = settings.base.copy()
+            enter(trials, "finish", context)
+            return _rest(context)
+        _begin_joint(trials, context, settings)
+
+
+def _planned(trials: CalibrationMotion, settings: TrialSettings) -> bool:
+    return not np.isfinite(settings.range[trials.joint])
+
+
+def _begin_joint(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> None:
+    """The joint's steps, or step 0: a probe is to tell them."""
+    trials.side, trials.k, trials.step, trials.count = 1, 0, 0.0, 0
+    _at_base(trials)
+    if _planned(trials, settings):
+        trials.reach = room(trials.joint, context.settings, settings)
+        return
+    trials.step = float(2.0 * settings.range[trials.joint] / (settings.stops - 1))
+    trials.count = settings.stops // 2
+
+
+def _at_base(trials: CalibrationMotion) -> None:
+    trials.last, trials.last_at = trials.base_pixels.copy(), 0.0
+    trials.before, trials.before_at = np.full_like(trials.base_pixels, np.nan), 0.0
+
+
+def _probe_failed(trials: CalibrationMotion) -> None:
+    trials.reach[0 if trials.side > 0 else 1] = 0.0
+    if trials.side < 0:
+        trials.step, trials.count = NO_STEP, 0
+    trials.side = -1
+
+
+def _plan(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> None:
+    """After the probe: the steps of both sides; the upper one first."""
+    trials.reach, steps, counts = plan_sides(
+        trials.base_pixels, trials.last, trials.last_at, trials.reach, context.settings, settings
+    )
+    trials.side, trials.k, trials.count, trials.step = 1, 0, counts[0], max(float(steps[0]), NO_STEP)
+    _at_base(trials)
+
+
+def _other_side(trials: CalibrationMotion, settings: TrialSettings) -> None:
+    """The lower side: with the stated steps, or with what the upper one has left of the joint's stops."""
+    trials.side, trials.k = -1, 0
+    _at_base(trials)
+    if not _planned(trials, settings):
+        trials.count = settings.stops - 1 - settings.stops // 2
+        return
+    left = max(settings.stops - 1 - int(trials.stops[trials.joint]), 2)
+    trials.count = left if trials.reach[1] > 0.0 else 0
+    trials.step = max(float(trials.reach[1]) / left, NO_STEP)
+
+
+def _further(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
+    """Set out for the next stop of this side, where the markers will be seen there."""
+    offset = trials.side * (trials.k + 1) * trials.step
+    if not _planned(trials, settings):
+        if trials.k >= trials.count:
+            return False
+    elif not _promising(trials, context, settings, offset):
+        return False
+    trials.k += 1
+    if _aim(trials, context, settings, offset):
+        return True
+    trials.k -= 1
+    return False
+
+
+def _promising(
+    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float
+) -> bool:
+    """Whether a planned joint goes on to ``offset``: the plan, or the last two stops, say that the markers stay.
+
+    The plan's straight lines are corrected on the way: a side that turns out longer gets more stops.
+    """
+    if trials.k == 0 or trials.count == 0:
+        return trials.count > 0
+    most = room(trials.joint, context.settings, settings)[0 if trials.side > 0 else 1]
+    crowded = int(trials.stops[trials.joint]) >= MOST_STOPS * settings.stops
+    if trials.k >= trials.count and (abs(offset) > most or crowded):
+        return False
+    ahead = extrapolated(trials.last, trials.last_at, trials.before, trials.before_at, offset)
+    return enough_inside(ahead, context.settings, settings)
+
+
+def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float) -> bool:
+    """Set out for ``offset`` from the base, unless a limit or a keep-out forbids it."""
+    target = settings.base.copy()
+    target[trials.joint] += offset
+    why = blocked(target, [trials.joint], context)
+    if why:
+        name = context.settings.joint_names[trials.joint]
+        context.emit(
+            "warning", id=trials.id,
+            message=f"calibration: joint {name} does not go to {target[trials.joint]:+.3f} {why}; its stops end there",
+        )  # fmt: skip
+        return False
+    trials.target = target
+    trials.before, trials.before_at = trials.last, trials.last_at
+    trials.last, trials.last_at = np.full_like(trials.base_pixels, np.nan), offset
+    trials.seen_turns = 0
+    trials.turn = -1
+    if _turns(trials, context, settings):
+        _turn_to(trials, context, settings, 0)
+    enter(trials, "move", context)
+    return True
+
+
+def _back_off(
+    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, where: str
+) -> SourceOutput:
+    """Take the last step back; this side ends there, or goes on in smaller steps where it has only begun."""
+    name = context.settings.joint_names[trials.joint]
+    context.emit(
+        "warning", id=trials.id,
+        message=f"calibration: joint {name} loses the markers {where} at {context.q[trials.joint]:+.3f}; backing off",
+    )  # fmt: skip
+    trials.target = settings.base.copy()
+    if trials.step == 0.0:
+        _probe_failed(trials)
+    else:
+        trials.k -= 1
+        trials.target[trials.joint] += trials.side * trials.k * trials.step
+        smallest = 2.0 * probe_size(context.settings.joint_kinds[trials.joint])
+        if _planned(trials, settings) and trials.k == 0 and trials.step > smallest:
+            trials.step *= 0.5
+            _at_base(trials)
+        else:
+            trials.count = 0
+    enter(trials, "return", context)
+    return _rest(context)
+
+
+def _poor(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> Reason | None:
+    j = trials.joint
+    visited = float(trials.highest[j] - trials.lowest[j])
+    return too_little(
+        j, int(trials.stops[j]) + 1, visited, float(trials.motion_sigmas[j]), trials.sigma_px, context.settings,
+        settings,
+    )  # fmt: skip
+
+
+def _abort(trials: CalibrationMotion, context: StepContext, reason: Reason) -> SourceOutput:
+    context.emit("calibration_aborted", id=trials.id, message=reason.hint, reasons=(reason,))
+    return _rest(context, finished=True)
+
+
+MIN_STOPS = 4  # of one joint, the base among them
+MIN_MOTION_SIGMAS = 40.0
+"""Motion in the images below which a joint's axis drowns in the noise of its stops."""
+PROBE: dict[JointKindName, float] = {"revolute": 0.02, "prismatic": 0.005}  # [rad, m]
+BORDER = 0.03
+"""Margin kept from the border of a view, of its width."""
+KEPT = 0.75
+"""Share of the markers seen at the base that must stay inside; never fewer than ``min_markers``."""
+
+
+def probe_size(kind: JointKindName) -> float:
+    """Offset of the first small motion of a joint [rad or m]."""
+    return PROBE[kind]
+
+
+def room(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
+    """How far (2,) a joint may go upwards and downwards from its base: its limits, and a sensible largest range."""
+    limits = core.limits
+    margin = limits.position_margin + 4.0 * ARRIVED
+    base = settings.base[joint]
+    up = limits.position_max[joint] - margin - base
+    down = base - limits.position_min[joint] - margin
+    largest = LARGEST_RANGE[core.joint_kinds[joint]]
+    return np.array([min(max(float(up), 0.0), largest), min(max(float(down), 0.0), largest)])
+
+
+def marker_pixels(samples: tuple[Sample, ...], core: CoreSettings) -> tuple[FloatArray, FloatArray]:
+    """Pixels (c, m, 2) and sigmas (c, m) [px] of a stop in the cell's order, NaN where a marker was not seen."""
+    row = {camera.name: c for c, camera in enumerate(core.cameras)}
+    column = {marker: i for i, marker in enumerate(core.marker_ids)}
+    pixels = np.full((len(row), len(column), 2), np.nan)
+    sigmas = np.full((len(row), len(column)), np.nan)
+    for sample in samples:
+        c = row[sample.camera]
+        for marker, pixel, covariance in zip(sample.ids, sample.pixels, sample.covariances, strict=True):
+            i = column[int(marker)]
+            pixels[c, i] = pixel
+            sigmas[c, i] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
+    return pixels, sigmas
+
+
+def image_motion(base: FloatArray, pixels: FloatArray, sigmas: FloatArray) -> float:
+    """Mean distance of the markers from where they were at the base, in sigmas, in the camera that shows it best.
+
+    ``base``, ``pixels`` (c, m, 2), ``sigmas`` (c, m) [px].
+    """
+    distance = np.sqrt(((pixels - base) ** 2).sum(axis=-1)) / sigmas
+    best = 0.0
+    for row in distance:
+        seen = row[np.isfinite(row)]
+        if seen.size:
+            best = max(best, float(seen.sum()) / seen.size)
+    return best
+
+
+def _needed(seen: int, settings: TrialSettings) -> int:
+    return max(settings.min_markers, int(np.ceil(KEPT * seen)))
+
+
+def enough_inside(pixels: FloatArray, core: CoreSettings, settings: TrialSettings) -> bool:
+    """Whether enough of the markers (p, c, m, 2) lie inside every view by a margin; NaN: was not seen, not counted."""
+    for c, camera in enumerate(core.cameras):
+        inside = _inside(pixels[:, c], camera.width, camera.height)
+        known = np.isfinite(pixels[:, c]).all(axis=-1)
+        for seen, kept in zip(known.sum(axis=-1), (inside & known).sum(axis=-1), strict=True):
+            if seen and kept < _needed(int(seen), settings):
+                return False
+    return True
+
+
+def _inside(pixels: FloatArray, width: int, height: int) -> npt.NDArray[np.bool_]:
+    margin = BORDER * width
+    top = np.array([width, height]) - 1.0 - margin
+    inside = (pixels >= margin) & (pixels <= top)
+    return np.asarray(inside.all(axis=-1))
+
+
+def extrapolated(
+    last: FloatArray, last_at: float, before: FloatArray, before_at: float, at: float
+) -> FloatArray:
+    """Pixels (p, c, m, 2) at offset ``at`` on the straight line through those of two stops."""
+    found: FloatArray = last + (last - before) * ((at - last_at) / (last_at - before_at))
+    return found
+
+
+def plan_sides(
+    base: FloatArray, probe: FloatArray, offset: float, reach: FloatArray, core: CoreSettings,
+    settings: TrialSettings,
+) -> tuple[FloatArray, FloatArray, tuple[int, int]]:  # fmt: skip
+    """From a probe's pixels (p, c, m, 2) at ``offset``: reach (2,) up and down, steps (2,), numbers of stops.
+
+    The reach is where, on straight lines through base and probe, too few markers would be left in some view, and never
+    beyond ``reach`` (2,) as given.
+    """
+    rates = (probe - base) / offset
+    found = np.array(
+        [
+            min([float(reach[i])] + [
+                _way(base[p, c], sign * rates[p, c], camera.width, camera.height, settings)
+                for p in np.flatnonzero(np.isfinite(probe - base).any(axis=(1, 2, 3)))
+                for c, camera in enumerate(core.cameras)
+            ])
+            for i, sign in enumerate((1.0, -1.0))
+        ]
+    )  # fmt: skip
+    found[found < 2.0 * abs(offset)] = 0.0
+    total = settings.stops - 1
+    if found.sum() == 0.0:
+        return found, np.zeros(2), (0, 0)
+    up = int(np.clip(round(total * found[0] / found.sum()), 1, total - 1)) if found.all() else 0
+    counts = (up, total - up) if found.all() else ((total, 0) if found[0] > 0.0 else (0, total))
+    steps = np.array([r / count if count else 0.0 for r, count in zip(found, counts, strict=True)])
+    return found, steps, counts
+
+
+def _way(pixels: FloatArray, rates: FloatArray, width: int, height: int, settings: TrialSettings) -> float:
+    """How far markers (m, 2) may go at ``rates`` (m, 2) [px a unit] until too few are left inside."""
+    margin = BORDER * width
+    low, high = np.full(2, margin), np.array([width, height]) - 1.0 - margin
+    ways = []
+    for pixel, rate in zip(pixels, rates, strict=True):
+        if not (np.isfinite(pixel).all() and np.isfinite(rate).all()):
+            continue
+        way = np.inf
+        for x, v, a, b in zip(pixel, rate, low, high, strict=True):
+            if v != 0.0:
+                way = min(way, max(0.0, ((b if v > 0.0 else a) - x) / v))
+        ways.append(way)
+    if not ways:
+        return 0.0
+    ways.sort(reverse=True)
+    return float(ways[min(_needed(len(ways), settings), len(ways)) - 1])
+
+
+def too_little(
+    joint: int, stops: int, visited: float, motion: float, sigma_px: float, core: CoreSettings,
+    settings: TrialSettings,
+) -> Reason | None:  # fmt: skip
+    """Why a joint's trial cannot identify it, and the cure: too few stops, too small a range, or too little motion
+    in the images (``motion`` in sigmas of ``sigma_px``).
+    """
+    name = core.joint_names[joint]
+    stated = np.isfinite(settings.range[joint])
+    wider = (
+        f"raise calibration.range.{name}"
+        if stated
+        else "put the base where this joint has more room before the border of a view or its limit"
+    )
+    if stops < MIN_STOPS or visited < settings.min_range:
+        return Reason(
+            "TRIAL_TOO_SMALL", "hold", name, visited, settings.min_range, "rad or m",
+            f"joint {name} was seen at {stops} stops over {visited:.3f}; at least {MIN_STOPS} stops over "
+            f"{settings.min_range} are needed: change calibration.base so that the markers stay in view, or {wider}",
+        )  # fmt: skip
+    if motion < MIN_MOTION_SIGMAS:
+        more = MIN_MOTION_SIGMAS / max(motion, 0.1)
+        return Reason(
+            "TRIAL_TOO_SMALL", "hold", name, motion, MIN_MOTION_SIGMAS, "sigmas",
+            f"joint {name} moved the markers by {motion:.1f} sigmas of {sigma_px:.3g} px over {visited:.3f}; at least "
+            f"{MIN_MOTION_SIGMAS:g} are needed to see its axis: {wider} ({more:.1f} times as much), put the markers "
+            "farther from its axis, or lower the noise (light, larger dots, calibration.frames)",
+        )  # fmt: skip
+    return None

@@ -1,0 +1,293 @@
+"""Incidences as a goal: points, lines and planes of the body onto ones of the scene (2.5.3), as a motion source."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import numpy as np
+
+from stereoservo.control.incidence import (
+    KINDS,
+    IncidenceStatus,
+    IncidenceTask,
+    SecondTask,
+    feature_form,
+    image_task,
+    incidence_freedoms,
+    incidence_reasons,
+    incidence_step,
+    joint_task,
+    no_second_task,
+)
+from stereoservo.control.law import Scene
+from stereoservo.core.context import RefusalError, SourceOutput, StepContext
+from stereoservo.core.goals.resolve import (
+    camera_index,
+    ideal_pixel,
+    joint_index,
+    marker_index,
+    of_this_model,
+    raw_set_points,
+)
+from stereoservo.core.goals.servo_goal import no_plan, run_fields, used_cameras
+from stereoservo.core.goals.target_checks import BodyState
+from stereoservo.core.prediction import ModelArrays, points_now, with_unit_height
+from stereoservo.core.sources.law import composition_of, options, run_ended
+from stereoservo.core.state import IncidenceGoal
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.kernels import project_points, triangulate
+from stereoservo.messages.goals import Feature, Goal, IncidenceTarget, JointTarget, PlanReport
+from stereoservo.numerics.arrays import FloatArray
+
+FEATURES = ("point", "line", "plane")
+SPAN_PX = 5.0
+"""Least distance in an image between markers, or from their line, that span a line or a plane."""
+MAKEABLE = 0.999
+"""Share of the residual that joints can take away, above which the arm has the freedoms it needs."""
+SECOND_AT_REST = 5e-3
+"""Joint velocity [rad/s or m/s] below which a second task has come as far as it gets."""
+
+
+def start_incidence(
+    goal: Goal, target: IncidenceTarget, context: StepContext, place: BodyState
+) -> IncidenceGoal:
+    """The state of the incidence law before its first step. Raises RefusalError naming what makes it unusable."""
+    model = context.state.model
+    assert model is not None
+    if len(context.settings.cameras) < 2:
+        raise RefusalError(
+            "TOO_FEW_CAMERAS", "distances in space need the images of two cameras; the cell has one",
+            value=1.0, threshold=2.0, unit="cameras",
+        )  # fmt: skip
+    of_this_model(target.model_epoch, model.epoch)
+    k, n = len(target.incidences), len(context.q)
+    kinds, markers = np.zeros(k, np.int64), np.full((k, 3), -1, np.int64)
+    fixed = np.zeros((k, 3, 4))
+    names = []
+    for i, spec in enumerate(target.incidences):
+        name = f"incidence {i + 1} ({spec.kind})"
+        moving, standing = (FEATURES.index(word) for word in spec.kind.split("-on-"))
+        own = _moving(spec.moving, moving, name, place)
+        kinds[i] = KINDS.index(spec.kind)
+        markers[i, : len(own)] = own
+        fixed[i] = _fixed(spec.fixed, standing, name, place, target.model_epoch)
+        names.append(name)
+    joints, joints_wanted = np.zeros(n), np.zeros(n)
+    c, m = len(context.settings.cameras), len(place.points)
+    set_points, wanted = np.zeros((c, m, 2)), np.zeros((c, m))
+    if isinstance(target.secondary, JointTarget):
+        for joint, position in target.secondary.positions.items():
+            j = joint_index(joint, context.settings)
+            joints[j], joints_wanted[j] = position, 1.0
+    elif target.secondary is not None:
+        of_this_model(target.secondary.model_epoch, model.epoch)
+        set_points, wanted = raw_set_points(target.secondary, place)
+    source = IncidenceGoal(
+        **run_fields(goal, context, used_cameras(goal, np.ones((c, m)), context)),
+        kinds=kinds, markers=markers, fixed=fixed, names=tuple(names), joints=joints, joints_wanted=joints_wanted,
+        set_points=set_points, wanted=wanted,
+    )  # fmt: skip
+    _drivable(source, context, place)
+    source.renew_lease(context.now_ns)
+    return source
+
+
+def _one_way(feature: Feature, name: str, which: str) -> None:
+    ways = [w for w in ("markers", "points", "pixels") if getattr(feature, w)]
+    if len(ways) != 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: its {which} feature is given by {' and '.join(ways) or 'nothing'}; give one of markers, points, "
+            "pixels",
+        )
+
+
+def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> list[int]:
+    """Indices of the markers that span the moving feature."""
+    _one_way(feature, name, "moving")
+    if not feature.markers:
+        raise RefusalError("FEATURE_UNCLEAR", f"{name}: what moves is given by markers of the body")
+    own = [marker_index(marker, place.arrays) for marker in feature.markers]
+    if len(set(own)) != dimension + 1 or len(own) != dimension + 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} different markers, got "
+            f"{list(feature.markers)}",
+            value=float(len(set(own))), threshold=float(dimension + 1), unit="markers",
+        )  # fmt: skip
+    pixels, _ = project_points(place.arrays.matrices, np.ascontiguousarray(place.points[own]))
+    width = 0.0
+    for image in pixels:
+        edges = image[1:] - image[0]
+        lengths = np.sqrt((edges * edges).sum(axis=-1))
+        if dimension == 1:
+            width = max(width, float(lengths[0]))
+        elif dimension == 2:
+            area = abs(float(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]))
+            width = max(width, area / max(float(lengths.max()), 1e-9))
+    if dimension > 0 and not width > SPAN_PX:
+        raise RefusalError(
+            "COLLINEAR_MARKERS" if dimension == 2 else "FEATURE_UNCLEAR",
+            f"{name}: markers {list(feature.markers)} span no {FEATURES[dimension]}: {width:.1f} px apart",
+            value=width, threshold=SPAN_PX, unit="px",
+        )  # fmt: skip
+    return own
+
+
+def _fixed(
+    feature: Feature, dimension: int, name: str, place: BodyState, model_epoch: int | None
+) -> FloatArray:
+    """(3, 4): a point of height 1 of the fixed feature, then its directions of height 0."""
+    _one_way(feature, name, "fixed")
+    if feature.markers:
+        raise RefusalError(
+            "FEATURE_UNCLEAR", f"{name}: markers move with the body; what stands is given by points or pixels"
+        )
+    if feature.points:
+        if model_epoch is None:
+            raise RefusalError(
+                "FRAME_UNKNOWN", f"{name}: points need the goal's model_epoch, in whose frame they are"
+            )
+        points = np.array(feature.points, dtype=np.float64)
+    else:
+        points = _triangulated(feature, name, place)
+    if len(points) != dimension + 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} points, got {len(points)}",
+            value=float(len(points)), threshold=float(dimension + 1), unit="points",
+        )  # fmt: skip
+    try:
+        return feature_form(points, dimension, place.arrays.plane_at_infinity, name)
+    except GeometryError as error:
+        raise RefusalError("FEATURE_UNCLEAR", str(error)) from error
+
+
+def _triangulated(feature: Feature, name: str, place: BodyState) -> FloatArray:
+    arrays, cameras = place.arrays, place.settings.cameras
+    counts = {len(pixels) for pixels in feature.pixels.values()}
+    if len(feature.pixels) < 2 or len(counts) != 1:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: pixels of the same points in two or more cameras are needed, got "
+            + ", ".join(f"{len(p)} in {c!r}" for c, p in feature.pixels.items()),
+        )
+    count = counts.pop()
+    pixels, weights = np.zeros((len(cameras), count, 2)), np.zeros((len(cameras), count))
+    for camera_name, points in feature.pixels.items():
+        c = camera_index(camera_name, place.settings)
+        for i, (u, v) in enumerate(points):
+            pixels[c, i] = ideal_pixel(cameras[c], arrays.lenses[c], f"{name}, point {i + 1}", u, v)
+            weights[c, i] = 1.0
+    found, ok = triangulate(arrays.matrices, pixels, weights, 5)
+    if not bool(np.asarray(ok).all()):
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: its pixels' rays do not meet in points; are the cameras' pixels swapped?",
+        )
+    scaled: FloatArray = with_unit_height(found, arrays.plane_at_infinity)
+    return scaled
+
+
+def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> None:
+    """Raises RefusalError for incidences that no motion of the arm brings nearer."""
+    assert context.weights is not None
+    assert context.pixels is not None
+    scene = _scene(source, context, place.arrays, place.points, context.weights)
+    step = incidence_step(scene, _task(source), options(source, context, None))
+    if step.share < MAKEABLE:
+        _has_freedoms(source, scene, place)
+    bad = tuple(
+        reason
+        for reason in incidence_reasons(step, _task(source), source.names)
+        if reason.code != "INCIDENCE_UNSEEN"
+    )
+    if bad:
+        first = bad[0]
+        raise RefusalError(
+            first.code, f"{first.subject}: {first.hint}", subject=first.subject, value=first.value,
+            threshold=first.threshold, unit=first.unit, further=bad[1:],
+        )  # fmt: skip
+
+
+def _has_freedoms(source: IncidenceGoal, scene: Scene, place: BodyState) -> None:
+    """Raises RefusalError for an incidence that needs a freedom which the arm lacks wherever it stands."""
+    camera = f"camera {place.settings.cameras[0].name}"
+    try:
+        lacking = incidence_freedoms(
+            scene, _task(source), place.arrays.plane_at_infinity, camera=camera, anywhere=True
+        )
+    except GeometryError:
+        return  # arm and cameras tell no right angles, so there are no words: the law itself will tell
+    for name, freedom in zip(source.names, lacking, strict=True):
+        if freedom is not None:
+            raise RefusalError(
+                "INCIDENCE_NOT_DRIVABLE", f"{name}: the arm lacks a freedom that it needs: {freedom.name}",
+                subject=name,
+            )  # fmt: skip
+
+
+def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutput:
+    """One step: the incidences, and the second task in what they leave free."""
+    arrays, prediction, weights, pixels = context.arrays, context.prediction, context.weights, context.pixels
+    if arrays is None or prediction is None or weights is None or pixels is None:
+        raise AssertionError("a law runs only with a model")
+    usable = weights * source.used[:, None]
+    points = points_now(
+        arrays, context.q, prediction, pixels, usable, context.state.correction, source.points
+    )
+    scene = _scene(source, context, arrays, points, usable)
+    task, how = _task(source), options(source, context, source.error_px)
+    second = _second(source, context, scene, how.gain)
+    step = incidence_step(scene, task, how, second)
+    error_px = float(step.error_px.max())
+    resting = bool((np.abs(step.velocity) < SECOND_AT_REST).all())
+    ended = run_ended(
+        source, context, error_px if isfinite(error_px) else None, int((usable.max(axis=0) > 0.0).sum()),
+        may_end=len(second.rates) == 0 or resting,
+    )  # fmt: skip
+    if ended is not None:
+        return ended
+    still = bool((step.status == int(IncidenceStatus.NOT_FINITE)).any())
+    return SourceOutput(
+        np.zeros_like(context.q) if still else step.velocity, True, source.goal.speed_scale, error_px=source.error_px,
+        task_error=step.error_px, reasons=incidence_reasons(step, task, source.names),
+    )  # fmt: skip
+
+
+def _task(source: IncidenceGoal) -> IncidenceTask:
+    return IncidenceTask(source.kinds, source.markers, source.fixed, source.tolerance_px)
+
+
+def _scene(
+    source: IncidenceGoal, context: StepContext, arrays: ModelArrays, points: FloatArray, weights: FloatArray
+) -> Scene:
+    prediction, pixels = context.prediction, context.pixels
+    assert prediction is not None
+    assert pixels is not None
+    return Scene(
+        prediction.operators,
+        composition_of(arrays),
+        arrays.matrices,
+        arrays.camera_centres,
+        points,
+        pixels,
+        weights,
+    )
+
+
+def _second(source: IncidenceGoal, context: StepContext, scene: Scene, gain: float) -> SecondTask:
+    if bool((source.joints_wanted > 0.0).any()):
+        return joint_task(
+            context.q, source.joints, source.joints_wanted, context.settings.limits.velocity_max, gain
+        )
+    if bool((source.wanted > 0.0).any()):
+        return image_task(
+            scene.operators, scene.matrices, scene.points, source.set_points, source.wanted, gain
+        )
+    return no_second_task(len(context.q))
+
+
+def incidence_report(source: IncidenceGoal, context: StepContext) -> PlanReport:
+    """The report of an incidence goal, which has no path to plan."""
+    return no_plan("incidence", "incidences leave freedoms open", source.time_limit_s)

@@ -1,0 +1,218 @@
+"""Goals in joint space: a straight line there, checked against limits and keep-outs before anything moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.core.context import RefusalError, SourceOutput, StepContext
+from stereoservo.core.goals.resolve import joint_index
+from stereoservo.core.prediction import ModelArrays, chain_at
+from stereoservo.core.settings import CoreSettings, LimitSettings
+from stereoservo.core.state import JointMove
+from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points
+from stereoservo.messages.goals import Approach, Goal, JointTarget, PlanReport
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray
+
+APPROACH_GAIN = 15.0  # [1/s] end of a joint move
+BRAKE_SHARE = 0.6  # of the acceleration limit that a joint move plans with
+ARRIVED = 5e-4  # [rad or m]
+ARRIVED_STEPS = 5
+REPORTED = 17
+"""Samples of a way that a report holds."""
+
+
+def joint_goal(goal: Goal, target: JointTarget, context: StepContext) -> JointMove:
+    """The move to ``target``. Raises RefusalError for joints that are not there and positions beyond limits."""
+    wanted = context.q.copy()
+    for name, position in target.positions.items():
+        wanted[joint_index(name, context.settings)] = position
+    _inside_limits(wanted, context)
+    move = joint_move_to(goal.id, wanted, goal.speed_scale, context, goal.time_limit_s, goal.lease_s)
+    move.acknowledge_s = goal.acknowledge_s
+    return move
+
+
+def joint_move_to(
+    goal_id: str,
+    target: FloatArray,
+    speed_scale: float,
+    context: StepContext,
+    time_limit_s: float | None = None,
+    lease_s: float | None = None,
+) -> JointMove:
+    """A move of all joints to ``target`` (n,), as it begins."""
+    move = JointMove(
+        id=goal_id,
+        target=np.array(target),
+        start=context.q.copy(),
+        speed_scale=speed_scale,
+        started_ns=context.now_ns,
+        time_limit_s=context.settings.time_limit_s if time_limit_s is None else time_limit_s,
+        lease_s=lease_s,
+        lease_until_ns=0,
+    )
+    move.renew_lease(context.now_ns)
+    return move
+
+
+def _inside_limits(target: FloatArray, context: StepContext) -> None:
+    limits = context.settings.limits
+    for i, name in enumerate(context.settings.joint_names):
+        low, high = (
+            limits.position_min[i] + limits.position_margin,
+            limits.position_max[i] - limits.position_margin,
+        )
+        if not low <= target[i] <= high and target[i] != context.q[i]:
+            raise RefusalError(
+                "JOINT_LIMIT",
+                f"joint {name}: {target[i]:.4f} is outside {low:.4f} … {high:.4f} (limits less the margin)",
+                subject=name, value=float(target[i]), threshold=float(high if target[i] > high else low),
+                unit="rad or m",
+            )  # fmt: skip
+
+
+def joint_report(move: JointMove, context: StepContext) -> PlanReport:
+    """What the move would do. Raises RefusalError where its line meets a keep-out."""
+    settings, limits = context.settings, context.settings.limits
+    start = context.q
+    for name, box in zip(limits.keep_out_names, limits.keep_outs, strict=True):
+        share = first_inside(box, limits.position_margin, start, move.target)
+        if share is not None:
+            raise RefusalError(
+                "KEEP_OUT",
+                f"the straight way in joint space meets keep-out {name!r} at {100.0 * share:.0f} % of it: go by a goal "
+                "beside it",
+                subject=name, value=share, threshold=1.0, unit="of the way",
+            )  # fmt: skip
+    shares = tuple(k / (REPORTED - 1.0) for k in range(REPORTED))
+    joints = np.array([start + share * (move.target - start) for share in shares])
+    return PlanReport(
+        law="joints",
+        way="straight in joint space",
+        seconds=_seconds(move, limits, start),
+        approaches=(_nearest_limit(move, context),),
+        shares=shares,
+        joints={name: tuple(float(x) for x in joints[:, j]) for j, name in enumerate(settings.joint_names)},
+        pixels={} if context.arrays is None else way_pixels(joints, context.arrays, context),
+    )
+
+
+def way_pixels(
+    joints: FloatArray, arrays: ModelArrays, context: StepContext
+) -> dict[str, dict[int, tuple[tuple[float, float], ...]]]:
+    """Raw pixels of every marker at ``joints`` (k, n), by camera and marker; markers outside the image are left out."""
+    found: dict[str, dict[int, tuple[tuple[float, float], ...]]] = {}
+    pixels = np.array(
+        [
+            project_points(arrays.matrices, transform_points(chain_at(arrays, q)[0], arrays.marker_points))[0]
+            for q in joints
+        ]
+    )
+    for c, camera in enumerate(context.settings.cameras):
+        markers = {}
+        for i, marker in enumerate(arrays.marker_ids):
+            way = tuple(distort_pixel(arrays.lenses[c], float(u), float(v)) for u, v in pixels[:, c, i])
+            if bool(np.isfinite(np.array(way)).all()):
+                markers[marker] = way
+        found[camera.name] = markers
+    return found
+
+
+def first_inside(box: FloatArray, margin: float, start: FloatArray, target: FloatArray) -> float | None:
+    """Share of the line from ``start`` to ``target`` (n,) at which it enters ``box`` (n, 2), or None.
+
+    An arm that stands inside already may leave: the safety stage lets it move outwards only.
+    """
+    enters, leaves = 0.0, 1.0
+    for j in range(start.size):
+        low, high = box[j, 0] - margin, box[j, 1] + margin
+        way = float(target[j] - start[j])
+        if way == 0.0:
+            if not low <= start[j] <= high:
+                return None
+            continue
+        first, second = sorted(((low - start[j]) / way, (high - start[j]) / way))
+        enters, leaves = max(enters, float(first)), min(leaves, float(second))
+    return enters if 0.0 < enters <= leaves else None
+
+
+def _seconds(move: JointMove, limits: LimitSettings, start: FloatArray) -> float:
+    """Time of the slowest joint at its speed and its braking."""
+    distance = np.abs(move.target - start)
+    speed = limits.velocity_max * (move.speed_scale * limits.speed_scale)
+    brake = BRAKE_SHARE * limits.acceleration_max
+    return float(np.where(distance > 0.0, distance / speed + speed / brake, 0.0).max())
+
+
+def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
+    limits = context.settings.limits
+    low, high = limits.position_min + limits.position_margin, limits.position_max - limits.position_margin
+    rooms = np.minimum(move.target - low, high - move.target)
+    start_rooms = np.minimum(context.q - low, high - context.q)
+    at_end = bool(rooms.min() <= start_rooms.min())
+    rooms = rooms if at_end else start_rooms
+    joint = int(rooms.argmin())
+    value = float((move.target if at_end else context.q)[joint])
+    upper = high[joint] - value < value - low[joint]
+    return Approach(
+        "JOINT_LIMIT", context.settings.joint_names[joint], value, float((high if upper else low)[joint]),
+        float(rooms[joint]), "rad or m", 1.0 if at_end else 0.0,
+    )  # fmt: skip
+
+
+# -- every step -----------------------------------------------------------------------------------------------
+
+
+def approach_velocity(
+    q: FloatArray, target: FloatArray, settings: CoreSettings, speed_scale: float
+) -> FloatArray:
+    """Joint velocity (n,) on the straight joint-space line to ``target``, slow enough to brake on it."""
+    distance = target - q
+    length = np.maximum(np.abs(distance), 1e-12)
+    limits = settings.limits
+    speed = np.minimum(
+        limits.velocity_max * (speed_scale * limits.speed_scale),
+        np.sqrt(2.0 * BRAKE_SHARE * limits.acceleration_max * length),
+    )
+    return distance * min(float((speed / length).min()), APPROACH_GAIN)
+
+
+def arrived(q: FloatArray, target: FloatArray) -> bool:
+    """Whether every joint is within ``ARRIVED`` of its target."""
+    return bool(np.abs(target - q).max() < ARRIVED)
+
+
+def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
+    """One step of a joint move; it ends when it arrived and rested, or at its time limit."""
+    still = arrived(context.q, move.target)
+    move.settled = move.settled + 1 if still else 0
+    worst = int(np.abs(move.target - context.q).argmax())
+    if move.settled >= ARRIVED_STEPS:
+        context.emit("goal_reached", id=move.id, message="joints at target")
+        return SourceOutput(np.zeros_like(context.q), finished=True, reached=True)
+    elapsed_s = (context.now_ns - move.started_ns) * 1e-9
+    if elapsed_s > move.time_limit_s:
+        name = context.settings.joint_names[worst]
+        reason = Reason(
+            "TIME_LIMIT", "hold", name, elapsed_s, move.time_limit_s, "s",
+            f"joint {name} is {abs(move.target[worst] - context.q[worst]):.4f} from its target: is it blocked, or at "
+            "a limit?",
+        )  # fmt: skip
+        context.emit("goal_aborted", id=move.id, message="joint move not finished in time", reasons=(reason,))
+        return SourceOutput(np.zeros_like(context.q), finished=True)
+    return SourceOutput(
+        approach_velocity(context.q, move.target, context.settings, move.speed_scale),
+        speed_scale=move.speed_scale,
+    )
+
+
+def joint_move_progress(source: JointMove, context: StepContext) -> tuple[float, float]:
+    """Share [0, 1] of the joint distance that is done, and the seconds left."""
+    limits = context.settings.limits
+    whole, left = np.abs(source.target - source.start), np.abs(source.target - context.q)
+    speed = limits.velocity_max * (source.speed_scale * limits.speed_scale)
+    seconds = np.where(left > 0.0, left / speed + 0.5 * speed / (BRAKE_SHARE * limits.acceleration_max), 0.0)
+    longest = float(whole.max())
+    done = 1.0 if longest == 0.0 else 1.0 - min(1.0, float(left.max()) / longest)
+    return done, float(seconds.max())

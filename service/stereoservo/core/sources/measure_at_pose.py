@@ -1,0 +1,261 @@
+"""Measurement at a pose: move there, settle, and average the pixels of every marker; for calibration and taught goals.
+
+Pixels here are raw: no model is needed, and what is kept stays true when the lens becomes better known.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.cycle import Sample
+from stereoservo.core.monitor_state import ObservationStatistics
+from stereoservo.core.prediction import joints_at
+from stereoservo.core.settings import CoreSettings, TrialSettings
+from stereoservo.core.sources.joint_move import ARRIVED, approach_velocity, arrived
+from stereoservo.core.state import PoseMeasurement
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.ports.devices import CameraObservation
+
+
+def measurement_buffers(settings: CoreSettings) -> dict[str, Any]:
+    """Empty sums of pixel sights for every camera and every marker id of the cell."""
+    c, m = len(settings.cameras), len(settings.marker_ids)
+    return {
+        "counts": np.zeros((c, m)),
+        "sums": np.zeros((c, m, 2)),
+        "first": np.zeros((c, m, 2)),
+        "deviation_sums": np.zeros((c, m, 2)),
+        "square_sums": np.zeros((c, m)),
+        "covariance_sums": np.zeros((c, m, 2, 2)),
+        "frames": np.zeros(c, dtype=np.int64),
+    }
+
+
+def add_observation(
+    sums: ObservationStatistics,
+    settings: CoreSettings,
+    observation: CameraObservation,
+    frames_wanted: int,
+    after_ns: int,
+) -> bool:
+    """Add one frame, when its shutter opened after ``after_ns`` and its camera still lacks frames; whether it was."""
+    camera = next(i for i, c in enumerate(settings.cameras) if c.name == observation.camera)
+    if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_wanted:
+        return False
+    sums.frames[camera] += 1
+    index = {marker: i for i, marker in enumerate(settings.marker_ids)}
+    rows = [k for k in range(observation.ids.size) if int(observation.ids[k]) in index]
+    if not rows:
+        return True
+    seen = np.array([index[int(observation.ids[k])] for k in rows])
+    pixels = observation.pixels[rows]
+    known = sums.counts[camera, seen] > 0
+    # The arm is never quite at rest: what all markers do together is motion, the remainder is the detector's noise.
+    together = (pixels - sums.first[camera, seen])[known].mean(axis=0) if known.any() else np.zeros(2)
+    sums.first[camera, seen[~known]] = pixels[~known] - together
+    deviation = pixels - sums.first[camera, seen] - together
+    sums.counts[camera, seen] += 1.0
+    sums.sums[camera, seen] += pixels
+    sums.deviation_sums[camera, seen] += deviation
+    sums.square_sums[camera, seen] += (deviation * deviation).sum(axis=-1)
+    sums.covariance_sums[camera, seen] += observation.covariances[rows]
+    return True
+
+
+def averages(sums: ObservationStatistics, settings: CoreSettings) -> tuple[Sample, ...]:
+    """Mean pixels with the covariance of the mean, of markers seen in at least half of the frames.
+
+    Of the detector's covariance the systematic part does not shrink with the number of frames.
+    """
+    samples = []
+    ids = np.array(settings.marker_ids, dtype=np.int64)
+    for camera, description in enumerate(settings.cameras):
+        frames = int(sums.frames[camera])
+        seen = (sums.counts[camera] * 2 >= max(frames, 1)) & (sums.counts[camera] > 0)
+        n = sums.counts[camera, seen]
+        mean = sums.sums[camera, seen] / n[:, None]
+        systematic = (1.0 - 1.0 / n)[:, None, None] * description.systematic_px**2 * np.eye(2)
+        scatter = sums.square_sums[camera, seen] - (sums.deviation_sums[camera, seen] ** 2).sum(axis=-1) / n
+        together = float(seen.sum()) / max(
+            float(seen.sum()) - 1.0, 1.0
+        )  # one freedom in so many went with the motion
+        samples.append(
+            Sample(
+                description.name,
+                ids[seen],
+                mean,
+                sums.covariance_sums[camera, seen] / (n * n)[:, None, None] + systematic,
+                frames,
+                n,
+                together * np.maximum(scatter, 0.0) / (2.0 * np.maximum(n - 1.0, 1.0)),
+            )
+        )
+    return tuple(samples)
+
+
+FIRST_FRAME_S = 120.0  # a camera that has never delivered may still be starting
+LOST_S = 0.4  # markers missing for so long in motion: back off
+AT_REST = 0.01  # [rad/s or m/s]
+
+Phase = Literal["move", "settle", "collect", "return", "finish"]
+
+
+def trial_settings(settings: CoreSettings) -> TrialSettings:
+    """The cell's [calibration] section. Raises ValueError where it has none."""
+    if settings.trials is None:
+        raise ValueError("the cell has no [calibration] section")
+    return settings.trials
+
+
+def first_visit(target: FloatArray, q: FloatArray, now_ns: int, settings: CoreSettings) -> dict[str, object]:
+    """Fields of a ``Visiting`` that sets out from ``q`` (n,) to ``target`` (n,)."""
+    return {
+        "phase": "move",
+        "target": target.copy(),
+        "phase_ns": now_ns,
+        "start": q.copy(),
+        "sums": ObservationStatistics(**measurement_buffers(settings)),
+        "joint_sum": np.zeros(q.size),
+    }
+
+
+def enter(visit: PoseMeasurement, phase: Phase, context: StepContext) -> None:
+    """Begin a phase."""
+    visit.phase = phase
+    visit.phase_ns = context.now_ns
+    visit.start = context.q.copy()
+    visit.lost_ns = 0
+    if phase == "collect":
+        visit.sums = ObservationStatistics(**measurement_buffers(context.settings))
+        visit.joint_sum = np.zeros_like(context.q)
+        visit.joint_frames = 0
+
+
+def at_target(visit: PoseMeasurement, context: StepContext) -> bool:
+    """Whether the arm rests at the target."""
+    return arrived(context.q, visit.target) and bool((np.abs(context.state.command) < AT_REST).all())
+
+
+def continue_move(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> SourceOutput:
+    """Towards the target."""
+    velocity = approach_velocity(context.q, visit.target, context.settings, trial.speed_scale)
+    return SourceOutput(velocity, speed_scale=trial.speed_scale)
+
+
+def too_slow(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> Reason | None:
+    """The stop is not reached in three times the time it takes."""
+    elapsed_s = (context.now_ns - visit.phase_ns) * 1e-9
+    speed = context.settings.limits.velocity_max * context.settings.limits.speed_scale
+    limit_s = 5.0 + 3.0 * float((np.abs(visit.target - visit.start) / (speed * trial.speed_scale)).max())
+    if elapsed_s <= limit_s:
+        return None
+    joint = int(np.abs(visit.target - context.q).argmax())
+    name = context.settings.joint_names[joint]
+    return Reason(
+        "STOP_NOT_REACHED", "hold", name, float(context.q[joint]), float(visit.target[joint]), "rad or m",
+        f"joint {name} did not reach its stop within {limit_s:.0f} s (tolerance {ARRIVED}): a limit, a keep-out, "
+        "or a blocked joint",
+    )  # fmt: skip
+
+
+def _of_body(ids: IntArray, static: tuple[int, ...]) -> int:
+    """How many of ``ids`` are not ``static``, of the scene."""
+    return sum(int(marker) not in static for marker in ids)
+
+
+def markers_lost(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> bool:
+    """Some camera has seen too few markers for ``LOST_S``."""
+    for observation in context.observations:
+        if _of_body(observation.ids, context.settings.scene_ids) < trial.min_markers:
+            visit.lost_ns = visit.lost_ns or context.now_ns
+            return (context.now_ns - visit.lost_ns) * 1e-9 > LOST_S
+    if context.observations:
+        visit.lost_ns = 0
+    return False
+
+
+def collect_samples(
+    visit: PoseMeasurement, context: StepContext, trial: TrialSettings
+) -> tuple[Sample, ...] | None:
+    """Settle, then average frames; the samples once there are enough or waiting is over, else None."""
+    if visit.phase == "settle":
+        if (context.now_ns - visit.phase_ns) * 1e-9 >= trial.settle_s:
+            enter(visit, "collect", context)
+        return None
+    for observation in context.observations:
+        at_shutter = joints_at(context.state.history, observation.t_shutter_ns)
+        if at_shutter is None:
+            continue
+        if add_observation(visit.sums, context.settings, observation, trial.frames, visit.phase_ns):
+            visit.joint_sum += at_shutter
+            visit.joint_frames += 1
+    silent = min(estimate.last_seq for estimate in context.state.cameras) < 0
+    if silent:
+        visit.silent_ns = context.now_ns
+    # A camera that has begun at last gets the whole of wait_s for its frames.
+    begin_ns = visit.phase_ns if silent else max(visit.phase_ns, visit.silent_ns)
+    waited_s = (context.now_ns - begin_ns) * 1e-9
+    limit_s = max(trial.wait_s, FIRST_FRAME_S) if silent else trial.wait_s
+    if bool((visit.sums.frames >= trial.frames).all()) or waited_s > limit_s:
+        return averages(visit.sums, context.settings)
+    return None
+
+
+def mean_joints(visit: PoseMeasurement) -> FloatArray:
+    """Joints (n,) while it looked."""
+    mean: FloatArray = visit.joint_sum / max(visit.joint_frames, 1)
+    return mean
+
+
+def too_few_seen(
+    samples: tuple[Sample, ...], trial: TrialSettings, static: tuple[int, ...] = ()
+) -> Sample | None:
+    """The camera that saw too few markers, or too few frames, at a stop; ``static`` points do not count."""
+    for sample in sorted(samples, key=lambda sample: _of_body(sample.ids, static)):
+        if _of_body(sample.ids, static) < trial.min_markers or sample.frames < max(1, trial.frames // 2):
+            return sample
+    return None
+
+
+def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...] = ()) -> Reason:
+    """Why nothing can begin: the base shows too little; ``static`` points do not count."""
+    seen = _of_body(poorest.ids, static)
+    if poorest.frames == 0:
+        return Reason(
+            "CAMERA_SILENT", "hold", poorest.camera, 0.0, float(trial.frames), "frames",
+            f"camera {poorest.camera} delivers no frames: is it connected? See the daemon's log",
+        )  # fmt: skip
+    if seen >= trial.min_markers:
+        return Reason(
+            "CAMERA_SILENT", "hold", poorest.camera, float(poorest.frames), float(trial.frames), "frames",
+            f"camera {poorest.camera} delivered {poorest.frames} of {trial.frames} frames at the base in "
+            f"{trial.wait_s:g} s: a slow or interrupted camera; see the daemon's log, or raise calibration.wait_s",
+        )  # fmt: skip
+    return Reason(
+        "MARKERS_NOT_SEEN", "hold", poorest.camera, float(seen), float(trial.min_markers), "markers",
+        f"camera {poorest.camera} shows {seen} markers in {poorest.frames} frames at the base: "
+        "check light, focus, and that the base configuration shows the marker body to every camera",
+    )  # fmt: skip
+
+
+def blocked(target: FloatArray, moving: list[int], context: StepContext) -> str:
+    """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty where it may.
+
+    The programme never leans on the safety stage: a keep-out blocks where it meets the box that the way from here
+    to the stop spans.
+    """
+    limits = context.settings.limits
+    margin = limits.position_margin + 2.0 * ARRIVED
+    for joint in moving:
+        low, high = limits.position_min[joint] + margin, limits.position_max[joint] - margin
+        if not low <= target[joint] <= high:
+            return "(joint limit)"
+    for name, box in zip(limits.keep_out_names, limits.keep_outs, strict=True):
+        low, high = np.minimum(context.q, target), np.maximum(context.q, target)
+        if bool(((box[:, 0] - margin <= high) & (low <= box[:, 1] + margin)).all()):
+            return f"(keep-out {name})"
+    return ""

@@ -1,0 +1,199 @@
+"""A goal that moves: set-points streamed by a client, filtered, carried on between messages, and fed forward.
+
+The client's stamps order its messages and give the target's velocity (`control.filters`); between two messages, and for
+a short while after the last, the target goes on as it went. A target that cannot be is refused and the former one kept.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import numpy as np
+
+from stereoservo.control.filters import (
+    ClientClock,
+    arrived,
+    empty_track,
+    observe,
+    predict,
+)
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.resolve import (
+    MAX_GOAL_RESIDUAL_PX,
+    marker_index,
+    normalize_scale,
+    of_this_model,
+    raw_set_points,
+    refined_pose,
+)
+from stereoservo.core.goals.target_checks import MIN_MARKERS, BodyState, in_view
+from stereoservo.core.prediction import ModelArrays
+from stereoservo.core.state import ServoGoal, Stream
+from stereoservo.kinematics.kernels import project_points, transform_points
+from stereoservo.messages.goals import FeatureTarget, PointTarget, UpdateGoal
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.linear import damped_least_squares
+
+JUMP_SHARE = 0.1
+"""Of an image's width that a set-point may move by from one message to the next."""
+QUIET_S = 0.5
+"""After such a silence of the client the goal stands, and may be reached."""
+FOLLOWING_REFINEMENTS = 3
+FEED_FORWARD_DAMPING = 1e-6
+
+
+def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: BodyState, epoch: int) -> str:
+    """Move the active goal. Raises RefusalError; the goal is then where it was."""
+    if not LAWS[source.law].follows_streams:
+        able = [repr(name) for name in LAWS.surest_first() if LAWS[name].follows_streams]
+        raise RefusalError(
+            "LAW_CANNOT_FOLLOW",
+            f"law {source.law!r} follows a way that was planned for a goal that stands; stream with "
+            f"{', '.join(able[:-1])} or {able[-1]}",
+            subject=source.law,
+        )
+    of_this_model(command.target.model_epoch, epoch)
+    set_points, wanted = _set_points(command.target, place)
+    wanted = wanted * source.wanted  # what the goal is judged by stays
+    shown = int((wanted.max(axis=0) > 0.0).sum())
+    if shown < MIN_MARKERS:
+        raise RefusalError(
+            "TOO_FEW_MARKERS",
+            f"the moved target shows {shown} of the goal's markers; at least {MIN_MARKERS} are needed",
+            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
+        )  # fmt: skip
+    stream = source.stream or Stream(
+        empty_track(len(source.wanted), source.wanted.shape[1]),
+        ClientClock(),
+        context.now_ns,
+        source.set_points,
+    )
+    stamp_s = _stamp(command, stream, context)
+    _no_jump(source, set_points, wanted, context)
+    if source.pose_known:
+        _one_body(source, place, set_points, wanted)
+    source.stream = Stream(
+        observe(stream.track, stamp_s, set_points, wanted),
+        arrived(stream.clock, stamp_s, context.now_ns * 1e-9),
+        context.now_ns,
+        np.where(wanted[..., None] > 0.0, set_points, source.set_points),
+    )
+    source.renew_lease(context.now_ns)
+    return "moved"
+
+
+def _set_points(target: FeatureTarget | PointTarget, place: BodyState) -> tuple[FloatArray, FloatArray]:
+    """(c, m, 2) ideal pixels and (c, m) 1 where the target says something."""
+    if isinstance(target, FeatureTarget):
+        return raw_set_points(target, place)
+    points = np.ones_like(place.points)
+    given = np.zeros(len(points))
+    for marker, coordinates in target.points.items():
+        i = marker_index(marker, place.arrays)
+        points[i] = normalize_scale(
+            np.array(coordinates), place.arrays, f"the point of marker {marker}", str(marker)
+        )
+        given[i] = 1.0
+    pixels, _ = project_points(place.arrays.matrices, points)
+    shown = in_view(place, pixels) * given[None, :]
+    return np.where(shown[..., None] > 0.0, pixels, 0.0), shown
+
+
+def _stamp(command: UpdateGoal, stream: Stream, context: StepContext) -> float:
+    if command.stamp_s is None:
+        return context.now_ns * 1e-9
+    if not isfinite(command.stamp_s) or command.stamp_s <= stream.track.stamp_s:
+        raise RefusalError(
+            "STAMP_NOT_LATER",
+            f"stamp_s {command.stamp_s} is not later than the one before, {stream.track.stamp_s}: stamps of one stream "
+            "increase",
+            value=command.stamp_s if isfinite(command.stamp_s) else None, threshold=stream.track.stamp_s, unit="s",
+        )  # fmt: skip
+    return command.stamp_s
+
+
+def _no_jump(source: ServoGoal, set_points: FloatArray, wanted: FloatArray, context: StepContext) -> None:
+    distance = np.where(wanted > 0.0, np.sqrt(((set_points - source.set_points) ** 2).sum(axis=-1)), 0.0)
+    camera = int(distance.max(axis=-1).argmax())
+    limit = JUMP_SHARE * context.settings.cameras[camera].width
+    largest = float(distance[camera].max())
+    if largest > limit:
+        assert context.arrays is not None
+        marker = context.arrays.marker_ids[int(distance[camera].argmax())]
+        raise RefusalError(
+            "TARGET_JUMP",
+            f"marker {marker} would jump by {largest:.1f} px; a streamed target moves by at most {limit:.0f} px a "
+            "message: send a new goal for another place",
+            subject=str(marker), value=largest, threshold=limit, unit="px",
+        )  # fmt: skip
+
+
+def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, wanted: FloatArray) -> None:
+    pose = refined_pose(
+        place.arrays,
+        _basis(place.arrays, place.operators),
+        source.target_points,
+        _identity(),
+        set_points,
+        wanted,
+    )
+    if not pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
+        raise RefusalError(
+            "NOT_RIGID",
+            f"no displacement of the marker body explains the moved target: marker {pose.worst_marker} is off by "
+            f"{pose.worst_px:.2f} px (up to {MAX_GOAL_RESIDUAL_PX} px is accepted)",
+            subject=str(pose.worst_marker), value=pose.worst_px if isfinite(pose.worst_px) else None,
+            threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
+        )  # fmt: skip
+
+
+def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool:
+    """Bring the goal to where it is now; False once the client has been silent for `QUIET_S`.
+
+    It then stands where the client last said.
+    """
+    stream, prediction = source.stream, context.prediction
+    assert stream is not None
+    assert prediction is not None
+    offset_s = stream.clock.offset_s or 0.0
+    moving = (context.now_ns - stream.updated_ns) * 1e-9 <= QUIET_S
+    pixels, rates, tracked = predict(stream.track, context.now_ns * 1e-9 - offset_s)
+    given = source.wanted * tracked
+    source.set_points = (
+        np.where(given[..., None] > 0.0, pixels, source.set_points) if moving else stream.set_points
+    )
+    source.rates = rates if moving else np.zeros_like(rates)
+    if source.pose_known:
+        pose = refined_pose(
+            arrays, _basis(arrays, prediction.operators), source.target_points, _identity(), source.set_points, given,
+            FOLLOWING_REFINEMENTS,
+        )  # fmt: skip
+        source.target_points = pose.points
+        source.centre_target = transform_points(pose.displacement, source.centre_target[None])[0]
+    if not moving:
+        source.stream = None
+    return moving
+
+
+def feed_forward(source: ServoGoal, context: StepContext, active: FloatArray) -> FloatArray:
+    """Joint velocity (n,) that moves the markers as their set-points move."""
+    prediction = context.prediction
+    assert prediction is not None
+    n = prediction.operators.shape[0]
+    velocity, _ = damped_least_squares(
+        np.ascontiguousarray(prediction.jacobian).reshape(-1, n), source.rates.reshape(-1),
+        np.repeat(active.reshape(-1), 2), FEED_FORWARD_DAMPING,
+    )  # fmt: skip
+    return velocity
+
+
+def _basis(arrays: ModelArrays, operators: FloatArray) -> FloatArray:
+    return operators if arrays.metric_basis is None else arrays.metric_basis
+
+
+def _identity() -> FloatArray:
+    identity = np.zeros((4, 4))
+    for i in range(4):
+        identity[i, i] = 1.0
+    return identity

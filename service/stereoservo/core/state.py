@@ -1,0 +1,498 @@
+"""The state of the core: one versioned, serialisable value. A copy of it, and the inputs, give the same outputs."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from stereoservo.control.faces import FaceChoice, Faces
+from stereoservo.control.filters import ClientClock, TargetTrack
+from stereoservo.core.cycle import decode_array, encode_array
+from stereoservo.core.monitor_state import (
+    MobileCamera,
+    ModelMonitor,
+    ObservationStatistics,
+    Relocalization,
+    nothing_sighted,
+)
+from stereoservo.core.settings import CoreSettings
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.goals import Goal, Request
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Lifecycle, ModelReadiness
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.planning.plan import Plan
+from stereoservo.planning.planner import Planning
+
+STATE_VERSION = 7
+HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
+
+
+class JointHistory(msgspec.Struct, eq=False):
+    """Ring of joint samples: stamps [ns] and positions; ``count`` samples were ever written."""
+
+    t_ns: IntArray
+    positions: FloatArray
+    count: int = 0
+
+
+class CameraEstimate(msgspec.Struct, eq=False):
+    """What one camera said, per marker of the model.
+
+    ``innovation`` (m, 2) [px]: filtered difference observed - predicted; ``sigma`` (m,) [px] of one observation;
+    ``seen_ns`` (m,): shutter time of the last accepted sight, 0 = never.
+    """
+
+    innovation: FloatArray
+    sigma: FloatArray
+    seen_ns: IntArray
+    last_seq: int = -1
+    last_visible: int = 0
+    accepted_ns: int = 0
+    """Shutter time of the last frame with three or more accepted markers."""
+    frames: int = 0
+    rejected_frames: int = 0
+    """Consecutive frames of which the gate refused more than half of the markers."""
+    agreeing_frames: int = 0
+    """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
+    rms_px: float = 0.0
+
+
+class Refused(msgspec.Struct, eq=False):
+    """Samples of one source that `ingest` refused: how many ever, and why the newest; None once one passed again."""
+
+    count: int = 0
+    reason: Reason | None = None
+
+
+class JointLoadStatistics(msgspec.Struct, eq=False):
+    """What the trial motions ``id`` have shown of the joints' loads so far; see `kinematics.model.JointLoads`."""
+
+    id: str
+    velocities: FloatArray
+    efforts: FloatArray
+    largest_efforts: FloatArray
+    following_errors: FloatArray
+
+
+class Contact(msgspec.Struct, eq=False):
+    """What the drives say of their loads, (n,) each; see ``contact``.
+
+    ``mean_efforts``: moving mean. ``effort_excess``, ``following_excess`` (samples, n), newest last: how far the last
+    samples lay beyond what is expected. ``low``, ``high`` (2, n), of efforts and following errors: what a contact has
+    brought, and what it may take away again in the next ``leave_s`` of motion.
+    """
+
+    mean_efforts: FloatArray
+    effort_excess: FloatArray
+    following_excess: FloatArray
+    low: FloatArray
+    high: FloatArray
+    efforts: FloatArray | None = None
+    following_errors: FloatArray | None = None
+    seen_ns: int = 0
+    leave_s: float = 0.0
+    loads: JointLoadStatistics | None = None
+
+
+class Holding(msgspec.Struct, tag="hold"):
+    """No motion."""
+
+
+class AwaitingAcknowledgement(msgspec.Struct, tag="acknowledge"):
+    """No motion: goal ``id`` is reached, and the queue waits until a client acknowledges it."""
+
+    id: str
+    acknowledge_s: float
+    until_ns: int
+
+
+class Jogging(msgspec.Struct, tag="jog", eq=False):
+    """Joint velocities until the dead man's lease runs out."""
+
+    velocity: FloatArray
+    until_ns: int
+
+
+class Leased(msgspec.Struct, eq=False):
+    """A goal whose client must renew its lease, where it has one."""
+
+    lease_s: float | None
+    lease_until_ns: int
+
+    def renew_lease(self, now_ns: int) -> None:
+        """The client spoke."""
+        self.lease_until_ns = now_ns + int((self.lease_s or 0.0) * 1e9)
+
+
+class JointMove(Leased, tag="joints", eq=False, kw_only=True):
+    """A straight line in joint space to ``target`` (n,)."""
+
+    id: str
+    target: FloatArray
+    speed_scale: float
+    started_ns: int
+    time_limit_s: float
+    start: FloatArray
+    """Where it set out from (n,)."""
+    acknowledge_s: float | None = None
+    settled: int = 0
+
+
+class ProgressHistory(msgspec.Struct, eq=False):
+    """What of a law's run tells whether it gets on; see ``progress``.
+
+    ``first_px``: the largest error so far; ``mean_px`` of late; ``least_px``: the smallest such mean, improved for the
+    last time after ``least_s`` of motion. ``reasons``: what was found when it was last looked at.
+    """
+
+    first_px: float = 0.0
+    mean_px: float = 0.0
+    least_px: float = 0.0
+    least_s: float = 0.0
+    reasons: list[Reason] = []
+
+
+class Stream(msgspec.Struct, eq=False):
+    """A goal that a client moves: its filtered set-points, in the client's time, and what it said last, when.
+
+    ``set_points`` (c, m, 2): ideal pixels, as they were last said.
+    """
+
+    track: TargetTrack
+    clock: ClientClock
+    updated_ns: int
+    set_points: FloatArray
+
+
+class LawRun(Leased, eq=False, kw_only=True):
+    """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
+
+    Gains [1/s] as in `commands.AdaptiveGain`. ``moved_s``: how long it has been allowed to move; ``held``: frames that
+    the error has been inside its tolerance.
+    """
+
+    goal: Goal
+    points: str
+    gain_near: float
+    gain_far: float
+    gain_slope: float
+    tolerance_px: float
+    hold_frames: int
+    time_limit_s: float
+    started_ns: int
+    used: FloatArray
+    moved_s: float = 0.0
+    held: int = 0
+    last_frames: int = 0
+    error_px: float | None = None
+    watch: ProgressHistory = msgspec.field(default_factory=ProgressHistory)
+
+
+class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
+    """A law drives the arm to set-points.
+
+    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0, and their velocities ``rates`` [px/s].
+    ``target_points`` (m, 4): all markers at the goal, where ``pose_known``; ``target_known`` (m,): those that fixed it;
+    ``faces`` of the body, and the ``choice`` of the one that the law works on. The centre is the affine middle of the
+    markers by ``centre_weights`` (m,), or, where these are zero, the point ``centre_body`` (4,) of the body in the
+    chain's zero; ``centre_target`` (4,) at the goal. ``stream``: where the goal moves, once a client has moved it. Law
+    A planned law follows its ``plan`` for a body that was at ``start_points`` (m, 4), at ``plan_s`` of it.
+    ``goal_joints`` (n,): where a plan ends.
+    """
+
+    law: str
+    jacobian: int
+    set_points: FloatArray
+    wanted: FloatArray
+    rates: FloatArray
+    target_points: FloatArray
+    target_known: FloatArray
+    pose_known: bool
+    centre_weights: FloatArray
+    centre_body: FloatArray
+    centre_target: FloatArray
+    faces: Faces
+    choice: FaceChoice
+    stream: Stream | None = None
+    plan: Plan | None = None
+    plan_s: float = 0.0
+    start_points: FloatArray | None = None
+    goal_joints: FloatArray | None = None
+
+
+class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):
+    """Incidences of the body with the scene, and a second task in their null space.
+
+    ``kinds`` (k,), ``markers`` (k, 3), ``fixed`` (k, 3, 4) as in `control.incidence.IncidenceTask`; ``names`` (k,) for
+    people. Second task: ``joints`` (n,) where ``joints_wanted`` (n,) is 1; ``set_points`` (c, m, 2) ideal pixels where
+    ``wanted`` (c, m) is 1.
+    """
+
+    kinds: IntArray
+    markers: IntArray
+    fixed: FloatArray
+    names: tuple[str, ...]
+    joints: FloatArray
+    joints_wanted: FloatArray
+    set_points: FloatArray
+    wanted: FloatArray
+
+
+class PoseMeasurement(Leased, eq=False, kw_only=True):
+    """Goes to configurations and looks from there at rest; see ``visiting``."""
+
+    id: str
+    phase: Literal["move", "settle", "collect", "return", "finish"]
+    target: FloatArray
+    phase_ns: int
+    start: FloatArray
+    """Measured positions when the current move began."""
+    sums: ObservationStatistics
+    joint_sum: FloatArray
+    joint_frames: int = 0
+    lost_ns: int = 0
+    silent_ns: int = 0
+    """When some camera was last known never to have delivered."""
+
+
+class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
+    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base.
+
+    ``last``, ``before`` (p, c, m, 2) [px], NaN where unseen: the markers at the two outermost stops of this side, for
+    each of the p positions of the spread joint (1 without), at the offsets ``last_at``, ``before_at`` from the base.
+    """
+
+    joint: int
+    side: int
+    k: int
+    count: int
+    """Stops planned on this side."""
+    step: float
+    """Between stops of this side [rad or m]; 0 before the probe has shown how far it may go."""
+    reach: FloatArray
+    """How far the joint may go upwards and downwards (2,), where it is planned from visibility."""
+    turn: int
+    """Position of the spread joint."""
+    seen_turns: int
+    base_pixels: FloatArray
+    last: FloatArray
+    last_at: float
+    before: FloatArray
+    before_at: float
+    lowest: FloatArray
+    highest: FloatArray
+    """Range really visited, by joint."""
+    stops: IntArray
+    """Stops recorded, by joint."""
+    motion_sigmas: FloatArray
+    """Largest motion in the images between base and a stop, in sigmas, by joint."""
+    sigma_px: float
+    """Of one marker at a stop, median."""
+
+
+class CheckMotion(PoseMeasurement, tag="checking", eq=False, kw_only=True):
+    """The check motion: ``targets`` (s, n) one after the other."""
+
+    targets: FloatArray
+    index: int
+    seen: int = 0
+    """Stops at which every camera saw enough."""
+    reset_zeros: bool = False
+
+
+class TeachingState(ObservationStatistics, eq=False):
+    """Averaging of a goal that is being shown."""
+
+    name: str
+    request: int
+    frames_wanted: int
+    started_ns: int
+
+
+Purpose = Literal["reply", "queue", "ahead", "again"]
+
+
+class PlanJob(msgspec.Struct, eq=False, kw_only=True):
+    """A goal that is being planned, and the ``source`` that it comes to.
+
+    ``purpose``: to answer ``request``; the next one of the queue; the one after this, ahead; the active one anew. From
+    ``joints`` (n,) with the body at ``points`` (m, 4).
+    """
+
+    request: int
+    purpose: Purpose
+    source: ServoGoal
+    planning: Planning
+    joints: FloatArray
+    points: FloatArray
+
+
+Source = (
+    Holding
+    | AwaitingAcknowledgement
+    | Jogging
+    | JointMove
+    | ServoGoal
+    | IncidenceGoal
+    | CalibrationMotion
+    | CheckMotion
+)
+
+
+class CoreState(msgspec.Struct, eq=False):
+    """All state of the core."""
+
+    version: int
+    step: int
+    event_seq: int
+    last_step_ns: int
+    """0 before the first step."""
+    lifecycle: Lifecycle
+    readiness: ModelReadiness
+    model: CellModel | None
+    pending_model: CellModel | None
+    history: JointHistory
+    last_joints_ns: int
+    last_joints_seq: int
+    refused_joints: Refused
+    refused_frames: list[Refused]
+    """By camera."""
+    velocities: FloatArray
+    command: FloatArray
+    cameras: list[CameraEstimate]
+    source: Source
+    queue: list[Goal]
+    queued_until_ns: dict[str, int]
+    """When the leases of queued goals run out, by id."""
+    planning: PlanJob | None
+    waiting: list[Request]
+    """Answered once the goal that is being planned has its answer."""
+    ahead: ServoGoal | None
+    """The next goal of the queue, planned from where the active one ends."""
+    not_ahead: str
+    """Id of a queued goal that cannot be planned ahead of its turn."""
+    teaching: TeachingState | None
+    held: bool
+    stopped: bool
+    stop_reason: Reason | None
+    """Why the core stopped the arm; None where somebody did."""
+    fault: list[Reason]
+    driver_request: str
+    missing_travel: FloatArray
+    """Commanded less measured travel of late (n,) [rad or m]; see ``following``."""
+    untold_travel: FloatArray
+    """Commanded since the last joint sample (n,)."""
+    last_followed_ns: int
+    last_positions: FloatArray | None
+    correction: FloatArray
+    """Joint-space correction that explains the innovations best (n,)."""
+    contact: Contact
+    watching: ModelMonitor
+    reanchoring: Relocalization | None
+    """While it is not None, no law runs: its goal waits."""
+    pending_reanchored: tuple[str, ...]
+    """Of ``pending_model``: see `cycle.ModelUpdate`."""
+    mobile: list[MobileCamera | None]
+    """By camera; None for those that stand for good."""
+    adjusted: tuple[str, ...]
+    """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
+
+
+def initial_state(settings: CoreSettings) -> CoreState:
+    """The state before the first step: nothing known, nothing allowed."""
+    n = len(settings.joint_names)
+    return CoreState(
+        version=STATE_VERSION,
+        step=0,
+        event_seq=0,
+        last_step_ns=0,
+        lifecycle=Lifecycle.UNCONFIGURED,
+        readiness=ModelReadiness.NONE,
+        model=None,
+        pending_model=None,
+        history=JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, n))),
+        last_joints_ns=0,
+        last_joints_seq=-1,
+        refused_joints=Refused(),
+        refused_frames=[Refused() for _ in settings.cameras],
+        velocities=np.zeros(n),
+        command=np.zeros(n),
+        cameras=[camera_estimate(0) for _ in settings.cameras],
+        source=Holding(),
+        queue=[],
+        queued_until_ns={},
+        planning=None,
+        waiting=[],
+        ahead=None,
+        not_ahead="",
+        teaching=None,
+        held=False,
+        stopped=False,
+        stop_reason=None,
+        fault=[],
+        driver_request="",
+        missing_travel=np.zeros(n),
+        untold_travel=np.zeros(n),
+        last_followed_ns=0,
+        last_positions=None,
+        correction=np.zeros(n),
+        contact=no_contact(n, 1 if settings.contact is None else settings.contact.samples),
+        watching=nothing_sighted(len(settings.cameras), 0, n, 0),
+        reanchoring=None,
+        pending_reanchored=(),
+        mobile=[None for _ in settings.cameras],
+        adjusted=(),
+    )
+
+
+def no_contact(n: int, samples: int) -> Contact:
+    """Nothing known of the loads of ``n`` joints."""
+    return Contact(
+        np.zeros(n), np.zeros((samples, n)), np.zeros((samples, n)), np.zeros((2, n)), np.zeros((2, n))
+    )
+
+
+def camera_estimate(markers: int) -> CameraEstimate:
+    """An estimate that has seen nothing, for ``markers`` markers."""
+    return CameraEstimate(
+        innovation=np.zeros((markers, 2)), sigma=np.ones(markers), seen_ns=np.zeros(markers, np.int64)
+    )
+
+
+class StateVersionError(ValueError):
+    """A state of another version of this program; ``version`` is its own."""
+
+    def __init__(self, version: int) -> None:
+        super().__init__(
+            f"its state is of version {version}, this program works with version {STATE_VERSION}: what the core "
+            "remembers has changed in between"
+        )
+        self.version = version
+
+
+class _Versioned(msgspec.Struct):
+    """What every state says of itself, whatever else it holds."""
+
+    version: int
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
+_decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
+
+
+def encode_state(state: CoreState) -> bytes:
+    """The state as bytes, bit for bit."""
+    return _encoder.encode(state)
+
+
+def decode_state(data: bytes) -> CoreState:
+    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
+    # Asked first: a state of another version may hold other fields, too.
+    version = msgspec.msgpack.decode(data, type=_Versioned).version
+    if version != STATE_VERSION:
+        raise StateVersionError(version)
+    state: CoreState = _decoder.decode(data)
+    return state

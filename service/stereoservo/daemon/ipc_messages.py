@@ -1,0 +1,168 @@
+"""Messages between the processes of one cell: structs, their msgpack codecs, capacities and layouts of the slots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from stereoservo.core.cycle import Event, Status, decode_array, encode_array
+from stereoservo.core.settings import CoreSettings, core_settings
+from stereoservo.daemon.pacing import LoopStatistics
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.cell_file import CameraSection, CellFile
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.goals import Request
+from stereoservo.messages.recording_request import RecordedImages
+from stereoservo.ports.devices import (
+    CameraDescription,
+    CameraObservation,
+    Clock,
+    DriverContext,
+    JointDriverDescription,
+    Prior,
+)
+from stereoservo.recording.step_records import StepMessage
+
+OBSERVATION_LAYOUT = "CameraObservation.1"
+PRIOR_LAYOUT = "Prior.1"
+STATE_LAYOUT = "ServoState.1"
+OBSERVATION_CAPACITY = 1 << 16
+PRIOR_CAPACITY = 1 << 16
+STATE_CAPACITY = 1 << 16
+
+COMMISSIONING_SPEED = 0.05
+
+
+class RunPlan(msgspec.Struct, frozen=True):
+    """The configuration of one run, fixed at its start; every process reads it instead of the cell file."""
+
+    cell: CellFile
+    cell_path: str
+    runtime: str
+    state: str
+    boot: str
+    joints: JointDriverDescription
+    cameras: tuple[CameraDescription, ...]
+    seed: int = 0
+    dry_run: bool = False
+    commissioning: bool = False
+    record: str = ""
+
+    @property
+    def directories(self) -> CellDirectories:
+        """The cell's directories."""
+        return CellDirectories(self.cell.cell.name, Path(self.runtime), Path(self.state))
+
+    def driver_context(self, clock: Clock, camera: CameraSection | None = None) -> DriverContext:
+        """The context for the constructor of the joint driver, or of driver and detector of ``camera``."""
+        return DriverContext(
+            clock=clock,
+            cell=self.cell.cell.name,
+            runtime_dir=Path(self.runtime),
+            cell_dir=Path(self.cell_path).parent,
+            camera="" if camera is None else camera.name,
+            seed=self.seed,
+            mount="eye_to_hand" if camera is None else camera.mount,
+        )
+
+    def settings(self) -> CoreSettings:
+        """The core's settings. Raises CellFileError where cell file and drivers contradict each other."""
+        cap = COMMISSIONING_SPEED if self.commissioning else 1.0
+        return core_settings(
+            self.cell, self.joints, self.cameras, speed_cap=cap, watch_following=not self.dry_run
+        )
+
+
+class Hello(msgspec.Struct, frozen=True, tag="hello"):
+    """First message of the gateway; ``last_event`` is the number of the last event it has, later ones are sent."""
+
+    last_event: int
+
+
+class Heartbeat(msgspec.Struct, frozen=True, tag="heartbeat"):
+    """Sign of life of the gateway; without it a moving arm is held."""
+
+
+class Ask(msgspec.Struct, frozen=True, tag="ask"):
+    """A request for the core."""
+
+    request: Request
+
+
+class NewModel(msgspec.Struct, frozen=True, tag="model", eq=False):
+    """A model for the core. ``reanchored``: see `cycle.ModelUpdate`."""
+
+    model: CellModel
+    reanchored: tuple[str, ...] = ()
+
+
+ToServo = Hello | Heartbeat | Ask | NewModel
+
+
+class ServoState(msgspec.Struct, frozen=True, eq=False):
+    """State of the servo process, published some tens of times a second."""
+
+    status: Status
+    loop: LoopStatistics
+    driver_configured: bool
+    driver_active: bool
+    gateway: bool
+    records_dropped: int
+    differences: tuple[str, ...]
+    """Reasons why the drives were sent something other than the core's command; empty where they were not."""
+
+
+class Report(msgspec.Struct, frozen=True):
+    """A message of a vision process or the supervisor that the gateway passes on to clients."""
+
+    origin: str
+    kind: str
+    message: str
+    t_ns: int
+    images: RecordedImages | None = None
+    """Of a recording of images that has ended."""
+
+
+class PlanError(Exception):
+    """The run plan of a cell cannot be read."""
+
+
+def _encoder() -> msgspec.msgpack.Encoder:
+    return msgspec.msgpack.Encoder(enc_hook=encode_array)
+
+
+_any_encoder = _encoder()
+to_servo_decoder = msgspec.msgpack.Decoder(ToServo, dec_hook=decode_array)
+event_decoder = msgspec.msgpack.Decoder(Event, dec_hook=decode_array)
+state_decoder = msgspec.msgpack.Decoder(ServoState, dec_hook=decode_array)
+observation_decoder = msgspec.msgpack.Decoder(CameraObservation, dec_hook=decode_array)
+prior_decoder = msgspec.msgpack.Decoder(Prior, dec_hook=decode_array)
+steps_decoder = msgspec.msgpack.Decoder(StepMessage, dec_hook=decode_array)
+report_decoder = msgspec.msgpack.Decoder(Report)
+_plan_decoder = msgspec.msgpack.Decoder(RunPlan)
+
+
+def encode(message: Any) -> bytes:
+    """Any of these structs as msgpack, arrays bit for bit."""
+    return _any_encoder.encode(message)
+
+
+def save_plan(plan: RunPlan) -> None:
+    """Write the plan into the runtime directory."""
+    path = Path(plan.runtime) / "plan.msgpack"
+    temporary = path.with_suffix(".new")
+    temporary.write_bytes(encode(plan))
+    temporary.replace(path)
+
+
+def load_plan(runtime: Path) -> RunPlan:
+    """Read the plan of the cell whose runtime directory this is. Raises PlanError."""
+    path = runtime / "plan.msgpack"
+    try:
+        return _plan_decoder.decode(path.read_bytes())
+    except OSError as error:
+        raise PlanError(f"{path}: {error.strerror}; this process is started by `stereoservo run`") from error
+    except msgspec.MsgspecError as error:
+        raise PlanError(f"{path}: {error}") from error

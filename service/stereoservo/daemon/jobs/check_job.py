@@ -1,0 +1,108 @@
+"""Check process: pixels of a check motion in, report on the model out; short-lived and niced like a fit.
+
+``python -m stereoservo.daemon.jobs.check_job CHECK.npz MODEL.json HISTORY.jsonl --limit-px X`` prints one JSON object:
+``{"check": …}`` with the report, or ``{"error": …}`` with exit code 1. The report is added to the history. With
+``--reset-to NEW.json --epoch N`` a second object follows: ``{"reset": …}`` once the model with moved joint zeros is
+saved, or ``{"error": …}`` with the reason why there is none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from stereoservo.calibration.change.check_trend import find_trend
+from stereoservo.calibration.change.model_check import ModelExamination, examine_model, make_check_report
+from stereoservo.calibration.change.zero_reset import reset_zeros
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
+from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line, trials_file
+from stereoservo.kinematics.model import ModelFileError, load_model, save_model, write_atomically
+from stereoservo.messages.check_report import CheckReport, ZeroReset
+
+
+def check_and_remember(
+    check: TrialData, model_path: Path, history_path: Path, limit_px: float
+) -> tuple[ModelExamination, CheckReport]:
+    """Examine a model, find trends over earlier checks, add the report to the history.
+
+    Raises CalibrationError, ModelFileError, OSError.
+    """
+    model = load_model(model_path)
+    made_from = trials_file(model_path, model.epoch)
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    examined = examine_model(model, check, made_from=load_trials(made_from) if made_from.exists() else None)
+    report = make_check_report(examined, limit_px=limit_px, created=created)
+    history, lost = load_checks(history_path)
+    grown = find_trend([*history, report])
+    notes = [] if grown is None else [grown.message]
+    if lost:
+        notes.append(f"{lost} earlier checks in {history_path} could not be read")
+    report = msgspec.structs.replace(report, trend="; ".join(notes))
+    save_checks(history_path, [*history, report])
+    return examined, report
+
+
+def reset_and_save(examined: ModelExamination, report: CheckReport, path: Path, epoch: int) -> ZeroReset:
+    """Save the model with drifted joint zeros moved. Raises CalibrationError, ModelFileError, OSError."""
+    model, reset = reset_zeros(examined, report, epoch=epoch, created=report.created)
+    save_model(model, path)
+    return msgspec.structs.replace(reset, model=str(path))
+
+
+def main() -> int:
+    """Entry of the process."""
+    parser = argparse.ArgumentParser(prog="python -m stereoservo.daemon.jobs.check_job", description=__doc__)
+    parser.add_argument("check", type=Path)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("history", type=Path)
+    parser.add_argument("--limit-px", type=float, required=True)
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
+    parser.add_argument("--reset-to", type=Path, help="model file for the joint zeros reset")
+    parser.add_argument("--epoch", type=int, default=0)
+    arguments = parser.parse_args()
+    become_child(arguments.parent)
+    try:
+        examined, report = check_and_remember(
+            load_trials(arguments.check), arguments.model, arguments.history, arguments.limit_px
+        )
+        print_line({"check": msgspec.to_builtins(report)})
+        if arguments.reset_to is not None:
+            reset = reset_and_save(examined, report, arguments.reset_to, arguments.epoch)
+            print_line({"reset": msgspec.to_builtins(reset)})
+    except (CalibrationError, ModelFileError, OSError) as error:
+        print_line(error_line(error))
+        return 1
+    return 0
+
+
+KEPT_CHECKS = 200
+
+
+def load_checks(path: Path) -> tuple[list[CheckReport], int]:
+    """The checks kept in ``path`` (none where there is no file), and how many lines could not be read. Raises
+    OSError.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return [], 0
+    found, lost = [], 0
+    for line in lines:
+        try:
+            found.append(msgspec.json.decode(line, type=CheckReport))
+        except msgspec.MsgspecError:
+            lost += 1
+    return found, lost
+
+
+def save_checks(path: Path, checks: list[CheckReport]) -> None:
+    """Write the newest ``KEPT_CHECKS`` checks. Raises OSError."""
+    write_atomically(path, b"".join(msgspec.json.encode(check) + b"\n" for check in checks[-KEPT_CHECKS:]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

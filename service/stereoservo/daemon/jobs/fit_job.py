@@ -1,0 +1,146 @@
+"""Fit process: trial data in, model file and report out; short-lived and niced, so that the loop is not disturbed.
+
+``python -m stereoservo.daemon.jobs.fit_job TRIALS.npz MODEL.json --epoch N`` prints one JSON object a line:
+``{"progress": …, "message": …}``, then ``{"model": …, "verdict": …}`` or ``{"error": …}``, and last ``{"report": …}``
+or ``{"report_error": …}``. Exit code 1 where there is no model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.fit_assessment import Acceptance, assess_failure, assess_fit, depth_spread
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
+from stereoservo.daemon.process_control import die_with_parent
+from stereoservo.geometry.distortion import LensEstimate
+from stereoservo.kinematics.model import ModelFileError, save_model, write_atomically
+
+NICENESS = 10
+
+
+def print_line(line: dict[str, Any]) -> None:
+    """One JSON object on stdout."""
+    sys.stdout.write(msgspec.json.encode(line, enc_hook=_plain).decode() + "\n")
+    sys.stdout.flush()
+
+
+def error_line(error: Exception) -> dict[str, Any]:
+    """An error as a line: its code, its text and the values that it speaks of."""
+    if isinstance(error, CalibrationError):
+        return {"error": {"code": error.code, "message": str(error), "data": error.data}}
+    return {"error": {"code": type(error).__name__, "message": str(error), "data": {}}}
+
+
+def become_child(parent: int) -> None:
+    """Nice, and gone with ``parent`` where there is one."""
+    if parent:
+        die_with_parent(parent, signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICENESS)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return str(value)
+
+
+def _progress(stage: str, fraction: float) -> None:
+    print_line({"progress": fraction, "message": stage})
+
+
+def fit_trials(
+    trials: TrialData,
+    model_path: Path,
+    epoch: int,
+    *,
+    progress: Callable[[str, float], None] | None = None,
+    lens_priors: Mapping[str, LensEstimate] | None = None,
+) -> tuple[CalibrationFit, Acceptance]:
+    """Fit trial data, save the model and the fit's figures; returns the fit and its assessment.
+
+    Raises CalibrationError, ModelFileError, OSError.
+    """
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    result = fit_model(trials, epoch=epoch, created=created, progress=progress, lens_priors=lens_priors)
+    save_model(result.model, model_path)
+    figures = msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n"
+    write_atomically(figures_file(model_path), figures)
+    return result, assess_fit(result.model, result.report, depth_spread(result.model, trials))
+
+
+def report_fit(
+    trials: TrialData, trials_path: Path, model_path: Path, result: CalibrationFit | None, said: Acceptance
+) -> Path:
+    """Write the report of a fit, or of a failure (``result`` None), beside the model. Raises OSError."""
+    # matplotlib is slow to import; the model must not wait for it.
+    from stereoservo.daemon.jobs.calibration_report import write_report
+
+    return write_report(
+        report_folder(model_path), trials, said, trials_path=trials_path,
+        model=None if result is None else result.model, report=None if result is None else result.report,
+    )  # fmt: skip
+
+
+def main() -> int:
+    """Entry of the process."""
+    parser = argparse.ArgumentParser(prog="python -m stereoservo.daemon.jobs.fit_job", description=__doc__)
+    parser.add_argument("trials", type=Path)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("--epoch", type=int, required=True)
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
+    arguments = parser.parse_args()
+    become_child(arguments.parent)
+    result: CalibrationFit | None = None
+    try:
+        trials = load_trials(arguments.trials)
+    except CalibrationError as error:
+        print_line(error_line(error))
+        return 1
+    try:
+        result, said = fit_trials(trials, arguments.model, arguments.epoch, progress=_progress)
+        print_line(
+            {"model": str(arguments.model), "epoch": arguments.epoch, "verdict": msgspec.to_builtins(said)}
+        )
+    except CalibrationError as error:
+        print_line(error_line(error))
+        said = assess_failure(error.code, error.message)
+    except (ModelFileError, OSError) as error:
+        print_line(error_line(error))
+        return 1
+    try:
+        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, said))})
+    except OSError as error:
+        print_line({"report_error": str(error)})
+    return 0 if result is not None else 1
+
+
+def trials_file(model_path: Path, epoch: int) -> Path:
+    """The trial data of the calibration with this epoch."""
+    return model_path.with_name(f"trials-{epoch:06d}.npz")
+
+
+def report_folder(model_path: Path) -> Path:
+    """The folder of a model's report; its page is ``index.html``."""
+    return model_path.with_name(f"{model_path.stem}-report")
+
+
+def figures_file(model_path: Path) -> Path:
+    """The figures of a model's fit, for programs."""
+    return model_path.with_name(f"{model_path.stem}-report.json")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""Interfaces of the servo loop and the vision loop to the other processes and to time.
+
+The loops' code exists once. Between processes the links are slots and sockets (`servo_links`, `vision`) and time is the
+host's; in lockstep (`lockstep`) the links are objects in memory and time is virtual.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from stereoservo.core.cycle import Event, ModelUpdate
+from stereoservo.daemon.ipc_messages import ServoState
+from stereoservo.daemon.pacing import LoopStatistics
+from stereoservo.messages.goals import Request
+from stereoservo.ports.devices import CameraObservation, Prior
+from stereoservo.recording.step_records import StepSink
+
+
+class GatewayMessages(NamedTuple):
+    """What the gateway has sent since the last cycle. ``heard``: whether it sent anything, a heartbeat included."""
+
+    heard: bool = False
+    requests: tuple[Request, ...] = ()
+    model_update: ModelUpdate | None = None
+
+
+class ServoLinks(Protocol):
+    """What the servo loop reads from and writes to the other processes. No call blocks."""
+
+    def receive(self) -> GatewayMessages:
+        """What the gateway has sent since the last call."""
+        ...
+
+    def observations(self) -> tuple[CameraObservation, ...]:
+        """The newest observation of each camera that was not returned before."""
+        ...
+
+    def stop_raised(self) -> bool:
+        """Whether the stop was raised since the last call; acknowledges it."""
+        ...
+
+    def step_recorder(self) -> StepSink | None:
+        """The recorder that is connected; a new object for each connection."""
+        ...
+
+    def publish_prior(self, prior: Prior) -> None:
+        """Hand the expected marker positions to a camera's vision loop."""
+        ...
+
+    def publish_state(self, state: ServoState) -> None:
+        """Replace the state that the gateway reads."""
+        ...
+
+    def publish_events(self, events: tuple[Event, ...]) -> None:
+        """Queue events, whose numbers ascend, and send what waits; none is lost while the gateway restarts."""
+        ...
+
+
+class VisionLinks(Protocol):
+    """What the vision loop of one camera reads from and writes to the servo loop. No call blocks."""
+
+    def newest_prior(self) -> Prior | None:
+        """The newest prior of this camera, of any age; None before the first."""
+        ...
+
+    def publish_observation(self, observation: CameraObservation) -> None:
+        """Replace the observation that the servo loop reads."""
+        ...
+
+
+class Pacing(Protocol):
+    """What starts the servo loop's cycles: a clock's grid (`pacing.ClockPacing`), or an arm that sets the beat."""
+
+    def wait(self) -> int:
+        """Block until the next cycle is due; returns the time then [ns]."""
+        ...
+
+    def statistics(self) -> LoopStatistics:
+        """Counts and quantiles of the cycles so far."""
+        ...

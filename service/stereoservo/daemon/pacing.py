@@ -1,0 +1,170 @@
+"""Pacing of the servo loop by a clock: absolute deadlines on a fixed grid, statistics, real-time scheduling.
+
+Slot k is at ``start + k * period`` whatever happened before, so that an oversleep does not shift the later ones. A
+cycle that ran over its slot's end skips the slots that have passed instead of catching up with a burst.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import msgspec
+
+_SUB_BITS = 4  # 16 bins an octave: quantiles good to 6 %
+_BINS = 48 << _SUB_BITS
+
+
+class LoopStatistics(msgspec.Struct, frozen=True):
+    """Counts and quantiles of the loop's cycles since its start. Lateness: wake-up behind its slot [us]."""
+
+    rate_hz: float
+    cycles: int
+    overruns: int
+    skipped: int
+    p50_us: float
+    p99_us: float
+    max_us: float
+    work_p50_us: float
+    work_p99_us: float
+    work_max_us: float
+
+
+class Histogram:
+    """Non-negative integers in bins of constant relative width (1/16); exact below 32."""
+
+    def __init__(self) -> None:
+        self._bins = [0] * _BINS
+        self.count = 0
+        self.maximum = 0
+
+    def add(self, value: int) -> None:
+        """Count ``value``; a negative one counts as 0."""
+        value = max(value, 0)
+        self._bins[_bin(value)] += 1
+        self.count += 1
+        self.maximum = max(self.maximum, value)
+
+    def quantile(self, fraction: float) -> float:
+        """The value below or at which ``fraction`` of the counted ones lie (upper edge of its bin, at most
+        the maximum).
+        """
+        if not self.count:
+            return 0.0
+        wanted = fraction * self.count
+        seen = 0
+        for index, count in enumerate(self._bins):
+            seen += count
+            if count and seen >= wanted:
+                return float(min(_upper_edge(index), self.maximum))
+        return float(self.maximum)
+
+
+def _bin(value: int) -> int:
+    octave = max(value.bit_length() - _SUB_BITS - 1, 0)
+    return min((octave << _SUB_BITS) + (value >> octave), _BINS - 1)
+
+
+def _upper_edge(index: int) -> int:
+    octave = max((index >> _SUB_BITS) - 1, 0)
+    return ((index - (octave << _SUB_BITS) + 1) << octave) - 1
+
+
+class ClockPacing:
+    """Starts the cycles at ``start + k * period``. ``now`` and ``sleep`` are injected for virtual time.
+
+    Time spent stopped in a debugger or a suspended machine shows as skipped slots, never as a burst of
+    cycles.
+    """
+
+    def __init__(
+        self,
+        period_ns: int,
+        *,
+        now: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if period_ns <= 0:
+            raise ValueError(f"period {period_ns} ns; it must be positive")
+        self.period_ns = period_ns
+        self._now = now
+        self._sleep = sleep
+        self._deadline = now()
+        self._woke = self._deadline
+        self.cycles = 0
+        self.overruns = 0
+        self.skipped = 0
+        self._lateness = Histogram()
+        self._work = Histogram()
+
+    def wait(self) -> int:
+        """Sleep until the next slot; returns the time of waking [ns]."""
+        before = self._now()
+        if self.cycles:
+            self._work.add((before - self._woke) // 1000)
+        target = self._deadline + self.period_ns
+        if before >= target:
+            behind = (before - target) // self.period_ns + 1
+            self.overruns += 1
+            self.skipped += behind
+            target += behind * self.period_ns
+        now = before
+        while now < target:
+            self._sleep((target - now) * 1e-9)
+            now = self._now()
+        self._deadline = target
+        self._woke = now
+        self._lateness.add((now - target) // 1000)
+        self.cycles += 1
+        return now
+
+    def statistics(self) -> LoopStatistics:
+        """Counts and quantiles since the start."""
+        return LoopStatistics(
+            rate_hz=1e9 / self.period_ns,
+            cycles=self.cycles,
+            overruns=self.overruns,
+            skipped=self.skipped,
+            p50_us=self._lateness.quantile(0.5),
+            p99_us=self._lateness.quantile(0.99),
+            max_us=float(self._lateness.maximum),
+            work_p50_us=self._work.quantile(0.5),
+            work_p99_us=self._work.quantile(0.99),
+            work_max_us=float(self._work.maximum),
+        )
+
+
+def prepare_realtime(priority: int) -> list[str]:
+    """Freeze the garbage collector's generations and ask for SCHED_FIFO (``priority`` 0: leave the
+    scheduler alone).
+
+    Returns warnings, each with its remedy; the loop runs without as well, and may wake late under load.
+    """
+    gc.collect()
+    gc.freeze()
+    if priority == 0:
+        return []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except PermissionError:
+        return [
+            f"no permission for SCHED_FIFO priority {priority}: the loop may wake late under load. Cure: "
+            f"`ulimit -r {priority}` before the start, or LimitRTPRIO={priority} in the systemd unit, "
+            "or servo.priority = 0 in the cell file to stop asking"
+        ]
+    return []
+
+
+@contextmanager
+def realtime_for_a_while(priority: int) -> Iterator[list[str]]:
+    """As :func:`prepare_realtime`, for a program that goes on afterwards. Yields the warnings."""
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield prepare_realtime(priority)
+    finally:
+        # The flag may be set, and not be cleared, without privileges.
+        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
+        gc.unfreeze()

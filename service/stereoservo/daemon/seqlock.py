@@ -1,0 +1,283 @@
+"""Sequence-locked slots in shared memory: newest-only hand-over between processes, and the stop slot.
+
+Python cannot fence memory (aarch64 may reorder the stores), so the sequence lock is only the fast path:
+every record carries a CRC-32 over its sequence number and bytes, and a reader believes nothing else. Files
+are created once, by the supervisor or the first writer, and keep their inode for the cell's life, so that
+a restarted process finds the slot it left.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import struct
+import time
+import zlib
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+_MAGIC = 0x53_53_4C_4F_54_31  # "SSLOT1"
+_HEADER_BYTES = 64
+_MAGIC_WORD, _LAYOUT_WORD, _CAPACITY_WORD, _PID_WORD, _EPOCH_WORD, _SEQUENCE_WORD, _LENGTH_WORD, _CRC_WORD = (
+    range(8)
+)
+
+_STOP_MAGIC = 0x53_53_54_4F_50_31  # "SSTOP1"
+_STOP_BYTES = 32
+_STOP_MAGIC_WORD, _RAISED_WORD, _ACKNOWLEDGED_WORD, _COUNT_WORD = range(4)
+
+
+class SlotError(Exception):
+    """A slot cannot be used: names the file, what it holds and what was expected.
+
+    Attributes:
+        path: the slot's file.
+        code: ``"missing"``, ``"layout"``, ``"busy"`` or ``"too_large"``.
+    """
+
+    def __init__(self, path: Path, code: str, message: str) -> None:
+        super().__init__(f"{path}: {message}")
+        self.path = path
+        self.code = code
+
+
+def layout_hash(layout: str) -> int:
+    """A 64-bit number that names a record layout, e.g. ``"CameraObservation.1"``."""
+    data = layout.encode()
+    return zlib.crc32(data) << 32 | zlib.crc32(data[::-1] + b"stereoservo")
+
+
+def create_slot(path: Path, capacity: int, layout: str) -> None:
+    """Make the file of a slot for records of up to ``capacity`` bytes; an existing fitting file stays as
+    it is.
+    """
+    size = _HEADER_BYTES + capacity
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        header = os.pread(fd, 24, 0)
+        wanted = struct.pack("=QQQ", _MAGIC, layout_hash(layout), capacity)
+        if header == wanted and os.fstat(fd).st_size == size:
+            return
+        os.ftruncate(fd, 0)
+        os.ftruncate(fd, size)
+        os.pwrite(fd, wanted, 0)
+    finally:
+        os.close(fd)
+
+
+class _Mapping:
+    """A file mapped as 64-bit words and bytes."""
+
+    def __init__(self, path: Path, minimum: int) -> None:
+        self.path = path
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except FileNotFoundError as error:
+            raise SlotError(path, "missing", "no such slot; is the cell's daemon running?") from error
+        size = os.fstat(self._fd).st_size
+        if size < minimum:
+            os.close(self._fd)
+            raise SlotError(path, "layout", f"holds {size} bytes; a slot has at least {minimum}")
+        self._map = mmap.mmap(self._fd, size)
+        self._bytes = memoryview(self._map)
+        self.words = self._bytes[: size - size % 8].cast("Q")
+
+    @property
+    def fd(self) -> int:
+        return self._fd
+
+    @property
+    def bytes(self) -> memoryview:
+        return self._bytes
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            self.words.release()
+            self._bytes.release()
+            self._map.close()
+            os.close(self._fd)
+            self._fd = -1
+
+
+def _open(path: Path, layout: str) -> tuple[_Mapping, int]:
+    mapping = _Mapping(path, _HEADER_BYTES)
+    magic, found, capacity = (
+        mapping.words[_MAGIC_WORD],
+        mapping.words[_LAYOUT_WORD],
+        mapping.words[_CAPACITY_WORD],
+    )
+    if magic != _MAGIC or found != layout_hash(layout) or len(mapping.bytes) != _HEADER_BYTES + capacity:
+        mapping.close()
+        raise SlotError(
+            path,
+            "layout",
+            f"is not a slot of layout {layout!r} (hash {found:#x}, expected {layout_hash(layout):#x})",
+        )
+    return mapping, capacity
+
+
+class SlotWriter:
+    """The one writer of a slot, enforced by a file lock that dies with its process.
+
+    Raises SlotError: another live writer, another layout.
+    """
+
+    def __init__(self, path: Path, capacity: int, layout: str) -> None:
+        create_slot(path, capacity, layout)
+        self._mapping, self._capacity = _open(path, layout)
+        self._path = path
+        try:
+            fcntl.flock(self._mapping.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            pid = self._mapping.words[_PID_WORD]
+            self._mapping.close()
+            raise SlotError(
+                path, "busy", f"already written by process {pid}; a slot has one writer"
+            ) from error
+        words = self._mapping.words
+        self._sequence = words[_SEQUENCE_WORD] + (words[_SEQUENCE_WORD] & 1)  # a crash may have left it odd
+        words[_PID_WORD] = os.getpid()
+        words[_EPOCH_WORD] += 1
+
+    def write(self, record: bytes) -> None:
+        """Replace the record. Raises SlotError where it is longer than the capacity."""
+        length = len(record)
+        if length > self._capacity:
+            raise SlotError(
+                self._path, "too_large", f"record of {length} bytes; the slot holds up to {self._capacity}"
+            )
+        words = self._mapping.words
+        sequence = self._sequence + 2
+        words[_SEQUENCE_WORD] = sequence - 1
+        self._mapping.bytes[_HEADER_BYTES : _HEADER_BYTES + length] = record
+        words[_LENGTH_WORD] = length
+        words[_CRC_WORD] = _crc(sequence, record)
+        words[_SEQUENCE_WORD] = sequence
+        self._sequence = sequence
+
+    def close(self) -> None:
+        """Release the mapping; the file stays. Idempotent."""
+        self._mapping.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class SlotReader:
+    """One of any number of readers.
+
+    ``torn`` counts reads that met a writer at work and were retried; ``missed`` counts polls that gave up
+    after ``retries`` of them (the record is then taken at the next poll).
+    """
+
+    def __init__(self, path: Path, layout: str, *, retries: int = 8) -> None:
+        self._mapping, self._capacity = _open(path, layout)
+        self._retries = retries
+        self._seen = 0
+        self.torn = 0
+        self.missed = 0
+
+    @property
+    def epoch(self) -> int:
+        """Counts the writers this slot has had."""
+        return int(self._mapping.words[_EPOCH_WORD])
+
+    def poll(self) -> bytes | None:
+        """The newest record if it was not read before, else None."""
+        return self._read(skip=self._seen)
+
+    def newest(self) -> bytes | None:
+        """The newest record, read before or not; None where there is none yet."""
+        return self._read(skip=0)
+
+    def _read(self, skip: int) -> bytes | None:
+        words, data = self._mapping.words, self._mapping.bytes
+        for _ in range(self._retries):
+            sequence = words[_SEQUENCE_WORD]
+            if sequence in (skip, 0):
+                return None
+            if not sequence & 1:
+                length = words[_LENGTH_WORD]
+                if length <= self._capacity:
+                    record = bytes(data[_HEADER_BYTES : _HEADER_BYTES + length])
+                    crc = words[_CRC_WORD]
+                    if words[_SEQUENCE_WORD] == sequence and crc == _crc(sequence, record):
+                        self._seen = sequence
+                        return record
+            self.torn += 1
+        self.missed += 1
+        return None
+
+    def close(self) -> None:
+        """Release the mapping. Idempotent."""
+        self._mapping.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _crc(sequence: int, record: bytes) -> int:
+    return zlib.crc32(record, sequence & 0xFFFFFFFF)
+
+
+def create_stop_slot(path: Path) -> None:
+    """Make the file of a stop slot, with no stop raised."""
+    path.write_bytes(struct.pack("=QQQQ", _STOP_MAGIC, 0, 0, 0))
+    path.chmod(0o600)
+
+
+class StopSlot:
+    """One word that any process may raise and the servo process reads each cycle and acknowledges.
+
+    Two processes that raise it at once both write a fresh word; whichever wins, the reader sees a change.
+    The count is for people to read and may miss one of two simultaneous raises.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._mapping = _Mapping(path, _STOP_BYTES)
+        if self._mapping.words[_STOP_MAGIC_WORD] != _STOP_MAGIC:
+            self._mapping.close()
+            raise SlotError(path, "layout", "is not a stop slot")
+        self._seen = self._mapping.words[_ACKNOWLEDGED_WORD]
+
+    def raise_stop(self) -> int:
+        """Ask for a stop; returns the word to be checked with :meth:`acknowledged`."""
+        words = self._mapping.words
+        word = max(time.monotonic_ns(), words[_RAISED_WORD] + 1)
+        words[_COUNT_WORD] += 1
+        words[_RAISED_WORD] = word
+        return word
+
+    def acknowledged(self, word: int) -> bool:
+        """Whether the servo process has seen the stop ``word`` or a later one."""
+        return bool(self._mapping.words[_ACKNOWLEDGED_WORD] >= word)
+
+    @property
+    def count(self) -> int:
+        """How often a stop was raised since the cell was started."""
+        return int(self._mapping.words[_COUNT_WORD])
+
+    def poll(self) -> bool:
+        """For the servo process: whether a stop was raised since the last poll; acknowledges it."""
+        raised = self._mapping.words[_RAISED_WORD]
+        if raised == self._seen:
+            return False
+        self._seen = raised
+        self._mapping.words[_ACKNOWLEDGED_WORD] = raised
+        return True
+
+    def close(self) -> None:
+        """Release the mapping. Idempotent."""
+        self._mapping.close()

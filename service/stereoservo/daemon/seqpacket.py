@@ -1,0 +1,152 @@
+"""Message channels between processes: non-blocking unix SEQPACKET sockets, bounded, with record boundaries.
+
+A :class:`ChannelServer` accepts any number of peers or, with ``single=True``, keeps only the newest (a
+restarted gateway replaces the one that died). Nothing here blocks; a full socket is reported to the
+caller, who decides what to drop.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from stereoservo.messages.directories import check_socket_path
+
+MAX_MESSAGE_BYTES = 1 << 20
+
+
+class ChannelError(Exception):
+    """A channel cannot be used. ``code``: ``"unreachable"``, ``"too_large"`` or ``"closed"``."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class PacketChannel:
+    """One end of a connected message channel."""
+
+    def __init__(self, connection: socket.socket, name: str) -> None:
+        connection.setblocking(False)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2 * MAX_MESSAGE_BYTES)
+        self._socket = connection
+        self._name = name
+        self._open = True
+
+    @classmethod
+    def connect(cls, path: Path) -> Self:
+        """Connect to a server. Raises ChannelError where nobody listens."""
+        check_socket_path(path)
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            connection.connect(str(path))
+        except OSError as error:
+            connection.close()
+            raise ChannelError(
+                "unreachable", f"{path}: nobody listens ({os.strerror(error.errno or 0)})"
+            ) from error
+        return cls(connection, str(path))
+
+    @property
+    def is_open(self) -> bool:
+        """False once either side has closed."""
+        return self._open
+
+    def send(self, message: bytes) -> bool:
+        """Send whole or not at all; False where the peer does not drain its socket or has gone.
+
+        Raises ChannelError for messages over ``MAX_MESSAGE_BYTES``.
+        """
+        if len(message) > MAX_MESSAGE_BYTES:
+            raise ChannelError(
+                "too_large", f"{self._name}: message of {len(message)} bytes; at most {MAX_MESSAGE_BYTES}"
+            )
+        if not self._open:
+            return False
+        try:
+            self._socket.send(message, socket.MSG_NOSIGNAL)
+        except OSError:
+            return False  # a peer that has gone may have left messages: `receive` finds its end
+        return True
+
+    def receive(self, limit: int = 64) -> list[bytes]:
+        """Up to ``limit`` waiting messages, oldest first; marks the channel closed when the peer has gone."""
+        messages: list[bytes] = []
+        while self._open and len(messages) < limit:
+            try:
+                message = self._socket.recv(MAX_MESSAGE_BYTES)
+            except BlockingIOError:
+                break
+            except ConnectionResetError:
+                continue  # raised once, where the peer left messages unread; those it sent are still there
+            except OSError:
+                self.close()
+                break
+            if not message:
+                self.close()
+                break
+            messages.append(message)
+        return messages
+
+    def close(self) -> None:
+        """Close this end. Idempotent."""
+        self._open = False
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class ChannelServer:
+    """Listens on a unix socket file; ``accept`` is polled."""
+
+    def __init__(self, path: Path, *, single: bool = False, max_peers: int = 32) -> None:
+        check_socket_path(path)
+        path.unlink(missing_ok=True)
+        self._path = path
+        self._single = single
+        self._max_peers = max_peers
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.setblocking(False)
+        self._socket.bind(str(path))
+        path.chmod(0o600)
+        self._socket.listen(8)
+        self.peers: list[PacketChannel] = []
+
+    def accept(self) -> list[PacketChannel]:
+        """Take waiting peers, drop those that have gone; returns the new ones."""
+        self.peers = [peer for peer in self.peers if peer.is_open]
+        fresh: list[PacketChannel] = []
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:  # nobody waits (or gave up while waiting)
+                break
+            if self._single:
+                for peer in self.peers:
+                    peer.close()
+                self.peers.clear()
+                fresh.clear()
+            elif len(self.peers) >= self._max_peers:
+                connection.close()
+                continue
+            channel = PacketChannel(connection, str(self._path))
+            self.peers.append(channel)
+            fresh.append(channel)
+        return fresh
+
+    def close(self) -> None:
+        """Close all peers and remove the socket file. Idempotent."""
+        for peer in self.peers:
+            peer.close()
+        self.peers.clear()
+        self._socket.close()
+        self._path.unlink(missing_ok=True)

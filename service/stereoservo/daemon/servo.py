@@ -1,0 +1,318 @@
+"""The servo loop: read joints and observations, step the core, command the joint driver, publish the result.
+
+`ServoProcess` is the loop on given links, pacing and clock; `main` runs it as a process of its own. That process holds
+nothing that could delay the arm: no zenoh, no scipy solver, no images, and it logs at its start and end only. Whatever
+ends it, the drives are stopped. ``python -m stereoservo.daemon.servo RUNTIME_DIRECTORY PARENT_PID``.
+"""
+
+from __future__ import annotations
+
+import gc
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from stereoservo.core.cycle import DriverFault, StepInputs, StepOutputs
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan
+from stereoservo.daemon.kernel_compilation import warm_up
+from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
+from stereoservo.daemon.pacing import ClockPacing, LoopStatistics, prepare_realtime
+from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
+from stereoservo.daemon.seqlock import SlotError
+from stereoservo.daemon.servo_links import ProcessLinks
+from stereoservo.messages.cell_file import CellFileError
+from stereoservo.messages.directories import DirectoryError
+from stereoservo.messages.goals import Hold, Request
+from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path
+from stereoservo.ports import plugins
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import Clock, DriverError, JointDriver, JointState
+from stereoservo.recording.step_records import StepStream
+
+GATEWAY_SILENCE_S = 0.5
+"""Without a heartbeat of the gateway for so long, a moving arm is held."""
+SILENCE = f"the servo process: its gateway said nothing for {GATEWAY_SILENCE_S:g} s (a busy computer?)"
+"""The operator's name in the event `held` that follows."""
+STATE_RATE_HZ = 50.0
+STATISTICS_EVERY_S = 0.5
+FAULT_READ_EVERY_S = 0.1
+"""How often a driver in fault is read."""
+REST_TIMEOUT_S = 1.5
+"""How long a shutdown waits for the core to bring the arm to rest before the driver's own stop."""
+CONFIGURE_TRIES = 20
+CONFIGURE_PAUSE_S = 0.5
+EXIT_SETUP = 3
+
+
+class ServoProcess:
+    """The servo loop of one cell, a cycle at a time, on any links, pacing and clock.
+
+    ``dry_run``: the core's commands and requests are computed and never reach the drives.
+    """
+
+    def __init__(
+        self,
+        core: ServoCore,
+        driver: JointDriver,
+        links: ServoLinks,
+        clock: Clock,
+        *,
+        rate_hz: float,
+        dry_run: bool = False,
+    ) -> None:
+        self.core = core
+        self.driver = driver
+        self._links = links
+        self._clock = clock
+        self._period_ns = round(1e9 / rate_hz)
+        self._dry_run = dry_run
+        self._stream = StepStream(core.settings, rate_hz)
+        self._configured = False
+        self._active = False
+        self._fault: DriverFault | None = None
+        self._fault_ns = 0
+        self._heard_ns = 0
+        self._silent = False
+        self._moving = False
+        self._differences: tuple[str, ...] = ()
+        self._state_every = max(1, round(rate_hz / STATE_RATE_HZ))
+        self._statistics_every = max(1, round(rate_hz * STATISTICS_EVERY_S))
+        self._cycles = 0
+        self._statistics: LoopStatistics | None = None
+
+    # -- driver ---------------------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Connect the driver. Raises DriverError."""
+        self.driver.configure()
+        self._configured = True
+
+    def shut_down(self) -> None:
+        """Stop the drives, switch off, release."""
+        self._stop()
+        try:
+            self._switch_off()
+        except DriverError as error:
+            write_log("servo", f"the drives were stopped but did not switch off: {error}")
+        finally:
+            self.driver.close()
+
+    def _stop(self) -> None:
+        # In a dry run somebody else may be driving this arm: not even a stop is sent.
+        if not self._dry_run:
+            self.driver.stop()
+
+    def _switch_off(self) -> None:
+        if not self._dry_run:
+            self.driver.deactivate()
+
+    def _latch_fault(self, error: DriverError, now_ns: int) -> None:
+        self._stop()
+        self._active = False
+        self._fault = DriverFault(error.code, str(error))
+        self._fault_ns = now_ns
+
+    def _read(self, now_ns: int) -> JointState | None:
+        if not self._configured:
+            return None
+        if self._fault is not None and now_ns - self._fault_ns < FAULT_READ_EVERY_S * 1e9:
+            return None
+        try:
+            return self.driver.read_state()
+        except DriverError as error:
+            self._latch_fault(error, now_ns)
+            return None
+
+    def _write(self, outputs: StepOutputs, now_ns: int) -> None:
+        if outputs.command is None or not self._active or self._dry_run:
+            return
+        try:
+            report = self.driver.write_velocity(outputs.command)
+        except DriverError as error:
+            self._latch_fault(error, now_ns)
+            return
+        self._differences = report.reasons
+
+    def _apply_driver_request(self, outputs: StepOutputs, now_ns: int) -> None:
+        """Change the driver's state as the core asks; where the driver refuses, the next step sees a fault."""
+        request = outputs.driver_request
+        if request == "":
+            return
+        try:
+            if request == "activate":
+                if not self._dry_run:
+                    self.driver.activate()
+                self._active = True
+                return
+            self._active = False
+            self._stop()
+            self._switch_off()
+            if request == "reset":
+                self._configured = False
+                self.configure()
+                self._fault = None
+        except DriverError as error:
+            self._latch_fault(error, now_ns)
+
+    # -- gateway --------------------------------------------------------------------------------------------
+
+    def _receive(self, now_ns: int) -> GatewayMessages:
+        """The gateway's messages; a hold is added where it has fallen silent and the arm moves."""
+        messages = self._links.receive()
+        if messages.heard:
+            self._heard_ns = now_ns
+            self._silent = False
+        elif self._heard_ns and not self._silent and now_ns - self._heard_ns > GATEWAY_SILENCE_S * 1e9:
+            self._silent = True
+            if self._moving:
+                return messages._replace(requests=(Request(-1, SILENCE, Hold()),))
+        return messages
+
+    def _publish(self, outputs: StepOutputs, pacing: Pacing) -> None:
+        """Priors to the cameras; state and events to the gateway."""
+        for prior in outputs.priors:
+            self._links.publish_prior(prior)
+        if self._statistics is None or self._cycles % self._statistics_every == 0:
+            self._statistics = pacing.statistics()
+        if outputs.events or self._cycles % self._state_every == 0:
+            state = ServoState(
+                status=outputs.status,
+                loop=self._statistics,
+                driver_configured=self._configured,
+                driver_active=self._active,
+                gateway=not self._silent and self._heard_ns > 0,
+                records_dropped=self._stream.dropped,
+                differences=self._differences,
+            )
+            self._links.publish_state(state)
+        self._cycles += 1
+        self._links.publish_events(outputs.events)  # after the state: who hears an event finds none older
+
+    # -- one cycle ------------------------------------------------------------------------------------------
+
+    def cycle(self, pacing: Pacing, *, stop: bool = False) -> tuple[StepInputs, StepOutputs]:
+        """Wait for the next cycle; read, step, write, publish. ``stop`` asks the core to brake (shutdown)."""
+        pacing.wait()
+        now_ns = self._clock.now_ns()
+        joints = self._read(now_ns)
+        messages = self._receive(now_ns)
+        observations = self._links.observations()
+        inputs = StepInputs(
+            now_ns=self._clock.now_ns(),  # after everything was read: no stamp can be later
+            period_ns=self._period_ns,
+            joints=joints,
+            observations=observations,
+            requests=messages.requests,
+            model_update=messages.model_update,
+            stop=self._links.stop_raised() or stop,
+            driver_configured=self._configured,
+            driver_active=self._active,
+            driver_fault=self._fault,
+        )
+        self._stream.before(self._links.step_recorder(), self.core, now_ns)
+        outputs = self.core.step(inputs)
+        self._write(outputs, now_ns)
+        self._apply_driver_request(outputs, now_ns)
+        self._moving = outputs.status.source != "hold" or bool(np.any(outputs.status.command))
+        self._publish(outputs, pacing)
+        self._stream.after(inputs, outputs)
+        return inputs, outputs
+
+    def come_to_rest(self, pacing: Pacing, cut_short: Callable[[], bool]) -> None:
+        """Let the core brake until its command is zero, at most ``REST_TIMEOUT_S`` or until ``cut_short``."""
+        until = self._clock.now_ns() + int(REST_TIMEOUT_S * 1e9)
+        first = True
+        while not cut_short() and self._clock.now_ns() < until:
+            _, outputs = self.cycle(pacing, stop=first)
+            first = False
+            if outputs.command is None or not outputs.command.any():
+                return
+
+
+def make_driver(plan: RunPlan, clock: Clock) -> JointDriver:
+    """The cell's joint driver, constructed and not connected. Raises PluginError, DriverError."""
+    kind = plugins.load(plugins.JOINT_DRIVERS, plan.cell.joints.driver)
+    driver: JointDriver = kind(plan.cell.joints.options, plan.driver_context(clock))
+    return driver
+
+
+def _configure(process: ServoProcess, termination: Termination, clock: MonotonicClock) -> None:
+    """Connect, trying again where the driver's error allows it. Raises DriverError."""
+    for attempt in range(CONFIGURE_TRIES):
+        try:
+            process.configure()
+            return
+        except DriverError as error:
+            if not error.retry or attempt == CONFIGURE_TRIES - 1 or termination.asked:
+                raise
+            clock.sleep(CONFIGURE_PAUSE_S)
+
+
+def run(plan: RunPlan, termination: Termination) -> None:
+    """Run until asked to end; the drives are stopped whatever happens."""
+    directories = plan.directories
+    clock = MonotonicClock()
+    hardware = hardware_lock_path(
+        directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options
+    )
+    locks = [FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}")]
+    if hardware is not None:
+        locks.append(FileLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
+    warm_up()  # compiled kernels are loaded now, not in the middle of a cycle
+    core = ServoCore(plan.settings())
+    driver = make_driver(plan, clock)
+    rate_hz = plan.cell.servo.rate_hz
+    links = ProcessLinks(directories, tuple(camera.name for camera in plan.cell.camera))
+    try:
+        process = ServoProcess(core, driver, links, clock, rate_hz=rate_hz, dry_run=plan.dry_run)
+        try:
+            # Before the drives are asked for: collecting garbage holds up every thread of this process, a driver's too.
+            for warning in prepare_realtime(plan.cell.servo.priority):
+                write_log("servo", warning)
+            _configure(process, termination, clock)
+            gc.freeze()
+            pacing = ClockPacing(round(1e9 / rate_hz))
+            while not termination.asked:
+                process.cycle(pacing)
+            process.come_to_rest(pacing, lambda: termination.signals >= 2)
+        finally:
+            process.shut_down()
+    finally:
+        links.close()
+        for lock in locks:
+            lock.release()
+
+
+def main() -> int:
+    """Entry of the process."""
+    runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
+    die_with_parent(parent, signal.SIGTERM)
+    termination = Termination()
+    try:
+        run(load_plan(runtime), termination)
+    except DriverError as error:
+        write_log("servo", f"joint driver: {error}")
+        return EXIT_SETUP
+    except (
+        AlreadyRunningError,
+        CellFileError,
+        DirectoryError,
+        PlanError,
+        SlotError,
+        plugins.PluginError,
+    ) as error:
+        write_log("servo", str(error))
+        return EXIT_SETUP
+    except msgspec.MsgspecError as error:
+        write_log("servo", f"a message of another process does not decode: {error}")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,147 @@
+"""The servo process's links to the other processes: slots in shared memory and sockets."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from stereoservo.core.cycle import Event, ModelUpdate
+from stereoservo.daemon.ipc_messages import (
+    OBSERVATION_LAYOUT,
+    PRIOR_CAPACITY,
+    PRIOR_LAYOUT,
+    STATE_CAPACITY,
+    STATE_LAYOUT,
+    Ask,
+    Hello,
+    NewModel,
+    ServoState,
+    encode,
+    observation_decoder,
+    to_servo_decoder,
+)
+from stereoservo.daemon.links import GatewayMessages
+from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot
+from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.goals import Request
+from stereoservo.ports.devices import CameraObservation, Prior
+from stereoservo.recording.step_records import StepMessage
+
+RETAINED_EVENTS = 2048
+
+
+class EventOutbox:
+    """The last ``RETAINED_EVENTS`` events, encoded, so that a restarted gateway can be sent what it missed."""
+
+    def __init__(self) -> None:
+        self._retained: deque[tuple[int, bytes]] = deque(maxlen=RETAINED_EVENTS)
+        self._sent = 0
+
+    def add(self, events: tuple[Event, ...]) -> None:
+        """Queue events; their numbers ascend."""
+        for event in events:
+            self._retained.append((event.seq, encode(event)))
+
+    def rewind(self, last_known: int) -> None:
+        """Send the events after ``last_known`` (again)."""
+        self._sent = last_known
+
+    def flush(self, peer: PacketChannel) -> None:
+        """Send what is due, as far as the socket takes it."""
+        if not self._retained or self._retained[-1][0] <= self._sent:
+            return
+        for seq, data in self._retained:
+            if seq > self._sent:
+                if not peer.send(data):
+                    return
+                self._sent = seq
+
+
+class _RecorderPeer:
+    """The gateway's end of the step socket as a `StepSink`."""
+
+    def __init__(self, channel: PacketChannel) -> None:
+        self.channel = channel
+
+    def send(self, message: StepMessage) -> bool:
+        return self.channel.send(encode(message))
+
+
+class ProcessLinks:
+    """`ServoLinks` of the servo process. Raises SlotError where a slot is missing or has another writer."""
+
+    def __init__(self, directories: CellDirectories, cameras: tuple[str, ...]) -> None:
+        self._stop = StopSlot(directories.stop_slot)
+        self._observations = [
+            SlotReader(directories.observation_slot(name), OBSERVATION_LAYOUT) for name in cameras
+        ]
+        self._priors = {
+            name: SlotWriter(directories.prior_slot(name), PRIOR_CAPACITY, PRIOR_LAYOUT) for name in cameras
+        }
+        self._state = SlotWriter(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)
+        self._control = ChannelServer(directories.control_socket, single=True)
+        self._steps = ChannelServer(directories.steps_socket, single=True)
+        self._gateway: PacketChannel | None = None
+        self._recorder: _RecorderPeer | None = None
+        self._outbox = EventOutbox()
+
+    def receive(self) -> GatewayMessages:
+        """Requests and model of the newest gateway connection. Raises msgspec.MsgspecError."""
+        heard = False
+        for peer in self._control.accept():
+            self._gateway = peer
+            heard = True
+        requests: list[Request] = []
+        update: ModelUpdate | None = None
+        for data in [] if self._gateway is None else self._gateway.receive():
+            heard = True
+            message = to_servo_decoder.decode(data)
+            if isinstance(message, Ask):
+                requests.append(message.request)
+            elif isinstance(message, NewModel):
+                update = ModelUpdate(message.model, message.reanchored)
+            elif isinstance(message, Hello):
+                self._outbox.rewind(message.last_event)
+        return GatewayMessages(heard, tuple(requests), update)
+
+    def observations(self) -> tuple[CameraObservation, ...]:
+        """The newest observation of each camera that was not returned before. Raises msgspec.MsgspecError."""
+        polled = (reader.poll() for reader in self._observations)
+        return tuple(observation_decoder.decode(data) for data in polled if data is not None)
+
+    def stop_raised(self) -> bool:
+        """Whether the stop slot was raised since the last call; acknowledges it."""
+        return self._stop.poll()
+
+    def step_recorder(self) -> _RecorderPeer | None:
+        """The newest connection to the step socket while it is open."""
+        for peer in self._steps.accept():
+            self._recorder = _RecorderPeer(peer)
+        if self._recorder is not None and not self._recorder.channel.is_open:
+            self._recorder = None
+        return self._recorder
+
+    def publish_prior(self, prior: Prior) -> None:
+        """Write a camera's prior slot."""
+        self._priors[prior.camera].write(encode(prior))
+
+    def publish_state(self, state: ServoState) -> None:
+        """Write the state slot."""
+        self._state.write(encode(state))
+
+    def publish_events(self, events: tuple[Event, ...]) -> None:
+        """Queue events and send what waits, as far as the gateway's socket takes it."""
+        self._outbox.add(events)
+        if self._gateway is not None and self._gateway.is_open:
+            self._outbox.flush(self._gateway)
+
+    def close(self) -> None:
+        """Release all; idempotent."""
+        self._control.close()
+        self._steps.close()
+        self._state.close()
+        for writer in self._priors.values():
+            writer.close()
+        for reader in self._observations:
+            reader.close()
+        self._stop.close()

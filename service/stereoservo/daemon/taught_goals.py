@@ -1,0 +1,200 @@
+"""Taught goals by name and their JSON file: set-points seen when a goal was shown, and the model in use.
+
+Schema 2 keeps beside the set-points of the moving body all other markers that were seen (the workpiece's, the tool's)
+and the cameras of the model, so that a goal can be transferred to the workpiece's present pose or to other cameras.
+Files of schema 1 are read; what they lack is taken from the model file of their epoch, where it still exists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from stereoservo.core.cycle import Event
+from stereoservo.kinematics.model import CellModel, Stratum, write_atomically
+from stereoservo.messages.goals import FeatureTarget, MarkerId, Pixel
+
+SCHEMA = 2
+READABLE_SCHEMAS = (1, 2)
+ModelOf = Callable[[int], CellModel | None]
+"""The model of an epoch, None where its file is gone."""
+
+
+class TaughtFileError(Exception):
+    """The file of taught goals cannot be used: names the file and the cause."""
+
+
+class TaughtCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A camera at the time of teaching: ``matrix`` 3x4 row by row, ``lens`` (k, cu, cv, r0), image size [px]."""
+
+    name: str
+    matrix: tuple[float, ...]
+    lens: tuple[float, ...]
+    width: int
+    height: int
+
+
+class TaughtModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The part of the model at the time of teaching that interprets the pixels: its cameras and its frame.
+
+    ``plane_at_infinity`` (4,), ``projective_to_euclidean`` 4x4 row by row, where the stratum has it.
+    """
+
+    epoch: int
+    stratum: Stratum
+    cameras: tuple[TaughtCamera, ...]
+    plane_at_infinity: tuple[float, ...]
+    projective_to_euclidean: tuple[float, ...] | None = None
+
+
+class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One taught goal, pixels raw.
+
+    ``target``: set-points of the moving body by camera and marker; ``others``: pixels of all other markers, alike;
+    ``sigmas``: standard deviations [px] of either, where known. ``joints`` at that moment, ``created`` its wall time.
+    ``tool``: the features by which the goal is meant, when they are not the body's own markers. ``model`` is None where
+    the file of schema 1 was written with a model whose file is gone.
+    """
+
+    target: FeatureTarget
+    joints: tuple[float, ...] = ()
+    created: str = ""
+    others: dict[str, dict[int, Pixel]] = {}
+    sigmas: dict[str, dict[int, float]] = {}
+    tool: tuple[MarkerId, ...] = ()
+    model: TaughtModel | None = None
+
+
+class TaughtFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    schema: int
+    goals: dict[str, TaughtGoal] = {}
+
+
+def feature_target(event: Event, epoch: int, body: tuple[int, ...] | None = None) -> FeatureTarget:
+    """Set-points of a ``taught`` event: of the markers ``body``, or of all."""
+    seen = _pixels(event)
+    return FeatureTarget(seen if body is None else _some(seen, body, of_body=True), model_epoch=epoch)
+
+
+def taught_goal(event: Event, model: CellModel, created: str, tool: tuple[MarkerId, ...] = ()) -> TaughtGoal:
+    """The goal that is stored for a ``taught`` event, with the model that was in use."""
+    return TaughtGoal(
+        feature_target(event, model.epoch, model.marker_ids),
+        () if event.joints is None else tuple(float(q) for q in event.joints),
+        created,
+        _some(_pixels(event), model.marker_ids, of_body=False),
+        {
+            sample.camera: {
+                int(marker): float(np.sqrt(0.5 * np.trace(covariance)))
+                for marker, covariance in zip(sample.ids, sample.covariances, strict=True)
+            }
+            for sample in event.samples
+        },
+        tool,
+        taught_model(model),
+    )
+
+
+def taught_model(model: CellModel) -> TaughtModel:
+    """The part of a model that is stored with a taught goal."""
+    upgrade = model.projective_to_euclidean
+    return TaughtModel(
+        model.epoch,
+        model.stratum,
+        tuple(
+            TaughtCamera(
+                camera.name,
+                tuple(camera.matrix.ravel().tolist()),
+                tuple(camera.lens.tolist()),
+                camera.width,
+                camera.height,
+            )
+            for camera in model.cameras
+        ),
+        tuple(model.plane_at_infinity.tolist()),
+        None if upgrade is None else tuple(upgrade.ravel().tolist()),
+    )
+
+
+def _pixels(event: Event) -> dict[str, dict[int, Pixel]]:
+    return {
+        sample.camera: {
+            int(marker): (float(pixel[0]), float(pixel[1]))
+            for marker, pixel in zip(sample.ids, sample.pixels, strict=True)
+        }
+        for sample in event.samples
+    }
+
+
+def _some(
+    pixels: dict[str, dict[int, Pixel]], body: tuple[int, ...], *, of_body: bool
+) -> dict[str, dict[int, Pixel]]:
+    """Of the pixels those of the body, or those that are not; cameras without any are left out."""
+    kept = {
+        camera: {marker: pixel for marker, pixel in points.items() if (marker in body) == of_body}
+        for camera, points in pixels.items()
+    }
+    return {camera: points for camera, points in kept.items() if points}
+
+
+def load_taught(path: Path, model_of: ModelOf = lambda _: None) -> dict[str, TaughtGoal]:
+    """All taught goals of a cell; none where there is no file. ``model_of``: for goals of schema 1.
+
+    Raises TaughtFileError.
+    """
+    if not path.exists():
+        return {}
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=TaughtFile)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise TaughtFileError(
+            f"{path}: cannot be read ({error}); move it away to start without taught goals"
+        ) from error
+    if found.schema not in READABLE_SCHEMAS:
+        known = " and ".join(str(schema) for schema in READABLE_SCHEMAS)
+        raise TaughtFileError(f"{path}: schema {found.schema}; this program reads {known}")
+    if found.schema == 1:
+        return {
+            name: migrated(goal, model_of(goal.target.model_epoch or 0)) for name, goal in found.goals.items()
+        }
+    for name, goal in found.goals.items():
+        _check_shapes(path, name, goal.model)
+    return dict(found.goals)
+
+
+def migrated(goal: TaughtGoal, model: CellModel | None) -> TaughtGoal:
+    """A goal of schema 1, in which all markers are set-points, with what its ``model`` adds."""
+    if model is None:
+        return goal
+    seen = goal.target.set_points
+    return msgspec.structs.replace(
+        goal,
+        target=FeatureTarget(_some(seen, model.marker_ids, of_body=True), goal.target.model_epoch),
+        others=_some(seen, model.marker_ids, of_body=False),
+        model=taught_model(model),
+    )
+
+
+def _check_shapes(path: Path, name: str, model: TaughtModel | None) -> None:
+    if model is None:
+        return
+    upgrade = model.projective_to_euclidean
+    sizes = [("plane_at_infinity", model.plane_at_infinity, 4)]
+    sizes += [] if upgrade is None else [("projective_to_euclidean", upgrade, 16)]
+    for camera in model.cameras:
+        sizes += [(f"{camera.name}.matrix", camera.matrix, 12), (f"{camera.name}.lens", camera.lens, 4)]
+    for what, values, size in sizes:
+        if len(values) != size:
+            raise TaughtFileError(
+                f"{path}: goals.{name}.model: {what} has {len(values)} numbers; {size} are needed"
+            )
+
+
+def save_taught(path: Path, goals: dict[str, TaughtGoal]) -> None:
+    """Write all taught goals, atomically. Raises OSError."""
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(TaughtFile(SCHEMA, goals)), indent=1))

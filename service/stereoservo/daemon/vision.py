@@ -1,0 +1,303 @@
+"""The vision loop of one camera: poll the driver, detect with the prior, publish the newest observation.
+
+`camera_loop` is the loop on given links and clock; `main` runs it as a process of its own. Errors of the camera are
+reported and answered by reconnecting with growing pauses, never by ending.
+``python -m stereoservo.daemon.vision RUNTIME_DIRECTORY PARENT_PID CAMERA``.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Generator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereoservo.daemon.camera_setup import make_camera
+from stereoservo.daemon.ipc_messages import (
+    OBSERVATION_CAPACITY,
+    OBSERVATION_LAYOUT,
+    PRIOR_LAYOUT,
+    PlanError,
+    Report,
+    RunPlan,
+    encode,
+    load_plan,
+    prior_decoder,
+)
+from stereoservo.daemon.links import VisionLinks
+from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
+from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
+from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path
+from stereoservo.messages.recording_request import RecordedImages, request_path
+from stereoservo.ports import plugins
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import (
+    CameraDriver,
+    CameraObservation,
+    Clock,
+    Detector,
+    DriverError,
+    Frame,
+    Prior,
+)
+
+if TYPE_CHECKING:
+    from stereoservo.recording.image_recording import ImageRecorder
+
+
+FIRST_PAUSE_S = 0.2
+LONGEST_PAUSE_S = 5.0
+SILENT_CAMERA_S = 2.0
+"""A camera that delivers nothing for so long is closed and opened again."""
+PRIOR_MAX_AGE_S = 0.5
+EXIT_SETUP = 3
+
+
+class Reporter:
+    """Sends reports to the gateway, oldest first; the last 64 that it cannot take yet are kept."""
+
+    def __init__(self, path: Path, origin: str, clock: Clock) -> None:
+        self._path = path
+        self._origin = origin
+        self._clock = clock
+        self._waiting: list[bytes] = []
+        self._channel: PacketChannel | None = None
+
+    def report(self, kind: str, message: str, images: RecordedImages | None = None) -> None:
+        """Queue a report, and log it."""
+        write_log(self._origin, message)
+        self._waiting.append(encode(Report(self._origin, kind, message, self._clock.now_ns(), images)))
+        del self._waiting[:-64]
+        self.flush()
+
+    def flush(self) -> None:
+        """Send the waiting reports, as far as the gateway takes them."""
+        if not self._waiting:
+            return
+        if self._channel is None or not self._channel.is_open:
+            try:
+                self._channel = PacketChannel.connect(self._path)
+            except ChannelError:  # the gateway is not up (yet): tried again at the next flush
+                return
+        while self._waiting and self._channel.send(self._waiting[0]):
+            self._waiting.pop(0)
+
+
+class VisionSlots:
+    """`VisionLinks` of a vision process: slots in shared memory. Raises SlotError where another process writes."""
+
+    def __init__(self, directories: CellDirectories, camera: str) -> None:
+        self._observations = SlotWriter(
+            directories.observation_slot(camera), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT
+        )
+        self._priors = SlotReader(directories.prior_slot(camera), PRIOR_LAYOUT)
+        self._prior: Prior | None = None
+
+    def newest_prior(self) -> Prior | None:
+        """The newest prior, of any age; None before the first. Raises msgspec.MsgspecError."""
+        data = self._priors.poll()
+        if data is not None:
+            self._prior = prior_decoder.decode(data)
+        return self._prior
+
+    def publish_observation(self, observation: CameraObservation) -> None:
+        """Replace the observation."""
+        self._observations.write(encode(observation))
+
+    def close(self) -> None:
+        """Release both slots. Idempotent."""
+        self._observations.close()
+        self._priors.close()
+
+
+class CameraPipeline:
+    """Driver and detector of one camera: publishes what is seen in the newest frame; ``images`` records all frames."""
+
+    def __init__(
+        self,
+        driver: CameraDriver,
+        detector: Detector | None,
+        links: VisionLinks,
+        clock: Clock,
+        images: ImageRecorder | None = None,
+    ) -> None:
+        self._driver = driver
+        self._images = images
+        self._detector = detector
+        self._links = links
+        self._clock = clock
+        self.frames = 0
+        self.written = 0
+
+    def open(self) -> None:
+        """Connect and start. Raises DriverError."""
+        self._driver.configure()
+        self._driver.activate()
+
+    def close(self) -> None:
+        """Stop and release; idempotent."""
+        try:
+            self._driver.deactivate()
+        except DriverError as error:
+            write_log("vision", f"camera did not deactivate: {error}")
+        finally:
+            self._driver.close()
+
+    def poll(self) -> bool:
+        """Take what arrived; True where an observation was published. Raises DriverError."""
+        arrived = self._driver.poll()
+        if not arrived:
+            return False
+        newest = arrived[-1]
+        self.frames += len(arrived)
+        if isinstance(newest, Frame):
+            if self._detector is None:
+                raise DriverError(
+                    "no_detector", "the camera delivers frames and the cell file names no detector"
+                )
+            observation = self._detector.detect(newest, self._fresh_prior())
+        else:
+            observation = newest
+        assert isinstance(observation, CameraObservation)
+        self._links.publish_observation(observation)
+        self.written += 1
+        if self._images is not None:
+            self._images.take(arrived)
+        return True
+
+    def _fresh_prior(self) -> Prior | None:
+        prior = self._links.newest_prior()
+        if prior is None or (self._clock.now_ns() - prior.t_ns) * 1e-9 > PRIOR_MAX_AGE_S:
+            return None
+        return prior
+
+
+def poll_interval_s(rate_hz: float) -> float:
+    """Seconds between two polls of a camera of ``rate_hz`` that has delivered nothing."""
+    return min(0.002, 0.1 / rate_hz)
+
+
+def camera_loop(
+    pipeline: CameraPipeline,
+    report: Callable[[str, str], None],
+    now_ns: Callable[[], int],
+    *,
+    camera: str,
+    poll_s: float,
+) -> Generator[float]:
+    """Run a camera for ever, and yield how many seconds to wait before it is resumed; closing it closes the camera.
+
+    Every failure is reported once and answered by a reconnect after a growing pause.
+    """
+    pause_s = FIRST_PAUSE_S
+    down = False
+    while True:
+        try:
+            pipeline.open()
+            heard_ns = now_ns()
+            yield 0.0
+            while True:
+                if pipeline.poll():
+                    heard_ns = now_ns()
+                    pause_s = FIRST_PAUSE_S
+                    if down:
+                        down = False
+                        report("camera_back", f"camera {camera} delivers again")
+                    yield 0.0
+                elif (now_ns() - heard_ns) * 1e-9 > SILENT_CAMERA_S:
+                    raise DriverError("silent", f"no image for {SILENT_CAMERA_S:g} s", retry=True)
+                else:
+                    yield poll_s
+        except DriverError as error:
+            if not down:
+                report("camera_lost", f"camera {camera}: {error}; trying again")
+            down = True
+        finally:
+            pipeline.close()
+        until = now_ns() + int(pause_s * 1e9)
+        while now_ns() < until:
+            yield min(0.05, pause_s)
+        pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+
+def run_camera(
+    loop: Generator[float],
+    ended: Callable[[], bool],
+    *,
+    sleep: Callable[[float], None],
+    between: Callable[[], None],
+) -> None:
+    """Run a `camera_loop` until ``ended``, and call ``between`` after each of its parts; closes the camera."""
+    with closing(loop):
+        while not ended():
+            pause_s = next(loop)
+            between()
+            if pause_s > 0.0:
+                sleep(pause_s)
+
+
+def run(plan: RunPlan, camera: str, termination: Termination) -> None:
+    """Run the process of ``camera`` until asked to end."""
+    directories = plan.directories
+    clock = MonotonicClock()
+    section = next(section for section in plan.cell.camera if section.name == camera)
+    description = next(description for description in plan.cameras if description.name == camera)
+    path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
+    lock = (
+        FileLock(path, f"camera driver {section.driver!r} with these options") if path is not None else None
+    )
+    driver, detector = make_camera(section, plan.driver_context(clock, section))
+    reporter = Reporter(directories.reports_socket, f"vision-{camera}", clock)
+    images: ImageRecorder | None = None
+    if description.delivers == "frames":
+        from stereoservo.recording.image_recording import (
+            ImageRecorder,
+        )  # OpenCV: not for cameras without pictures
+
+        order = request_path(directories)
+        images = ImageRecorder(order, camera, section.driver, description.rate_hz, reporter.report)
+
+    def between() -> None:
+        if images is not None:
+            images.poll_request(clock.now_ns())
+        reporter.flush()
+
+    try:
+        with closing(VisionSlots(directories, camera)) as links:
+            pipeline = CameraPipeline(driver, detector, links, clock, images)
+            loop = camera_loop(
+                pipeline,
+                reporter.report,
+                clock.now_ns,
+                camera=camera,
+                poll_s=poll_interval_s(description.rate_hz),
+            )
+            run_camera(loop, lambda: termination.asked, sleep=clock.sleep, between=between)
+    finally:
+        if images is not None:
+            images.close()
+        if lock is not None:
+            lock.release()
+
+
+def main() -> int:
+    """Entry of the process."""
+    runtime, parent, camera = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+    die_with_parent(
+        parent, signal.SIGKILL
+    )  # nothing to put in order here, and a hung driver must not survive
+    termination = Termination()
+    try:
+        run(load_plan(runtime), camera, termination)
+    except (AlreadyRunningError, DriverError, PlanError, SlotError, plugins.PluginError) as error:
+        write_log(f"vision-{camera}", str(error))
+        return EXIT_SETUP
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

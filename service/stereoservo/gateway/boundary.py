@@ -1,0 +1,74 @@
+"""Error boundary for untrusted messages: an exception becomes a refusal, counted and logged, and ends no process."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+
+from stereoservo.daemon.process_control import write_log
+from stereoservo.gateway.point_alignment import TransferError
+from stereoservo.messages.keys import InvalidKeyError
+from stereoservo.messages.wire import MessageError, Reply
+
+LOG_INTERVAL_S = 1.0
+MAX_TEXT_CHARS = 2000
+"""Of a refusal or a line of the log: both may quote a message of 64 KiB, and the last 10 000 events are kept."""
+EXPECTED_ERRORS = (MessageError, InvalidKeyError, TransferError)
+"""What the gateway's own checks raise; their texts are made for clients."""
+
+
+class LimitedLog:
+    """Log of what clients can cause as often as they like: a line a second at most; ``count``: of all of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._logged = -LOG_INTERVAL_S
+
+    def add(self, text: str) -> None:
+        """Count, and log unless another line was logged within the last second."""
+        self.count += 1
+        now = time.monotonic()
+        if now - self._logged >= LOG_INTERVAL_S:
+            self._logged = now
+            printable = "".join(character if character.isprintable() else " " for character in _cut(text))
+            write_log("gateway", f"{printable} ({self.count} of this kind since the start)")
+
+
+class Boundary:
+    """Takes the messages of one thread. ``refusals`` counts and logs those that raised."""
+
+    def __init__(self, boot: str) -> None:
+        self.refusals = LimitedLog()
+        self._boot = boot
+
+    def take(self, key: str, work: Callable[[], None], refuse: Callable[[Reply], None]) -> None:
+        """Do ``work`` for a message that came on ``key``; where it raises, call ``refuse`` with the refusal."""
+        try:
+            work()
+        except Exception as error:
+            problem = str(error) if isinstance(error, EXPECTED_ERRORS) else f"{type(error).__name__}: {error}"
+            self.refusals.add(f"refused a message on {key!r}: {problem}{_origin(error)}")
+            refuse(Reply(accepted=False, message=_message(error), problems=(_cut(problem),), boot=self._boot))
+
+
+def _message(error: Exception) -> str:
+    """The first sentence of a refusal."""
+    if isinstance(error, TransferError):
+        return "no goal could be made"
+    if isinstance(error, EXPECTED_ERRORS):
+        return "the message is not valid"
+    return "the message could not be taken; the daemon's log says where it failed"
+
+
+def _origin(error: Exception) -> str:
+    """The code line that raised an unforeseen error; empty for the others."""
+    if isinstance(error, EXPECTED_ERRORS):
+        return ""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f" ({frame.name}, {frame.filename}:{frame.lineno})"
+
+
+def _cut(text: str) -> str:
+    rest = len(text) - MAX_TEXT_CHARS
+    return text if rest <= 0 else f"{text[:MAX_TEXT_CHARS]}… ({rest} characters more)"

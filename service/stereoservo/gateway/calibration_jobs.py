@@ -1,0 +1,223 @@
+"""Calibrations and model checks: collects the samples, runs the fit in a process of its own, installs the model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stereoservo.calibration.fit_assessment import assess_failure
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.core.cycle import Event
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.sources.check import RESET_ZEROS
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
+from stereoservo.gateway.child_jobs import CheckJob, FitFailedError, FitJob, calibration_result
+from stereoservo.gateway.persistence import ModelStore
+from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.kinematics.model import CellModel, ModelFileError
+from stereoservo.messages.check_report import ZeroReset
+from stereoservo.messages.wire import CalibrationResult
+
+
+class CalibrationJobs:
+    """The cell's model and how it comes about. ``model`` is the one that was given to the core last.
+
+    ``notes``: what is wrong with the model files, until a newer model is there.
+    """
+
+    def __init__(
+        self, settings: CoreSettings, models: ModelStore, link: ServoConnection, log: EventLog, history: Path
+    ) -> None:
+        self._settings = settings
+        self._models = models
+        self._link = link
+        self._log = log
+        self._history = history
+        self._job = TrialCollector(settings)
+        self._fit: FitJob | None = None
+        self._fit_id = ""
+        self._told = False
+        self._check: CheckJob | None = None
+        self._check_id = ""
+        self._handed: tuple[str, CalibrationResult | ZeroReset] | None = None
+        self.model: CellModel | None = None
+        self.notes: tuple[str, ...] = ()
+
+    def load(self, core_epoch: int) -> None:
+        """Give the newest fitting model of the disk to the core, unless that (epoch ``core_epoch``) has it."""
+        model, passed = self._models.newest_fitting(self._settings)
+        used = "no model is used" if model is None else f"model epoch {model.epoch} is used instead"
+        self.notes = tuple(f"model passed over: {text}; {used}" for text in passed)
+        for text in self.notes:
+            self._log.add("warning", message=text, origin="gateway")
+        # Given again to a core that has it, after a restart of the gateway, it would lose its estimates.
+        if model is not None and (model.epoch == core_epoch or self._link.send_model(model)):
+            self.model = model
+
+    def core_event(self, event: Event, *, fresh: bool) -> None:
+        """Take an event of the core; ``fresh``: it was not acted upon before a restart of the gateway."""
+        self._job.add(event)
+        if event.kind == "calibration_finished" and fresh:
+            self._start_fit()
+        elif event.kind == "check_finished" and fresh:
+            self._start_check(reset=event.name == RESET_ZEROS)
+        elif event.kind == "model" and self._handed is not None:
+            handed, self._handed = self._handed, None
+            self.notes = ()
+            self._tell_taken(*handed)
+        elif event.kind == "warning" and event.message.startswith("model refused"):
+            goal_id = self._fit_id if self._handed is None else self._handed[0]
+            self._handed = None
+            self._failed(goal_id, event.message)
+
+    def _tell_taken(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
+        """The core works with the model that was handed over."""
+        if isinstance(what, ZeroReset):
+            self._log.add("zeros_reset", message=what.message, id=goal_id, reset=what, origin="gateway")
+            return
+        self._log.add(
+            "calibrated",
+            message=f"model epoch {what.epoch}: {what.rms_px:.4f} px rms. {what.verdict}",
+            id=goal_id,
+            calibration=what,
+            origin="gateway",
+        )
+
+    def _start_fit(self) -> None:
+        self.cancel()
+        self._fit_id, self._told = self._job.id, False
+        try:
+            epoch = self._models.next_epoch()
+            self._fit = FitJob(self._job.trials(), self._models.path(epoch), epoch)
+        except (CalibrationError, OSError) as error:
+            self._failed(self._fit_id, str(error), getattr(error, "code", ""))
+            return
+        message = f"{self._job.stops} stops"
+        if self._job.standing:
+            markers = ", ".join(str(marker) for marker in self._job.standing)
+            message += f"; markers {markers} stood still: they are not of the body, and left out"
+        if self._job.strayed:
+            markers = ", ".join(str(marker) for marker in self._job.strayed)
+            message += (
+                f"; markers {markers} are static by the cell file's [scene], but moved in the images: they are left "
+                "out of the scene. Are they on the arm, did something push them?"
+            )
+        self._log.add("fit_started", message=message, id=self._fit_id, progress=0.0, origin="gateway")
+
+    def _start_check(self, *, reset: bool) -> None:
+        if self._check is not None:
+            self._check.close()
+            self._check = None
+        self._check_id = self._job.id
+        if self.model is None:
+            self._failed(self._check_id, "the model that was to be checked is gone")
+            return
+        path = self._models.path(self.model.epoch)
+        try:
+            epoch = self._models.next_epoch()
+            self._check = CheckJob(
+                self._job.trials(), path, self._history, self._settings.tolerance_px,
+                reset_to=self._models.path(epoch) if reset else None, epoch=epoch,
+            )  # fmt: skip
+        except (CalibrationError, OSError) as error:
+            self._failed(self._check_id, str(error), getattr(error, "code", ""))
+
+    def poll(self) -> None:
+        """Report the progress of a running fit or check, and act on its result."""
+        if self._fit is not None:
+            self._poll_fit(self._fit)
+        if self._check is not None:
+            self._poll_check(self._check)
+
+    def _poll_fit(self, fit: FitJob) -> None:
+        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        for step in fit.poll():
+            self._log.add(
+                "fit_progress",
+                message=step.message,
+                id=self._fit_id,
+                progress=step.progress,
+                origin="gateway",
+            )
+        if fit.decided and not self._told:
+            self._told = True
+            self._decide(fit)
+        if not ended:
+            return
+        report = fit.said.get("report")
+        if report is not None:
+            self._log.add(
+                "calibration_report",
+                message=f"report in {report}",
+                id=self._fit_id,
+                name=report,
+                origin="gateway",
+            )
+        elif "model" in fit.said or "error" in fit.said:
+            cause = fit.said.get("report_error", "its process ended early")
+            self._log.add(
+                "calibration_report", message=f"no report could be written: {cause}", id=self._fit_id,
+                accepted=False, origin="gateway",
+            )  # fmt: skip
+        fit.close()
+        self._fit = None
+
+    def _decide(self, fit: FitJob) -> None:
+        try:
+            model, verdict, seconds = fit.model()
+            result = calibration_result(
+                model, fit.model_path, verdict, fit.report_path, fit.trials_path, seconds
+            )
+        except (FitFailedError, ModelFileError) as error:
+            code = getattr(error, "code", "")
+            kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
+            self._failed(self._fit_id, f"{assess_failure(code, str(error)).text} {kept}", code)
+            return
+        self._hand_over(model, self._fit_id, result, fit.model_path)
+
+    def _hand_over(
+        self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path
+    ) -> None:
+        """Send a model to the core, which takes it once the arm is at rest; ``what`` is reported then."""
+        if not self._link.send_model(model):
+            self._failed(goal_id, f"the servo process does not take the model; it is saved as {path}")
+            return
+        self.model, self._handed = model, (goal_id, what)
+
+    def _poll_check(self, check: CheckJob) -> None:
+        ended = check.ended
+        for _ in check.poll():
+            pass
+        if not ended:
+            return
+        try:
+            report = check.report()
+        except FitFailedError as error:
+            self._failed(self._check_id, str(error), error.code)
+        else:
+            text = "; ".join(part for part in (report.message, report.trend) if part)
+            self._log.add("checked", message=text, id=self._check_id, check=report, origin="gateway")
+            if check.reset_to is not None:
+                self._take_zeros(check, check.reset_to)
+        check.close()
+        self._check = None
+
+    def _take_zeros(self, check: CheckJob, path: Path) -> None:
+        try:
+            model, reset = check.reset()
+        except FitFailedError as error:
+            self._failed(self._check_id, str(error), error.code)
+        except ModelFileError as error:
+            self._failed(self._check_id, str(error))
+        else:
+            self._hand_over(model, self._check_id, reset, path)
+
+    def _failed(self, goal_id: str, message: str, code: str = "") -> None:
+        self._log.add("calibration_failed", message=message, id=goal_id, name=code, origin="gateway")
+
+    def cancel(self) -> None:
+        """End what runs. Idempotent."""
+        for job in (self._fit, self._check):
+            if job is not None:
+                job.close()
+        self._fit = self._check = None

@@ -1,0 +1,191 @@
+"""Child processes that fit or check a model, polled without waiting."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import msgspec
+
+from stereoservo.calibration.fit_assessment import Acceptance
+from stereoservo.calibration.trial_data import TrialData, save_trials
+from stereoservo.daemon.jobs.fit_job import figures_file, report_folder, trials_file
+from stereoservo.daemon.process_control import child_environment
+from stereoservo.kinematics.model import CellModel, load_model
+from stereoservo.messages.check_report import CheckReport, ZeroReset
+from stereoservo.messages.wire import CalibrationResult
+
+FIT_TIMEOUT_S = 600.0
+
+
+class FitFailedError(Exception):
+    """A fit gave no model, a check no answer; ``code`` is the calibration's."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class FitProgress(msgspec.Struct, frozen=True):
+    """Progress of a fit."""
+
+    progress: float
+    message: str
+
+
+class ChildJob:
+    """A child process that prints JSON objects, one a line. ``said`` holds all but the progress."""
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self._started = time.monotonic()
+        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - read when the process has ended
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments, "--parent", str(os.getpid())],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._errors, env=child_environment(),
+        )  # fmt: skip
+        assert self._process.stdout is not None
+        self._output = self._process.stdout
+        os.set_blocking(self._output.fileno(), False)
+        self._buffer = b""
+        self.said: dict[str, Any] = {}
+
+    def poll(self) -> Iterator[FitProgress]:
+        """Progress printed since the last poll."""
+        while chunk := (b"" if self._output.closed else self._output.read()):
+            self._buffer += chunk
+        *lines, self._buffer = self._buffer.split(b"\n")
+        for line in lines:
+            said = msgspec.json.decode(line)
+            if "progress" in said:
+                yield msgspec.convert(said, FitProgress)
+            else:
+                self.said |= said
+
+    @property
+    def seconds(self) -> float:
+        """Its run time [s]."""
+        return time.monotonic() - self._started
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended (it is ended after ``FIT_TIMEOUT_S``)."""
+        if self.seconds > FIT_TIMEOUT_S:
+            self.cancel()
+        return self._process.poll() is not None
+
+    def require(self, key: str) -> Any:
+        """The value it printed under ``key``. Raises FitFailedError with its own error, or with how it ended."""
+        if key in self.said:
+            return self.said[key]
+        if failure := self.said.get("error"):
+            raise FitFailedError(failure["code"], failure["message"])
+        code = self._process.wait()
+        self._errors.seek(0)
+        said = self._errors.read().decode(errors="replace").strip()
+        last = said.splitlines()[-1] if said else "no message"
+        raise FitFailedError("fit_process", f"the process ended with exit code {code}: {last}")
+
+    def close(self) -> None:
+        """End it, and release what it held. Idempotent."""
+        self.cancel()
+        self._output.close()
+        self._errors.close()
+
+    def cancel(self) -> None:
+        """End it. Idempotent."""
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+
+
+class FitJob(ChildJob):
+    """A running fit: gives a model or the cause of its failure, and later a report."""
+
+    def __init__(self, trials: TrialData, model_path: Path, epoch: int) -> None:
+        self.model_path = model_path
+        self.trials_path = trials_file(model_path, epoch)
+        self.report_path = report_folder(model_path) / "index.html"
+        save_trials(trials, self.trials_path)
+        super().__init__(
+            "stereoservo.daemon.jobs.fit_job", str(self.trials_path), str(model_path), "--epoch", str(epoch)
+        )
+        self._seconds: float | None = None
+
+    @property
+    def decided(self) -> bool:
+        """Whether there is a model, or a cause why there is none."""
+        return "model" in self.said or "error" in self.said or self.ended
+
+    def model(self) -> tuple[CellModel, Acceptance, float]:
+        """The model, what is to be said of it, and the seconds it took. Raises FitFailedError, ModelFileError."""
+        self.require("model")
+        if self._seconds is None:
+            self._seconds = self.seconds
+        return load_model(self.model_path), msgspec.convert(self.said["verdict"], Acceptance), self._seconds
+
+
+class CheckJob(ChildJob):
+    """A running check of a model. ``reset_to``: file for a model, of ``epoch``, with drifted joint zeros reset."""
+
+    def __init__(
+        self, check: TrialData, model_path: Path, history: Path, limit_px: float, *,
+        reset_to: Path | None = None, epoch: int = 0,
+    ) -> None:  # fmt: skip
+        path = model_path.with_name("check.npz")
+        save_trials(check, path)
+        self.reset_to = reset_to
+        wanted = [] if reset_to is None else ["--reset-to", str(reset_to), "--epoch", str(epoch)]
+        super().__init__(
+            "stereoservo.daemon.jobs.check_job", str(path), str(model_path), str(history), "--limit-px",
+            repr(limit_px), *wanted,
+        )  # fmt: skip
+
+    def report(self) -> CheckReport:
+        """The report of the check. Raises FitFailedError."""
+        return msgspec.convert(self.require("check"), CheckReport)
+
+    def reset(self) -> tuple[CellModel, ZeroReset]:
+        """The model with moved zeros, and what was moved. Raises FitFailedError, ModelFileError."""
+        reset = msgspec.convert(self.require("reset"), ZeroReset)
+        return load_model(Path(reset.model)), reset
+
+
+def calibration_result(
+    model: CellModel,
+    path: Path,
+    verdict: Acceptance,
+    report: Path | None,
+    trials: Path | None,
+    seconds: float,
+) -> CalibrationResult:
+    """The figures of a fit that clients want. Raises FitFailedError where the model carries no statistics."""
+    statistics = model.statistics
+    if statistics is None:
+        raise FitFailedError("no_statistics", f"{path}: the fitted model carries no statistics")
+    return CalibrationResult(
+        rms_px=statistics.rms_px,
+        per_joint_px={joint.name: joint.rms_px for joint in statistics.joints},
+        covariance_ok=statistics.chi2_ok,
+        model=str(path),
+        epoch=model.epoch,
+        stratum=model.stratum,
+        chi2=statistics.chi2,
+        degrees_of_freedom=statistics.degrees_of_freedom,
+        measurements=statistics.measurements,
+        parameters=statistics.parameters,
+        outliers=statistics.outliers,
+        joints=len(model.joint_names),
+        images=statistics.images,
+        seconds=seconds,
+        verdict=verdict.text,
+        grade=verdict.grade,
+        report="" if report is None else str(report),
+        trials="" if trials is None else str(trials),
+        figures=str(figures_file(path)),
+    )

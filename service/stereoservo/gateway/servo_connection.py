@@ -1,0 +1,116 @@
+"""Connection of the gateway to the servo process: requests and heartbeats out; events, state and step records in."""
+
+from __future__ import annotations
+
+import time
+
+import msgspec
+
+from stereoservo.core.cycle import Event
+from stereoservo.daemon.ipc_messages import (
+    STATE_LAYOUT,
+    Ask,
+    Heartbeat,
+    Hello,
+    NewModel,
+    ServoState,
+    encode,
+    event_decoder,
+    state_decoder,
+    steps_decoder,
+)
+from stereoservo.daemon.seqlock import SlotReader
+from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.goals import Command, Request
+from stereoservo.recording.step_records import StepMessage
+
+HEARTBEAT_EVERY_S = 0.05
+RECONNECT_EVERY_S = 0.1
+
+
+class ServoConnection:
+    """Connection to the servo process; reconnects by itself, blocks never. ``records``: take step records, too."""
+
+    def __init__(self, directories: CellDirectories) -> None:
+        self._directories = directories
+        self.records = False
+        self._control: PacketChannel | None = None
+        self._steps: PacketChannel | None = None
+        self._state = SlotReader(directories.state_slot, STATE_LAYOUT)
+        self._last_beat = 0.0
+        self._last_try = 0.0
+        self._last_event = 0
+        # A restarted gateway is sent old replies again: numbers must not meet those of its predecessor.
+        self._next_request = time.monotonic_ns() // 1000
+
+    @property
+    def connected(self) -> bool:
+        """Whether the servo process takes requests."""
+        return self._control is not None and self._control.is_open
+
+    def poll_connection(self) -> None:
+        """Connect where needed, and send a heartbeat when one is due."""
+        now = time.monotonic()
+        if now - self._last_try >= RECONNECT_EVERY_S:
+            self._last_try = now
+            if not self.connected:
+                self._control = _try(self._directories, "control_socket")
+                if self._control is not None:
+                    self._control.send(encode(Hello(self._last_event)))
+            if self.records and (self._steps is None or not self._steps.is_open):
+                self._steps = _try(self._directories, "steps_socket")
+        if not self.records and self._steps is not None:
+            self._steps.close()
+            self._steps = None
+        if self._control is not None and now - self._last_beat >= HEARTBEAT_EVERY_S:
+            self._last_beat = now
+            self._control.send(encode(Heartbeat()))
+
+    def send_command(self, command: Command, operator: str) -> int | None:
+        """Send a command; returns its request number, None where the servo process is not connected."""
+        number = self._next_request
+        self._next_request += 1
+        if self._control is None or not self._control.send(encode(Ask(Request(number, operator, command)))):
+            return None
+        return number
+
+    def send_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
+        """Send a model to the core, without its covariance: the loop does not use it, and messages are bounded."""
+        bare = msgspec.structs.replace(model, covariance=None)
+        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
+
+    def events(self) -> list[Event]:
+        """Core events since the last call, in order."""
+        if self._control is None:
+            return []
+        found = [event_decoder.decode(data) for data in self._control.receive(256)]
+        if found:
+            self._last_event = max(self._last_event, found[-1].seq)
+        return found
+
+    def steps(self, limit: int = 512) -> list[StepMessage]:
+        """Step records since the last call, at most ``limit``."""
+        if self._steps is None:
+            return []
+        return [steps_decoder.decode(data) for data in self._steps.receive(limit)]
+
+    def state(self) -> ServoState | None:
+        """The servo process's newest state, if it is new."""
+        data = self._state.poll()
+        return None if data is None else state_decoder.decode(data)
+
+    def close(self) -> None:
+        """Release all; idempotent."""
+        for channel in (self._control, self._steps):
+            if channel is not None:
+                channel.close()
+        self._state.close()
+
+
+def _try(directories: CellDirectories, name: str) -> PacketChannel | None:
+    try:
+        return PacketChannel.connect(getattr(directories, name))
+    except ChannelError:  # not up (yet); tried again
+        return None

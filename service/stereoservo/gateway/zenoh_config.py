@@ -1,0 +1,100 @@
+"""zenoh configuration of the gateway's two sessions; refuses endpoints open to the network without TLS."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from pathlib import Path
+from typing import Any
+
+from stereoservo.client.session import SessionError, base_config, client_config, client_mode
+from stereoservo.messages.cell_file import CellFile, TlsSection
+from stereoservo.messages.directories import check_socket_path
+
+_NETWORK_ENDPOINT = re.compile(
+    r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}"
+)
+
+
+def endpoint_of(cell: CellFile, socket: Path) -> str:
+    """The endpoint for clients of this host: the unix socket, or the site's router."""
+    if cell.zenoh.mode == "client" and cell.zenoh.endpoints:
+        return cell.zenoh.endpoints[0]
+    return f"unixsock-stream/{socket}"
+
+
+def gateway_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
+    """The gateway's main session: the router itself, or a client of a site's router.
+
+    A router listens on the unix socket in any case: the gateway's own second session and this host's clients use it.
+    Raises SessionError: an endpoint reaches beyond this host without TLS on both sides.
+    """
+    section = cell.zenoh
+    for endpoint in section.endpoints:
+        check_endpoint(endpoint, section.tls)
+    config = base_config()
+    client = section.mode == "client"
+    if section.tls is not None:
+        side = "connect" if client else "listen"
+        config["transport"]["link"]["tls"] = {
+            "root_ca_certificate": str(cell_dir / section.tls.root_ca_certificate),
+            f"{side}_private_key": str(cell_dir / section.tls.listen_private_key),
+            f"{side}_certificate": str(cell_dir / section.tls.listen_certificate),
+            "enable_mtls": section.tls.enable_mtls,
+        }
+    if client:
+        if not section.endpoints:
+            raise SessionError(
+                'zenoh.mode = "client" needs zenoh.endpoints: the router to join, e.g. ["tls/router:7447"]'
+            )
+        return config | client_mode(list(section.endpoints))
+    check_socket_path(socket)
+    endpoints = [f"unixsock-stream/{socket}", *section.endpoints]
+    return config | {"mode": "router", "listen": {"endpoints": endpoints}, "connect": {"endpoints": []}}
+
+
+def stop_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
+    """The session for stop and enable: a client of the gateway's own router, or of the site's."""
+    if cell.zenoh.mode == "client":
+        return gateway_config(cell, cell_dir, socket)
+    return client_config(endpoint_of(cell, socket))
+
+
+def check_endpoint(endpoint: str, tls: TlsSection | None) -> None:
+    """Check an endpoint that the daemon listens on or connects to: beyond this host, both sides show a certificate.
+
+    Parameters of zenoh behind the address (``?…``, ``#…``) are refused: they override the session's TLS options.
+    Raises SessionError.
+    """
+    if endpoint.startswith("unixsock-stream/") and not set(endpoint) & set("?#"):
+        return
+    match = _NETWORK_ENDPOINT.fullmatch(endpoint)
+    if match is None:
+        raise SessionError(
+            f"zenoh.endpoints: {endpoint!r}; valid are unixsock-stream/PATH, tcp/127.0.0.1:PORT, or "
+            "tls/HOST:PORT with [zenoh.tls], without ? or # parameters"
+        )
+    local = is_loopback(match["host"])
+    if match["protocol"] == "tcp":
+        if not local:
+            raise SessionError(
+                f"zenoh.endpoints: {endpoint!r}: without TLS every host on the way could command the arm; "
+                "use tcp on 127.0.0.1, [::1] or localhost, or tls/HOST:PORT with [zenoh.tls]"
+            )
+    elif tls is None:
+        raise SessionError(f"zenoh.endpoints: {endpoint!r} needs [zenoh.tls]")
+    elif not tls.enable_mtls and not local:
+        raise SessionError(
+            f"zenoh.tls.enable_mtls = false with zenoh.endpoints {endpoint!r}: every host could command the arm "
+            "without a certificate; leave enable_mtls out, or use tls on 127.0.0.1, [::1] or localhost"
+        )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether ``host`` is this host for certain: ``localhost``, 127.0.0.0/8 or [::1]. Other names are not looked up."""
+    if host.startswith("["):
+        return host == "[::1]"
+    try:
+        return host.lower() == "localhost" or ipaddress.IPv4Address(host).is_loopback
+    except ipaddress.AddressValueError:  # a name, or not in four decimal numbers
+        return False

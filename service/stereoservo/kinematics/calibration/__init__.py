@@ -1,1 +1,0 @@
-"""Self-calibration from joint-wise trial motions (thesis 5.4)."""

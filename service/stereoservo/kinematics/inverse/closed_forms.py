@@ -1,0 +1,293 @@
+"""What a subproblem in closed form answers: candidates, joint by joint, not yet checked against the whole chain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.displacements import exp_rotation, exp_translation
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+FREE = 1e-9
+"""Radius of a joint's circle, as a share of what its operator could move, below which the joint moves nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Branches:
+    """k candidates for n joints, as motions from the zero.
+
+    ``steps`` (k, n) [rad or m]. ``excess`` (k, n): by how much a joint's equation fails to have a root, as a share of
+    its amplitude; 0 where it has one, infinite where the joint moves nothing that matters. The step is then that of
+    the nearest approach. ``free`` (k, n): the equation holds for every position of this joint, which stays at its seed.
+    """
+
+    steps: FloatArray
+    excess: FloatArray
+    free: BoolArray
+
+
+def single(step: float, excess: float = 0.0, free: bool = False) -> Branches:
+    """One candidate of one joint."""
+    return Branches(np.array([[step]]), np.array([[excess]]), np.array([[free]]))
+
+
+def beside(first: Branches, second: Branches) -> Branches:
+    """Joints of ``second`` after those of ``first``; the one with a single candidate goes with all of the other."""
+    k = max(len(first.steps), len(second.steps))
+
+    def wide(left: npt.NDArray, right: npt.NDArray) -> npt.NDArray:  # type: ignore[type-arg]
+        parts = [part if len(part) == k else np.repeat(part, k, axis=0) for part in (left, right)]
+        return np.concatenate(parts, axis=1)
+
+    return Branches(
+        wide(first.steps, second.steps), wide(first.excess, second.excess), wide(first.free, second.free)
+    )
+
+
+def together(several: list[Branches]) -> Branches:
+    """All candidates of ``several``, one list."""
+    return Branches(
+        np.concatenate([branches.steps for branches in several]),
+        np.concatenate([branches.excess for branches in several]),
+        np.concatenate([branches.free for branches in several]),
+    )
+
+
+def one_of(branches: Branches, i: int) -> Branches:
+    """Candidate ``i`` alone."""
+    part = slice(i, i + 1)
+    return Branches(branches.steps[part], branches.excess[part], branches.free[part])
+
+
+INDEPENDENT = 1e-9
+"""Least over largest singular value of the joints' directions that are not linearly dependent."""
+
+
+def prismatic_joints(operators: FloatArray, A: FloatArray, target: FloatArray) -> Branches:
+    """Positions [m] of n joints of operators (n, 4, 4) that take points ``A`` (m, 4) to ``target`` (m, 4) (6.6).
+
+    Planes through each target, its orthogonal complement (3, 4), hold the moved point: no heights are needed. Where
+    the target is off what the joints reach, the least squares over these planes; where directions depend on one
+    another, the least motion, with these joints marked free.
+    """
+    rows, sides = [], []
+    for point, goal in zip(A, target, strict=True):
+        planes = np.linalg.svd(goal[None] / np.linalg.norm(goal))[2][1:]
+        rows.append(planes @ (operators @ point).T)
+        sides.append(-planes @ point)
+    matrix, side = np.concatenate(rows), np.concatenate(sides)
+    steps, _, _, singular = np.linalg.lstsq(matrix, side, rcond=INDEPENDENT)
+    dependent = singular <= INDEPENDENT * max(float(singular[0]), 1e-300)
+    free = np.zeros(len(operators), dtype=bool)
+    if len(singular) < len(operators) or dependent.any():
+        kernel = np.linalg.svd(matrix)[2][int((~dependent).sum()) :]
+        free = np.abs(kernel).max(axis=0) > INDEPENDENT
+    return Branches(steps[None], np.zeros((1, len(operators))), free[None])
+
+
+@dataclass(frozen=True, eq=False)
+class Crossing:
+    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one where it only comes near, or the seed
+    where it lies there all the time. ``excess`` and ``free`` as in `Branches`.
+    """
+
+    angles: FloatArray
+    excess: float
+    free: bool
+
+
+def circle_meets_plane(G: FloatArray, A: FloatArray, plane: FloatArray, seed: float = 0.0) -> Crossing:
+    """Both roots of ``aᵀ exp(θĤ) A = 0`` (6.8): ``p₀ + p_s sinθ - p_c cosθ = 0`` (errata to 6.9, 6.10).
+
+    ``G`` (4, 4) revolute, ``A`` (4,), ``plane`` (4,).
+    """
+    first, second = G @ A, G @ (G @ A)
+    p_s, p_c = float(plane @ first), float(plane @ second)
+    p_0 = float(plane @ A) + p_c
+    amplitude = float(np.hypot(p_s, p_c))
+    scale = float(np.linalg.norm(plane) * np.linalg.norm(A)) * max(1.0, float(np.linalg.norm(G)) ** 2)
+    if amplitude <= FREE * scale:
+        held = abs(p_0) <= FREE * scale
+        return Crossing(np.array([seed]), 0.0 if held else np.inf, held)
+    middle = -np.arctan2(p_s, p_c)
+    room = (amplitude - p_0) * (amplitude + p_0)
+    if room <= 0.0:
+        nearest = middle if p_0 > 0.0 else middle + np.pi
+        return Crossing(np.array([nearest]), abs(p_0) / amplitude - 1.0, False)
+    half = np.arctan2(np.sqrt(room), p_0)
+    return Crossing(np.array([middle + half, middle - half]), 0.0, False)
+
+
+def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float = 0.0) -> Branches:
+    """The angle [rad] about a revolute operator ``G`` (4, 4) that takes points ``A`` (..., 4) nearest to ``target``.
+
+    Points and targets of equal heights. The radial part of the target, ``-Ĥ²A*``, is resolved along those of the point
+    and of its motion, ``-Ĥ²A`` and ``ĤA``: the plane of (6.11) through axis and target in one linear step, with
+    neither the trivial second root nor a choice of plane. ``excess``: how far the radii differ. Free where all of
+    ``A`` lies on the axis.
+    """
+    points, goals = np.reshape(A, (-1, 4)), np.reshape(target, (-1, 4))
+    square = G @ G
+    radial, along, wanted = -points @ square.T, points @ G.T, -goals @ square.T
+    size = float(np.linalg.norm(radial))
+    if size <= FREE * float(np.linalg.norm(square) * np.linalg.norm(points)):
+        return single(seed, free=True)
+    basis = np.stack([radial.ravel(), along.ravel()])
+    cosine, sine = np.linalg.solve(basis @ basis.T, basis @ wanted.ravel())
+    return single(float(np.arctan2(sine, cosine)), abs(float(np.hypot(cosine, sine)) - 1.0))
+
+
+def plane_across(G: FloatArray, A: FloatArray) -> FloatArray:
+    """The plane (4,) across the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0`` that stays fixed.
+
+    Also where A lies on the axis, and spans no circle with ``ĤA`` and ``Ĥ²A``.
+    """
+    pencil = np.linalg.svd(G)[0][:, 2:]
+    heights = A @ pencil
+    return np.asarray(pencil @ np.array([heights[1], -heights[0]]), dtype=np.float64)
+
+
+def axis_points(G: FloatArray) -> FloatArray:
+    """Two orthonormal points (2, 4) on the axis of ``G`` (4, 4), its kernel."""
+    return np.asarray(np.linalg.svd(G)[2][2:], dtype=np.float64)
+
+
+def common_point(operators: FloatArray) -> FloatArray:
+    """The point (4,), at unit norm, nearest to all axes of revolute ``operators`` (k, 4, 4), each at unit norm."""
+    unit = operators / np.linalg.norm(operators, axis=(1, 2), keepdims=True)
+    return np.asarray(np.linalg.svd(unit.reshape(-1, 4))[2][3], dtype=np.float64)
+
+
+def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
+    """Angles of two joints ``G`` (2, 4, 4) that are not parallel, ``exp(θ₁Ĥ₁) exp(θ₂Ĥ₂) A = A*`` (6.12).
+
+    The target on its way back about joint 1 crosses the plane of the circle of ``A`` about joint 2 twice (6.16);
+    each crossing leaves one turn about joint 2. ``A``, ``target`` (4,) of equal heights; ``seed`` (2,).
+    """
+    if np.linalg.norm(G[1] @ A) <= FREE * np.linalg.norm(G[1]) * np.linalg.norm(A):
+        return beside(turn_between(G[0], A, target, seed[0]), single(seed[1], free=True))
+    crossing = circle_meets_plane(-G[0], target, plane_across(G[1], A), seed[0])
+    found = []
+    for angle in crossing.angles:
+        before = exp_rotation(G[0], -angle) @ target
+        first = single(float(angle), crossing.excess, crossing.free)
+        found.append(beside(first, turn_between(G[1], A, before, seed[1])))
+    return together(found)
+
+
+def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
+    """Angles of two joints ``G`` (2, 4, 4) with parallel axes, ``exp(θ₁Ĥ₁) exp(θ₂Ĥ₂) A = A*`` (6.17-6.22).
+
+    The law of cosines needs lengths in the plane of motion up to one scale. Joint 1 has them: its operator is a quarter
+    turn of that plane's directions, which are its range, so that they are complex numbers. ``A``, ``target`` (4,) of
+    equal heights, ``seed`` (2,). Axes of opposite sense are parallel, too. Corrupted input is projected onto the
+    range of joint 1.
+    """
+    square = -G[0] @ G[0]
+    range_basis = np.linalg.svd(square)[0]
+    e = square @ range_basis[:, 0]
+    frame = np.linalg.pinv(np.stack([e, G[0] @ e], axis=1))
+
+    def direction(v: FloatArray) -> complex:
+        x, y = frame @ v
+        return complex(x, y)
+
+    opposite = (direction(G[1] @ e) / direction(e)).imag < 0.0
+    turning = -G[1] if opposite else G[1]
+    radial = -turning @ (turning @ A)
+    arm, between = direction(radial), direction(square @ (A - radial))
+    wanted = direction(square @ target)
+    size = max(abs(arm), abs(between), abs(wanted))
+    if abs(between) <= FREE * size:
+        whole = float(np.angle(wanted / arm)) if abs(arm) > FREE * size else 0.0
+        second = single(_signed(whole - seed[0], opposite), free=True)
+        return beside(single(float(seed[0]), free=True), second)
+    if abs(arm) <= FREE * size:
+        return beside(single(float(np.angle(wanted / between))), single(float(seed[1]), free=True))
+    cosine = (abs(wanted) ** 2 - abs(between) ** 2 - abs(arm) ** 2) / (2.0 * abs(between) * abs(arm))
+    bend = np.arctan2(np.sqrt(max(0.0, (1.0 - cosine) * (1.0 + cosine))), cosine)
+    middle = np.angle(between / arm)
+    excess = max(0.0, abs(cosine) - 1.0)
+    found = []
+    for turn in (middle + bend, middle - bend) if excess == 0.0 else (middle + bend,):
+        reach = between + np.exp(1j * turn) * arm
+        second = single(_signed(float(turn), opposite), excess)
+        if min(abs(reach), abs(wanted)) <= FREE * size:
+            found.append(beside(single(float(seed[0]), free=abs(wanted) <= FREE * size), second))
+        else:
+            found.append(beside(single(float(np.angle(wanted / reach))), second))
+    return together(found)
+
+
+def _signed(angle: float, opposite: bool) -> float:
+    return -angle if opposite else angle
+
+
+def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
+    """Angles of three joints ``G`` (3, 4, 4) that take ``A`` (4,) to ``target`` (4,), up to four (6.24-6.26).
+
+    Joints 2 and 3 keep the point in the plane across their axes (6.23), which leaves two angles of joint 1; each leaves
+    a problem of two parallel joints. Equal heights; ``seed`` (3,).
+    """
+    crossing = circle_meets_plane(-G[0], target, plane_across(G[1], A), seed[0])
+    found = []
+    for angle in crossing.angles:
+        before = exp_rotation(G[0], -angle) @ target
+        first = single(float(angle), crossing.excess, crossing.free)
+        found.append(beside(first, two_parallel(G[1:], A, before, seed[1:])))
+    return together(found)
+
+
+def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
+    """Angles of three joints ``G`` (3, 4, 4) whose product is the rotation ``H`` (4, 4), up to two (6.27, 6.28).
+
+    A point of the last axis, away from the centre, tells the first two; the rest of the rotation tells the last.
+    Where the first and the last axis fall together, the first joint stays at its ``seed`` (3,) and is marked free.
+    """
+    centre = common_point(G)
+    ends = axis_points(G[2])
+    share = ends @ centre
+    A = np.array([share[1], -share[0]]) @ ends
+    first_two = two_general(G[:2], A, H @ A, seed[:2])
+    found = []
+    for i, (first, second) in enumerate(first_two.steps):
+        rest = exp_rotation(G[1], -second) @ exp_rotation(G[0], -first) @ H
+        # The columns of the identity as points: turned, they are the columns of the rotation itself.
+        last = turn_between(G[2], np.eye(4), rest.T, seed[2])
+        found.append(beside(one_of(first_two, i), last))
+    return together(found)
+
+
+def arm_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
+    """Angles of six revolute joints ``G`` (6, 4, 4) whose product is ``H`` (4, 4), up to eight (6.29, 6.30).
+
+    The wrist's centre is moved by the arm alone: ``H W = H₁H₂H₃ W`` (errata to 6.29). What is left of ``H`` is the
+    wrist's rotation. ``seed`` (6,).
+    """
+    centre = common_point(G[3:])
+    return _with_wrist(G, H, seed, arm(G[:3], centre, H @ centre, seed[:3]), exp_rotation)
+
+
+def gantry_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
+    """Three prismatic joints under a spherical wrist, ``G`` (6, 4, 4): up to two ways to ``H`` (4, 4)."""
+    centre = common_point(G[3:])
+    place = prismatic_joints(G[:3], centre[None], (H @ centre)[None])
+    return _with_wrist(G, H, seed, place, exp_translation)
+
+
+def _with_wrist(
+    G: FloatArray,
+    H: FloatArray,
+    seed: FloatArray,
+    place: Branches,
+    exponential: Callable[[FloatArray, FloatArray], FloatArray],
+) -> Branches:
+    found = []
+    for i, steps in enumerate(place.steps):
+        moves = exponential(G[:3], steps)
+        rotation = np.linalg.solve(moves[0] @ moves[1] @ moves[2], H)
+        found.append(beside(one_of(place, i), wrist(G[3:], rotation, seed[3:])))
+    return together(found)

@@ -1,0 +1,154 @@
+"""Running daemons: how to find them, and how to start one as a child process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from stereoservo.messages.directories import CellDirectories, cell_directories, runtime_root
+from stereoservo.messages.locks import holder
+
+
+class DaemonInfo(msgspec.Struct, frozen=True):
+    """``daemon.json`` in the runtime directory, written by the gateway once it listens."""
+
+    cell: str
+    endpoint: str
+    boot: str
+    pid: int
+    cell_path: str
+    dry_run: bool = False
+    commissioning: bool = False
+
+
+class NotRunningError(Exception):
+    """No daemon runs for a cell; lists those that do."""
+
+    def __init__(self, cell: str, running: tuple[str, ...]) -> None:
+        super().__init__(
+            f"no daemon runs for cell {cell!r}; running: {', '.join(running) or 'none'}. "
+            f"Start it with `stereoservo run CELL.toml`"
+        )
+        self.cell = cell
+        self.running = running
+
+
+class DaemonError(Exception):
+    """A daemon that was started did not come up; carries its exit code and what it said."""
+
+    def __init__(self, message: str, code: int | None, output: str) -> None:
+        super().__init__(message)
+        self.code = code
+        self.output = output
+
+
+def daemon_info(directories: CellDirectories) -> DaemonInfo | None:
+    """Description of the running daemon; None where none runs or it is not ready yet."""
+    if holder(directories.daemon_lock) is None:
+        return None
+    try:
+        return msgspec.json.decode(directories.daemon.read_bytes(), type=DaemonInfo)
+    except (FileNotFoundError, msgspec.MsgspecError):
+        return None
+
+
+def live_cells() -> list[DaemonInfo]:
+    """All daemons of this user that are up."""
+    root = runtime_root()
+    if not root.is_dir():
+        return []
+    found = []
+    for path in sorted(root.iterdir()):
+        if path.is_dir() and (path / "daemon.lock").exists():
+            info = daemon_info(cell_directories(path.name))
+            if info is not None:
+                found.append(info)
+    return found
+
+
+def find_daemon(cell: str) -> DaemonInfo:
+    """The daemon of ``cell``, a name or the path of a cell file. Raises NotRunningError, CellFileError."""
+    name = cell
+    if cell.endswith(".toml"):
+        from stereoservo.messages.cell_file import load_cell_file  # not for a client that gives a name
+
+        name = load_cell_file(Path(cell)).cell.name
+    info = daemon_info(cell_directories(name))
+    if info is None:
+        raise NotRunningError(name, tuple(found.cell for found in live_cells()))
+    return info
+
+
+class DaemonProcess:
+    """``stereoservo run`` as a child process; a context manager that ends it.
+
+    ``log``: file that takes its stderr (default: inherited).
+    """
+
+    def __init__(
+        self,
+        cell_path: Path,
+        *,
+        options: tuple[str, ...] = (),
+        log: Path | None = None,
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        self.cell_path = cell_path
+        self._log = log
+        stream = log.open("wb") if log is not None else None
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "stereoservo.cli.main", "run", str(cell_path), *options],
+                stdin=subprocess.DEVNULL,
+                stdout=stream if stream is not None else sys.stderr,
+                stderr=stream if stream is not None else None,
+                env={**os.environ, **(environment or {})},
+            )
+        finally:
+            if stream is not None:
+                stream.close()
+
+    def wait_ready(self, timeout_s: float = 600.0) -> DaemonInfo:
+        """Wait until it takes requests. Raises DaemonError with what it said."""
+        until = time.monotonic() + timeout_s
+        while time.monotonic() < until:
+            code = self.process.poll()
+            if code is not None:
+                raise DaemonError(
+                    f"the daemon ended at its start (exit code {code}): {self.output()}", code, self.output()
+                )
+            for info in live_cells():
+                if info.pid == self.process.pid:
+                    return info
+            time.sleep(0.05)
+        raise DaemonError(f"the daemon was not ready within {timeout_s:g} s", None, self.output())
+
+    def output(self) -> str:
+        """Its log so far, where it logs into a file."""
+        return self._log.read_text(errors="replace").strip() if self._log is not None else ""
+
+    def stop(self, how: signal.Signals = signal.SIGTERM, timeout_s: float = 20.0) -> int:
+        """End it in good order; gives its exit code. Idempotent."""
+        if self.process.poll() is None:
+            self.process.send_signal(how)
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()

@@ -1,0 +1,103 @@
+"""The zenoh key space ``stereoservo/v1/<cell>/…``; names in it are checked, since zenoh accepts nearly any key."""
+
+from __future__ import annotations
+
+import re
+
+ROOT = "stereoservo/v1"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+VERBS = (
+    "enable",
+    "disable",
+    "hold",
+    "resume",
+    "reset",
+    "jog",
+    "home",
+    "calibrate",
+    "teach",
+    "cancel",
+    "renew",
+    "update",
+    "acknowledge",
+    "record",
+    "synthesise",
+)
+"""Commands with an operator; ``stop`` has a key of its own."""
+
+
+class InvalidKeyError(ValueError):
+    """A name or key outside of the key space; the text has the valid form."""
+
+
+def check_name(kind: str, name: str) -> str:
+    """``name`` itself where it may stand in a key. Raises InvalidKeyError."""
+    if not NAME.fullmatch(name):
+        raise InvalidKeyError(
+            f"{kind} {name!r}: letters, digits, '_' and '-' are valid, up to 64, a letter or digit first"
+        )
+    return name
+
+
+class KeySpace:
+    """The keys of one cell. Raises InvalidKeyError for names that cannot stand in a key."""
+
+    def __init__(self, cell: str) -> None:
+        self.prefix = f"{ROOT}/{check_name('cell', cell)}"
+        self.state = f"{self.prefix}/state"
+        self.event = f"{self.prefix}/event"
+        self.info = f"{self.prefix}/info"
+        self.alive = f"{self.prefix}/alive"
+        self.stop = f"{self.prefix}/command/stop"
+        self.any_goal = f"{self.prefix}/goal/*"
+        self.any_schema = f"{self.prefix}/schema/*"
+
+    def features(self, camera: str) -> str:
+        """The key on which the features of ``camera`` are published."""
+        return f"{self.prefix}/features/{check_name('camera', camera)}"
+
+    def goal(self, operator: str) -> str:
+        """The key of ``operator``'s goals, for puts and queries."""
+        return f"{self.prefix}/goal/{check_name('operator', operator)}"
+
+    def command(self, verb: str, operator: str) -> str:
+        """The key of ``operator``'s commands ``verb``."""
+        _check_verb(verb)
+        return f"{self.prefix}/command/{verb}/{check_name('operator', operator)}"
+
+    def any_command(self, verb: str) -> str:
+        """``verb`` of every operator."""
+        _check_verb(verb)
+        return f"{self.prefix}/command/{verb}/*"
+
+    def schema(self, name: str) -> str:
+        """The JSON Schema of message ``name``."""
+        return f"{self.prefix}/schema/{check_name('schema', name)}"
+
+    def operator_of_goal(self, key: str) -> str:
+        """The operator of a concrete goal key. Raises InvalidKeyError (a wildcard put reaches every
+        subscriber).
+        """
+        return check_name("operator", self._rest(key, "goal", 1)[0])
+
+    def command_of(self, key: str) -> tuple[str, str]:
+        """Verb and operator of a concrete command key. Raises InvalidKeyError."""
+        verb, operator = self._rest(key, "command", 2)
+        _check_verb(verb)
+        return verb, check_name("operator", operator)
+
+    def schema_of(self, key: str) -> str:
+        """The message name of a concrete schema key. Raises InvalidKeyError."""
+        return check_name("schema", self._rest(key, "schema", 1)[0])
+
+    def _rest(self, key: str, branch: str, parts: int) -> list[str]:
+        head = f"{self.prefix}/{branch}/"
+        rest = key.removeprefix(head).split("/")
+        if not key.startswith(head) or len(rest) != parts:
+            raise InvalidKeyError(f"key {key!r}: {head}{'/'.join(['<name>'] * parts)} is valid")
+        return rest
+
+
+def _check_verb(verb: str) -> None:
+    if verb not in VERBS:
+        raise InvalidKeyError(f"command {verb!r}; there are: stop, {', '.join(VERBS)}")

@@ -1,0 +1,25 @@
+"""The struct `Reason`: why the arm is slow, held or faulted, as code, value, threshold, unit and a hint in words."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+Level = Literal["info", "slow", "hold", "fault"]
+
+
+class Reason(msgspec.Struct, frozen=True):
+    """One entry of the status set.
+
+    ``code`` is stable and machine-readable, e.g. ``JOINT_LIMIT``; ``subject`` names the joint, camera or marker;
+    ``value`` and ``threshold`` are in ``unit``; ``hint`` tells the person at the cell how to leave.
+    """
+
+    code: str
+    level: Level
+    subject: str = ""
+    value: float | None = None
+    threshold: float | None = None
+    unit: str = ""
+    hint: str = ""

@@ -1,0 +1,66 @@
+"""Request to the vision processes to record their images, and their reports of what was recorded.
+
+The order is a small file in the cell's runtime directory, replaced as a whole and looked at a few times a second: a
+vision process that starts late, or again, finds it there.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from stereoservo.messages.directories import CellDirectories
+
+IMAGES_SUFFIX = ".images"
+
+
+class ImageRecordingRequest(msgspec.Struct, frozen=True):
+    """Request to record into ``directory`` (empty: to stop). ``number`` is different for each request."""
+
+    number: int = 0
+    directory: str = ""
+
+
+class RecordedImages(msgspec.Struct, frozen=True):
+    """Report of one camera's recording. ``left_out``: delivered frames that are not in it; ``why`` it ended."""
+
+    camera: str
+    file: str
+    frames: int
+    left_out: int
+    bytes: int
+    why: str = ""
+
+
+class ImagesRecorded(msgspec.Struct, frozen=True):
+    """A recording of images that has ended."""
+
+    directory: str
+    cameras: tuple[RecordedImages, ...]
+
+
+def request_path(directories: CellDirectories) -> Path:
+    """The file of a cell's request."""
+    return directories.runtime / "images.json"
+
+
+def images_directory(recording: Path) -> Path:
+    """The image directory of a flight recording: ``NAME.images`` beside ``NAME.mcap``."""
+    return recording.with_suffix(IMAGES_SUFFIX)
+
+
+def write_request(path: Path, order: ImageRecordingRequest) -> None:
+    """Replace the request. Raises OSError."""
+    temporary = path.with_suffix(".new")
+    temporary.write_bytes(msgspec.json.encode(order))
+    temporary.replace(path)
+
+
+def read_request(path: Path) -> ImageRecordingRequest | None:
+    """The current request; None where there is none. Raises msgspec.MsgspecError."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    return msgspec.json.decode(data, type=ImageRecordingRequest)

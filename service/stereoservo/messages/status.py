@@ -1,0 +1,61 @@
+"""Lifecycle, model readiness and model health of a cell, as the core writes them and clients read them."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import msgspec
+
+
+class Lifecycle(StrEnum):
+    """Lifecycle of the arm's drives. FAULT is latched until an explicit reset."""
+
+    UNCONFIGURED = "unconfigured"
+    INACTIVE = "inactive"
+    ACTIVE = "active"
+    FAULT = "fault"
+
+
+class ModelReadiness(StrEnum):
+    """State of the model of arm and cameras."""
+
+    NONE = "none"
+    CANDIDATE = "candidate"
+    VALID = "valid"
+    SUSPECT = "suspect"
+
+
+class CameraHealth(msgspec.Struct, frozen=True):
+    """Agreement of one camera's newest frame with the model.
+
+    Chi-square per degree of freedom, rms innovation [px], the ``worst`` marker (-1: none) and its innovation.
+    ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``. ``timing``: in words, where the stamps are
+    seen to be wrong.
+    """
+
+    chi2: float = 0.0
+    rms_px: float = 0.0
+    worst: int = -1
+    worst_px: float = 0.0
+    place: str = ""
+    timing: str = ""
+
+
+class Health(msgspec.Struct, frozen=True):
+    """Health of the model, by the model monitor.
+
+    ``verdict``: ``ok``, ``camera_moved``, ``cameras_moved_together``, ``cameras_or_arm``, ``marker_slipped``,
+    ``joint_zero``, ``unclear``, or ``unknown`` without a model; ``subjects`` names the cameras, the marker or the
+    joint; ``size`` in ``unit`` with its standard ``deviation``; ``text``: with what to do. ``masked``: markers that are
+    not used. ``reanchoring``: what is being done for cameras that have moved, in a word.
+    """
+
+    verdict: str = "unknown"
+    subjects: tuple[str, ...] = ()
+    size: float = 0.0
+    deviation: float = 0.0
+    unit: str = ""
+    text: str = ""
+    cameras: dict[str, CameraHealth] = {}
+    masked: tuple[int, ...] = ()
+    reanchoring: str = ""

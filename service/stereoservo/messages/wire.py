@@ -1,0 +1,466 @@
+"""State, event, feature and reply messages of the daemon, and the JSON codec of every message on zenoh."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar, get_args
+
+import msgspec
+from msgspec import Meta
+
+from stereoservo.messages.check_report import CheckReport, ZeroReset
+from stereoservo.messages.goals import (
+    LAW_TITLE,
+    AcknowledgeGoal,
+    Calibrate,
+    CancelGoal,
+    Command,
+    Disable,
+    Enable,
+    Goal,
+    Hold,
+    Home,
+    Jog,
+    MarkerId,
+    Name,
+    PlanReport,
+    RenewGoal,
+    Reset,
+    Resume,
+    Target,
+    Teach,
+    UpdateGoal,
+)
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.recording_request import ImagesRecorded
+from stereoservo.messages.status import Health
+
+ENCODING = "application/json"
+MAX_PAYLOAD_BYTES = 65_536
+
+Drawn = tuple[float, float, float]
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+_T = TypeVar("_T")
+_NOT_FINITE = re.compile(rb"(?<![\w\"])(-?NaN|[+-]?Infinity|-?inf|nan)(?![\w\"])")
+
+
+COMMANDS: dict[str, type[Command]] = {
+    "enable": Enable,
+    "disable": Disable,
+    "hold": Hold,
+    "resume": Resume,
+    "reset": Reset,
+    "jog": Jog,
+    "home": Home,
+    "calibrate": Calibrate,
+    "teach": Teach,
+    "cancel": CancelGoal,
+    "renew": RenewGoal,
+    "update": UpdateGoal,
+    "acknowledge": AcknowledgeGoal,
+}
+"""What the payload of ``command/<verb>/<operator>`` decodes into; the ``command`` tag may be left out."""
+
+
+class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", forbid_unknown_fields=True):
+    """Begin or end a flight recording. The gateway's own business: the core does not hear of it.
+
+    ``images``: with what the cameras deliver, in the directory ``NAME.images`` beside the recording ``NAME.mcap``.
+    """
+
+    on: bool = True
+    images: bool = False
+
+
+class Synthesise(
+    msgspec.Struct, frozen=True, tag="synthesise", tag_field="command", forbid_unknown_fields=True
+):
+    """Make the goal ``name`` from drawings. The gateway's own business: the core does not hear of it.
+
+    ``workpiece``, ``tool``: marker -> (x, y, z) in the coordinates of either's drawing, one unit of length for both.
+    ``pose`` 4x4, row-major: from the tool's drawing to the workpiece's, in the position of alignment. The workpiece's
+    markers are to be seen now.
+    """
+
+    name: Name
+    workpiece: dict[MarkerId, Drawn]
+    tool: dict[MarkerId, Drawn]
+    pose: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)] = IDENTITY
+
+
+class MessageError(ValueError):
+    """A message cannot be sent or taken: names the place in it, the value and what would have been valid."""
+
+
+class JointInfo(msgspec.Struct, frozen=True):
+    """A joint of the cell; limits [rad or m, s]."""
+
+    name: str
+    kind: str
+    position_min: float
+    position_max: float
+    velocity_max: float
+
+
+class CameraInfo(msgspec.Struct, frozen=True):
+    """A camera of the cell; size [px]."""
+
+    name: str
+    width: int
+    height: int
+    rate_hz: float
+    mount: str
+    marker_ids: tuple[int, ...]
+
+
+class ModelInfo(msgspec.Struct, frozen=True):
+    """The model in use."""
+
+    epoch: int
+    stratum: str
+    marker_ids: tuple[int, ...]
+    created: str
+    rms_px: float | None = None
+    path: str = ""
+
+
+class TaughtInfo(msgspec.Struct, frozen=True):
+    """A taught goal and the model it was taught with. ``standing``: markers beside body and ``tool``."""
+
+    name: str
+    model_epoch: int
+    created: str
+    standing: tuple[int, ...] = ()
+    tool: tuple[int, ...] = ()
+
+
+class CellInfo(msgspec.Struct, frozen=True):
+    """Description of a cell, constant from step to step; ``get …/info``."""
+
+    cell: str
+    version: str
+    boot: str
+    joints: tuple[JointInfo, ...]
+    cameras: tuple[CameraInfo, ...]
+    laws: tuple[str, ...]
+    law: str
+    tolerance_px: float
+    model: ModelInfo | None = None
+    taught: tuple[TaughtInfo, ...] = ()
+    can_calibrate: bool = False
+    can_home: bool = False
+    dry_run: bool = False
+    commissioning: bool = False
+    recording: str = ""
+
+
+class LoopInfo(msgspec.Struct, frozen=True):
+    """Statistics of the servo loop since its start; lateness and work [us]."""
+
+    rate_hz: float
+    cycles: int
+    overruns: int
+    skipped: int
+    lateness_us: dict[str, float]
+    work_us: dict[str, float]
+    records_dropped: int = 0
+
+
+class StateMessage(msgspec.Struct, frozen=True):
+    """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970]."""
+
+    cell: str
+    boot: str
+    t_ns: int
+    t_wall: float
+    lifecycle: str
+    model: str
+    model_epoch: int
+    source: str
+    goal: str
+    law: str
+    level: str
+    reasons: tuple[Reason, ...]
+    joints: dict[str, float]
+    velocities: dict[str, float]
+    command: dict[str, float]
+    error_px: float | None
+    task_error: tuple[float, ...]
+    innovation_px: dict[str, float]
+    visible: dict[str, int]
+    loop: LoopInfo
+    driver_active: bool = False
+    servo_alive: bool = True
+    dry_run: bool = False
+    differences: tuple[str, ...] = ()
+    last_event: int = 0
+    notes: tuple[str, ...] = ()
+    """Remarks for the cell's keeper, on a damaged model file for instance."""
+    progress: float | None = None
+    """Of the active goal's way, 0 to 1, where it is known."""
+    seconds_left: float | None = None
+    efforts: dict[str, float] = {}
+    """As the drives tell them [N m or N, or shares of the rated torque]; empty where they do not."""
+    following_errors: dict[str, float] = {}
+    """Set less actual position [rad or m]."""
+    effort_limits: dict[str, float] = {}
+    """How far efforts may go from their moving mean before the arm stops for a contact; absent where nobody knows."""
+    following_limits: dict[str, float] = {}
+    """How large following errors may become before the arm stops for a contact."""
+    health: Health = Health()
+    """Whether the images agree with the model, by camera; what explains it where they do not, and what is done."""
+
+
+class FeaturesMessage(msgspec.Struct, frozen=True):
+    """Markers of one frame: pixels (u, v) [px], integer = pixel centre; ``sigmas`` [px] of one axis."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_received_ns: int
+    t_wall: float
+    ids: tuple[int, ...]
+    pixels: tuple[tuple[float, float], ...]
+    sigmas: tuple[float, ...]
+
+
+class CalibrationResult(msgspec.Struct, frozen=True):
+    """Result of a calibration. ``covariance_ok``: the residuals are what the measurement noise explains
+    (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
+    ``seconds``: what the fit took. ``report`` (a page), ``figures`` (for programs), ``trials``: files on the daemon's
+    host; the report is there once ``calibration_report`` was told.
+    """
+
+    rms_px: float
+    per_joint_px: dict[str, float]
+    covariance_ok: bool
+    model: str
+    epoch: int
+    stratum: str
+    chi2: float
+    degrees_of_freedom: int
+    measurements: int
+    parameters: int
+    outliers: int
+    joints: int
+    images: int
+    seconds: float
+    verdict: str = ""
+    grade: str = ""
+    report: str = ""
+    trials: str = ""
+    figures: str = ""
+
+
+class EventMessage(msgspec.Struct, frozen=True):
+    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal it speaks of."""
+
+    seq: int
+    boot: str
+    t_ns: int
+    t_wall: float
+    kind: str
+    message: str = ""
+    id: str = ""
+    request: int = -1
+    operator: str = ""
+    accepted: bool | None = None
+    reasons: tuple[Reason, ...] = ()
+    name: str = ""
+    error_px: float | None = None
+    progress: float | None = None
+    origin: str = "core"
+    calibration: CalibrationResult | None = None
+    check: CheckReport | None = None
+    reset: ZeroReset | None = None
+    images: ImagesRecorded | None = None
+
+
+class EventList(msgspec.Struct, frozen=True):
+    """Answer to ``get …/event?from=N``: at most a few hundred; ``next`` is where to go on, ``first`` the
+    oldest kept.
+    """
+
+    boot: str
+    first: int
+    next: int
+    events: tuple[EventMessage, ...]
+
+
+class Reply(msgspec.Struct, frozen=True):
+    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message itself.
+
+    ``plan``: what a goal would do, or will, where it was planned.
+    """
+
+    accepted: bool
+    message: str = ""
+    id: str = ""
+    request: int = -1
+    reasons: tuple[Reason, ...] = ()
+    problems: tuple[str, ...] = ()
+    boot: str = ""
+    plan: PlanReport | None = None
+
+
+SCHEMAS: dict[str, Any] = {
+    "goal": Goal,
+    "state": StateMessage,
+    "event": EventMessage,
+    "events": EventList,
+    "features": FeaturesMessage,
+    "info": CellInfo,
+    "reply": Reply,
+    "command-record": Record,
+    "command-synthesise": Synthesise,
+    **{f"command-{verb}": kind for verb, kind in COMMANDS.items()},
+}
+
+
+def schema(name: str, laws: Sequence[str]) -> bytes:
+    """The JSON Schema of a message as JSON, in which a law is one of ``laws``.
+
+    Raises MessageError with the names there are.
+    """
+    kind = SCHEMAS.get(name)
+    if kind is None:
+        raise MessageError(f"no schema {name!r}; there are: {', '.join(SCHEMAS)}")
+    tree = msgspec.json.schema(kind)
+    _list_laws(tree, list(laws))
+    return msgspec.json.encode(tree)
+
+
+def _list_laws(tree: Any, laws: list[str]) -> None:
+    """Add ``laws`` as the valid values, in place, wherever a schema holds the name of a law."""
+    if isinstance(tree, dict):
+        if tree.get("title") == LAW_TITLE:
+            tree["enum"] = laws
+        for branch in tree.values():
+            _list_laws(branch, laws)
+    elif isinstance(tree, list):
+        for branch in tree:
+            _list_laws(branch, laws)
+
+
+def encode(message: Any) -> bytes:
+    """A message as JSON. Raises MessageError for a number that is not finite (JSON would turn it into
+    null).
+    """
+    tree = msgspec.to_builtins(message)
+    require_finite(tree)
+    return msgspec.json.encode(tree)
+
+
+def require_finite(tree: Any, where: str = "") -> None:
+    """Raises MessageError naming the place of the first number that is not finite."""
+    if isinstance(tree, float):
+        if not math.isfinite(tree):
+            raise MessageError(f"{where or 'value'} is {tree}; finite numbers are valid")
+    elif isinstance(tree, dict):
+        for key, value in tree.items():
+            require_finite(value, f"{where}.{key}" if where else str(key))
+    elif isinstance(tree, list | tuple):
+        for index, value in enumerate(tree):
+            require_finite(value, f"{where}[{index}]")
+
+
+def decode(data: bytes, kind: type[_T]) -> _T:
+    """Take a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do
+    not.
+
+    Raises MessageError, whatever the bytes: too large, not JSON, a number that is not finite, a field that does not
+    fit.
+    """
+    if len(data) > MAX_PAYLOAD_BYTES:
+        raise MessageError(f"payload of {len(data)} bytes; at most {MAX_PAYLOAD_BYTES} are taken")
+    found = read(data, kind)
+    _require_bounded(msgspec.to_builtins(found, str_keys=True))
+    return found
+
+
+def read(data: bytes, kind: type[_T]) -> _T:
+    """A message of the daemon's, as large as it is. Raises MessageError like :func:`decode`, whatever the bytes."""
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.ValidationError as error:
+        raise MessageError(_misfit(str(error), data, kind)) from error
+    except Exception as error:  # the decoder's errors have no class in common
+        raise MessageError(_undecodable(error, data)) from error
+
+
+def _undecodable(error: Exception, data: bytes) -> str:
+    """Why ``data`` is not JSON."""
+    if isinstance(error, RecursionError):
+        return "payload is nested too deeply; a message has few levels"
+    if isinstance(error, UnicodeDecodeError):
+        return f"payload is not UTF-8: {error.reason} 0x{error.object[error.start]:02x}"
+    if match := _NOT_FINITE.search(data):
+        return f"{match[0].decode()} is not a JSON number; finite numbers are valid"
+    return f"payload is not JSON: {error}"
+
+
+def _misfit(error: str, data: bytes, kind: Any) -> str:
+    """A validation error with its place, the value that was given, and the words that would have been valid."""
+    text, _, where = error.partition(" - at `")
+    if where.startswith("key` in `"):
+        return f"a key of {where.removeprefix('key` in `$.').rstrip('`')}: {text}"
+    place = where.rstrip("`").removeprefix("$").lstrip(".")
+    if not place:
+        known = getattr(kind, "__struct_fields__", ()) if "unknown field" in text else ()
+        return text + (f"; known: {', '.join(known)}" if known else "")
+    try:
+        value: Any = msgspec.json.decode(data)
+    except (
+        Exception
+    ):  # what the typed decoder, which ends at the first misfit, did not reach; the place alone is told
+        return f"{place}: {text}"
+    for part in place.split("."):
+        value = value.get(part) if isinstance(value, dict) and "[" not in part else None
+    given = (
+        "" if value is None or isinstance(value, dict | list) or repr(value) in text else f", got {value!r}"
+    )
+    words = _valid_words().get(place, ()) if text.startswith("Invalid ") else ()
+    return f"{place}: {text}{given}" + (f"; valid: {', '.join(words)}" if words else "")
+
+
+@functools.cache
+def _valid_words() -> dict[str, tuple[str, ...]]:
+    """The values of those fields of a goal that take one of a few words, by the field's place in the message."""
+    return {
+        **{
+            field.name: tuple(
+                word
+                for part in get_args(field.type)
+                for word in get_args(part) or (part,)
+                if isinstance(word, str)
+            )
+            for field in msgspec.structs.fields(Goal)
+        },
+        "target.kind": tuple(str(target.__struct_config__.tag) for target in get_args(Target)),
+        "target.relative_to": ("workpiece", "cameras"),
+        "command": ("renew", "update", "acknowledge", "cancel"),
+    }
+
+
+def _require_bounded(tree: Any) -> None:
+    """Raises MessageError for an integer that does not fit 64 bits: no later stage could carry it."""
+    if isinstance(tree, int):
+        if not -(1 << 63) <= tree < 1 << 63:
+            raise MessageError(f"integer {tree} is out of range; -2^63 to 2^63 - 1 are valid")
+    elif isinstance(tree, dict):
+        for value in tree.values():
+            _require_bounded(value)
+    elif isinstance(tree, list | tuple):
+        for value in tree:
+            _require_bounded(value)
+
+
+def decode_command(verb: str, data: bytes) -> Command:
+    """The payload of ``command/<verb>``; an empty one stands for ``{}``. Raises MessageError."""
+    kind: Any = COMMANDS[verb]
+    command: Command = decode(data or b"{}", kind)
+    return command

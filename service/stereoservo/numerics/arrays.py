@@ -1,0 +1,12 @@
+"""Types of the arrays that pass between modules."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+KindArray = npt.NDArray[np.uint8]
+ImageArray = npt.NDArray[np.uint8]

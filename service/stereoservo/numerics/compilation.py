@@ -1,0 +1,27 @@
+"""How kernels are compiled: by numba, cached on disk, in exact arithmetic."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def kernel(function: _F) -> _F:
+    """Compile for the loop: cached on disk, exact arithmetic, no Python objects.
+
+    Numba renews a cached kernel when its own file changes, not when a kernel that it calls changes in another
+    file: after an edit here, touch the callers' files. Where no cache directory is writable the kernel is
+    compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
+    """
+    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
+    try:
+        compiled = numba.njit(cache=True, **options)(function)
+    except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
+        warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=2)
+        compiled = numba.njit(**options)(function)
+    return cast(_F, compiled)

@@ -1,0 +1,210 @@
+"""Small linear algebra in numba: without BLAS, LAPACK or fastmath. Tested against numpy.
+
+Explicit loops in a fixed order: the same input gives the same bits on one machine. Arrays are float64.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+
+PIVOT_TOLERANCE = 1e-14
+"""Cholesky pivot, relative to the largest diagonal, below which the normal equations count as singular."""
+
+SWEEPS = 40
+ORTHOGONAL = 1e-15
+NEGLIGIBLE = 1e-17
+"""One-sided Jacobi: columns are orthogonal below this cosine; and a column below this share of the matrix is
+rounding.
+"""
+
+
+@kernel
+def cholesky_solve(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
+    """Solve ``N x = b`` for symmetric ``N`` (n, n), which is overwritten by its factor.
+
+    Returns the smallest pivot over the largest diagonal; 0 (and ``x = 0``) where ``N`` is singular or not
+    finite.
+    """
+    n = b.shape[0]
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, N[i, i])
+    smallest = math.inf
+    good = largest > 0.0 and largest < math.inf
+    for j in range(n):
+        if not good:
+            break
+        pivot = N[j, j]
+        for k in range(j):
+            pivot -= N[j, k] * N[j, k]
+        if not pivot > PIVOT_TOLERANCE * largest:
+            good = False
+            break
+        smallest = min(smallest, pivot)
+        root = math.sqrt(pivot)
+        N[j, j] = root
+        for i in range(j + 1, n):
+            s = N[i, j]
+            for k in range(j):
+                s -= N[i, k] * N[j, k]
+            N[i, j] = s / root
+    if not good:
+        for i in range(n):
+            x[i] = 0.0
+        return 0.0
+    for i in range(n):
+        s = b[i]
+        for k in range(i):
+            s -= N[i, k] * x[k]
+        x[i] = s / N[i, i]
+    for back in range(n):
+        i = n - 1 - back
+        s = x[i]
+        for k in range(i + 1, n):
+            s -= N[k, i] * x[k]
+        x[i] = s / N[i, i]
+    return smallest / largest
+
+
+@kernel
+def add_equation(row: FloatArray, error: float, weight: float, N: FloatArray, b: FloatArray) -> None:
+    """One equation ``row·x = error`` of squared weight ``weight`` into the normal equations ``N x = b``.
+
+    ``row`` (n,); of ``N`` (n, n) the lower triangle is added to.
+    """
+    for i in range(b.shape[0]):
+        weighted = weight * row[i]
+        b[i] += weighted * error
+        for k in range(i + 1):
+            N[i, k] += weighted * row[k]
+
+
+@kernel
+def add_pixel_equations(
+    rows: FloatArray, u: float, v: float, weight: float, N: FloatArray, b: FloatArray
+) -> None:
+    """`add_equation` for the two ``rows`` (2, n) of a pixel and its errors ``u``, ``v``."""
+    for i in range(b.shape[0]):
+        weighted_u, weighted_v = weight * rows[0, i], weight * rows[1, i]
+        b[i] += weighted_u * u + weighted_v * v
+        for k in range(i + 1):
+            N[i, k] += weighted_u * rows[0, k] + weighted_v * rows[1, k]
+
+
+@kernel
+def damped_solve(N: FloatArray, b: FloatArray, damping: float, x: FloatArray) -> float:
+    """`cholesky_solve` with ``damping`` times the largest diagonal of ``N`` (n, n) added to its diagonal."""
+    largest = 0.0
+    for i in range(b.shape[0]):
+        largest = max(largest, N[i, i])
+    for i in range(b.shape[0]):
+        N[i, i] += damping * largest
+    return cholesky_solve(N, b, x)
+
+
+@kernel
+def damped_least_squares(
+    J: FloatArray, e: FloatArray, weights: FloatArray, damping: float
+) -> tuple[FloatArray, float]:
+    """``x`` (n,) of least ``Σ w²(Jx − e)² + damping·d·|x|²``, ``d`` the largest diagonal of ``JᵀW²J``.
+
+    ``J`` (r, n), ``e`` (r,), ``weights`` (r,) = 1/sigma, 0 where missing (the row is then not read). Returns
+    ``x`` and the conditioning: the smallest Cholesky pivot of the damped normal matrix over its largest
+    diagonal, 0 (with ``x = 0``) where it is singular.
+    """
+    rows, n = J.shape
+    N = np.zeros((n, n))
+    b = np.zeros(n)
+    x = np.zeros(n)
+    for r in range(rows):
+        w = weights[r]
+        if w == 0.0:
+            continue
+        add_equation(J[r], e[r], w * w, N, b)
+    conditioning = damped_solve(N, b, damping, x)
+    return x, conditioning
+
+
+@kernel
+def right_singular(A: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Right singular vectors as columns (n, n) and singular values (n,), descending, of ``A`` (r, n), r any.
+
+    One-sided Jacobi: relative accuracy also of small values, no LAPACK. Vectors are unique up to sign.
+    """
+    rows, n = A.shape
+    U = A.copy()
+    V = np.zeros((n, n))
+    for i in range(n):
+        V[i, i] = 1.0
+    total = 0.0
+    for r in range(rows):
+        for i in range(n):
+            total += U[r, i] * U[r, i]
+    floor = NEGLIGIBLE * math.sqrt(total)
+    for _ in range(SWEEPS):
+        rotated = False
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                alpha, beta, gamma = 0.0, 0.0, 0.0
+                for r in range(rows):
+                    alpha += U[r, p] * U[r, p]
+                    beta += U[r, q] * U[r, q]
+                    gamma += U[r, p] * U[r, q]
+                size = abs(gamma)
+                if not (
+                    size > floor * math.sqrt(max(alpha, beta)) and size > ORTHOGONAL * math.sqrt(alpha * beta)
+                ):
+                    continue
+                rotated = True
+                zeta = (beta - alpha) / (2.0 * gamma)
+                t = math.copysign(1.0, zeta) / (abs(zeta) + math.sqrt(1.0 + zeta * zeta))
+                c = 1.0 / math.sqrt(1.0 + t * t)
+                s = c * t
+                for r in range(rows):
+                    u = U[r, p]
+                    U[r, p] = c * u - s * U[r, q]
+                    U[r, q] = s * u + c * U[r, q]
+                for r in range(n):
+                    v = V[r, p]
+                    V[r, p] = c * v - s * V[r, q]
+                    V[r, q] = s * v + c * V[r, q]
+        if not rotated:
+            break
+    values = np.zeros(n)
+    for i in range(n):
+        s2 = 0.0
+        for r in range(rows):
+            s2 += U[r, i] * U[r, i]
+        values[i] = math.sqrt(s2)
+    for i in range(n - 1):
+        best = i
+        for k in range(i + 1, n):
+            if values[k] > values[best]:
+                best = k
+        if best != i:
+            values[i], values[best] = values[best], values[i]
+            for r in range(n):
+                v = V[r, i]
+                V[r, i] = V[r, best]
+                V[r, best] = v
+    return V, values
+
+
+@kernel
+def null_direction(A: FloatArray) -> tuple[FloatArray, float, float, float]:
+    """Unit ``x`` (n,) of least ``|A x|`` for ``A`` (r, n), and the smallest, second-smallest, largest
+    singular value.
+
+    With one column the three values are one.
+    """
+    V, values = right_singular(A)
+    n = values.shape[0]
+    x = np.empty(n)
+    for i in range(n):
+        x[i] = V[i, n - 1]
+    return x, values[n - 1], values[max(n - 2, 0)], values[0]

@@ -1,0 +1,313 @@
+"""Frame in which all motions of an arm are Euclidean rotations and translations, from its operators alone.
+
+The operators leave the plane at infinity and, in it, one quadratic form: ``SᵀQ + QS = 0`` for their action ``S`` on
+displacements (5.59). Its square root makes the frame. Nothing else is known or needed: the length of its unit is chosen
+(the cameras are one away from the centre), and for an arm that turns about one direction only, or not at all, any frame
+that its motions agree with serves, since the others are out of its reach. Kernels, for the loop.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.kinematics.kernels import invert4, multiply4_into, symmetric_eigen4
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import cholesky_solve
+
+OPERATOR_WEIGHT = 1e-3
+"""Of the operators beside the heights in the plane at infinity: heights are exact by convention, operators measured."""
+PRISMATIC = 1e-12
+"""Square of the turn relative to that of the operator's block, below which a joint does not turn."""
+AVERAGED = 5
+"""Angles over which a form is averaged: it is of second degree in sine and cosine, so that five are exact."""
+INVERSE_ITERATIONS = 3
+SHIFT = 1e-10
+"""Relative, of the inverse iteration."""
+
+
+@kernel
+def plane_at_infinity(operators: FloatArray, points: FloatArray) -> FloatArray:
+    """``a∞`` (4,) with ``a∞ᵀM = 1`` for ``points`` (k, 4) and ``a∞ᵀĤ_j = 0``; zeros where neither determines it."""
+    N = np.zeros((4, 4))
+    b = np.zeros(4)
+    for p in range(points.shape[0]):
+        for i in range(4):
+            b[i] += points[p, i]
+            for k in range(4):
+                N[i, k] += points[p, i] * points[p, k]
+    for j in range(operators.shape[0]):
+        G = operators[j]
+        size = 0.0
+        for i in range(4):
+            for k in range(4):
+                size += G[i, k] * G[i, k]
+        if not size > 0.0:
+            continue
+        weight = OPERATOR_WEIGHT * OPERATOR_WEIGHT / size
+        for i in range(4):
+            for k in range(4):
+                for r in range(4):
+                    N[i, k] += weight * G[i, r] * G[k, r]
+    plane = np.zeros(4)
+    cholesky_solve(N, b, plane)
+    return plane
+
+
+@kernel
+def conjugated(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
+    """``A G B`` of (4, 4)."""
+    first = np.empty((4, 4))
+    out = np.empty((4, 4))
+    multiply4_into(A, G, first)
+    multiply4_into(first, B, out)
+    return out
+
+
+@kernel
+def average_over_turns(form: FloatArray, generator: FloatArray) -> None:
+    """A quadratic ``form`` (k, k), in place, averaged over all turns by a ``generator`` (k, k) of eigenvalues 0, ±i."""
+    size = form.shape[0]
+    square, turned = np.zeros((size, size)), np.empty((size, size))
+    product, total = np.empty((size, size)), np.zeros((size, size))
+    _multiply_into(generator, generator, square)
+    share = 1.0 / AVERAGED
+    for sample in range(AVERAGED):
+        angle = 2.0 * math.pi * sample / AVERAGED
+        sine, versine = math.sin(angle), 1.0 - math.cos(angle)
+        for i in range(size):
+            for k in range(size):
+                turned[i, k] = sine * generator[i, k] + versine * square[i, k]
+            turned[i, i] += 1.0
+        _multiply_into(form, turned, product)
+        for i in range(size):
+            for k in range(size):
+                for r in range(size):
+                    total[i, k] += share * turned[r, i] * product[r, k]
+    for i in range(size):
+        for k in range(size):
+            form[i, k] = total[i, k]
+
+
+@kernel
+def _multiply_into(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    for i in range(A.shape[0]):
+        for k in range(B.shape[1]):
+            total = 0.0
+            for r in range(A.shape[1]):
+                total += A[i, r] * B[r, k]
+            out[i, k] = total
+
+
+@kernel
+def _averaged_form(blocks: FloatArray) -> FloatArray:
+    """A positive form (3, 3), averaged over the turns of each block (k, 3, 3) of eigenvalues 0, ±i in sequence."""
+    Q = np.eye(3)
+    for j in range(blocks.shape[0]):
+        average_over_turns(Q, blocks[j])
+    return Q
+
+
+@kernel
+def _invariant_form(blocks: FloatArray, start: FloatArray) -> FloatArray:
+    """The form (3, 3) of least ``Σ|SᵀQ + QS|²``, by inverse iteration from ``start``."""
+    rows = np.array([0, 0, 0, 1, 1, 2])
+    columns = np.array([0, 1, 2, 1, 2, 2])
+    N = np.zeros((6, 6))
+    change = np.zeros((6, 6))
+    U = np.zeros((3, 3))
+    for j in range(blocks.shape[0]):
+        S = blocks[j]
+        for nth in range(6):
+            for i in range(3):
+                for k in range(3):
+                    U[i, k] = 0.0
+            U[rows[nth], columns[nth]] = 1.0
+            U[columns[nth], rows[nth]] = 1.0
+            for entry in range(6):
+                i, k = rows[entry], columns[entry]
+                total = 0.0
+                for r in range(3):
+                    total += S[r, i] * U[r, k] + U[i, r] * S[r, k]
+                change[entry, nth] = total
+        for i in range(6):
+            for k in range(6):
+                for r in range(6):
+                    N[i, k] += change[r, i] * change[r, k]
+    trace = 0.0
+    for i in range(6):
+        trace += N[i, i]
+    q = np.empty(6)
+    for nth in range(6):
+        q[nth] = start[rows[nth], columns[nth]]
+    x = np.empty(6)
+    for _ in range(INVERSE_ITERATIONS):
+        shifted = N.copy()
+        for i in range(6):
+            shifted[i, i] += SHIFT * trace
+        if cholesky_solve(shifted, q, x) == 0.0:
+            break
+        size = math.sqrt(
+            x[0] * x[0] + x[3] * x[3] + x[5] * x[5] + 2.0 * (x[1] * x[1] + x[2] * x[2] + x[4] * x[4])
+        )
+        for i in range(6):
+            q[i] = x[i] / size
+    Q = np.empty((3, 3))
+    for nth in range(6):
+        Q[rows[nth], columns[nth]] = q[nth]
+        Q[columns[nth], rows[nth]] = q[nth]
+    return Q
+
+
+@kernel
+def _root(Q: FloatArray, L: FloatArray) -> bool:
+    """``Q = L Lᵀ`` for (3, 3); False where it is not positive."""
+    for j in range(3):
+        for i in range(j, 3):
+            s = Q[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                if not s > 0.0:
+                    return False
+                L[j, j] = math.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+    return True
+
+
+@kernel
+def motion_frame(
+    operators: FloatArray, plane: FloatArray, centre: FloatArray, eyes: FloatArray
+) -> FloatArray:
+    """``W`` (4, 4): ``W (x, y, z, 1)`` is a point of height 1, ``W (0, 0, 0, 1)`` the ``centre`` (4,).
+
+    In its coordinates the ``operators`` (n, 4, 4) are Euclidean twists, and the mean distance of ``eyes`` (c, 4) from
+    the centre is 1. All NaN where ``plane`` (4,) is no plane.
+    """
+    pivot = 0
+    for i in range(1, 4):
+        if abs(plane[i]) > abs(plane[pivot]):
+            pivot = i
+    W = np.zeros((4, 4))
+    column = 0
+    for i in range(4):
+        if i == pivot:
+            continue
+        W[i, column] = 1.0
+        W[pivot, column] = -plane[i] / plane[pivot]
+        column += 1
+    for i in range(4):
+        W[i, 3] = centre[i]
+    inverse = invert4(W)
+    blocks = np.empty((operators.shape[0], 3, 3))
+    turning = 0
+    for j in range(operators.shape[0]):
+        S = conjugated(inverse, operators[j], W)
+        square, size = 0.0, 0.0
+        for i in range(3):
+            for k in range(3):
+                square -= 0.5 * S[i, k] * S[k, i]
+                size += S[i, k] * S[i, k]
+        whole = size + S[0, 3] * S[0, 3] + S[1, 3] * S[1, 3] + S[2, 3] * S[2, 3]
+        if not square > PRISMATIC * whole:
+            continue
+        angle = math.sqrt(square)
+        for i in range(3):
+            for k in range(3):
+                blocks[turning, i, k] = S[i, k] / angle
+        turning += 1
+    blocks = blocks[:turning]
+    averaged = _averaged_form(blocks)
+    L = np.zeros((3, 3))
+    if turning == 0 or not _root(_invariant_form(blocks, averaged), L):
+        _root(averaged, L)
+    # the columns of the displacements, times the inverse of Lᵀ
+    D = np.empty((4, 3))
+    for r in range(4):
+        for k in range(3):
+            s = W[r, k]
+            for i in range(k):
+                s -= D[r, i] * L[k, i]
+            D[r, k] = s / L[k, k]
+    for r in range(4):
+        for k in range(3):
+            W[r, k] = D[r, k]
+    inverse = invert4(W)
+    if eyes.shape[0] == 0:
+        return W
+    distance = 0.0
+    for c in range(eyes.shape[0]):
+        square = 0.0
+        for i in range(3):
+            x = 0.0
+            for k in range(4):
+                x += inverse[i, k] * eyes[c, k]
+            square += x * x
+        distance += math.sqrt(square) / eyes.shape[0]
+    for r in range(4):
+        for k in range(3):
+            W[r, k] *= distance
+    return W
+
+
+@kernel
+def turn(axis: FloatArray, angle: float) -> FloatArray:
+    """Rotation (3, 3) by ``angle`` [rad] about the unit vector ``axis`` (3,)."""
+    sine, half = math.sin(angle), math.sin(0.5 * angle)
+    versine = 2.0 * half * half
+    x, y, z = axis[0], axis[1], axis[2]
+    R = np.empty((3, 3))
+    R[0, 0] = 1.0 - versine * (y * y + z * z)
+    R[1, 1] = 1.0 - versine * (x * x + z * z)
+    R[2, 2] = 1.0 - versine * (x * x + y * y)
+    R[0, 1], R[1, 0] = versine * x * y - sine * z, versine * x * y + sine * z
+    R[0, 2], R[2, 0] = versine * x * z + sine * y, versine * x * z - sine * y
+    R[1, 2], R[2, 1] = versine * y * z - sine * x, versine * y * z + sine * x
+    return R
+
+
+@kernel
+def turn_between(X: FloatArray, Y: FloatArray) -> FloatArray:
+    """Axis and angle (4,) of the rotation that takes the spread of points ``X`` (m, 3) to that of ``Y`` best (Horn).
+
+    Angle in [0, π] [rad]; at 0 the axis is the third of the frame. At π it may have either sense.
+    """
+    m = X.shape[0]
+    mean_x, mean_y = np.zeros(3), np.zeros(3)
+    for p in range(m):
+        for i in range(3):
+            mean_x[i] += X[p, i] / m
+            mean_y[i] += Y[p, i] / m
+    S = np.zeros((3, 3))
+    for p in range(m):
+        for i in range(3):
+            for k in range(3):
+                S[i, k] += (X[p, i] - mean_x[i]) * (Y[p, k] - mean_y[k])
+    N = np.empty((4, 4))
+    N[0, 0] = S[0, 0] + S[1, 1] + S[2, 2]
+    N[0, 1] = S[1, 2] - S[2, 1]
+    N[0, 2] = S[2, 0] - S[0, 2]
+    N[0, 3] = S[0, 1] - S[1, 0]
+    N[1, 1] = S[0, 0] - S[1, 1] - S[2, 2]
+    N[2, 2] = -S[0, 0] + S[1, 1] - S[2, 2]
+    N[3, 3] = -S[0, 0] - S[1, 1] + S[2, 2]
+    N[1, 2] = S[0, 1] + S[1, 0]
+    N[1, 3] = S[2, 0] + S[0, 2]
+    N[2, 3] = S[1, 2] + S[2, 1]
+    for i in range(4):
+        for k in range(i):
+            N[i, k] = N[k, i]
+    _, vectors = symmetric_eigen4(N)
+    w, x, y, z = vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = math.sqrt(x * x + y * y + z * z)
+    out = np.zeros(4)
+    out[2] = 1.0
+    if sine > 0.0:
+        out[0], out[1], out[2] = x / sine, y / sine, z / sine
+    out[3] = 2.0 * math.atan2(sine, w)
+    return out

@@ -1,0 +1,409 @@
+"""Inverse kinematics along a path of an arm's body: damped Gauss-Newton steps on its points, sample by sample. Kernels.
+
+The operators are those at the present joints (Theorem 10), moved along with the arm; so any arm of
+`kinematics.composition` can be used, whatever its number of joints. The self-motion of a redundant arm keeps its joints
+away from their limits.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from stereoservo.kinematics.composition import displace, move_operators
+from stereoservo.kinematics.kernels import multiply4_into
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import add_equation, damped_solve, right_singular
+from stereoservo.planning.constraint_margins import Constraints, check_joints, check_view, limit_pull, moved
+from stereoservo.planning.path import pose_on_path
+
+ARRIVED = 1e-7
+"""Distance of a point from its place, as a share of the cameras' distance: below a thousandth of a pixel."""
+SETTLED = 1e-6
+"""Largest joint step [rad or frame lengths] at which an arm that cannot follow is as near as it comes."""
+ITERATIONS, LENIENT_ITERATIONS = 8, 3
+"""At most, where the arm must arrive, and where it goes as near as it comes."""
+STRIDE, STRIDE_PX = 0.1, 2.0
+"""Joint step of a sample [rad or frame lengths] from which on the midpoint is checked too; its tolerance."""
+DAMPING = 1e-9
+"""Of the normal matrix, relative to its largest diagonal."""
+LARGEST_STEP = 0.3
+"""Of a joint in one iteration [rad or lengths]: larger ones lie beyond what a linear model says."""
+SELF_MOTION = 0.08
+"""Share of a joint's distance from the middle of its range that self-motion takes off in a sample, at the limit."""
+FREEDOM_RATIO = 1e-3
+"""Singular value of the operators, relative to the largest, below which a freedom is lost."""
+
+
+class Arm(NamedTuple):
+    """An arm that moves along a path, in place; in a motion frame.
+
+    ``composition`` as in `kinematics.composition`; ``operators`` (n, 4, 4) and ``joints`` (n,) where it is,
+    ``displacement`` (4, 4) of its body so far, ``bias`` (n,): error of the first step of the sample before.
+    """
+
+    composition: int
+    operators: FloatArray
+    joints: FloatArray
+    displacement: FloatArray
+    bias: FloatArray
+
+
+class PathRecord(NamedTuple):
+    """Samples of an arm along a path: ``joints`` (K, n), ``displacements`` (K, 4, 4), and the closest approaches so
+    far, ``table`` (6, 7).
+    """
+
+    joints: FloatArray
+    displacements: FloatArray
+    table: FloatArray
+
+
+@kernel
+def freedoms(operators: FloatArray) -> int:
+    """Number of freedoms, at most 6, of an arm with ``operators`` (n, 4, 4) in a motion frame."""
+    n = operators.shape[0]
+    stacked = np.empty((6, n))
+    for j in range(n):
+        stacked[0, j], stacked[1, j], stacked[2, j] = (
+            operators[j, 2, 1],
+            operators[j, 0, 2],
+            operators[j, 1, 0],
+        )
+        for i in range(3):
+            stacked[3 + i, j] = operators[j, i, 3]
+    _, values = right_singular(stacked)
+    rank = 0
+    while rank < min(n, 6) and values[rank] > FREEDOM_RATIO * values[0]:
+        rank += 1
+    return rank
+
+
+@kernel
+def _normal_equations(
+    operators: FloatArray, points: FloatArray, required: FloatArray, N: FloatArray, b: FloatArray
+) -> float:
+    """Of least ``Σ|Ĥ_j x Δq_j − (x* − x)|²``; the largest ``|x* − x|``."""
+    n, m = operators.shape[0], points.shape[0]
+    J = np.empty((3, n))
+    worst = 0.0
+    for i in range(n):
+        b[i] = 0.0
+        for k in range(n):
+            N[i, k] = 0.0
+    for p in range(m):
+        length = 0.0
+        for i in range(3):
+            length += (required[p, i] - points[p, i]) ** 2
+        worst = max(worst, length)
+        for j in range(n):
+            G = operators[j]
+            for i in range(3):
+                J[i, j] = G[i, 0] * points[p, 0] + G[i, 1] * points[p, 1] + G[i, 2] * points[p, 2] + G[i, 3]
+        for i in range(3):
+            add_equation(J[i], required[p, i] - points[p, i], 1.0, N, b)
+    for i in range(n):
+        for k in range(i):
+            N[k, i] = N[i, k]
+    return math.sqrt(worst)
+
+
+@kernel
+def move_arm(arm: Arm, step: FloatArray) -> None:
+    """Move the arm by ``step`` (n,), in place."""
+    product = np.empty((4, 4))
+    multiply4_into(displace(arm.operators, arm.composition, step), arm.displacement, product)
+    after = move_operators(arm.operators, arm.composition, step)
+    for i in range(4):
+        for k in range(4):
+            arm.displacement[i, k] = product[i, k]
+    for j in range(arm.joints.shape[0]):
+        arm.joints[j] += step[j]
+        for i in range(4):
+            for k in range(4):
+                arm.operators[j, i, k] = after[j, i, k]
+
+
+@kernel
+def reach(
+    required: FloatArray, constraints: Constraints, arm: Arm, redundant: bool, iterations: int
+) -> float:
+    """Largest distance left after at most ``iterations`` steps of the arm that bring its body to ``required`` (m, 3).
+
+    The arm moves in place, as near as it comes. ``redundant``: it has self-motion, which keeps its joints away from
+    their limits.
+    """
+    body, bias = constraints.body, arm.bias
+    n = arm.joints.shape[0]
+    N = np.empty((n, n))
+    b = np.empty(n)
+    x = np.empty(n)
+    rest = np.zeros(n)
+    worst = 0.0
+    for iteration in range(iterations):
+        points = moved(arm.displacement, body)
+        worst = _normal_equations(arm.operators, points, required, N, b)
+        if worst <= ARRIVED and (iteration > 0 or not redundant):
+            break
+        z = np.zeros(n)
+        if redundant and iteration == 0:
+            pull, half = limit_pull(arm.joints, constraints.lower, constraints.upper)
+            for i in range(n):
+                z[i] = SELF_MOTION * half[i] * pull[i]
+            for i in range(n):
+                for k in range(n):
+                    b[i] -= N[i, k] * z[k]
+        damped_solve(N, b, DAMPING, x)
+        size = 0.0
+        for i in range(n):
+            x[i] += z[i]
+            if iteration == 0:
+                x[i] += bias[i]
+            size = max(size, abs(x[i]))
+        if not math.isfinite(size):
+            break
+        if size > LARGEST_STEP:
+            for i in range(n):
+                x[i] *= LARGEST_STEP / size
+        if iteration > 0:
+            for i in range(n):
+                rest[i] += x[i]
+        else:
+            for i in range(n):
+                rest[i] = bias[i]
+        move_arm(arm, x)
+        if size < SETTLED:
+            worst = 0.0
+            points = moved(arm.displacement, body)
+            for p in range(points.shape[0]):
+                square = 0.0
+                for i in range(3):
+                    square += (required[p, i] - points[p, i]) ** 2
+                worst = max(worst, math.sqrt(square))
+            break
+    for i in range(n):
+        bias[i] = rest[i] if abs(rest[i]) < 0.1 * LARGEST_STEP else 0.0
+    return worst
+
+
+@kernel
+def pixel_distance(
+    cameras: FloatArray, must_stay_visible: FloatArray, X: FloatArray, Y: FloatArray
+) -> tuple[float, int]:
+    """Largest distance [px] between the images of points (m, 3) and (m, 3), and whose; infinite behind a camera."""
+    worst, which = 0.0, 0
+    for c in range(cameras.shape[0]):
+        P = cameras[c]
+        for p in range(X.shape[0]):
+            if not must_stay_visible[p] > 0.0:
+                continue
+            d = P[2, 0] * X[p, 0] + P[2, 1] * X[p, 1] + P[2, 2] * X[p, 2] + P[2, 3]
+            g = P[2, 0] * Y[p, 0] + P[2, 1] * Y[p, 1] + P[2, 2] * Y[p, 2] + P[2, 3]
+            if not (d > 0.0 and g > 0.0):
+                return math.inf, p
+            square = 0.0
+            for r in range(2):
+                square += (
+                    (P[r, 0] * X[p, 0] + P[r, 1] * X[p, 1] + P[r, 2] * X[p, 2] + P[r, 3]) / d
+                    - (P[r, 0] * Y[p, 0] + P[r, 1] * Y[p, 1] + P[r, 2] * Y[p, 2] + P[r, 3]) / g
+                ) ** 2
+            if square > worst:
+                worst, which = square, p
+    return math.sqrt(worst), which
+
+
+@kernel
+def _points_on_path(
+    path: FloatArray, path_parameter: float, body: FloatArray, residual: FloatArray
+) -> FloatArray:
+    """Required points (m, 3) of the body on the path, with its share of the ``residual`` (m, 3) at the end."""
+    points = moved(pose_on_path(path, path_parameter), body)
+    for p in range(points.shape[0]):
+        for i in range(3):
+            points[p, i] += path_parameter * residual[p, i]
+    return points
+
+
+@kernel
+def _deviation_between(
+    arm: Arm, joints_before: FloatArray, displacement_before: FloatArray, constraints: Constraints
+) -> tuple[float, int]:
+    """Distance [px] of the body from its path half-way between two samples, and which marker's.
+
+    Near singularities joints run while the body hardly moves, and between samples it leaves the path.
+    """
+    s = constraints
+    n = arm.joints.shape[0]
+    back = np.empty(n)
+    stride = 0.0
+    for j in range(n):
+        back[j] = 0.5 * (joints_before[j] - arm.joints[j])
+        stride = max(stride, 2.0 * abs(back[j]))
+    if not stride > STRIDE:
+        return 0.0, 0
+    half = np.empty((4, 4))
+    multiply4_into(displace(arm.operators, arm.composition, back), arm.displacement, half)
+    midpoint = moved(arm.displacement, s.body)
+    before = moved(displacement_before, s.body)
+    for p in range(midpoint.shape[0]):
+        for i in range(3):
+            midpoint[p, i] = 0.5 * (midpoint[p, i] + before[p, i])
+    return pixel_distance(s.cameras, s.must_stay_visible, moved(half, s.body), midpoint)
+
+
+@kernel
+def _record_sample(
+    k: int, path_parameter: float, constraints: Constraints, arm: Arm, record: PathRecord
+) -> int:
+    """Record sample ``k`` of the arm and check it: kind of limit broken or −1."""
+    for j in range(arm.joints.shape[0]):
+        record.joints[k, j] = arm.joints[j]
+    for i in range(4):
+        for r in range(4):
+            record.displacements[k, i, r] = arm.displacement[i, r]
+    broken = check_joints(arm.joints, path_parameter, constraints, record.table)
+    if broken < 0:
+        broken = check_view(
+            moved(arm.displacement, constraints.body), path_parameter, constraints, record.table, True
+        )
+    return broken
+
+
+@kernel
+def check_path(
+    path: FloatArray,
+    first: int,
+    last: int,
+    samples: int,
+    constraints: Constraints,
+    residual: FloatArray,
+    table: FloatArray,
+) -> tuple[int, int]:
+    """Kind of limit broken or −1, and where, of samples ``first`` to before ``last`` of a path in closed form."""
+    for k in range(first, last):
+        path_parameter = k / (samples - 1.0)
+        points = _points_on_path(path, path_parameter, constraints.body, residual)
+        broken = check_view(points, path_parameter, constraints, table, True)
+        if broken >= 0:
+            return broken, k
+    return -1, last
+
+
+@kernel
+def follow_path(
+    path: FloatArray,
+    first: int,
+    last: int,
+    constraints: Constraints,
+    residual: FloatArray,
+    arm: Arm,
+    redundant: bool,
+    tolerance: float,
+    record: PathRecord,
+) -> tuple[int, int]:
+    """Kind of limit broken or −1, and where, of the arm along samples ``first`` to before ``last`` of a path.
+
+    ``residual`` (m, 3): distance of each point from its goal at the path's end, distributed over the path. The arm
+    moves in place; ``record`` is filled. ``tolerance`` [px] between path and arm: beyond it the path is not
+    reachable; infinite for arms that lack freedoms, which leave the path between its ends.
+    """
+    s = constraints
+    samples = record.joints.shape[0]
+    for k in range(first, last):
+        path_parameter = k / (samples - 1.0)
+        if k > 0:
+            required = _points_on_path(path, path_parameter, s.body, residual)
+            firm = math.isfinite(tolerance) or k == samples - 1
+            left = reach(required, s, arm, redundant, ITERATIONS if firm else LENIENT_ITERATIONS)
+            distance, marker, limit = 0.0, 0, tolerance
+            if left > ARRIVED:
+                distance, marker = pixel_distance(
+                    s.cameras, s.must_stay_visible, moved(arm.displacement, s.body), required
+                )
+            if distance <= limit:
+                limit = STRIDE_PX
+                distance, marker = _deviation_between(
+                    arm, record.joints[k - 1], record.displacements[k - 1], s
+                )
+            if not distance <= limit:
+                table = record.table
+                table[5, 0], table[5, 1] = limit - distance, limit - distance
+                table[5, 2], table[5, 3] = distance, limit
+                table[5, 4], table[5, 5], table[5, 6] = -1.0, marker, path_parameter
+                return 5, k
+        broken = _record_sample(k, path_parameter, s, arm, record)
+        if broken >= 0:
+            return broken, k
+    return -1, last
+
+
+@kernel
+def follow_joint_line(
+    step: FloatArray, first: int, last: int, constraints: Constraints, arm: Arm, record: PathRecord
+) -> tuple[int, int]:
+    """As `follow_path`, of a path that is a straight line in joint space, by ``step`` (n,) a sample."""
+    samples = record.joints.shape[0]
+    for k in range(first, last):
+        if k > 0:
+            move_arm(arm, step)
+        broken = _record_sample(k, k / (samples - 1.0), constraints, arm, record)
+        if broken >= 0:
+            return broken, k
+    return -1, last
+
+
+SEEDS = 32
+ROUNDS = 5
+"""Calls of `reach` from one seed at most."""
+TURN = 2.0 * math.pi
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53)
+
+
+def seed_joints(nth: int, joints: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Joints (n,) number ``nth`` of a sequence that fills the ranges evenly; number 0: the present joints.
+
+    A range without an end goes half a turn, or one length of the frame, beyond the present position.
+    """
+    if nth == 0:
+        return joints.copy()
+    low = np.where(np.isfinite(lower), np.maximum(lower, joints - TURN), joints - 0.5 * TURN)
+    high = np.where(np.isfinite(upper), np.minimum(upper, joints + TURN), joints + 0.5 * TURN)
+    shares = np.array([math.sqrt(_PRIMES[j % len(_PRIMES)]) * nth % 1.0 for j in range(len(joints))])
+    seed: FloatArray = low + shares * (high - low)
+    return seed
+
+
+@kernel
+def joints_from_seed(
+    seed: FloatArray, goal: FloatArray, constraints: Constraints, turns: FloatArray, start: Arm
+) -> tuple[FloatArray, bool]:
+    """Joints (n,) that bring the body to the ``goal`` (m, 3), found from ``seed`` (n,); and whether they do.
+
+    ``start``: the arm where its body is now, left as it is. Joints that turn (``turns`` (n,), 1 or 0) are wound into
+    their limits, near to where they are now.
+    """
+    joints, lower, upper = start.joints, constraints.lower, constraints.upper
+    n = joints.shape[0]
+    at = joints.copy()
+    displacement = np.zeros((4, 4))
+    for i in range(4):
+        displacement[i, i] = 1.0
+    arm = Arm(start.composition, start.operators.copy(), at, displacement, np.zeros(n))
+    move_arm(arm, seed - joints)
+    left = math.inf
+    for _ in range(ROUNDS):
+        arm.bias[:] = 0.0
+        left = reach(goal, constraints, arm, False, ITERATIONS)
+        if left <= ARRIVED:
+            break
+    for j in range(n):
+        if turns[j] > 0.0 and math.isfinite(at[j]):
+            at[j] -= TURN * math.floor((at[j] - joints[j]) / TURN + 0.5)
+            if at[j] > upper[j]:
+                at[j] -= TURN
+            elif at[j] < lower[j]:
+                at[j] += TURN
+    return at, left <= ARRIVED

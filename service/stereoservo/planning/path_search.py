@@ -1,0 +1,399 @@
+"""Search for a feasible path: a state machine whose stages can stop after any sample.
+
+``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: the arm along it. Where the arm
+cannot follow the path that was asked for, ``UNCONSTRAINED_IK`` follows it once more without limits, which gives the
+joints at the goal, and ``STRAIGHT_IN_JOINTS`` tries the straight line in joint space to these. When all else fails,
+``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import msgspec
+import numpy as np
+
+from stereoservo.kinematics.composition import Composition
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.planning.constraint_margins import (
+    JOINT_LIMIT,
+    KEEP_OUT,
+    KINDS,
+    NOT_REACHABLE,
+    Constraints,
+    check_joints,
+    empty_table,
+    moved,
+)
+from stereoservo.planning.detours import CANDIDATES, Candidate, name_of, other_profile, path_of
+from stereoservo.planning.motion_frame import conjugated, turn_between
+from stereoservo.planning.path import LINEAR, pose_on_path
+from stereoservo.planning.path_ik import (
+    SEEDS,
+    Arm,
+    PathRecord,
+    check_path,
+    follow_joint_line,
+    follow_path,
+    joints_from_seed,
+    pixel_distance,
+    seed_joints,
+)
+from stereoservo.planning.plan import ClosestApproach, Plan, PlanRequest
+from stereoservo.planning.primitives import HINGE, PLANAR, RIGID_FREEDOMS, TRANSLATION
+from stereoservo.planning.time_scaling import sample_times
+from stereoservo.planning.visibility_constraints import writable_copy
+
+SAMPLES = 65
+"""Of a path: half a turn in steps of three degrees."""
+TOLERANCE_PX = 2.0
+"""Largest distance in the images between the path and the arm that follows it, and between its end and the goal."""
+WORK_OF_ARM = 16
+"""Work of one sample of the arm, in samples of the closed form in the images."""
+WORK_OF_PATH = 8
+"""Work of setting up one path, likewise."""
+WORK_OF_SEED = 20 * WORK_OF_ARM
+"""Work of seeking the goal from one seed, likewise."""
+MOST_FOLLOWED = 120
+"""Paths that the arm follows before the search ends."""
+GOAL_MISSED = 30
+"""What a path counts that ends beside the goal, for want of freedoms: few others will do better."""
+GOAL_BEYOND = 90
+"""What it counts that the goal itself is beyond a joint's limit, unless joints turn there another way."""
+
+MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
+"""What the ``index`` of an approach NOT_REACHABLE names."""
+
+
+class Stage(IntEnum):
+    """What the next samples are of."""
+
+    CLOSED_FORM = 0
+    FOLLOW_PATH = 1
+    UNCONSTRAINED_IK = 2
+    STRAIGHT_IN_JOINTS = 3
+    MULTISTART_IK = 4
+
+
+class Planning(msgspec.Struct, eq=False):
+    """Work on a plan, between two slices. ``finished``: there is a ``plan``, or a ``failure``.
+
+    ``failure``: that of the goal itself, where it has one, that of the requested path, that of the other path that came
+    farthest. ``frame`` (4, 4) and its ``inverse``: the motion frame; ``goal`` (m, 3) in it. ``operators``, ``joints``,
+    ``displacement`` (4, 4): the arm at ``sample`` of the path number ``candidate``; ``table``: closest
+    approaches so far.
+    """
+
+    request: PlanRequest
+    frame: FloatArray
+    inverse: FloatArray
+    constraints: Constraints = msgspec.field(name="surroundings")
+    goal: FloatArray
+    residual: FloatArray = msgspec.field(name="rest")
+    directions: FloatArray
+    turnings: FloatArray
+    useful: tuple[bool, ...]
+    centre_translation: FloatArray = msgspec.field(name="centre_way")
+    start_operators: FloatArray
+    rank: int
+    path: FloatArray = msgspec.field(name="way")
+    operators: FloatArray
+    joints: FloatArray
+    displacement: FloatArray
+    bias: FloatArray
+    all_joints: FloatArray
+    all_displacements: FloatArray
+    table: FloatArray
+    joint_step: FloatArray
+    turns: FloatArray
+    candidate: int = -1
+    stage: int = int(Stage.CLOSED_FORM)
+    sample: int = 0
+    followed: int = 0
+    tried: int = 0
+    looked: bool = False
+    seeds: int = 0
+    goal_failure: ClosestApproach | None = None
+    asked_failure: ClosestApproach | None = None
+    best_failure: ClosestApproach | None = None
+    finished: bool = False
+    plan: Plan | None = None
+    failure: tuple[ClosestApproach, ...] = ()
+
+
+def plan_on(planning: Planning, samples: int) -> None:
+    """Evaluate at most ``samples`` samples of paths (those in the images alone count a sixteenth)."""
+    p = planning
+    work = max(1, samples) * WORK_OF_ARM
+    while work > 0 and not p.finished:
+        if p.stage == Stage.MULTISTART_IK:
+            _next_seed(p)
+            work -= WORK_OF_SEED
+            continue
+        cost = 1 if p.stage == Stage.CLOSED_FORM else WORK_OF_ARM
+        count = max(1, min(SAMPLES - p.sample, work // cost))
+        broken, reached = _samples(p, p.sample + count)
+        work -= cost * (reached - p.sample + 1)
+        p.sample = reached
+        if broken >= 0:
+            _fail(p, broken)
+        elif reached == SAMPLES:
+            _end(p)
+        if p.sample == 0:
+            work -= WORK_OF_PATH
+
+
+def next_candidate(planning: Planning) -> None:
+    """Set up the next candidate path that differs from those before it; finish where there is none."""
+    p = planning
+    p.stage, p.sample = int(Stage.CLOSED_FORM), 0
+    p.table = empty_table()
+    while p.followed < MOST_FOLLOWED and p.candidate + 1 < len(CANDIDATES):
+        p.candidate += 1
+        candidate = CANDIDATES[p.candidate]
+        if not p.useful[candidate.turning] or not (p.request.bend or _straight(candidate)):
+            continue
+        profile = other_profile(p.request.profile, candidate.profile)
+        if profile is None:
+            continue
+        path = path_of(candidate, profile, p.turnings[candidate.turning], p.centre_translation, p.directions)
+        if candidate.profile > 1 and float(np.abs(path[14:]).max()) == LINEAR:
+            continue  # one component alone: the linear path again
+        p.path = path
+        p.tried += 1
+        return
+    if p.request.bend and p.request.composition != Composition.SIMULTANEOUS:
+        p.stage = int(Stage.MULTISTART_IK)
+    else:
+        _give_up(p)
+
+
+def _give_up(p: Planning) -> None:
+    p.finished = True
+    p.failure = tuple(f for f in (p.goal_failure, p.asked_failure, p.best_failure) if f is not None)
+
+
+def _next_seed(p: Planning) -> None:
+    """Find the goal's joints from the next seed; where they keep the limits, the straight line to them is next."""
+    if p.seeds >= SEEDS:
+        _give_up(p)
+        return
+    joints, arrived = _from_seed(p, p.seeds)
+    p.seeds += 1
+    if arrived and int(check_joints(joints, 1.0, p.constraints, empty_table())) < 0:
+        _straight_to(p, joints)
+
+
+def stay(planning: Planning) -> None:
+    """The goal is the present pose: a plan of no duration."""
+    p = planning
+    start_arm(p, Stage.STRAIGHT_IN_JOINTS)
+    broken, _ = _samples(p, 1)
+    if broken >= 0:
+        p.failure = (approach(p, broken),)
+    else:
+        p.plan = Plan(
+            times=np.zeros(1),
+            joints=p.all_joints[:1].copy(),
+            displacements=np.eye(4)[None],
+            shares=np.ones(1),
+            way="none: the goal is where the body is",
+            approaches=_approaches(p),
+        )
+    p.finished = True
+
+
+def start_arm(planning: Planning, stage: Stage) -> None:
+    """Put the arm back to its present joints, for ``stage``."""
+    p = planning
+    p.stage, p.sample = int(stage), 0
+    p.operators = p.start_operators.copy()
+    p.joints = np.array(p.request.joints, dtype=np.float64)
+    p.displacement = np.eye(4)
+    p.bias = np.zeros(len(p.joints))
+    p.table = empty_table()
+
+
+def _samples(p: Planning, until: int) -> tuple[int, int]:
+    """Samples of the present stage: kind of limit broken or −1, and up to where."""
+    if p.stage == Stage.CLOSED_FORM:
+        broken, reached = check_path(p.path, p.sample, until, SAMPLES, p.constraints, p.residual, p.table)
+        return int(broken), int(reached)
+    arm = Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias)
+    record = PathRecord(p.all_joints, p.all_displacements, p.table)
+    if p.stage == Stage.STRAIGHT_IN_JOINTS:
+        broken, reached = follow_joint_line(p.joint_step, p.sample, until, p.constraints, arm, record)
+    else:
+        unconstrained = p.stage == Stage.UNCONSTRAINED_IK
+        # an arm that lacks freedoms leaves the path between its ends
+        tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
+        broken, reached = follow_path(
+            p.path, p.sample, until, _unlimited(p.constraints) if unconstrained else p.constraints, p.residual,
+            arm, len(p.joints) > p.rank, tolerance, record,
+        )  # fmt: skip
+    return int(broken), int(reached)
+
+
+def _unlimited(constraints: Constraints) -> Constraints:
+    s = constraints
+    return s._replace(
+        must_stay_visible=np.zeros_like(s.must_stay_visible),
+        sides=np.zeros_like(s.sides),
+        lower=np.full_like(s.lower, -np.inf),
+        upper=np.full_like(s.upper, np.inf),
+        keep_outs=s.keep_outs[:0].copy(),
+    )
+
+
+def _fail(p: Planning, kind: int) -> None:
+    if kind == NOT_REACHABLE:
+        p.table[kind, 4] = _missing_freedom(p)
+    failure = approach(p, kind)
+    if p.tried == 1 and p.asked_failure is None:
+        p.asked_failure = failure
+    elif p.best_failure is None or failure.share > p.best_failure.share:
+        p.best_failure = failure
+    if p.stage == Stage.FOLLOW_PATH and kind in (JOINT_LIMIT, KEEP_OUT, NOT_REACHABLE) and not p.looked:
+        p.looked = True
+        start_arm(p, Stage.UNCONSTRAINED_IK)
+    elif p.seeds > 0:
+        p.stage, p.sample = int(Stage.MULTISTART_IK), 0
+    else:
+        next_candidate(p)
+
+
+def _end(p: Planning) -> None:
+    """The last sample of a stage is done."""
+    if p.stage == Stage.CLOSED_FORM:
+        p.followed += 1
+        start_arm(p, Stage.FOLLOW_PATH)
+        return
+    s = p.constraints
+    distance, marker = pixel_distance(s.cameras, s.must_stay_visible, moved(p.displacement, s.body), p.goal)
+    missed = not distance <= TOLERANCE_PX
+    if p.stage == Stage.UNCONSTRAINED_IK:
+        _continue_from_goal_joints(p, missed)
+    elif missed:
+        p.followed += GOAL_MISSED
+        room = TOLERANCE_PX - distance
+        p.table[NOT_REACHABLE] = (room, room, distance, TOLERANCE_PX, -1.0, marker, 1.0)
+        _fail(p, NOT_REACHABLE)
+    else:
+        _finish(p)
+
+
+def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
+    """Go on with the nearer of the joints at the end of the requested path and those of a direct step to the goal."""
+    start, s = writable_copy(p.request.joints), p.constraints
+    found, table = [], empty_table()
+    if not missed:
+        broken = int(check_joints(p.joints, 1.0, s, table))
+        if broken < 0:
+            found.append(p.joints)
+        else:
+            p.table = table
+            p.goal_failure = approach(p, broken)
+            p.followed += GOAL_BEYOND
+    if p.request.composition != Composition.SIMULTANEOUS and (p.request.bend or p.rank < RIGID_FREEDOMS):
+        joints, arrived = _from_seed(p, 0)
+        if arrived and int(check_joints(joints, 1.0, s, empty_table())) < 0:
+            found.append(joints)
+        if found:
+            nearest = min(found, key=lambda q: float(np.abs(q - start).max()))
+            _straight_to(p, nearest)
+            return
+    next_candidate(p)
+
+
+def _from_seed(p: Planning, nth: int) -> tuple[FloatArray, bool]:
+    s, start = p.constraints, writable_copy(p.request.joints)
+    seed = seed_joints(nth, start, s.lower, s.upper)
+    arm = Arm(int(p.request.composition), p.start_operators, start, np.eye(4), np.zeros(len(start)))
+    joints, arrived = joints_from_seed(seed, p.goal, s, p.turns, arm)
+    return joints, bool(arrived)
+
+
+def _straight_to(p: Planning, joints: FloatArray) -> None:
+    p.goal_failure = None  # of another posture, not of the goal
+    p.joint_step = (joints - p.request.joints) / (SAMPLES - 1.0)
+    start_arm(p, Stage.STRAIGHT_IN_JOINTS)
+
+
+def _finish(p: Planning) -> None:
+    r = p.request
+    times = sample_times(
+        p.all_joints,
+        writable_copy(r.speed_scale * r.limits.velocity_max),
+        writable_copy(r.speed_scale * r.limits.acceleration_max),
+        r.profile == "exponential",
+    )
+    candidate = CANDIDATES[p.candidate]
+    profile = other_profile(r.profile, candidate.profile) or r.profile
+    p.plan = Plan(
+        times=times,
+        joints=p.all_joints.copy(),
+        displacements=np.stack([conjugated(p.frame, H, p.inverse) for H in p.all_displacements]),
+        shares=np.arange(SAMPLES) / (SAMPLES - 1.0),
+        way="straight in the joints" if p.stage == Stage.STRAIGHT_IN_JOINTS else name_of(candidate, profile),
+        approaches=_approaches(p),
+    )
+    p.finished = True
+
+
+def _straight(candidate: Candidate) -> bool:
+    return candidate.profile == 0 and candidate.bend == (0.0, 0.0, 0.0) and candidate.turning in (0, 2)
+
+
+def _missing_freedom(p: Planning) -> float:
+    """Which of `MISSING_FREEDOMS` is most of the distance between the body and its pose on the path."""
+    body = p.constraints.body
+    required = p.goal
+    if p.stage != Stage.STRAIGHT_IN_JOINTS:
+        required = moved(pose_on_path(p.path, float(p.table[NOT_REACHABLE, 6])), body)
+    here = moved(p.displacement, body)
+    rotation = turn_between(here, required)
+    offsets = body - body.sum(axis=0) / len(body)
+    size = math.sqrt(float((offsets * offsets).sum(axis=1).max()))
+    shift = (required - here).sum(axis=0) / len(body)
+    if math.sqrt(float((shift * shift).sum())) / size >= float(rotation[3]):
+        return 0.0
+    normal = face_normal(here, p.constraints.faces)
+    if normal is None:
+        return 1.0
+    return 2.0 if abs(float((normal * rotation[:3]).sum())) > math.sqrt(0.5) else 1.0
+
+
+def _approaches(p: Planning) -> tuple[ClosestApproach, ...]:
+    return tuple(approach(p, kind) for kind in range(NOT_REACHABLE) if p.table[kind, 0] < math.inf)
+
+
+def approach(planning: Planning, kind: int) -> ClosestApproach:
+    """Closest approach to one kind of limit, from its row of the table."""
+    row = planning.table[kind]
+    index = int(row[4])
+    unit = ("", "", "px", "deg", "of its depth now", "px")[kind]
+    if kind in (JOINT_LIMIT, KEEP_OUT):
+        joint = index if kind == JOINT_LIMIT else 0
+        unit = "rad" if planning.turns[joint] > 0.0 else "m"
+    return ClosestApproach(
+        what=KINDS[kind],
+        index=index,
+        value=float(row[2]),
+        limit=float(row[3]),
+        unit=unit,
+        room=float(row[1]),
+        share=float(row[6]),
+        marker=int(row[5]),
+    )
+
+
+def face_normal(points: FloatArray, faces: IntArray) -> FloatArray | None:
+    """Unit normal (3,) of the first face of ``points`` (m, 3); None without faces."""
+    if len(faces) == 0:
+        return None
+    a, b, c = (points[int(i)] for i in faces[0])
+    u, v = b - a, c - a
+    normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    unit: FloatArray = normal / math.sqrt(float((normal * normal).sum()))
+    return unit

@@ -1,0 +1,38 @@
+"""Clocks: the monotonic clock of this host and the virtual clock of lockstep."""
+
+from __future__ import annotations
+
+import time
+
+
+class MonotonicClock:
+    """``CLOCK_MONOTONIC`` of this host."""
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+        return time.monotonic_ns()
+
+    def sleep(self, seconds: float) -> None:
+        """Block for ``seconds``."""
+        time.sleep(seconds)
+
+
+class VirtualClock:
+    """A clock that is set by its owner; starts at one second so that 'never' (0) is always old."""
+
+    def __init__(self, start_ns: int = 1_000_000_000) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """Virtual time [ns]."""
+        return self._now_ns
+
+    def advance_to(self, t_ns: int) -> None:
+        """Move to ``t_ns``. Raises ValueError when that lies in the past."""
+        if t_ns < self._now_ns:
+            raise ValueError(f"virtual time cannot run backwards: now {self._now_ns} ns, asked {t_ns} ns")
+        self._now_ns = t_ns
+
+    def sleep(self, seconds: float) -> None:
+        """Move on by ``seconds``, at least by one nanosecond."""
+        self._now_ns += max(1, round(seconds * 1e9))

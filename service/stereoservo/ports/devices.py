@@ -1,0 +1,317 @@
+"""The ports: protocols of joint drivers, camera drivers and detectors, their descriptions and samples.
+
+All stamps are ``CLOCK_MONOTONIC`` nanoseconds of this host (in lockstep: the virtual clock), taken from
+``DriverContext.clock``. Every sample carries a stamp and a sequence number. Joint quantities are [rad], [rad/s]
+for revolute and [m], [m/s] for prismatic joints. Pixels: raw ones, those of the
+image; integer = pixel centre.
+
+Calls are non-blocking within ``call_budget_us`` of the description. ``describe()`` works before anything is
+connected. Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import msgspec
+
+from stereoservo.messages.cell_file import Mount
+from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
+
+JointKindName = Literal["revolute", "prismatic"]
+Pacing = Literal["clock", "driver", "lockstep"]
+
+
+class DriverError(Exception):
+    """A driver cannot do what was asked. Carries data; the text has the cause, the value and what would be valid.
+
+    Attributes:
+        code: short machine-readable cause, e.g. ``"not_configured"``, ``"option"``, ``"connection_lost"``.
+        data: the values the message speaks of.
+        retry: whether the same call may succeed later without a change of configuration.
+    """
+
+    def __init__(self, code: str, message: str, *, retry: bool = False, **data: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.data = data
+        self.retry = retry
+
+
+class JointSpec(msgspec.Struct, frozen=True):
+    """A joint's name, kind and limits: those of the machine; the cell's can only be tighter."""
+
+    name: str
+    kind: JointKindName
+    position_min: float
+    position_max: float
+    velocity_max: float
+    acceleration_max: float
+
+
+class JointDriverDescription(msgspec.Struct, frozen=True):
+    """The joints, rate and pacing of a joint driver, readable before it is connected.
+
+    ``home``: a configuration in which the arm may well be (in joint order; empty: none is known).
+    ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
+    ``lacks``: which of ``efforts`` and ``following_errors`` its samples do not carry, as far as it is known beforehand.
+    """
+
+    driver: str
+    joints: tuple[JointSpec, ...]
+    rate_hz: float
+    pacing: Pacing
+    command_timeout_s: float
+    call_budget_us: float
+    home: tuple[float, ...] = ()
+    effort_units: tuple[str, ...] = ()
+    lacks: tuple[Literal["efforts", "following_errors"], ...] = ()
+
+
+class CameraDescription(msgspec.Struct, frozen=True):
+    """Image size and rate of a camera; ``delivers``: ``frames`` (a detector follows) or ``observations`` (markers)."""
+
+    driver: str
+    name: str
+    width: int
+    height: int
+    rate_hz: float
+    delivers: Literal["frames", "observations"]
+    call_budget_us: float
+    marker_ids: tuple[int, ...] = ()
+    systematic_px: float = 0.0
+
+
+class DetectorDescription(msgspec.Struct, frozen=True):
+    """The marker ids that a detector can report.
+
+    ``systematic_px``: standard deviation [px] of its errors that do not average out over frames of a scene at rest
+    (sampling, rounding to grey levels); contained in the covariances that it states.
+    """
+
+    detector: str
+    marker_ids: tuple[int, ...]
+    systematic_px: float = 0.0
+
+
+class JointState(msgspec.Struct, frozen=True, eq=False):
+    """One joint sample: ``positions`` (n,), ``velocities`` (n,), and, where the drives have them, (n,) each:
+    ``efforts`` [N m or N; shares of the rated torque where the driver does not know that] and ``following_errors``,
+    set less actual position [rad or m].
+    """
+
+    seq: int
+    t_ns: int
+    positions: FloatArray
+    velocities: FloatArray
+    efforts: FloatArray | None = None
+    following_errors: FloatArray | None = None
+
+
+class CommandReport(msgspec.Struct, frozen=True, eq=False):
+    """Joint velocities (n,) that were commanded (``asked``) and sent, and the reasons why they differ."""
+
+    seq: int
+    t_ns: int
+    asked: FloatArray
+    sent: FloatArray
+    reasons: tuple[str, ...] = ()
+
+
+class Frame(msgspec.Struct, frozen=True, eq=False):
+    """One image ``(height, width)`` uint8 with its stamps."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_received_ns: int
+    image: ImageArray
+
+
+class CameraObservation(msgspec.Struct, frozen=True, eq=False):
+    """Markers seen in one frame: ``ids`` (k,), ``pixels`` (k, 2) [px], ``covariances`` (k, 2, 2) [px²]."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_received_ns: int
+    ids: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
+
+
+class Prior(msgspec.Struct, frozen=True, eq=False):
+    """Predicted markers of one camera at ``t_ns``; a detector extrapolates them to its frame's stamp.
+
+    ``ids`` (k,), ``pixels`` (k, 2) [px], ``velocities`` (k, 2) [px/s], ``covariances`` (k, 2, 2) [px²].
+    Never fed back as a measurement.
+    """
+
+    camera: str
+    t_ns: int
+    ids: IntArray
+    pixels: FloatArray
+    velocities: FloatArray
+    covariances: FloatArray
+
+
+@runtime_checkable
+class Clock(Protocol):
+    """The one source of time that drivers and the loop read."""
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+        ...
+
+
+@dataclass(frozen=True)
+class DriverContext:
+    """The surroundings that a driver gets at construction, beside its own options.
+
+    ``camera``, ``mount``: of a camera driver or detector, as the cell file has them.
+    """
+
+    clock: Clock
+    cell: str
+    runtime_dir: Path
+    cell_dir: Path
+    camera: str = ""
+    seed: int = 0
+    services: dict[str, Any] = field(default_factory=dict)
+    """In-process objects shared between drivers of one process (lockstep: the simulated world)."""
+    mount: Mount = "eye_to_hand"
+
+
+@runtime_checkable
+class JointDriver(Protocol):
+    """An arm. Constructed as ``Driver(options, context)``; the constructor connects to nothing."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
+
+    def describe(self) -> JointDriverDescription:
+        """Joints, limits, rate, pacing; works unconnected."""
+        ...
+
+    def configure(self) -> None:
+        """Connect and check the machine. Raises DriverError. Nothing moves."""
+        ...
+
+    def activate(self) -> None:
+        """Power circuits on, brakes released, velocity zero. Raises DriverError."""
+        ...
+
+    def read_state(self) -> JointState:
+        """Newest joint sample; valid once configured. Raises DriverError."""
+        ...
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        """Command joint velocities (n,). Raises DriverError unless active. Feeds the drive's watchdog."""
+        ...
+
+    def stop(self) -> None:
+        """Bring the arm to rest. Any state, idempotent, never raises."""
+        ...
+
+    def deactivate(self) -> None:
+        """Stop, then power off. Idempotent."""
+        ...
+
+    def close(self) -> None:
+        """Release everything. Idempotent; never raises."""
+        ...
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One result of an examination of a cell. ``ok``: passed, failed, or None for a remark without a verdict.
+
+    ``remedy``: the setting or act that removes the cause; ``cure`` in JSON.
+    """
+
+    name: str
+    ok: bool | None
+    message: str
+    remedy: str = msgspec.field(default="", name="cure")
+
+
+@runtime_checkable
+class ExaminableJointDriver(Protocol):
+    """A joint driver that can examine its machine for `stereoservo doctor`; the driver is not configured then."""
+
+    def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+        """Findings on the machine: connect, examine, release. ``may_move`` is asked before any joint is moved.
+
+        Never raises on what the machine does: a failure is a finding.
+        """
+        ...
+
+
+@runtime_checkable
+class CameraDriver(Protocol):
+    """A camera. Constructed as ``Driver(options, context)`` with ``context.camera`` its name in the cell."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
+
+    def describe(self) -> CameraDescription:
+        """Size, rate, what it delivers; works unconnected."""
+        ...
+
+    def configure(self) -> None:
+        """Open the source. Raises DriverError."""
+        ...
+
+    def activate(self) -> None:
+        """Start delivery. Raises DriverError."""
+        ...
+
+    def poll(self) -> list[Frame] | list[CameraObservation]:
+        """Frames or observations since the last poll, newest last; may skip old ones. Raises DriverError."""
+        ...
+
+    def deactivate(self) -> None:
+        """Stop delivery. Idempotent."""
+        ...
+
+    def close(self) -> None:
+        """Release everything. Idempotent; never raises."""
+        ...
+
+
+class CameraStatistics(msgspec.Struct, frozen=True):
+    """Counts of a camera driver since ``activate``: ``frames`` that its source gave, ``dropped`` ones that never
+    came (gaps of its sequence or its grid), ``frozen`` ones withheld since they repeat the one before, ``reconnects``.
+
+    ``settings``: what the source was asked for and what it says it does, by name, e.g. ``{"exposure": (10.0, 12.0)}``.
+    """
+
+    frames: int = 0
+    dropped: int = 0
+    frozen: int = 0
+    reconnects: int = 0
+    settings: dict[str, tuple[float | None, float | None]] = {}
+
+
+@runtime_checkable
+class CountingCameraDriver(Protocol):
+    """A camera driver that counts its frames."""
+
+    def statistics(self) -> CameraStatistics:
+        """Counts since ``activate``; any state."""
+        ...
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds markers in one camera's images. Constructed as ``Detector(options, context)``."""
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
+
+    def describe(self) -> DetectorDescription:
+        """The marker ids that it can report."""
+        ...
+
+    def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+        """Markers in ``frame``; without a (fresh) prior, acquisition in the whole image. Never raises on content."""
+        ...

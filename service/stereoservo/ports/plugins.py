@@ -1,0 +1,79 @@
+"""Plug-ins by entry point (drivers, detectors, laws, commands): imported on demand; a broken one is listed as such."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+JOINT_DRIVERS = "stereoservo.joint_drivers"
+CAMERA_DRIVERS = "stereoservo.camera_drivers"
+DETECTORS = "stereoservo.detectors"
+LAWS = "stereoservo.laws"
+COMMANDS = "stereoservo.commands"
+GROUPS = (JOINT_DRIVERS, CAMERA_DRIVERS, DETECTORS, LAWS, COMMANDS)
+
+
+class PluginError(Exception):
+    """A plug-in is unknown or does not import. ``known`` lists the names of its group."""
+
+    def __init__(self, group: str, name: str, message: str, known: tuple[str, ...]) -> None:
+        super().__init__(message)
+        self.group = group
+        self.name = name
+        self.known = known
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One entry point; ``error`` is empty where it imports (or was not tried)."""
+
+    group: str
+    name: str
+    value: str
+    distribution: str
+    error: str = ""
+
+
+def names(group: str) -> tuple[str, ...]:
+    """Names of a group, sorted; imports nothing."""
+    return tuple(sorted({entry.name for entry in entry_points(group=group)}))
+
+
+def list_plugins(group: str, *, check: bool = False) -> list[Plugin]:
+    """All plug-ins of a group; ``check`` imports each and notes its error. Never raises for a broken one."""
+    found = []
+    for entry in sorted(entry_points(group=group), key=lambda e: e.name):
+        error = ""
+        if check:
+            try:
+                entry.load()
+            except Exception as caught:  # whatever a third party's module raises on import
+                error = f"{type(caught).__name__}: {caught}"
+        found.append(Plugin(group, entry.name, entry.value, _distribution(entry), error))
+    return found
+
+
+def load(group: str, name: str) -> Any:
+    """Import one plug-in. Raises PluginError: unknown (lists what there is) or broken (gives its error)."""
+    matching = [entry for entry in entry_points(group=group) if entry.name == name]
+    known = names(group)
+    kind = group.rpartition(".")[2].replace("_", " ").removesuffix("s")
+    if not matching:
+        raise PluginError(group, name, f"no {kind} {name!r}; there are: {', '.join(known) or 'none'}", known)
+    origins = sorted({entry.value for entry in matching})
+    if len(origins) > 1:
+        raise PluginError(group, name, f"{kind} {name!r} is offered twice: {', '.join(origins)}", known)
+    try:
+        return matching[0].load()
+    except Exception as error:
+        raise PluginError(
+            group,
+            name,
+            f"{kind} {name!r} ({matching[0].value}) does not import: {type(error).__name__}: {error}",
+            known,
+        ) from error
+
+
+def _distribution(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""

@@ -1,0 +1,177 @@
+"""Step records and checkpoints: their encoding, and the stream of them from the servo loop to a recorder."""
+
+from __future__ import annotations
+
+import platform
+import zlib
+from collections.abc import Container
+from functools import cache
+from typing import Protocol
+
+import msgspec
+import numba
+import numpy as np
+
+import stereoservo
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array, encode_array
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import encode_state
+from stereoservo.numerics.arrays import FloatArray
+
+
+class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
+    """Inputs of step ``step``, the velocity that came of it, and a CRC of all outputs."""
+
+    step: int
+    inputs: StepInputs
+    command: FloatArray | None
+    raw: FloatArray
+    outputs_crc: int
+
+
+class Fingerprint(msgspec.Struct, frozen=True):
+    """What bit-for-bit replay depends on."""
+
+    stereoservo: str
+    python: str
+    numpy: str
+    numba: str
+    processor: str
+    libc: str
+    laws: dict[str, str] = {}
+    """Version and source hash of every law that was installed; empty in recordings made before it was kept."""
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
+_decoder = msgspec.msgpack.Decoder(StepRecord, dec_hook=decode_array)
+
+
+def encode_step(inputs: StepInputs, outputs: StepOutputs) -> bytes:
+    """A step record as bytes; the CRC covers every output."""
+    record = StepRecord(
+        outputs.status.step,
+        inputs,
+        outputs.command,
+        outputs.status.command_raw,
+        zlib.crc32(_encoder.encode(outputs)),
+    )
+    return _encoder.encode(record)
+
+
+def decode_step(data: bytes) -> StepRecord:
+    """Inverse of :func:`encode_step`. Raises msgspec.MsgspecError."""
+    return _decoder.decode(data)
+
+
+@cache
+def fingerprint() -> Fingerprint:
+    """The fingerprint of this process."""
+    return Fingerprint(
+        stereoservo=stereoservo.__version__,
+        python=platform.python_version(),
+        numpy=np.__version__,
+        numba=numba.__version__,
+        processor=_processor(),
+        libc=" ".join(platform.libc_ver()),
+        laws=LAWS.sources(),
+    )
+
+
+def comparable(recorded: Fingerprint, present: Fingerprint, used: Container[str]) -> bool:
+    """Whether a replay must give the same bits, for a recording in which the laws ``used`` ran.
+
+    Laws that did not run do not matter, nor those of a recording that holds none.
+    """
+    bare = msgspec.structs.replace(present, laws=recorded.laws)
+    laws = recorded.laws.items()
+    return recorded == bare and all(present.laws.get(name) == source for name, source in laws if name in used)
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+            found = [
+                line.split(":", 1)[1].strip() for line in file if line.startswith(("model name", "flags"))
+            ]
+    except OSError:
+        return platform.processor()
+    flags = f"{zlib.crc32(found[1].encode()):08x}" if len(found) > 1 else ""
+    return f"{found[0]} {flags}".strip() if found else platform.processor()
+
+
+CHECKPOINT_EVERY_S = 5.0
+
+
+class RecordingStart(msgspec.Struct, frozen=True, tag="start", array_like=True, eq=False):
+    """First message to a recorder."""
+
+    settings: CoreSettings
+    fingerprint: Fingerprint
+
+
+class RecordedStep(msgspec.Struct, frozen=True, tag="step", array_like=True):
+    """One encoded step record. ``lost``: steps dropped just before it because the recorder did not keep up."""
+
+    t_ns: int
+    data: bytes
+    lost: int = 0
+
+
+class RecordedCheckpoint(msgspec.Struct, frozen=True, tag="checkpoint", array_like=True):
+    """The encoded state before step ``step``."""
+
+    t_ns: int
+    step: int
+    state: bytes
+    lost: int = 0
+
+
+StepMessage = RecordingStart | RecordedStep | RecordedCheckpoint
+
+
+class StepSink(Protocol):
+    """One connected recorder, as the servo loop sees it."""
+
+    def send(self, message: StepMessage) -> bool:
+        """Hand a message over; False where the recorder cannot take it now."""
+        ...
+
+
+class StepStream:
+    """Sends each step, and a checkpoint at the start, every ``CHECKPOINT_EVERY_S`` and after a gap.
+
+    ``dropped`` counts the steps that a recorder could not take.
+    """
+
+    def __init__(self, settings: CoreSettings, rate_hz: float) -> None:
+        self._start = RecordingStart(settings, fingerprint())
+        self._every = max(1, round(CHECKPOINT_EVERY_S * rate_hz))
+        self._connected: StepSink | None = None
+        self._sink: StepSink | None = None
+        self._since_checkpoint = 0
+        self._lost = 0
+        self.dropped = 0
+
+    def before(self, sink: StepSink | None, core: ServoCore, now_ns: int) -> None:
+        """Begin where ``sink`` is a new recorder; send a checkpoint of ``core`` when one is due."""
+        if sink is not self._connected:
+            self._connected = sink
+            self._sink = sink if sink is not None and sink.send(self._start) else None
+            self._since_checkpoint, self._lost = self._every, 0
+        if self._sink is None:
+            return
+        if self._since_checkpoint >= self._every or self._lost:
+            state = RecordedCheckpoint(now_ns, core.state.step, encode_state(core.state), self._lost)
+            if self._sink.send(state):
+                self._since_checkpoint, self._lost = 0, 0
+
+    def after(self, inputs: StepInputs, outputs: StepOutputs) -> None:
+        """Send the step."""
+        if self._sink is None:
+            return
+        self._since_checkpoint += 1
+        if self._lost or not self._sink.send(RecordedStep(inputs.now_ns, encode_step(inputs, outputs))):
+            self._lost += 1
+            self.dropped += 1

@@ -1,1 +1,0 @@
-"""Emulated cameras: the simulated cell as MJPEG streams on loopback, with what goes wrong with real ones."""

@@ -1,0 +1,98 @@
+"""The demonstration as real processes: a daemon, and a client over zenoh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.client import Client, ClientError, GoalHandle, GoalResult, TimedOutError
+from stereoservo.kinematics.model import load_model
+from stereoservo.messages.goals import JointTarget, LawName
+from stereoservo.messages.wire import EventMessage
+from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
+
+LOOK_EVERY_S = 2.0
+RECENT_EVENTS = 50
+
+
+class LiveDemonstrator:
+    """``scenario.Operator`` as a goal client of a running daemon."""
+
+    def __init__(self, client: Client, progress: Callable[[float], None]) -> None:
+        self._client = client
+        self._progress = progress
+
+    def enable(self) -> None:
+        """Enable the arm."""
+        self._client.enable()
+
+    def calibrate(self) -> Calibrated:
+        """Calibrate; the model is read from where the daemon stored it."""
+        start = time.monotonic()
+        result = self._client.calibrate(self._hear)
+        seconds = time.monotonic() - start
+        return Calibrated(load_model(Path(result.model)), seconds)
+
+    def _hear(self, event: EventMessage) -> None:
+        if event.progress is not None:
+            self._progress(event.progress)
+
+    def move(self, joints: dict[str, float]) -> None:
+        """Joint goal."""
+        self._reach(self._client.goal(JointTarget(joints)))
+
+    def teach(self, name: str, frames: int) -> None:
+        """Teach what is seen."""
+        self._client.teach(name, frames)
+
+    def home(self) -> None:
+        """Move home."""
+        self._reach(self._client.home())
+
+    def joints(self) -> npt.NDArray[np.float64]:
+        """Measured joint positions (n,)."""
+        return np.array(list(self._client.status().joints.values()))
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that the goal's plan needs."""
+        plan = self._client.check(self._client.make_goal(target, law=law)).plan
+        assert plan is not None  # a goal of the images is planned
+        return plan.seconds
+
+    def servo(self, target: VisualTarget, law: LawName) -> str:
+        """Run a goal to its end, under a lease."""
+        result = self._ended(self._client.goal(target, law=law, lease_s=2.0))
+        return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
+
+    def _ended(self, handle: GoalHandle) -> GoalResult:
+        """Wait for a goal's end. Raises ClientError where the cell is held, since nobody here would resume it."""
+        while True:
+            try:
+                return handle.wait(LOOK_EVERY_S)
+            except TimedOutError:
+                self._require_not_held()
+
+    def _require_not_held(self) -> None:
+        state = self._client.status()
+        if not any(reason.code == "HELD" for reason in state.reasons):
+            return
+        told = [
+            event.message
+            for event in self._client.events(max(1, state.last_event - RECENT_EVENTS)).events
+            if event.kind == "held"
+        ]
+        raise ClientError(
+            f"the cell was held and nobody resumed it: {told[-1] if told else 'no event says why'}"
+        )
+
+    def _reach(self, handle: GoalHandle) -> None:
+        self._ended(handle)
+        handle.reached()
+
+    def rest(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)

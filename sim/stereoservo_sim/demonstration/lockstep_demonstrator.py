@@ -1,0 +1,68 @@
+"""The demonstration in one process on a virtual clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.daemon.lockstep import LockstepCell
+from stereoservo.messages.goals import JointTarget, LawName
+from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
+from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
+
+
+class LockstepDemonstrator:
+    """``scenario.Operator`` on a cell in lockstep."""
+
+    def __init__(self, cell: LockstepCell, seed: int, progress: Callable[[float], None]) -> None:
+        self._cell = cell
+        self._operator = LockstepOperator(cell, seed=seed)
+        self._progress = progress
+
+    def enable(self) -> None:
+        """Wait for the first joint samples and frames, then enable."""
+        self._cell.run_for(0.5)
+        self._operator.enable()
+
+    def calibrate(self) -> Calibrated:
+        """Trial motions and fit; ``seconds`` are virtual."""
+        start_ns = self._cell.clock.now_ns()
+        model = self._operator.calibrate(lambda _, fraction: self._progress(fraction))
+        return Calibrated(model, (self._cell.clock.now_ns() - start_ns) * 1e-9)
+
+    def move(self, joints: dict[str, float]) -> None:
+        """Joint goal."""
+        event = self._operator.goal(JointTarget(joints))
+        if event.kind != "goal_reached":
+            raise RuntimeError(f"the arm did not reach the pose to be shown: {event.message}")
+
+    def teach(self, name: str, frames: int) -> None:
+        """Teach what is seen."""
+        self._operator.teach(name, frames)
+
+    def home(self) -> None:
+        """Move home."""
+        self._operator.home()
+
+    def joints(self) -> npt.NDArray[np.float64]:
+        """Measured joint positions (n,), a step later."""
+        return self._cell.step().status.positions
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that the goal's plan needs."""
+        return self._operator.planned(target, law=law).seconds
+
+    def servo(self, target: VisualTarget, law: LawName) -> str:
+        """Run a goal to its end."""
+        event = self._operator.goal(target, law=law)
+        return (
+            "reached"
+            if event.kind == "goal_reached"
+            else f"{event.kind.removeprefix('goal_')}: {event.message}"
+        )
+
+    def rest(self, seconds: float) -> None:
+        """Let virtual time pass."""
+        self._cell.run_for(seconds)

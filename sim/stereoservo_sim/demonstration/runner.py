@@ -1,0 +1,171 @@
+"""Conducts the demonstration, as real processes or in lockstep, and gathers what is to be judged and reported."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereoservo.client import Client
+from stereoservo.daemon.lockstep import LockstepCell
+from stereoservo.kinematics.model import save_model
+from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
+from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.messages.wire import LoopInfo
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo_sim.demonstration.emulated import (
+    ANY_PORT,
+    ANY_SERVER,
+    has_emulated_cameras,
+    has_emulated_drives,
+    move_to_channel,
+    move_to_server,
+)
+from stereoservo_sim.demonstration.live_demonstrator import LiveDemonstrator
+from stereoservo_sim.demonstration.lockstep_demonstrator import LockstepDemonstrator
+from stereoservo_sim.demonstration.scenario import GOALS, Calibrated, ShownGoal, perform
+from stereoservo_sim.demonstration.truth import TruthLog
+from stereoservo_sim.emulators.emulator_process import EmulatorProcess
+from stereoservo_sim.world.history import TrueJointHistory
+from stereoservo_sim.world.simulated_cell import goals_of
+
+
+class DemoFailedError(Exception):
+    """The demonstration did not do what it promises."""
+
+
+@dataclass(frozen=True)
+class DemonstrationProgress:
+    """Where the demonstration tells how it goes: lines of text, and a fraction of the work in hand."""
+
+    tell: Callable[[str], None]
+    progress: Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """Everything that judgement and report need."""
+
+    cell: CellFile
+    joint_names: tuple[str, ...]
+    calibrated: Calibrated
+    outcomes: dict[str, str]
+    truth_t: IntArray
+    truth_q: FloatArray
+    recording: Path
+    out: Path
+    loop: LoopInfo | None
+    seed: int
+    lockstep: bool
+    goals: Sequence[ShownGoal] = GOALS
+
+
+def conduct_lockstep(
+    cell_path: Path, out: Path, seed: int, stage: DemonstrationProgress, goals: Sequence[ShownGoal] = GOALS
+) -> Demonstration:
+    """One process, virtual time, deterministic given the seed."""
+    cell = load_cell_file(cell_path)
+    recording = out / "flight.mcap"
+    recording.unlink(missing_ok=True)  # of an earlier demonstration
+    with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
+        history = TrueJointHistory.in_memory(len(cell.safety.limit), capacity=1 << 16)
+        with LockstepCell(
+            cell, cell_dir=cell_path.parent, runtime_dir=Path(scratch), seed=seed, recording=recording,
+            services={"world": history},
+        ) as lockstep:  # fmt: skip
+            log = TruthLog(history)
+            lockstep.on_step = _every(2000, log.take)
+            names = lockstep.settings.joint_names
+            calibrated, outcomes = perform(
+                LockstepDemonstrator(lockstep, seed, stage.progress),
+                names,
+                _configurations(cell),
+                stage.tell,
+                goals,
+            )
+            times, positions = log.end()
+    save_model(calibrated.model, out / "model.json")
+    return Demonstration(
+        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True, goals
+    )
+
+
+def _configurations(cell: CellFile) -> dict[str, FloatArray]:
+    return goals_of(cell.camera[0].mount)
+
+
+def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], None]:
+    count = 0
+
+    def on_step(_inputs: object, _outputs: object) -> None:
+        nonlocal count
+        count += 1
+        if count % steps == 0:
+            act()
+
+    return on_step
+
+
+def conduct_live(
+    cell_path: Path, out: Path, seed: int, stage: DemonstrationProgress, goals: Sequence[ShownGoal] = GOALS
+) -> Demonstration:
+    """Real processes: a daemon in directories of its own, and a client over zenoh."""
+    cell = load_cell_file(cell_path)
+    recording = out / "flight.mcap"
+    recording.unlink(missing_ok=True)  # of an earlier demonstration
+    with ExitStack() as ends:
+        scratch = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="stereoservo-")))
+        os.environ[RUNTIME_VARIABLE] = str(scratch / "run")
+        os.environ[STATE_VARIABLE] = str(scratch / "state")
+        if has_emulated_drives(cell):
+            cell_path = _emulate_drives(ends, cell_path, scratch, out, stage)
+        if has_emulated_cameras(cell):
+            cell_path = _emulate_cameras(ends, cell_path, scratch, out, stage)
+        stage.tell("starting the daemon (the first start compiles the kernels)")
+        options = ("--seed", str(seed), "--record", str(recording))
+        with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
+            daemon.wait_ready()
+            log = TruthLog.of_directory(cell_directories(cell.cell.name).runtime)
+            log.follow()
+            with Client(cell.cell.name) as client:
+                names = tuple(joint.name for joint in client.info().joints)
+                calibrated, outcomes = perform(
+                    LiveDemonstrator(client, stage.progress), names, _configurations(cell), stage.tell, goals
+                )
+                loop = client.status().loop
+            times, positions = log.end()
+            code = daemon.stop()
+            if code != 0:
+                raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
+    save_model(calibrated.model, out / "model.json")
+    return Demonstration(
+        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False, goals
+    )
+
+
+def _emulate_drives(
+    ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress
+) -> Path:
+    """Start the cell's emulated drives on a free port, to end with ``ends``; the cell file that speaks to them."""
+    drives = EmulatorProcess(cell_path, options=("--channel", ANY_PORT), log=out / "drives.log")
+    channel = ends.enter_context(drives).wait_ready()
+    stage.tell(f"emulated drives on {channel}")
+    return move_to_channel(cell_path, scratch, channel)
+
+
+def _emulate_cameras(
+    ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress
+) -> Path:
+    """The same with the cell's cameras: they look at the arm through its history in the runtime directory."""
+    cameras = EmulatorProcess(
+        cell_path, what="cameras", options=("--channel", ANY_SERVER), log=out / "cameras.log"
+    )
+    channel = ends.enter_context(cameras).wait_ready()
+    stage.tell(f"emulated cameras at {channel}")
+    folder = scratch / "streams"
+    folder.mkdir()
+    return move_to_server(cell_path, folder, channel)

@@ -1,1 +1,0 @@
-"""Emulated drives: what a rack of servo drives on a CAN bus does, frame by frame."""

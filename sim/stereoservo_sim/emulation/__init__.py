@@ -1,1 +1,0 @@
-"""What every emulator has: a console for orders, and life as a child process."""

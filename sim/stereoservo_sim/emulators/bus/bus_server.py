@@ -1,0 +1,298 @@
+"""A rack in real time: bus time is CLOCK_MONOTONIC, the master sits behind an endpoint."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.options import CanOptions
+from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator, BusEvent
+from stereoservo_sim.emulators.bus.endpoints import (
+    Endpoint,
+    EndpointError,
+    PythonCanEndpoint,
+    SlcanPty,
+    SlcanTcp,
+)
+from stereoservo_sim.emulators.fault_engine import FaultCommandError
+
+SPIN_NS = 100_000
+"""With bit times the last bit before an event is not slept through: a sleep ends some 60 µs late."""
+ASKING_NS = 200_000
+"""How often an endpoint is asked that cannot be waited for."""
+STALL_NS = 2_000_000
+"""A loop that wakes later than this was stalled."""
+LATE_FRAME_NS = 500_000
+ENDING_NS = 500_000_000
+"""How long after power off the arm is followed until it stands."""
+
+
+class Stalls(msgspec.Struct):
+    """How late the serving loop came: the largest lateness and gap, how often it was later than STALL_NS, and how many
+    frames left more than LATE_FRAME_NS after their end on the bus.
+    """
+
+    turns: int = 0
+    frames: int = 0
+    late_frames: int = 0
+    stalls: int = 0
+    latest_ns: int = 0
+    longest_gap_ns: int = 0
+
+    def words(self) -> str:
+        """For people."""
+        return (
+            f"server loop: {self.turns} turns, latest {self.latest_ns * 1e-6:.2f} ms, longest gap "
+            f"{self.longest_gap_ns * 1e-6:.2f} ms, {self.stalls} stalls over {STALL_NS * 1e-6:g} ms; "
+            f"{self.late_frames} of {self.frames} frames left {LATE_FRAME_NS * 1e-6:g} ms late or later"
+        )
+
+
+class _Request:
+    """An order of another thread, and its answer."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.done = threading.Event()
+        self.answer = ""
+        self.error: Exception | None = None
+
+
+class RackServer:
+    """Serves ``rack`` at ``endpoint`` until told to end.
+
+    ``on_event`` gets every event of the rack, in the serving thread. ``run`` serves in the calling thread; as a context
+    manager the server runs in a thread of its own, and what failed there is raised at the end.
+    """
+
+    def __init__(
+        self,
+        rack: BusEmulator,
+        endpoint: Endpoint,
+        *,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.rack = rack
+        self.endpoint = endpoint
+        self.stalls = Stalls()
+        self.on_event: Callable[[BusEvent], None] | None = None
+        self._clock_ns = clock_ns
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        self._requests: deque[_Request] = deque()
+        self._lock = threading.Lock()
+        self._over = False
+        self._watched: dict[int, Callable[[], None]] = {}
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: BaseException | None = None
+        self._turned_ns = clock_ns()
+        rack.on_adapter = endpoint.plug
+
+    @property
+    def start_ns(self) -> int:
+        """When the drives were switched on."""
+        return self.rack.start_ns
+
+    @property
+    def channel(self) -> str:
+        """How a master reaches the drives."""
+        return self.endpoint.channel
+
+    def watch(self, descriptor: int, act: Callable[[], None]) -> None:
+        """Call ``act`` in the serving loop whenever ``descriptor`` is readable."""
+        self._watched[descriptor] = act
+
+    def unwatch(self, descriptor: int) -> None:
+        """End it."""
+        self._watched.pop(descriptor, None)
+
+    def obey(self, text: str) -> str:
+        """An order, from the serving thread itself. Raises FaultCommandError."""
+        answer = self.rack.order(text, self._clock_ns())
+        return f"{answer}\n{self.stalls.words()}" if text.split()[:1] == ["status"] else answer
+
+    def order(self, text: str, timeout_s: float = 10.0) -> str:
+        """An order, from any other thread. Raises FaultCommandError."""
+        request = _Request(text)
+        with self._lock:
+            if self._over:
+                raise FaultCommandError(f"{text!r}: the server has ended")
+            self._requests.append(request)
+            os.write(self._wake_write, b"\0")
+        if not request.done.wait(timeout_s):
+            raise FaultCommandError(f"{text!r}: no answer within {timeout_s:g} s; the server does not run")
+        if request.error is not None:
+            raise request.error
+        return request.answer
+
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Serve until ``ended``; then power off, and the arm comes to rest. Closes endpoint and rack."""
+        try:
+            self._turned_ns = self._clock_ns()
+            self.rack.run_until(self._turned_ns)
+            while not ended():
+                self.turn()
+            now = self._clock_ns()
+            self.endpoint.close()
+            self.rack.power_off(now)
+            while not self.rack.at_rest() and self._clock_ns() < now + ENDING_NS:
+                self._sleep([], self.rack.due_ns())
+                self.rack.run_until(self._clock_ns())
+            self._pass_events()
+        finally:
+            self.endpoint.close()
+            self.rack.close()
+            self._end_requests()
+
+    def _end_requests(self) -> None:
+        with self._lock:
+            self._over = True
+            os.close(self._wake_read)
+            os.close(self._wake_write)
+            while self._requests:
+                request = self._requests.popleft()
+                request.error = FaultCommandError(f"{request.text!r}: the server has ended")
+                request.done.set()
+
+    def turn(self) -> None:
+        """Wait for the next event or input, and let the bus go on to the present."""
+        descriptors = self.endpoint.descriptors()
+        wanted = self.rack.due_ns()
+        if not descriptors:
+            wanted = min(wanted, self._clock_ns() + ASKING_NS)
+        ready = self._sleep([*descriptors, self._wake_read, *self._watched], wanted)
+        now = self._clock_ns()
+        self._count(now, wanted)
+        come = not descriptors or not set(ready).isdisjoint(descriptors)
+        frames = self.endpoint.take() if come else []
+        for t_ns, frame in self._stamped(frames, wanted, now):
+            self.rack.inject(frame, t_ns)
+        self._catch_up(now)
+        if self._wake_read in ready:
+            self._answer()
+        for descriptor in [one for one in self._watched if one in ready]:
+            self._watched[descriptor]()
+        self._pass_events()
+        self._turned_ns = now
+
+    def _sleep(self, descriptors: list[int], until_ns: int) -> list[int]:
+        """Wait for input or for ``until_ns``; what is readable. With bit times the end is waited for awake."""
+        spin = SPIN_NS if self.rack.wire.bitrate is not None else 0
+        left_ns = until_ns - self._clock_ns() - spin
+        return select.select(descriptors, [], [], max(left_ns, 0) * 1e-9)[0]
+
+    def _stamped(self, frames: list[CanFrame], wanted: int, now: int) -> list[tuple[int, CanFrame]]:
+        """When the master sent its frames: now; those that came while the loop was stalled, evenly since then.
+
+        Otherwise the drives would watch their time-outs run off before they hear what had come in time.
+        """
+        if now - wanted < STALL_NS:
+            return [(now, frame) for frame in frames]
+        step = (now - wanted) // (len(frames) + 1)
+        return [(wanted + (k + 1) * step, frame) for k, frame in enumerate(frames)]
+
+    def _count(self, now: int, wanted: int) -> None:
+        stalls = self.stalls
+        stalls.turns += 1
+        stalls.latest_ns = max(stalls.latest_ns, now - wanted)
+        stalls.longest_gap_ns = max(stalls.longest_gap_ns, now - self._turned_ns)
+        stalls.stalls += now - wanted > STALL_NS
+
+    def _catch_up(self, now: int) -> None:
+        """Everything up to ``now``. What has ended on the bus does not wait for the arm's next step to be computed."""
+        while (due := self.rack.due_ns()) <= now:
+            self.rack.run_until(due)
+            self._give()
+        self.rack.run_until(now)
+        self._give()
+
+    def _give(self) -> None:
+        delivered = self.rack.delivered()
+        if delivered:
+            self.endpoint.give(delivered)
+            late_ns = self._clock_ns() - delivered[0][0]
+            self.stalls.frames += len(delivered)
+            self.stalls.late_frames += len(delivered) * (late_ns > LATE_FRAME_NS)
+
+    def _answer(self) -> None:
+        os.read(self._wake_read, 4096)
+        while self._requests:
+            request = self._requests.popleft()
+            try:
+                request.answer = self.obey(request.text)
+            except FaultCommandError as error:
+                request.error = error
+            request.done.set()
+
+    def _pass_events(self) -> None:
+        news = self.rack.take_news()
+        if self.on_event is not None:
+            for event in news:
+                self.on_event(event)
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._serve, name="emulated-drives", daemon=True)
+        self._thread.start()
+        return self
+
+    def _serve(self) -> None:
+        try:
+            self.run(self._ended.is_set)
+        except BaseException as error:  # shown by __exit__: a thread has nobody to raise to
+            self._failure = error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        if self._failure is not None and error is None:
+            raise self._failure
+
+
+def open_endpoint(channel: str, bus_bitrate: int) -> Endpoint:
+    """The endpoint for ``channel``.
+
+    ``socket://127.0.0.1:PORT`` (0: a free port), ``pty``, or python-can's ``INTERFACE:CHANNEL``.
+    Raises EndpointError.
+    """
+    if channel == "pty":
+        return SlcanPty(bus_bitrate)
+    if channel.startswith("socket://"):
+        host, _, port = channel.removeprefix("socket://").rpartition(":")
+        if host not in ("127.0.0.1", "localhost") or not port.isdecimal() or int(port) > 65_535:
+            raise EndpointError(
+                f"channel {channel!r}: emulated drives listen on this host only: socket://127.0.0.1:PORT (0: free)"
+            )
+        return SlcanTcp(int(port), bus_bitrate)
+    interface, separator, name = channel.partition(":")
+    if separator and interface and name:
+        return PythonCanEndpoint(interface, name)
+    raise EndpointError(
+        f"channel {channel!r} cannot be served; valid: socket://127.0.0.1:PORT (0: a free one), pty, or a python-can "
+        "interface as INTERFACE:CHANNEL, e.g. socketcan:vcan0"
+    )
+
+
+def served_channel(options: CanOptions) -> str:
+    """The channel at which a cell's master looks for its drives. Raises EndpointError where it cannot be served."""
+    channel = str(options.channel)
+    if channel.startswith("socket://"):
+        return channel
+    if options.interface in ("stereoservo_slcan", "slcan", "virtual"):
+        raise EndpointError(
+            f"the cell's channel is {options.interface} {channel!r}, which another process cannot stand in for; give "
+            "--channel pty or --channel socket://127.0.0.1:0, and the cell the channel that is then printed"
+        )
+    return f"{options.interface}:{channel}"

@@ -1,0 +1,185 @@
+"""Racks from cell files: nodes of the cell's protocol and the plant that ``[emulate.drives]`` names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+import stereoservo_drivers.canopen
+from stereoservo.messages.cell_file import CellFile
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.options import decode_options, invalid
+from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
+from stereoservo_sim.emulators.bus.plant import STEP_NS, AxisPlant, PlantSettings
+from stereoservo_sim.emulators.fault_engine import EmulationError
+from stereoservo_sim.emulators.nodes.node import EmulatedAxis, EmulatedNode
+from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
+from stereoservo_sim.world.velocity_drives import IdealPlant, Plant
+
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+
+SHIPPED_EDS = Path(stereoservo_drivers.canopen.__file__).parent / "drive402.eds"
+DEFAULT_RATED_TORQUE = 100.0
+"""[N m] of a joint of the simulated arm for which neither the driver's options nor ``[emulate.drives]`` say it."""
+
+
+class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[emulate.drives]``.
+
+    ``plant``: ``pybullet``, the simulated arm as rigid bodies (joints of its names), or ``ideal``, any joints, without
+    mass. ``bit_time``: frames take their time on the wire. ``start``: positions by joint [rad or m] of an arm that was
+    never moved; ``resume``: an arm whose truth file exists stands where that ends. ``brake_ms``: what the brakes take
+    to open and to close. ``rated_torques`` by joint [N m or N] where they are not the driver's. ``eds``: of the
+    emulated drives where it is not the driver's, relative to the cell file. ``machine``: see PlantSettings.
+    """
+
+    plant: Literal["pybullet", "ideal"] = "pybullet"
+    bit_time: bool = False
+    start: dict[str, float] = {}
+    resume: bool = True
+    brake_ms: NonNegative = 50.0
+    rated_torques: dict[str, Positive] = {}
+    eds: str = ""
+    machine: PlantSettings = PlantSettings()
+
+
+def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
+    """The CAN options and the emulation's settings of a cell. Raises EmulationError, DriverError."""
+    if cell.joints.driver != "canopen":
+        raise EmulationError(
+            f"cell {cell.cell.name!r}: joints.driver is {cell.joints.driver!r}; drives are emulated for 'canopen' "
+            "(the shipped cell 'hil-can' is one)"
+        )
+    unknown = [name for name in cell.emulate if name not in ("drives", "cameras")]
+    if unknown:
+        raise EmulationError(
+            f"cell {cell.cell.name!r}: emulate.{unknown[0]} is unknown; valid: emulate.drives, emulate.cameras"
+        )
+    options = decode_options(CanOptions, cell.joints.options, "canopen")
+    try:
+        settings = msgspec.convert(cell.emulate.get("drives", {}), DrivesSettings)
+    except msgspec.ValidationError as error:
+        what = invalid(DrivesSettings, cell.emulate["drives"], error)
+        raise EmulationError(f"cell {cell.cell.name!r}: emulate.drives: {what}") from error
+    return options, settings
+
+
+def make_rack(
+    options: CanOptions,
+    settings: DrivesSettings | None = None,
+    *,
+    t_ns: int,
+    runtime_dir: Path | None = None,
+    cell_dir: Path = Path(),
+) -> BusEmulator:
+    """The emulated drives of ``options``, switched on at ``t_ns``.
+
+    ``runtime_dir``: where the arm's truth is written; None: nowhere. ``cell_dir``: what an EDS is relative to.
+    Raises EmulationError.
+    """
+    settings = settings or DrivesSettings()
+    names = [joint.name for joint in options.joint]
+    for key, given in (("start", settings.start), ("rated_torques", settings.rated_torques)):
+        for name in given:
+            if name not in names:
+                raise EmulationError(f"emulate.drives.{key}: no joint {name!r}; joints: {', '.join(names)}")
+    history = _history(runtime_dir, len(names), t_ns)
+    newest = history.newest() if history is not None and settings.resume else None
+    start = _start(options, settings)
+    positions = newest[1] if newest is not None else start
+    plant, rated = _plant(options, settings, positions)
+    axes = [EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(options.joint, positions, strict=True)]
+    eds = _eds(options, settings, cell_dir)
+    nodes = [
+        _node(options, joint, axis, settings, eds) for joint, axis in zip(options.joint, axes, strict=True)
+    ]
+    moved = AxisPlant(axes, plant, settings.machine, t_ns=t_ns, history=history, rated=rated)
+    return BusEmulator(nodes, moved, bitrate=options.bitrate if settings.bit_time else None, t_ns=t_ns)
+
+
+def _eds(options: CanOptions, settings: DrivesSettings, cell_dir: Path) -> Path:
+    named = settings.eds or options.eds
+    path = cell_dir / named
+    if not named or (path.name == SHIPPED_EDS.name and not path.exists()):
+        return SHIPPED_EDS
+    if not path.is_file():
+        key = "emulate.drives.eds" if settings.eds else "joints.options.eds"
+        raise EmulationError(f"{key} = {named!r}: there is no file {path}; leave eds out for the shipped one")
+    return path
+
+
+def _node(
+    options: CanOptions, joint: CanJoint, axis: EmulatedAxis, settings: DrivesSettings, eds: Path
+) -> EmulatedNode:
+    if options.protocol == "odrive":
+        from stereoservo_sim.emulators.nodes.odrive_node import OdriveNode
+
+        return OdriveNode(joint.node_id, axis, joint)
+    from stereoservo_sim.emulators.nodes.cia402_node import Cia402Node
+    from stereoservo_sim.emulators.nodes.node import NodeSettings
+
+    return Cia402Node(joint.node_id, axis, joint, eds=eds, settings=NodeSettings(brake_ms=settings.brake_ms))
+
+
+def _start(options: CanOptions, settings: DrivesSettings) -> FloatArray:
+    """Where an arm stands that was never moved: as ordered, else the simulated cell's base, else the middle."""
+    positions = np.array([min(max(0.0, joint.position_min), joint.position_max) for joint in options.joint])
+    names = tuple(joint.name for joint in options.joint)
+    if settings.plant == "pybullet":
+        from stereoservo_sim.world.simulated_cell import demo_cell
+
+        cell = demo_cell()
+        if names == cell.robot.joint_names:
+            positions = cell.base.copy()
+    for k, joint in enumerate(options.joint):
+        value = settings.start.get(joint.name, float(positions[k]))
+        if not joint.position_min <= value <= joint.position_max:
+            raise EmulationError(
+                f"emulate.drives.start.{joint.name}: {value:g} is outside the joint's range, "
+                f"{joint.position_min:g} to {joint.position_max:g}"
+            )
+        positions[k] = value
+    return positions
+
+
+def _plant(
+    options: CanOptions, settings: DrivesSettings, positions: FloatArray
+) -> tuple[Plant, list[float] | None]:
+    """What moves, and what its efforts are shares of."""
+    if settings.plant == "ideal":
+        return IdealPlant(positions), None
+    from stereoservo_sim.world.physics import PhysicsError, PybulletPlant
+    from stereoservo_sim.world.simulated_cell import demo_cell
+
+    robot = demo_cell().robot
+    names = tuple(joint.name for joint in options.joint)
+    if names != robot.joint_names:
+        raise EmulationError(
+            f"emulate.drives.plant = 'pybullet' is the simulated arm with joints {', '.join(robot.joint_names)}; this "
+            f"cell has {', '.join(names)}: name them so, or take plant = 'ideal'"
+        )
+    ratings: Mapping[str, Any] = settings.rated_torques
+    rated = [
+        float(ratings.get(joint.name) or joint.rated_torque or DEFAULT_RATED_TORQUE)
+        for joint in options.joint
+    ]
+    try:
+        return PybulletPlant(robot, positions, STEP_NS * 1e-9), rated
+    except PhysicsError as error:
+        raise EmulationError(str(error)) from error
+
+
+def _history(runtime_dir: Path | None, joints: int, t_ns: int) -> TrueJointHistory | None:
+    if runtime_dir is None:
+        return None
+    try:
+        return TrueJointHistory.create(runtime_dir / FILE_NAME, joints, now_ns=t_ns, capacity=CAPACITY)
+    except HistoryError as error:
+        raise EmulationError(str(error)) from error

@@ -1,0 +1,309 @@
+"""Faults of the CAN arm in virtual time: the driver's master against the emulated rack, bit times included.
+
+Each trial drives six axes at a steady speed, makes one fault happen at a random phase of the cycle, and looks at the
+axes' true velocities: when the master knew, when all axes stood, what was latched, whether anything moved or
+was powered again by itself afterwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import DriverError
+from stereoservo_drivers.canopen.driver import make_bringup, make_codec
+from stereoservo_drivers.canopen.master import Master, MasterFault, MasterSettings, Mode
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.fault_cases import FaultCase
+from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
+
+AXES = 6
+RATE_HZ = 250.0
+COUNTS_PER_REV = 4096.0
+GEAR_RATIO = 100.0
+SPEED_COUNTS_S = 50_000.0
+RAMP_COUNTS_S2 = 4e6
+"""From ``SPEED_COUNTS_S`` to rest in 12.5 ms."""
+BOOT_S = 1.5
+"""Time that the drives get to boot before bring-up."""
+ENABLE_S = 1.0
+SETTLE_S = 0.1
+"""After the fault, at least: in this time the axes must come to rest, and what is tolerated must not latch."""
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """One fault, once. Times after the fault [ms]; None: not detected, or never at rest.
+
+    ``code``: what was latched first, or why bring-up refused. ``restarted``: something moved or was powered
+    again by itself. ``problem``: what went otherwise than the table says, or that reset and enable did not bring
+    the arm back (of a cause that stays: that they did); empty: nothing.
+    """
+
+    detected_ms: float | None
+    rest_ms: float | None
+    code: str
+    restarted: bool
+    problem: str
+
+
+class TrialError(Exception):
+    """The trial could not even begin: bring-up or enabling failed without a fault having been ordered."""
+
+
+def trial_options(protocol: str, **changes: object) -> CanOptions:
+    """Options of six joints of the table's speed and ramps."""
+    odrive = protocol == "odrive"
+    counts_per_rad = COUNTS_PER_REV * GEAR_RATIO / (2.0 * math.pi)
+    ramp = RAMP_COUNTS_S2 / counts_per_rad
+    joints = tuple(
+        CanJoint(
+            name=f"j{k}",
+            node_id=k,
+            counts_per_rev=1.0 if odrive else COUNTS_PER_REV,
+            gear_ratio=GEAR_RATIO,
+            direction=1 if k % 2 else -1,
+            max_velocity=1.0,
+            max_acceleration=ramp,
+            quick_stop_deceleration=ramp,
+            position_min=-3.0,
+            position_max=3.0,
+        )
+        for k in range(1, AXES + 1)
+    )
+    base = CanOptions(
+        protocol="odrive" if odrive else "cia402",
+        interface="virtual",
+        channel="trial",
+        rate_hz=RATE_HZ,
+        joint=joints,
+    )
+    return msgspec.structs.replace(base, **changes)
+
+
+def trial_speed() -> float:
+    """[rad/s]"""
+    return SPEED_COUNTS_S / (COUNTS_PER_REV * GEAR_RATIO / (2.0 * math.pi))
+
+
+class FaultRig:
+    """Rack, master and its host, up to where the case's fault happens."""
+
+    def __init__(self, case: FaultCase, protocol: str) -> None:
+        self.case = case
+        options = trial_options(protocol, **case.options)
+        self.rack = make_rack(options, DrivesSettings(plant="ideal", bit_time=True), t_ns=0)
+        self.axes = [node.axis for node in self.rack.nodes]
+        codec = make_codec(options)
+        self.bringup = make_bringup(options, codec, Path())
+        self.master = Master(codec, MasterSettings.of(options))
+        self.host = VirtualHost(self.rack, self.master)
+        self.host.wait(BOOT_S)
+
+    def order(self, texts: tuple[str, ...]) -> None:
+        """Give orders to the rack now."""
+        for text in texts:
+            self.rack.order(text, self.host.t_ns)
+
+    def enable(self) -> None:
+        """Ask for it and let time pass until the master has decided."""
+        self.master.request_enable(self.host.t_ns)
+        until = self.host.t_ns + round(ENABLE_S * 1e9)
+        while self.host.t_ns < until and self.master.mode in (Mode.OFF, Mode.ENABLING):
+            self.master.port_called(self.host.t_ns)
+            self.host.wait(1.0 / RATE_HZ)
+
+    def start(self) -> None:
+        """Bring-up and enable. Raises TrialError."""
+        try:
+            self.bringup.connect(self.host)
+        except DriverError as error:
+            raise TrialError(f"bring-up failed: {error}") from error
+        self.host.begin_cycle()
+        self.host.wait(0.05)
+        self.enable()
+        if self.master.mode is not Mode.RUNNING:
+            raise TrialError(f"not enabled: {self.master.fault}, {self.master.codec.status_words()}")
+        self.host.velocities = np.zeros(AXES)
+
+    def warm_up(self, speed: FloatArray) -> None:
+        """Drive at ``speed`` (n,). Raises TrialError."""
+        self.host.velocities = speed
+        self.host.wait(self.case.warm_s)
+        if self.master.fault is not None or not self.all_move(speed):
+            raise TrialError(f"not at speed: {self.master.fault}, {[axis.velocity for axis in self.axes]}")
+
+    def all_move(self, speed: FloatArray) -> bool:
+        """All axes at ``speed`` (n,), within 2 %."""
+        return all(abs(axis.velocity - v) < 0.02 * abs(v) for axis, v in zip(self.axes, speed, strict=True))
+
+    def still(self) -> bool:
+        """All axes at rest."""
+        return self.rack.at_rest()
+
+
+def run_trial(
+    case: FaultCase,
+    protocol: str,
+    rng: np.random.Generator,
+    *,
+    run_on_s: float = 1.0,
+    rig: Callable[[FaultCase, str], FaultRig] = FaultRig,
+) -> Trial:
+    """One trial on a new ``rig``. ``run_on_s``: how long after rest nothing may move by itself. Raises TrialError."""
+    return _run(rig(case, protocol), rng, run_on_s)
+
+
+def _run(rig: FaultRig, rng: np.random.Generator, run_on_s: float) -> Trial:
+    case = rig.case
+    if case.stage == "start":
+        return _start_trial(rig, run_on_s)
+    speed = trial_speed() * rng.choice([-1.0, 1.0], AXES)
+    if case.towards:
+        speed[case.towards - 1] = trial_speed()
+    rig.start()
+    if case.stage != "standing":
+        rig.warm_up(speed)
+    rig.host.wait(rng.uniform(0.0, 1.0) / RATE_HZ)
+    t0 = rig.host.t_ns
+    rig.order(case.orders)
+    rig.host.velocities = speed
+    _strike(rig)
+    if case.by == "nobody":
+        return _tolerated(rig, speed)
+    rest_ns = _until_rest(rig, t0)
+    _recover(rig)
+    fault = rig.master.fault
+    detected_ms = None if fault is None else (fault.t_ns - t0) * 1e-6
+    rest_ms = None if rest_ns is None else (rest_ns - t0) * 1e-6
+    restarted = _restarts(rig, run_on_s)
+    return Trial(
+        detected_ms=detected_ms,
+        rest_ms=rest_ms,
+        code="" if fault is None else fault.code,
+        restarted=restarted,
+        problem=_problem(case, fault, rest_ms, restarted) or _reset(rig, speed),
+    )
+
+
+def _strike(rig: FaultRig) -> None:
+    """What becomes of the host."""
+    if rig.case.host in ("killed", "cycle_hangs"):
+        rig.host.cycling = False
+    elif rig.case.host == "loop_hangs":
+        rig.host.velocities = None
+
+
+def _until_rest(rig: FaultRig, t0: int) -> int | None:
+    """Run on until the axes have stood for a while; when the last one came to rest, None: never."""
+    rig.host.wait(max(SETTLE_S, 2e-3 * (rig.case.bound_ms or 0.0)))
+    if not rig.still():
+        return None
+    rests = [event.t_ns for event in rig.rack.events if event.kind == "all_rest" and event.t_ns >= t0]
+    return rests[-1] if rests else None
+
+
+def _recover(rig: FaultRig) -> None:
+    """The cause goes away; a thread that hung goes on."""
+    rig.order(rig.case.afterwards)
+    if rig.case.host == "cycle_hangs":
+        rig.host.cycling = True
+        rig.host.wait(8.0 / RATE_HZ)
+
+
+def _restarts(rig: FaultRig, run_on_s: float) -> bool:
+    """Whether anything moves or gets power within ``run_on_s``, though commands go on and enabling is asked for."""
+    since = rig.host.t_ns
+    positions = [axis.position for axis in rig.axes]
+    rig.host.velocities = np.full(AXES, trial_speed())
+    if rig.master.fault is not None:
+        rig.master.request_enable(since)
+    rig.host.wait(run_on_s)
+    moved = max(abs(axis.position - before) for axis, before in zip(rig.axes, positions, strict=True))
+    again = any(event.kind in ("moves", "power_on") for event in rig.rack.events if event.t_ns > since)
+    return again or moved > 1e-4 or not rig.still()
+
+
+def _problem(case: FaultCase, fault: MasterFault | None, rest_ms: float | None, restarted: bool) -> str:
+    if rest_ms is None:
+        return "never at rest"
+    if case.bound_ms is not None and rest_ms > case.bound_ms:
+        return f"at rest after {rest_ms:.1f} ms"
+    if restarted:
+        return "moved or was powered again by itself"
+    code = "nothing" if fault is None else fault.code
+    if case.codes and code not in case.codes:
+        return f"latched {code}, not {' or '.join(case.codes)}"
+    return ""
+
+
+def _reset(rig: FaultRig, speed: FloatArray) -> str:
+    """Reset, see that it enables nothing, enable, move. What went wrong; with a cause that stays: that nothing did."""
+    if rig.case.host == "killed":
+        return ""
+    rig.host.end_cycle()
+    try:
+        if rig.case.host == "adapter_gone":
+            rig.bringup.connect(rig.host)
+        else:
+            rig.bringup.reset(rig.host)
+    except DriverError as error:
+        rig.host.resume_cycle()
+        rig.host.wait(0.05)
+        refused = rig.case.stage == "reset" and rig.master.fault is not None
+        return "" if refused else f"reset refused: {error}"
+    rig.host.velocities = speed
+    rig.host.begin_cycle()
+    rig.host.wait(0.05)
+    if rig.case.stage == "reset":
+        return "" if rig.master.fault is not None else "the reset was not refused"
+    if rig.master.fault is not None:
+        return f"latched again after the reset: {rig.master.fault.text()}"
+    if any(axis.powered for axis in rig.axes) or not rig.still():
+        return "the reset gave power"
+    rig.enable()
+    rig.host.wait(0.1)
+    if rig.master.mode is not Mode.RUNNING or not rig.all_move(speed):
+        return f"not moving after reset and enable: {rig.master.fault}"
+    return ""
+
+
+def _tolerated(rig: FaultRig, speed: FloatArray) -> Trial:
+    rig.host.wait(SETTLE_S)
+    fault = rig.master.fault
+    problem = ""
+    if fault is not None:
+        problem = f"latched {fault.code}: {fault.message}"
+    elif not rig.all_move(speed):
+        problem = "the axes do not move on"
+    elif rig.master.statistics.lost == 0:
+        problem = "nothing was lost"
+    return Trial(None, None, fault.code if fault else "", False, problem)
+
+
+def _start_trial(rig: FaultRig, run_on_s: float) -> Trial:
+    """Faults that are there before bring-up: refused, or latched and enabling refused."""
+    rig.order(rig.case.orders)
+    rig.host.wait(0.01)  # what was on the wire
+    code = ""
+    try:
+        rig.bringup.connect(rig.host)
+    except DriverError as error:
+        code = error.code
+    else:
+        rig.host.begin_cycle()
+        rig.host.wait(0.05)
+        rig.enable()
+        code = rig.master.fault.code if rig.master.fault is not None else ""
+    restarted = _restarts(rig, run_on_s)
+    problem = ""
+    if code not in rig.case.codes:
+        problem = f"refused with {code or 'nothing'}, not {' or '.join(rig.case.codes)}"
+    elif restarted:
+        problem = "something moved or was powered"
+    return Trial(None, None, code, restarted, problem)

@@ -1,0 +1,211 @@
+"""One emulated camera: shutters, pictures, and when they are sent. The same in virtual and in real time."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.messages.cell_file import Mount
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports.devices import Clock, DriverContext, Frame
+from stereoservo_drivers.pybullet import PybulletCameraDriver
+from stereoservo_sim.emulators.cameras import effects
+from stereoservo_sim.emulators.cameras.stream_settings import CamerasSettings, StreamSettings
+from stereoservo_sim.world.workpiece import Moved
+
+
+@dataclass(frozen=True)
+class StreamPicture:
+    """A JPEG and its stamps: shutter and sending time [ns], ``seq`` of the camera's grid of shutters."""
+
+    seq: int
+    t_shutter_ns: int
+    t_send_ns: int
+    data: bytes = field(repr=False)
+
+
+@dataclass
+class CameraCondition:
+    """What orders have made of a camera. ``look``: ``black``, ``white``, ``flip``, ``mirror``, or empty.
+
+    ``gone``: its pictures are lost. ``truncate``, ``corrupt``: so many of the next JPEGs are spoilt.
+    """
+
+    frozen: bool = False
+    gone: bool = False
+    look: str = ""
+    size: tuple[int, int] | None = None
+    gain: float = 1.0
+    lamp: bool = False
+    latency_ns: int = 0
+    jitter_ns: int = 0
+    truncate: int = 0
+    corrupt: int = 0
+
+    def words(self) -> str:
+        """For people."""
+        marks = [name for name in ("frozen", "gone", "lamp") if getattr(self, name)]
+        marks += [self.look] if self.look else []
+        marks += [f"{self.size[0]}x{self.size[1]}"] if self.size else []
+        marks += [f"exposure {self.gain:g}"] if self.gain != 1.0 else []
+        return ", ".join(
+            [*marks, f"latency {self.latency_ns * 1e-6:g} ms", f"jitter {self.jitter_ns * 1e-6:g} ms"]
+        )
+
+
+class EmulatedView(PybulletCameraDriver):
+    """The simulated camera whose grid of shutters and losses may change while it runs."""
+
+    driver = "emulated"
+
+    def change(self, **options: Any) -> None:
+        """Other ``phase_s`` or ``drop_rate`` from the next shutter on."""
+        self._options = msgspec.structs.replace(self._options, **options)
+
+    @property
+    def phase_s(self) -> float:
+        """When its shutters open, after those of a camera without skew."""
+        return self._options.phase_s
+
+    @property
+    def drop_rate(self) -> float:
+        """Chance that a picture is lost."""
+        return self._options.drop_rate
+
+    def next_shutter_ns(self) -> int:
+        """When the next shutter opens that no picture was taken of."""
+        return self._shutter(self._next)
+
+
+class EmulatedCamera:
+    """Pictures of one view of the simulated cell, whose arm's history lies in ``runtime_dir``.
+
+    ``services``: the arm's history in this process instead. Raises DriverError where the rig has no such view.
+    """
+
+    def __init__(
+        self,
+        stream: StreamSettings,
+        settings: CamerasSettings,
+        *,
+        clock: Clock,
+        mount: Mount = "eye_to_hand",
+        runtime_dir: Path = Path(),
+        services: dict[str, Any] | None = None,
+    ) -> None:
+        self.name = stream.name
+        self.stream = stream.stream
+        self.rate_hz = stream.rate_hz
+        self.quality = settings.quality
+        self.condition = self._fresh(stream)
+        self._stream = stream
+        self._clock = clock
+        self._seed = settings.seed
+        self._moved = stream.moved
+        self._sent_ns = 0
+        self._last = b""
+        self._light: npt.NDArray[np.float32] | None = None
+        options = {
+            "view": stream.view, "k1": stream.k1, "moved": msgspec.to_builtins(stream.moved), "rate_hz": stream.rate_hz,
+            "phase_s": stream.skew_ms * 1e-3, "latency_s": 0.0, "drop_rate": stream.drop_rate, "noise": settings.noise,
+            "blur": settings.blur, "background": settings.background, "workpiece": settings.workpiece,
+        }  # fmt: skip
+        context = DriverContext(
+            clock=clock, cell="emulated", runtime_dir=runtime_dir, cell_dir=Path(), camera=stream.name,
+            seed=settings.seed, services=services or {}, mount=mount,
+        )  # fmt: skip
+        self.view = EmulatedView(options, context)
+
+    @staticmethod
+    def _fresh(stream: StreamSettings) -> CameraCondition:
+        return CameraCondition(
+            gain=stream.gain,
+            latency_ns=round(stream.latency_ms * 1e6),
+            jitter_ns=round(stream.jitter_ms * 1e6),
+        )
+
+    def open(self) -> None:
+        """Load the renderer; shutters from now on."""
+        self.view.configure()
+        self.view.activate()
+
+    def close(self) -> None:
+        """Release. Idempotent."""
+        self.view.close()
+
+    def due_ns(self) -> int:
+        """When the next shutter opens."""
+        return self.view.next_shutter_ns()
+
+    def expose(self) -> StreamPicture | None:
+        """The picture of the newest shutter, once the arm's history reaches it; None before, and for a lost one."""
+        frames = self.view.poll()
+        if not frames or self.condition.gone:
+            return None
+        (frame,) = frames
+        assert isinstance(frame, Frame)
+        data = self._developed(frame)
+        rng = np.random.default_rng((self._seed, zlib.crc32(self.name.encode()), frame.seq, 1))
+        return StreamPicture(
+            frame.seq, frame.t_shutter_ns, self._sending_ns(frame, rng), self._spoilt(data, rng)
+        )
+
+    def _developed(self, frame: Frame) -> bytes:
+        if not (self.condition.frozen and self._last):
+            self._last = effects.jpeg(self._disturbed(frame.image), self.quality)
+        return self._last
+
+    def _disturbed(self, image: ImageArray) -> ImageArray:
+        condition = self.condition
+        if condition.lamp:
+            if self._light is None:
+                self._light = effects.lamp_light(*image.shape)
+            image = effects.lit(image, self._light)
+        image = effects.exposed(image, condition.gain)
+        if condition.look in ("black", "white"):
+            image = effects.even(image, 0 if condition.look == "black" else 255)
+        image = effects.turned(image, condition.look)
+        return image if condition.size is None else effects.resized(image, condition.size)
+
+    def _sending_ns(self, frame: Frame, rng: np.random.Generator) -> int:
+        """Pictures keep their order, whatever the jitter."""
+        condition = self.condition
+        jitter = round(condition.jitter_ns * float(rng.uniform(-1.0, 1.0)))
+        self._sent_ns = max(self._sent_ns, frame.t_shutter_ns + max(condition.latency_ns + jitter, 0))
+        return self._sent_ns
+
+    def _spoilt(self, data: bytes, rng: np.random.Generator) -> bytes:
+        condition = self.condition
+        if condition.truncate > 0:
+            condition.truncate -= 1
+            return effects.cut(data)
+        if condition.corrupt > 0:
+            condition.corrupt -= 1
+            return effects.corrupted(data, rng)
+        return data
+
+    def bump(self, turn_deg: float, shift_m: float, axis: int) -> None:
+        """Turn about its own ``axis`` (0 x, 1 y, 2 z) and shift along its x, beside what it was moved by before."""
+        turns, shifts = list(self._moved.turn_deg), list(self._moved.shift_m)
+        turns[axis] += turn_deg
+        shifts[0] += shift_m
+        self._move(Moved((shifts[0], shifts[1], shifts[2]), (turns[0], turns[1], turns[2])))
+
+    def _move(self, moved: Moved) -> None:
+        self._moved = moved
+        self.view.bump(moved)
+
+    def put_back(self) -> None:
+        """Where it stood at first."""
+        self._move(self._stream.moved)
+
+    def clear(self) -> None:
+        """All as the cell file has it, but for where the camera stands."""
+        self.condition = self._fresh(self._stream)
+        self.view.change(phase_s=self._stream.skew_ms * 1e-3, drop_rate=self._stream.drop_rate)

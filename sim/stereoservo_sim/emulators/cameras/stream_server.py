@@ -1,0 +1,334 @@
+"""The streams of a studio over HTTP on loopback, in real time: one loop for all clients, one thread that renders."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+from stereoservo_sim.emulators.cameras import http_pages
+from stereoservo_sim.emulators.cameras.camera_emulator import NEVER_NS, CameraEmulator, CameraEvent
+from stereoservo_sim.emulators.cameras.emulated_camera import StreamPicture
+from stereoservo_sim.emulators.fault_engine import EmulationError
+
+SEND_BUFFER = 1 << 17
+"""[bytes] What the kernel keeps of a stream for a client that does not read: a picture or two."""
+REQUEST_NS = 5_000_000_000
+LONGEST_WAIT_S = 0.2
+LATEST_NS = 10_000_000
+"""A picture that could not be sent in time is withheld: real cameras stay punctual while this computer is busy."""
+BACKLOG = 16
+
+
+class _Client:
+    """A connection. ``stream``: once it has asked for one; ``once``: for one picture of it."""
+
+    def __init__(self, link: socket.socket, now_ns: int) -> None:
+        self.link = link
+        self.opened_ns = now_ns
+        self.asked = bytearray()
+        self.stream = ""
+        self.once = False
+        self.waiting = memoryview(b"")
+        self.hold = 0  # bytes of what waits that a stalled stream keeps back
+        self.cut = False  # it ends in the middle of its next picture
+        self.last = False  # closed when nothing waits any more
+        self.seq = -1
+
+
+class CameraServer:
+    """Serves ``studio`` at ``http://127.0.0.1:port`` (0: a free one), in the thread that calls ``run``.
+
+    ``on_event`` gets every event, in that thread. Raises EmulationError where the port is taken.
+    """
+
+    def __init__(
+        self, studio: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32
+    ) -> None:
+        self.studio = studio
+        self.on_event: Callable[[CameraEvent], None] | None = None
+        self.pictures = 0
+        self.withheld = 0
+        self.late_ns = 0
+        self._cell = cell
+        self._connections = connections
+        self._clients: list[_Client] = []
+        self._newest: dict[str, StreamPicture] = {}
+        self._watched: dict[int, Callable[[], None]] = {}
+        self._selector = selectors.DefaultSelector()
+        self._ended = threading.Event()
+        self._look = threading.Event()
+        self._failure: BaseException | None = None
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        try:
+            self._listener = socket.create_server(("127.0.0.1", port), backlog=BACKLOG)
+        except OSError as error:
+            os.close(self._wake_read)
+            os.close(self._wake_write)
+            raise EmulationError(
+                f"cannot listen on 127.0.0.1:{port}: {error.strerror}; another port, or 0 for a free one, would do"
+            ) from error
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
+        studio.on_hang_up = self._hang_up
+        studio.wanted.clear()
+
+    @property
+    def url(self) -> str:
+        """Where the streams are."""
+        return f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+
+    @property
+    def start_ns(self) -> int:
+        """What the times of orders count from."""
+        return self.studio.start_ns
+
+    @property
+    def streams(self) -> dict[str, str]:
+        """Paths by the cameras' names."""
+        return {camera.name: camera.stream for camera in self.studio.cameras}
+
+    def watch(self, descriptor: int, act: Callable[[], None]) -> None:
+        """Call ``act`` in the serving loop whenever ``descriptor`` is readable."""
+        try:
+            self._selector.register(descriptor, selectors.EVENT_READ, act)
+        except PermissionError:  # a regular file is always readable: read it to its end at once
+            self._watched[descriptor] = act
+
+    def unwatch(self, descriptor: int) -> None:
+        """End it."""
+        if self._watched.pop(descriptor, None) is None:
+            self._selector.unregister(descriptor)
+
+    def obey(self, text: str) -> str:
+        """An order, from the serving thread itself. Raises FaultCommandError."""
+        answer = self.studio.order(text, time.monotonic_ns())
+        self._look.set()
+        return f"{answer}\n{self.words()}" if text.split()[:1] == ["status"] else answer
+
+    def words(self) -> str:
+        """For people."""
+        return (
+            f"{len(self._clients)} connections; {self.pictures} pictures sent, {self.withheld} withheld since this "
+            f"computer was busy (at most {self.late_ns * 1e-6:.1f} ms after their time)"
+        )
+
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Serve until ``ended``; then close all. What fails in rendering is raised here."""
+        darkroom = threading.Thread(target=self._render, name="darkroom", daemon=True)
+        darkroom.start()
+        try:
+            while not ended() and self._failure is None:
+                self._turn()
+        finally:
+            self._ended.set()
+            self._look.set()
+            darkroom.join()
+            for client in list(self._clients):
+                self._close(client)
+            self._selector.close()
+            self._listener.close()
+            os.close(self._wake_read)
+            os.close(self._wake_write)
+            self.studio.close()
+        if self._failure is not None:
+            raise self._failure
+
+    # -- rendering ----------------------------------------------------------------------------------------------------
+
+    def _render(self) -> None:
+        try:
+            while not self._ended.is_set():
+                before_ns = self.studio.sending_ns()
+                due_ns = self.studio.take(time.monotonic_ns())
+                if self.studio.sending_ns() != before_ns:
+                    self._wake()
+                wait_s = LONGEST_WAIT_S if due_ns == NEVER_NS else (due_ns - time.monotonic_ns()) * 1e-9
+                if wait_s > 0 and self._look.wait(min(wait_s, LONGEST_WAIT_S)):
+                    self._look.clear()
+        except BaseException as error:  # raised by run(): a thread has nobody to raise to
+            self._failure = error
+            self._wake()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._wake_write, b"\0")
+
+    def _woken(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._wake_read, 4096)
+
+    # -- the loop -----------------------------------------------------------------------------------------------------
+
+    def _turn(self) -> None:
+        until_ns = self.studio.sending_ns()
+        wait_s = min(max((until_ns - time.monotonic_ns()) * 1e-9, 0.0), LONGEST_WAIT_S)
+        for key, events in self._selector.select(0.0 if self._watched else wait_s):
+            if isinstance(key.data, _Client):
+                self._serve(key.data, events)
+            else:
+                key.data()
+        for act in list(self._watched.values()):
+            act()
+        now_ns = time.monotonic_ns()
+        self.studio.run_until(now_ns)
+        for stream, picture in self.studio.sent(now_ns):
+            late_ns = now_ns - picture.t_send_ns
+            self.late_ns = max(self.late_ns, late_ns)
+            if late_ns > LATEST_NS:
+                self.withheld += 1
+                continue
+            self._newest[stream] = picture
+            self.pictures += 1
+        for client in list(self._clients):
+            if not client.stream and not client.last and now_ns - client.opened_ns > REQUEST_NS:
+                self._close(client)
+            else:
+                self._feed(client)
+        self._pass_events()
+
+    def _pass_events(self) -> None:
+        for event in self.studio.take_news():
+            if self.on_event is not None:
+                self.on_event(event)
+
+    def _accept(self) -> None:
+        try:
+            link, _ = self._listener.accept()
+        except OSError:  # it went away again
+            return
+        link.setblocking(False)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        client = _Client(link, time.monotonic_ns())
+        self._clients.append(client)
+        self._selector.register(link, selectors.EVENT_READ, client)
+        if len(self._clients) > self._connections:
+            self._refuse(client, "503 Service Unavailable", f"{self._connections} connections are the most")
+
+    def _serve(self, client: _Client, events: int) -> None:
+        if events & selectors.EVENT_READ and not self._hear(client):
+            self._close(client)
+        elif events & selectors.EVENT_WRITE:
+            self._feed(client)
+
+    def _hear(self, client: _Client) -> bool:
+        """What a client says; False where it has gone."""
+        try:
+            data = client.link.recv(4096)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        if not data:
+            return False
+        if client.stream or client.last:
+            return True  # what comes after the request is of no interest
+        client.asked += data
+        try:
+            request = http_pages.parse_request(bytes(client.asked))
+            if request is not None:
+                self._answer(client, request)
+        except http_pages.BadRequestError as error:
+            self._refuse(client, error.status, str(error))
+        return True
+
+    def _answer(self, client: _Client, request: http_pages.HttpRequest) -> None:
+        """Raises BadRequestError."""
+        streams = list(self.streams.values())
+        stream = next((s for s in streams if request.path in (s, http_pages.still_path(s))), None)
+        if stream is None and request.path != "/":
+            raise http_pages.BadRequestError("404 Not Found", f"no {request.path[:80]} here")
+        if stream in self.studio.refused:
+            raise http_pages.BadRequestError("503 Service Unavailable", f"{request.path} is refused by order")
+        if stream is None or request.head:
+            page = http_pages.index(self._cell, streams)
+            self._say(client, page if not request.head else page.partition(b"\r\n\r\n")[0] + b"\r\n\r\n")
+            return
+        client.stream, client.once = stream, request.path != stream
+        client.asked.clear()
+        if client.once:
+            self._newest.pop(stream, None)  # one from now on, not the last that somebody looked at
+        else:
+            client.waiting = memoryview(http_pages.stream_head())
+        self._say_event("connected", stream)
+        self._wanted()
+
+    def _refuse(self, client: _Client, status: str, message: str) -> None:
+        error = http_pages.BadRequestError(status, message)
+        self._say(client, http_pages.failure(error, list(self.streams.values())))
+
+    def _say(self, client: _Client, data: bytes) -> None:
+        """Send, then close."""
+        client.waiting, client.last = memoryview(data), True
+        self._feed(client)
+
+    def _feed(self, client: _Client) -> None:
+        """Send what waits; once nothing does, begin with the newest picture."""
+        if not client.waiting and client.stream and not client.last:
+            self._next(client)
+        stalled = client.stream in self.studio.stalled
+        allowed = len(client.waiting) - (client.hold if stalled else 0)
+        if allowed > 0:
+            try:
+                sent = client.link.send(client.waiting[:allowed])
+            except BlockingIOError:
+                sent = 0
+            except OSError:
+                self._close(client)
+                return
+            client.waiting = client.waiting[sent:]
+        if client.last and not client.waiting:
+            self._close(client)
+            return
+        blocked = bool(client.waiting) and not stalled
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if blocked else 0)
+        if self._selector.get_key(client.link).events != wanted:
+            self._selector.modify(client.link, wanted, client)
+
+    def _next(self, client: _Client) -> None:
+        picture = self._newest.get(client.stream)
+        if picture is None or picture.seq == client.seq:
+            return
+        client.seq = picture.seq
+        data = http_pages.still(picture) if client.once else http_pages.part(picture)
+        client.hold = len(data) // 2
+        if client.cut:
+            data = data[: len(data) // 2]
+        client.last = client.cut or client.once
+        client.waiting = memoryview(data)
+
+    def _hang_up(self, stream: str, within: bool) -> None:
+        for client in [client for client in self._clients if client.stream == stream]:
+            if within:
+                client.cut = True
+            else:
+                self._close(client)
+
+    def _close(self, client: _Client) -> None:
+        if client not in self._clients:
+            return
+        self._clients.remove(client)
+        self._selector.unregister(client.link)
+        client.link.close()
+        if client.stream:
+            self._say_event("gone", client.stream)
+            self._wanted()
+
+    def _say_event(self, kind: str, stream: str) -> None:
+        name = next(camera.name for camera in self.studio.cameras if camera.stream == stream)
+        self.studio.tell(time.monotonic_ns(), kind, name)
+
+    def _wanted(self) -> None:
+        self.studio.wanted = {client.stream for client in self._clients if client.stream}
+        for stream in list(self._newest):
+            if stream not in self.studio.wanted:
+                del self._newest[stream]
+        self._look.set()

@@ -1,0 +1,284 @@
+"""What an emulated CiA 402 drive does with its power stage, brake and ramps, and what it measures.
+
+Units: positions in counts, velocities in the drive's velocity units, accelerations in velocity units per second.
+"""
+
+from __future__ import annotations
+
+import math
+
+from stereoservo_drivers.canopen.options import CanJoint
+from stereoservo_sim.emulators.nodes.dictionary import Dictionary
+from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
+from stereoservo_sim.emulators.nodes.state_machine import HALT_OPTION, STATUS, Cia402State, PowerMachine, Ramp
+from stereoservo_sim.world.velocity_drives import REST_VELOCITY
+
+PROFILE_VELOCITY, CYCLIC_VELOCITY = 3, 9
+FOLLOWING_ERROR = 0x8611
+REACHED_SHARE = 0.01
+"""Velocity window of "target reached" as a share of the largest velocity; the EDS has no 0x606D."""
+STANDING_UNITS = 1
+"""Up to this velocity [velocity units] bit 12 of profile velocity says that the speed is zero (0x606F)."""
+PARAMETERS = (HALT_OPTION, 0x6065, 0x6066, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085)
+LIMIT_FACTOR = 2.0
+"""Braking at the current limit, as a multiple of the quick stop deceleration."""
+
+
+def wrap32(value: int) -> int:
+    """``value`` in 32 bits, as a counter that overflows."""
+    return (value + 2**31) % 2**32 - 2**31
+
+
+def clamp16(value: int) -> int:
+    """``value`` held inside 16 bits."""
+    return max(-(2**15), min(2**15 - 1, value))
+
+
+class Brake:
+    """A holding brake that takes its time."""
+
+    def __init__(self, travel_ns: int) -> None:
+        self._travel_ns = travel_ns
+        self.closed = True
+        self._wanted = True
+        self._due_ns = NEVER_NS
+
+    def move(self, closed: bool, t_ns: int) -> None:
+        """Order it; the same order again changes nothing."""
+        if closed is not self._wanted:
+            self._wanted = closed
+            self._due_ns = t_ns + self._travel_ns
+        if t_ns >= self._due_ns:
+            self.closed = self._wanted
+            self._due_ns = NEVER_NS
+
+    def due_ns(self) -> int:
+        """When it arrives."""
+        return self._due_ns
+
+
+class DriveMotion:
+    """Drives one axis as the power machine and the objects say; computes the objects that tell of it."""
+
+    def __init__(
+        self,
+        axis: EmulatedAxis,
+        joint: CanJoint,
+        dictionary: Dictionary,
+        machine: PowerMachine,
+        settings: NodeSettings,
+    ) -> None:
+        self.axis = axis
+        self.machine = machine
+        self.warning = False
+        self._dictionary = dictionary
+        self._settings = settings
+        turns = joint.gear_ratio / (1.0 if joint.kind == "prismatic" else 2.0 * math.pi)
+        self._direction = joint.direction
+        self._counts = joint.direction * joint.counts_per_rev * turns
+        self._units = joint.direction * (joint.velocity_units_per_rev_s or joint.counts_per_rev) * turns
+        self._offset = joint.offset_rad
+        self._brake = Brake(round(settings.brake_ms * 1e6))
+        self._mirror: float | None = None
+        self._limited = False
+        self._following = False
+        self._beyond_since_ns = NEVER_NS
+        for index in PARAMETERS:
+            dictionary.changed(index, lambda sub, value: self.load_parameters())
+        self.load_parameters()
+
+    def load_parameters(self) -> None:
+        """Take limits and ramps over from the dictionary."""
+        get = self._dictionary.get
+        speeding_up, slowing_down, quick = (self._acceleration(index) for index in (0x6083, 0x6084, 0x6085))
+        limit = LIMIT_FACTOR * quick
+        self._speeding_up, self._slowing_down = speeding_up, slowing_down
+        self._ramps = {Ramp.SLOW_DOWN: slowing_down, Ramp.QUICK: quick, Ramp.CURRENT_LIMIT: limit}
+        self._ramps[Ramp.VOLTAGE_LIMIT] = limit
+        self._halt = Ramp(get(HALT_OPTION, 0, 1))
+        self._largest = min(get(0x607F, 0, 2**32 - 1), get(0x6080, 0, 2**32 - 1))
+        low, high = get(0x607D, 1), get(0x607D, 2)
+        self._low = low if -(2**31) < low < high else None
+        self._high = high if low < high < 2**31 - 1 else None
+        self._window = get(0x6065, 0, abs(round(self._counts * self._settings.following_window)))
+        self._window_ns = get(0x6066) * 1_000_000
+
+    def _acceleration(self, index: int) -> float:
+        """[rad/s² or m/s²]"""
+        value = self._dictionary.get(index)
+        return value / abs(self._units) if value else self.axis.joint.acceleration_max
+
+    # -- what is measured ----------------------------------------------------------------------------------------
+
+    def _measured(self) -> float:
+        """Joint position as the encoder has it: mirrored about where it was when it began to count backwards."""
+        axis = self.axis
+        if not axis.inverted_encoder:
+            self._mirror = None
+            return axis.position
+        if self._mirror is None:
+            self._mirror = axis.position
+        return 2.0 * self._mirror - axis.position
+
+    def position(self) -> int:
+        """0x6064."""
+        return wrap32(round(self._counts * (self._measured() + self._offset)))
+
+    def velocity(self) -> int:
+        """0x606C."""
+        velocity = -self.axis.velocity if self.axis.inverted_encoder else self.axis.velocity
+        return wrap32(round(self._units * velocity))
+
+    def velocity_demand(self) -> int:
+        """0x606B."""
+        return wrap32(round(self._units * self.axis.set_velocity))
+
+    def torque(self) -> int:
+        """0x6077 [permille of the rated torque], in the motor's direction."""
+        return clamp16(round(1000.0 * self._direction * self.axis.effort))
+
+    def _error(self) -> float:
+        return self.axis.set_position - self._measured() if self.machine.powered else 0.0
+
+    def following_error(self) -> int:
+        """0x60F4 [counts]: demanded less measured position."""
+        return max(-(2**31), min(2**31 - 1, round(self._counts * self._error())))
+
+    def digital_inputs(self) -> int:
+        """0x60FD: bits 0 and 1 are the limit switches of the motor's negative and positive side."""
+        side = self.axis.limit_switch * self._direction
+        return (side < 0) | (side > 0) << 1
+
+    def status(self) -> int:
+        """0x6041. Bit 12 in mode 9: the drive follows the command; in mode 3: speed is zero, bit 10 target reached."""
+        machine = self.machine
+        word = STATUS[machine.state] | 0x10 | 0x200
+        if self.warning and machine.state not in (Cia402State.FAULT, Cia402State.FAULT_REACTION):
+            word |= 0x80
+        if self._limited or self.axis.limit_switch:
+            word |= 0x800
+        mode = self._dictionary.get(0x6061)
+        standing = abs(self.velocity()) <= STANDING_UNITS
+        if mode == CYCLIC_VELOCITY and self._following:
+            word |= 0x1000
+        if mode == PROFILE_VELOCITY:
+            word |= 0x1000 * standing | 0x400 * self._reached(standing)
+        return word
+
+    def _reached(self, standing: bool) -> bool:
+        if self.machine.state is not Cia402State.ENABLED:
+            return False
+        if self.machine.halted:
+            return standing
+        target = self._dictionary.get(0x60FF)
+        return abs(self.velocity() - target) <= max(REACHED_SHARE * self._largest, STANDING_UNITS)
+
+    # -- what is done --------------------------------------------------------------------------------------------
+
+    def power_lost(self, t_ns: int) -> None:
+        """The supply is gone or the firmware starts anew, with its parameters."""
+        self.load_parameters()
+        self._limited = self._following = False
+        self._beyond_since_ns = NEVER_NS
+        self._brake.move(True, t_ns)  # it closes without power
+        self._rest()
+
+    def _rest(self) -> None:
+        axis = self.axis
+        axis.powered = False
+        axis.target = 0.0
+        axis.brake_closed = self._brake.closed
+
+    def step(self, t_ns: int) -> bool:
+        """Bring axis, brake and machine to ``t_ns``; whether the following error has exceeded its limit."""
+        for _ in range(len(Cia402State)):
+            state = self.machine.state
+            self._act(t_ns)
+            if self.machine.state is state:
+                break
+        self.axis.brake_closed = self._brake.closed
+        return self._off_course(t_ns)
+
+    def _act(self, t_ns: int) -> None:
+        machine, axis = self.machine, self.axis
+        self._following = self._limited = False
+        if not machine.powered:
+            self._brake.move(True, t_ns)
+            self._rest()
+            return
+        axis.powered = True
+        standing = abs(axis.set_velocity) <= REST_VELOCITY
+        if machine.after is not None and standing:
+            axis.target = 0.0
+            self._brake.move(True, t_ns)
+            if self._brake.closed:
+                machine.rested()
+            return
+        self._brake.move(False, t_ns)
+        if machine.opening:
+            axis.target = 0.0
+            if not self._brake.closed:
+                machine.opened()
+        elif machine.state is not Cia402State.ENABLED or machine.ramp is not None:
+            self._brake_with(machine.ramp or Ramp.QUICK)
+        elif machine.halted:
+            self._brake_with(self._halt)
+        else:
+            self._follow()
+
+    def _brake_with(self, ramp: Ramp) -> None:
+        self.axis.target = 0.0
+        self.axis.acceleration = self._ramps[ramp]
+
+    def _follow(self) -> None:
+        """Enabled: the target velocity within the drive's limits; ramps of 0x6083 and 0x6084.
+
+        In cyclic synchronous velocity the standard leaves ramps to the master; this drive bounds the acceleration by
+        0x6083 there, both ways, as many do.
+        """
+        axis, get = self.axis, self._dictionary.get
+        mode = get(0x6061)
+        wanted = get(0x60FF) if mode in (PROFILE_VELOCITY, CYCLIC_VELOCITY) else 0
+        allowed = max(-self._largest, min(self._largest, wanted))
+        target = allowed / self._units
+        slower = abs(target) < abs(axis.set_velocity) or target * axis.set_velocity < 0.0
+        acceleration = self._slowing_down if slower and mode == PROFILE_VELOCITY else self._speeding_up
+        stopped = target != 0.0 and self._barred(math.copysign(1.0, target))
+        if stopped:
+            self._brake_with(Ramp.QUICK)
+        else:
+            axis.target, axis.acceleration = target, acceleration
+        self._limited = stopped or allowed != wanted
+        self._following = mode == CYCLIC_VELOCITY and not stopped
+
+    def _barred(self, side: float) -> bool:
+        """Whether a limit switch or a software limit (0x607D) stands against motion to ``side`` of the joint.
+
+        Software limits are seen in time for the quick stop ramp to end there; the whole range of 32 bits is no limit.
+        """
+        axis = self.axis
+        if axis.limit_switch * side > 0:
+            return True
+        outward = self._counts * side > 0
+        limit = self._high if outward else self._low
+        if limit is None:
+            return False
+        braking = max(axis.set_velocity * side, 0.0) ** 2 / (2.0 * self._ramps[Ramp.QUICK])
+        rest = self._counts * (self._measured() + side * braking + self._offset)
+        return rest >= limit if outward else rest <= limit
+
+    def _off_course(self, t_ns: int) -> bool:
+        if not self.machine.powered:
+            self._beyond_since_ns = NEVER_NS
+            return False
+        beyond = self._window != 2**32 - 1 and abs(self.following_error()) > self._window
+        if not beyond:
+            self._beyond_since_ns = NEVER_NS
+            return False
+        self._beyond_since_ns = min(self._beyond_since_ns, t_ns)
+        return t_ns - self._beyond_since_ns >= self._window_ns
+
+    def due_ns(self, t_ns: int) -> int:
+        """When ``step`` is next needed."""
+        tick = t_ns + self._settings.tick_ns if self.machine.powered else NEVER_NS
+        return min(tick, self._brake.due_ns())

@@ -1,0 +1,254 @@
+"""Process data of an emulated node: four RPDOs and four TPDOs as their parameters say (CiA 301, 7.2.2, 7.5.2.35)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_sim.emulators.nodes.dictionary import Dictionary, SdoError
+from stereoservo_sim.emulators.nodes.node import NEVER_NS
+from stereoservo_sim.emulators.nodes.pdo_rules import (
+    COUNT,
+    EVENT_TYPES,
+    INVALID,
+    LAST_SYNCHRONOUS,
+    NO_REMOTE,
+    RPDO_COMMUNICATION,
+    RPDO_MAPPING,
+    TPDO_COMMUNICATION,
+    TPDO_MAPPING,
+    Mapped,
+    check_communication,
+    check_mapping,
+    mapped,
+)
+
+TOO_SHORT, TOO_LONG, DEADLINE = 0x8210, 0x8220, 0x8250
+"""Emergency codes: PDO not processed, length exceeded, RPDO time-out (CiA 301, table 26)."""
+
+Report = Callable[[int, bool], None]
+"""(emergency code, whether the error is there or gone)."""
+
+
+@dataclass
+class _Rpdo:
+    can_id: int | None
+    kind: int
+    timeout_ns: int
+    objects: tuple[Mapped, ...]
+    length: int
+    pending: bytes | None = None
+    deadline_ns: int = NEVER_NS
+
+
+@dataclass
+class _Tpdo:
+    can_id: int | None
+    remote: bool
+    kind: int
+    inhibit_ns: int
+    event_ns: int
+    start: int
+    objects: tuple[Mapped, ...]
+    syncs: int = 0
+    sent: bytes | None = None
+    free_ns: int = 0
+    event_due_ns: int = NEVER_NS
+    wanted: bool = False
+
+
+class ProcessData:
+    """PDOs of one node. ``operational`` is set by the node; nothing is taken or sent outside of it."""
+
+    def __init__(self, dictionary: Dictionary, report: Report) -> None:
+        self._dictionary = dictionary
+        self._report = report
+        self.operational = False
+        self._errors: set[int] = set()
+        for k in range(COUNT):
+            for index in (RPDO_COMMUNICATION + k, TPDO_COMMUNICATION + k):
+                dictionary.guard(index, partial(check_communication, dictionary, index))
+            for index in (RPDO_MAPPING + k, TPDO_MAPPING + k):
+                dictionary.guard(index, partial(check_mapping, dictionary, index))
+            for index in (RPDO_COMMUNICATION + k, RPDO_MAPPING + k):
+                dictionary.changed(index, partial(self._rpdo_changed, k))
+            for index in (TPDO_COMMUNICATION + k, TPDO_MAPPING + k):
+                dictionary.changed(index, partial(self._tpdo_changed, k))
+        self.reload()
+
+    def _rpdo_changed(self, k: int, sub: int, value: int) -> None:
+        self._rpdos[k] = self._rpdo(k)
+        self._index()
+
+    def _tpdo_changed(self, k: int, sub: int, value: int) -> None:
+        self._tpdos[k] = self._tpdo(k)
+        self._index()
+
+    def _index(self) -> None:
+        self._received = {p.can_id for p in self._rpdos if p.can_id is not None}
+        self._requested = {p.can_id for p in self._tpdos if p.can_id is not None and p.remote}
+        self._synchronous = [p for p in self._tpdos if p.can_id is not None and p.kind <= LAST_SYNCHRONOUS]
+        self._event_driven = [p for p in self._tpdos if p.can_id is not None and p.kind in EVENT_TYPES]
+
+    def reload(self) -> None:
+        """Take all parameters over from the dictionary; counts and deadlines start anew."""
+        self._rpdos = [self._rpdo(k) for k in range(COUNT)]
+        self._tpdos = [self._tpdo(k) for k in range(COUNT)]
+        self._index()
+
+    def _rpdo(self, k: int) -> _Rpdo:
+        index, get = RPDO_COMMUNICATION + k, self._dictionary.get
+        cob_id = get(index, 1, INVALID)
+        objects = mapped(self._dictionary, RPDO_MAPPING + k)
+        used = not cob_id & INVALID and bool(objects)
+        return _Rpdo(
+            can_id=cob_id & 0x7FF if used else None,
+            kind=get(index, 2),
+            timeout_ns=get(index, 5) * 1_000_000,
+            objects=objects,
+            length=sum(o.size for o in objects),
+        )
+
+    def _tpdo(self, k: int) -> _Tpdo:
+        index, get = TPDO_COMMUNICATION + k, self._dictionary.get
+        cob_id = get(index, 1, INVALID)
+        objects = mapped(self._dictionary, TPDO_MAPPING + k)
+        used = not cob_id & INVALID and bool(objects)
+        return _Tpdo(
+            can_id=cob_id & 0x7FF if used else None,
+            remote=not cob_id & NO_REMOTE,
+            kind=get(index, 2),
+            inhibit_ns=get(index, 3) * 100_000,
+            event_ns=get(index, 5) * 1_000_000,
+            start=get(index, 6),
+            objects=objects,
+        )
+
+    def enter_operational(self, operational: bool) -> None:
+        """On the NMT state's change: event-driven TPDOs are sent once, deadlines begin with the first RPDO."""
+        if operational == self.operational:
+            return
+        self.operational = operational
+        self.reload()
+        for tpdo in self._tpdos:
+            tpdo.wanted = operational and tpdo.kind in EVENT_TYPES
+        if not operational:
+            for code in tuple(self._errors):
+                self._error(code, there=False)
+
+    def _error(self, code: int, *, there: bool) -> None:
+        if there and code not in self._errors:
+            self._errors.add(code)
+            self._report(code, True)
+        elif not there and code in self._errors:
+            self._errors.remove(code)
+            self._report(code, False)
+
+    def listens(self, frame: CanFrame) -> bool:
+        """Whether the frame is one of these PDOs."""
+        if not self.operational:
+            return False
+        return frame.id in (self._requested if frame.remote else self._received)
+
+    def receive(self, frame: CanFrame, t_ns: int) -> list[CanFrame]:
+        """An RPDO, or a remote request of a TPDO, that it listens to; gives what is sent at once."""
+        if frame.remote:
+            asked = [p for p in self._tpdos if p.can_id == frame.id and p.remote]
+            return [self._transmit(p, t_ns) for p in asked]
+        for rpdo in self._rpdos:
+            if rpdo.can_id == frame.id:
+                self._take(rpdo, frame.data, t_ns)
+        return []
+
+    def _take(self, rpdo: _Rpdo, data: bytes, t_ns: int) -> None:
+        self._error(TOO_SHORT, there=len(data) < rpdo.length)
+        self._error(TOO_LONG, there=len(data) > rpdo.length)
+        if len(data) < rpdo.length:
+            return
+        self._error(DEADLINE, there=False)
+        rpdo.deadline_ns = t_ns + rpdo.timeout_ns if rpdo.timeout_ns else NEVER_NS
+        if rpdo.kind <= LAST_SYNCHRONOUS:
+            rpdo.pending = data
+        else:
+            self._apply(rpdo, data)
+
+    def _apply(self, rpdo: _Rpdo, data: bytes) -> None:
+        at = 0
+        for o in rpdo.objects:
+            if not o.dummy:
+                with suppress(SdoError):  # nobody to tell: the object keeps its value, as in real drives
+                    self._dictionary.store(o.index, o.sub, data[at : at + o.size])
+            at += o.size
+
+    def waits_for_sync(self) -> bool:
+        """Whether an RPDO has come that the next SYNC makes effective."""
+        return any(rpdo.pending is not None for rpdo in self._rpdos)
+
+    def sync(self, counter: int | None, t_ns: int) -> list[CanFrame]:
+        """SYNC: synchronous TPDOs with values of now, then synchronous RPDOs take effect."""
+        if not self.operational:
+            return []
+        frames = [self._transmit(p, t_ns) for p in self._synchronous if self._due_at_sync(p, counter)]
+        for rpdo in self._rpdos:
+            if rpdo.pending is not None:
+                data, rpdo.pending = rpdo.pending, None
+                self._apply(rpdo, data)
+        return frames
+
+    def _due_at_sync(self, tpdo: _Tpdo, counter: int | None) -> bool:
+        if tpdo.kind == 0:
+            return self._content(tpdo) != tpdo.sent
+        if tpdo.start and counter is not None and tpdo.sent is None and tpdo.syncs == 0:
+            if counter != tpdo.start:
+                return False
+            tpdo.syncs = tpdo.kind - 1
+        tpdo.syncs += 1
+        if tpdo.syncs < tpdo.kind:
+            return False
+        tpdo.syncs = 0
+        return True
+
+    def _content(self, tpdo: _Tpdo) -> bytes:
+        return b"".join([self._dictionary.encoded(o.index, o.sub) for o in tpdo.objects])
+
+    def _transmit(self, tpdo: _Tpdo, t_ns: int) -> CanFrame:
+        tpdo.sent = self._content(tpdo)
+        tpdo.wanted = False
+        tpdo.free_ns = t_ns + tpdo.inhibit_ns
+        if tpdo.kind in EVENT_TYPES and tpdo.event_ns:
+            tpdo.event_due_ns = t_ns + tpdo.event_ns
+        assert tpdo.can_id is not None
+        return CanFrame(id=tpdo.can_id, data=tpdo.sent)
+
+    def check_deadlines(self, t_ns: int) -> None:
+        """Report RPDOs that have not come in time."""
+        if not self.operational:
+            return
+        for rpdo in self._rpdos:
+            if t_ns >= rpdo.deadline_ns:
+                rpdo.deadline_ns = NEVER_NS
+                self._error(DEADLINE, there=True)
+
+    def events(self, t_ns: int) -> list[CanFrame]:
+        """Event-driven TPDOs whose content has changed or whose timer has run out, as the inhibit time allows."""
+        if not self.operational:
+            return []
+        frames = []
+        for tpdo in self._event_driven:
+            if tpdo.wanted or t_ns >= tpdo.event_due_ns or self._content(tpdo) != tpdo.sent:
+                tpdo.wanted = True
+                if t_ns >= tpdo.free_ns:
+                    frames.append(self._transmit(tpdo, t_ns))
+        return frames
+
+    def due_ns(self) -> int:
+        """When ``check_deadlines`` or ``events`` is next needed."""
+        if not self.operational:
+            return NEVER_NS
+        due = min([rpdo.deadline_ns for rpdo in self._rpdos])
+        for tpdo in self._event_driven:
+            due = min(due, tpdo.free_ns if tpdo.wanted else tpdo.event_due_ns)
+        return due

@@ -1,0 +1,134 @@
+"""All experiments of ``stereoservo reproduce``, declared once each, by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stereoservo_sim.experiments.experiment import Experiment, ExperimentError, Option, repetitions
+
+
+def parse_tags(text: str) -> tuple[int, ...]:
+    """Tag ids from ``0,2,3``; an empty text is no tag. Raises ExperimentError."""
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise ExperimentError("option", f"--table-tags {text!r}; needed: ids by commas, like 0,2,3") from None
+
+
+REAL_FRANKA_OPTIONS = (
+    Option(
+        "data", Path, "folder with ee_poses.csv and images", argument="directory",
+        required="--data DIR, a folder with ee_poses.csv and images",
+    ),
+    Option("hand_tag", int, "id of the tag on the hand [default: 9]"),
+    Option("table_tags", str, "ids of tags lying on the table, by commas [default: 0,2,3]", parse=parse_tags),
+)  # fmt: skip
+
+EXPERIMENTS: dict[str, Experiment] = {
+    experiment.name: experiment
+    for experiment in (
+        Experiment(
+            "real-franka",
+            "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
+            "real.real_franka",
+            REAL_FRANKA_OPTIONS,
+            "real.real_franka_report",
+            "report_real_franka",
+        ),
+        Experiment(
+            "gripper",
+            "fig. 3.5: affine calibration from small translations of a gripper, over noise and number of motions",
+            "translations.gripper",
+            (repetitions(20),),
+        ),
+        Experiment(
+            "grid",
+            "fig. 3.6: affine calibration before a grid, single motions beside cumulative estimates",
+            "translations.grid",
+            (repetitions(20),),
+        ),
+        Experiment(
+            "pan-tilt",
+            "table 4.1, figs 4.8, 4.9: a pan-tilt head calibrates itself and predicts the image after a motion",
+            "rotations.pan_tilt",
+            (repetitions(20),),
+        ),
+        Experiment(
+            "homing",
+            "fig. 4.10: a pan-tilt head finds home from one point, its errors beside the Cramer-Rao bound",
+            "rotations.homing",
+            (repetitions(10),),
+        ),
+        Experiment(
+            "house",
+            "fig. 3.7: affine calibration from interest points of an unknown object, judged on the grid",
+            "translations.house",
+            (repetitions(50),),
+        ),
+        Experiment(
+            "robot",
+            "tables 5.1 to 5.4: self-calibration of a 6R arm from a turned plate; images, axes, links, intrinsics",
+            "arms.robot_report",
+            (repetitions(30),),
+        ),
+        Experiment(
+            "random-rigs",
+            "self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds",
+            "arms.random_rigs",
+            (repetitions(12),),
+        ),
+        Experiment(
+            "inverse-kinematics",
+            "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
+            "arms.inverse_kinematics",
+            (repetitions(100),),
+        ),
+        Experiment(
+            "tasks-abc",
+            "figs 8.6 to 8.12: three alignments by image-based stereo control, projective and coarse calibration",
+            "laws.tasks_abc",
+            (repetitions(12),),
+        ),
+        Experiment(
+            "benchmark-180",
+            "figs 8.13 to 8.22: half a turn of a tilted face by the classical and the Cartesian laws",
+            "laws.benchmark_180",
+            figures="laws.benchmark_figures",
+        ),
+        Experiment(
+            "projective-vs-euclidean",
+            "thesis 9.3: the same tasks with a projective model and with metric ones of growing errors",
+            "laws.projective_vs_euclidean",
+            (repetitions(50),),
+        ),
+        Experiment(
+            "unsynchronised",
+            "cameras without a trigger beside the same with one: 15 ms skew, 40 ms latency, and a latency told wrongly",
+            "cameras.unsynchronised",
+            (repetitions(3),),
+        ),
+        Experiment(
+            "mobile-cameras",
+            "fig. 9.1: four cameras before one tool, two of them carried about: every pair, all, and all on the move",
+            "cameras.mobile_cameras",
+            (repetitions(3),),
+        ),
+        Experiment(
+            "laws",
+            "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
+            "laws.laws_compared",
+            figures="laws.laws_figures",
+            reported_by="report_laws",
+        ),
+    )
+}
+
+
+def find_experiment(name: str) -> Experiment:
+    """The experiment of that name. Raises ExperimentError, listing those there are."""
+    if name not in EXPERIMENTS:
+        known = ", ".join(sorted(EXPERIMENTS))
+        raise ExperimentError(
+            "experiment", f"no experiment {name!r}; known: {known}", known=sorted(EXPERIMENTS)
+        )
+    return EXPERIMENTS[name]

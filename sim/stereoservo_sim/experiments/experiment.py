@@ -1,0 +1,196 @@
+"""The base of every experiment: options, run, JSON answer, figures, table for people, verdict.
+
+An experiment is declared once in :mod:`stereoservo_sim.experiments.catalogue`; what it computes is in the module that
+the declaration names, loaded when it runs. With NAME the experiment's name in snake case, that module (or the module of
+its figures) holds
+
+- ``run_NAME(*, seed, progress, **options)``: the result,
+- ``draw_NAME(result, folder)``: writes the figures, gives their paths,
+- ``show_NAME(answer, console)``: prints the answer for people; left out where :func:`show_rows` serves.
+
+Where the result is not the JSON answer itself, ``reported_by`` of the declaration names the function that makes it.
+Every answer has ``experiment``, ``seed``, ``rows`` and, where the thesis gives values, ``thesis``. Statements of
+``beside_thesis`` that hold or do not (booleans) are the verdict.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+
+from stereoservo_sim.progress import ProgressCall
+
+LISTED, WIDEST = 200, 400
+"""Rows of a table that a person still reads; its characters across at most."""
+
+
+class ExperimentError(Exception):
+    """Input of an experiment is missing, malformed or too little. The text says what, the value, what would
+    be valid.
+
+    Attributes:
+        code: short machine-readable cause, e.g. ``"data_missing"``, ``"csv"``, ``"tag_not_seen"``.
+        data: the values that the message speaks of; plain JSON types.
+    """
+
+    def __init__(self, code: str, message: str, **data: Any) -> None:
+        super().__init__(message)
+        self.code = code
+        self.data = data
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of the command line that an experiment takes.
+
+    ``parse`` gives the argument from the given value and raises ExperimentError; ``argument`` is its name in
+    ``run_NAME`` (default: the option's). ``default``: the value where none is given; None: ``run_NAME``'s own.
+    ``required``: what the error says where it is missing.
+    """
+
+    name: str
+    kind: type
+    help: str
+    argument: str = ""
+    default: Any = None
+    parse: Callable[[Any], Any] = lambda value: value
+    required: str = ""
+    least: int | None = None
+
+    @property
+    def flag(self) -> str:
+        """As on the command line, e.g. ``--hand-tag``."""
+        return f"--{self.name.replace('_', '-')}"
+
+
+def repetitions(default: int) -> Option:
+    """``--seeds``: how many repetitions, each with a seed of its own."""
+    return Option("seeds", int, "how many repetitions", default=default, least=1)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment by its ``name`` on the command line. ``module``, ``figures``: below ``experiments``; ``figures`` is
+    given where the figures are not drawn in ``module``. ``reported_by``: the function that makes the JSON answer of the
+    result; empty where the result is the answer."""
+
+    name: str
+    summary: str
+    module: str
+    options: tuple[Option, ...] = ()
+    figures: str = ""
+    reported_by: str = ""
+
+    def run(self, seed: int, given: Mapping[str, Any], progress: ProgressCall) -> Any:
+        """The result, with the options that were ``given`` (None: not given). Raises ExperimentError."""
+        taken = {option.name for option in self.options}
+        for name, value in given.items():
+            if value is not None and name not in taken:
+                raise ExperimentError("option", f"{self.name} does not take --{name.replace('_', '-')}")
+        arguments = {}
+        for option in self.options:
+            value = given.get(option.name)
+            if value is None and option.required:
+                raise ExperimentError("option", f"{self.name} needs {option.required}")
+            if value is not None:
+                arguments[option.argument or option.name] = option.parse(value)
+            elif option.default is not None:
+                arguments[option.argument or option.name] = option.default
+        return self._function(self._named("run"))(seed=seed, progress=progress, **arguments)
+
+    def report(self, result: Any) -> dict[str, Any]:
+        """The answer as a JSON object."""
+        answer: dict[str, Any] = self._function(self.reported_by)(result) if self.reported_by else result
+        return answer
+
+    def draw(self, result: Any, folder: Path) -> list[Path]:
+        """Write the figures into ``folder``; their paths."""
+        paths: list[Path] = self._function(self._named("draw"))(result, folder)
+        return paths
+
+    def show(self, answer: dict[str, Any], console: Console) -> None:
+        """Print the answer for people, then what was assumed and written."""
+        (self._optional(self._named("show")) or show_rows)(answer, console)
+        for assumption in answer.get("assumptions", []):
+            console.print(f"assumed: {assumption}")
+        for path in answer.get("plots", []):
+            console.print(f"wrote {path}")
+
+    def verdict(self, answer: dict[str, Any]) -> dict[str, bool]:
+        """Statements beside the thesis that hold or do not, those of several rows together."""
+        statements: dict[str, bool] = {}
+        for item in answer.get("beside_thesis", []):
+            for name, value in item.items():
+                if isinstance(value, bool):
+                    statements[name] = statements.get(name, True) and value
+        return statements
+
+    def _named(self, what: str) -> str:
+        return f"{what}_{self.name.replace('-', '_')}"
+
+    def _optional(self, function: str) -> Callable[..., Any] | None:
+        """A function of the experiment's modules, which are loaded now; None where they have none of that name."""
+        for module in filter(None, (self.module, self.figures)):
+            found = getattr(import_module(f"stereoservo_sim.experiments.{module}"), function, None)
+            if found is not None:
+                return found  # type: ignore[no-any-return]
+        return None
+
+    def _function(self, function: str) -> Callable[..., Any]:
+        found = self._optional(function)
+        if found is None:
+            raise AttributeError(f"experiments.{self.module} has no {function}")
+        return found
+
+
+def show_rows(answer: dict[str, Any], console: Console) -> None:
+    """Print the rows as a table, a spread as its median and the 16th to 84th percentile; then the thesis's values.
+
+    ``title`` describes the rows where they are not medians over seeds. More than ``LISTED`` rows are left to ``--json``
+    where a summary stands beside the thesis.
+    """
+    rows = answer["rows"]
+    title = answer.get("title") or f"{answer['experiment']}: {answer['seeds']} seeds; medians (16 % to 84 %)"
+    if len(rows) > LISTED and answer.get("beside_thesis"):
+        console.print(f"{title}; all {len(rows)} rows: --json, curves: --plot DIR")
+    else:
+        names = list(rows[0])
+        table = Table(title=title, title_justify="left")
+        for name in names:
+            table.add_column(
+                name, justify="left" if isinstance(rows[0][name], str) else "right", no_wrap=True
+            )
+        for row in rows:
+            table.add_row(*(cell_text(row[name]) for name in names))
+        # A table cut off is useless: a narrow terminal wraps the lines instead.
+        wide = console.options.update(width=WIDEST)
+        needed = Measurement.get(console, wide, table).maximum
+        Console(file=console.file, width=max(console.width, needed), markup=False).print(table)
+    for item in answer.get("beside_thesis", []):
+        console.print(
+            "beside the thesis: " + ", ".join(f"{key} {cell_text(value)}" for key, value in item.items())
+        )
+    console.print(f"thesis: {json.dumps(answer['thesis'])}")
+
+
+def cell_text(value: Any) -> str:
+    """A value of a row as text; a spread (median, p16, p84) as ``median (p16 to p84)``."""
+    if isinstance(value, dict):
+        return (
+            "-"
+            if value["median"] is None
+            else f"{value['median']:.4g} ({value['p16']:.4g} to {value['p84']:.4g})"
+        )
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return " to ".join(cell_text(item) for item in value)
+    return "-" if value is None else str(value)

@@ -1,0 +1,67 @@
+"""The model that a calibration without noise would find of a synthetic cell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.geometry.cameras import pixel_normaliser
+from stereoservo.geometry.strata import euclidean_to_projective
+from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, Stratum
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.synthetic import SyntheticCell
+
+
+def twists(cell: SyntheticCell, zero: FloatArray) -> FloatArray:
+    """How each joint moves the markers in the rig's frame at ``zero`` (n,): twists (n, 4, 4), base first."""
+    points, directions = cell.axes(zero)
+    if cell.mount == "eye_in_hand":
+        to_rig = np.linalg.inv(cell.flange(zero))
+        points = points @ to_rig[:3, :3].T + to_rig[:3, 3]
+        directions = -directions @ to_rig[:3, :3].T
+    result = np.zeros((len(cell.kinds), 4, 4))
+    for T, kind, c, w in zip(result, cell.kinds, points, directions, strict=True):
+        if kind == "revolute":
+            T[:3, :3] = [[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]
+            T[:3, 3] = -T[:3, :3] @ c
+        else:
+            T[:3, 3] = w
+    return result
+
+
+def exact_model(
+    cell: SyntheticCell,
+    zero: FloatArray | None = None,
+    stratum: Stratum = "metric",
+    plane: tuple[float, float, float, float] = (0.05, -0.03, 0.4, 0.3),
+) -> CellModel:
+    """``cell`` in the canonical projective frame with ``plane`` as its plane at infinity; ``zero``: home if None.
+
+    ``plane`` must not pass between the markers as seen from the left camera; the default stays clear of them for
+    cameras of ordinary focal lengths. ``stratum`` says how much of it the model tells.
+    """
+    zero = cell.home if zero is None else zero
+    normaliser = pixel_normaliser(cell.width, cell.height)
+    to_left, infinity = cell.poses[0], np.array(plane)
+    frame = euclidean_to_projective(infinity, normaliser @ cell.intrinsics[0])
+    change = frame @ to_left
+    back = np.linalg.inv(change)
+    cameras = np.array([K @ pose[:3] for K, pose in zip(cell.intrinsics, cell.poses, strict=True)]) @ back
+    return CellModel(
+        schema=MODEL_SCHEMA,
+        epoch=1,
+        joint_names=cell.joint_names,
+        joint_kinds=cell.kinds,
+        zero=np.asarray(zero, dtype=np.float64),
+        generators=change @ twists(cell, zero) @ back,
+        cameras=tuple(
+            CameraModel(f"cam{c}", matrix, cell.width, cell.height, lens)
+            for c, (matrix, lens) in enumerate(zip(cameras, cell.lenses, strict=True))
+        ),
+        marker_ids=cell.marker_ids,
+        marker_points=cell.markers(np.atleast_2d(zero))[0] @ change.T,
+        plane_at_infinity=infinity,
+        stratum=stratum,
+        projective_to_euclidean=np.linalg.inv(frame) if stratum == "metric" else None,
+        statistics=None,
+        mount=cell.mount,
+    )

@@ -1,0 +1,236 @@
+"""Random cells, each from one seed: rigs, arms, marker bodies and noise; and the judge of what a fit says of them.
+
+What is drawn: baseline 0.08 to 0.5 m, vergence 0 to 60°, focal lengths 450 to 1600 px on 640x480 (the two cameras
+within 10 % of each other), principal points off by up to 30 px, roll up to 10° between the cameras; four families
+of arms in random configurations; four bodies, two of them flat, 0.6 to 2 m away, tilted by up to 40°; noise 0.01 to
+1 px (log-uniform), 9 to 15 stops a joint.
+
+What is drawn again: rigs that do not both see the whole body at home, and configurations in which some joint cannot
+move by ``MIN_RANGE`` with ``MIN_SHOWN`` markers in both images. An operator would choose another home, too. Nothing
+else is: no case is drawn again because its fit is hard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.trial_data import TrialData
+from stereoservo.kinematics.model import pinhole
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.synthetic import (
+    OFFSET_ROWS,
+    RX90_ROWS,
+    SyntheticCell,
+    dh_link,
+    flat_plate,
+    rotation,
+    translation,
+    two_faces,
+)
+
+Row = tuple[float, float, float]
+
+BASELINES = (0.08, 0.5)
+"""[m]"""
+VERGENCES = (0.0, 60.0)
+"""Angle between the optical axes [°]."""
+FOCALS = (450.0, 1600.0)
+"""[px], 640 px wide images."""
+FOCAL_RATIO = 0.1
+"""How far the right camera's focal length may differ from the left one's."""
+PRINCIPAL_OFFSET = 30.0
+"""[px]"""
+ROLL = 10.0
+"""About the optical axes, between the cameras [°]."""
+DISTANCES = (0.6, 2.0)
+"""From the rig to the body [m]."""
+TILT = 40.0
+"""Largest angle of the body against the rig's axis [°]."""
+NOISES = (0.01, 1.0)
+"""[px], log-uniform."""
+STOPS = (9, 15)
+"""A joint."""
+MAX_RANGE = 0.6
+"""Widest motion of a joint to either side [rad]."""
+MIN_RANGE = 0.05
+"""A home at which some joint may move less than this to either side [rad] is drawn again."""
+MIN_SHOWN = 4
+"""Markers that both images hold at every stop."""
+MARGIN = 4.0
+"""Distance of markers from the edge of the image [px]."""
+
+UR_ROWS: tuple[Row, ...] = (
+    (0, 90, 0.15), (-0.42, 0, 0), (-0.39, 0, 0), (0, 90, 0.13), (0, -90, 0.1), (0, 0, 0.08),
+)  # fmt: skip
+"""Three parallel axes and a wrist whose axes do not meet, rows (a [m], alpha [°], d [m])."""
+
+
+@dataclass(frozen=True, eq=False)
+class RandomCase:
+    """A cell with its noise [px], stops a joint, and what it was made of; ``redraws``: homes and rigs given up."""
+
+    seed: int
+    cell: SyntheticCell
+    sigma: float
+    stops: int
+    arm: str
+    body: str
+    redraws: int
+
+    def trials(self) -> TrialData:
+        """Trial data, reproducible; markers out of an image are missing."""
+        rng = np.random.default_rng([self.seed, 1])
+        return hidden_out_of_view(self.cell, self.cell.trials(self.sigma, rng, self.stops))
+
+    def held_out(self, count: int = 40) -> FloatArray:
+        """Configurations (count, n) inside the ranges with a marker in both images."""
+        rng = np.random.default_rng([self.seed, 2])
+        drawn = self.cell.held_out(rng, 20 * count)
+        # A pose counts while it has a marker in both images; home always does.
+        seen = self.cell.in_view(drawn).all(axis=0).any(axis=1)
+        kept = drawn[seen][:count]
+        return kept if len(kept) else self.cell.home[None]
+
+
+def hidden_out_of_view(cell: SyntheticCell, trials: TrialData) -> TrialData:
+    """The trials with NaN where the cell's exact pixels lie outside an image."""
+    seen = cell.in_view(trials.positions)
+    return msgspec.structs.replace(trials, pixels=np.where(seen[..., None], trials.pixels, np.nan))
+
+
+def random_case(seed: int) -> RandomCase:
+    """The cell of ``seed``: the same seed, the same case, to the last bit."""
+    rng = np.random.default_rng([seed, 0])
+    body_name = str(rng.choice(list(BODIES), p=SHARES))
+    arm = str(rng.choice(list(ARMS)))
+    sigma = float(np.exp(rng.uniform(*np.log(NOISES))))
+    stops = int(rng.integers(STOPS[0], STOPS[1] + 1))
+    redraws = 0
+    while True:
+        cell = _drawn(rng, arm, BODIES[body_name]())
+        if cell is not None:
+            return RandomCase(seed, cell, sigma, stops, arm, body_name, redraws)
+        redraws += 1
+
+
+def random_pair(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Intrinsics (2, 3, 3) and poses (2, 4, 4) of two cameras that look along the rig's z."""
+    baseline, vergence = rng.uniform(*BASELINES), rng.uniform(*VERGENCES)
+    focal = rng.uniform(*FOCALS)
+    intrinsics, poses = [], []
+    for side in (-1.0, 1.0):
+        own = focal if side < 0 else focal * (1.0 + rng.uniform(-1.0, 1.0) * FOCAL_RATIO)
+        centre = rng.uniform(-PRINCIPAL_OFFSET, PRINCIPAL_OFFSET, 2)
+        aspect = rng.uniform(0.98, 1.02)
+        intrinsics.append([[own, 0, 319.5 + centre[0]], [0, own * aspect, 239.5 + centre[1]], [0, 0, 1]])
+        roll = rng.uniform(-0.5, 0.5) * ROLL
+        poses.append(
+            rotation("z", roll)
+            @ rotation("y", side * 0.5 * vergence)
+            @ translation(-side * 0.5 * baseline, 0, 0)
+        )
+    return np.array(intrinsics), np.array(poses)
+
+
+def visible_ranges(cell: SyntheticCell) -> FloatArray:
+    """Widest motion (n,) [rad or m] to either side of home, up to ``MAX_RANGE``, with ``MIN_SHOWN`` markers in
+    both images, as the trial programme would find it.
+    """
+    steps = np.linspace(0.0, MAX_RANGE, 61)
+    n = len(cell.home)
+    ranges = np.empty(n)
+    for j in range(n):
+        good = np.ones(len(steps), dtype=bool)
+        for sign in (-1.0, 1.0):
+            positions = np.repeat(cell.home[None], len(steps), axis=0)
+            positions[:, j] += sign * steps
+            good &= cell.in_view(positions, MARGIN).all(axis=0).sum(axis=1) >= MIN_SHOWN
+        reached = int(np.argmin(good)) if not good.all() else len(steps)
+        ranges[j] = steps[max(0, reached - 1)]
+    return ranges
+
+
+def _drawn(rng: np.random.Generator, arm: str, body: FloatArray) -> SyntheticCell | None:
+    """A cell, or None where this draw does not show the body or lets some joint move too little."""
+    rows, home = ARMS[arm](rng)
+    intrinsics, poses = random_pair(rng)
+    tilt_axis = rng.uniform(0.0, 360.0)
+    facing = (
+        translation(0, 0, rng.uniform(*DISTANCES))
+        @ rotation("z", tilt_axis)
+        @ rotation("y", rng.uniform(0.0, TILT))
+        @ rotation("z", rng.uniform(0.0, 360.0))
+        @ rotation("x", 180)
+    )
+    links = tuple(dh_link(*row) for row in rows)
+    lenses = np.tile(pinhole(), (2, 1))
+    none = np.zeros(len(rows))
+    cell = SyntheticCell(
+        np.eye(4), ("revolute",) * len(rows), links, body, intrinsics, poses, home, none, lenses
+    )
+    middle = translation(*body.mean(axis=0))
+    cell = replace(cell, base=facing @ np.linalg.inv(cell.flange(home) @ middle))
+    if not cell.in_view(home[None], MARGIN).all():
+        return None
+    ranges = visible_ranges(cell)
+    return replace(cell, ranges=ranges) if float(ranges.min()) >= MIN_RANGE else None
+
+
+def _posed(
+    rows: tuple[Row, ...], home_deg: tuple[float, ...]
+) -> Callable[[np.random.Generator], tuple[tuple[Row, ...], FloatArray]]:
+    """A known arm within 30° of a home."""
+
+    def draw(rng: np.random.Generator) -> tuple[tuple[Row, ...], FloatArray]:
+        return rows, np.radians(np.array(home_deg) + rng.uniform(-30, 30, len(rows)))
+
+    return draw
+
+
+def _random_arm(rng: np.random.Generator) -> tuple[tuple[Row, ...], FloatArray]:
+    """Six rows: twists of 0, ±90° or anything, lengths up to 0.4 m, in any configuration."""
+    rows = []
+    for _ in range(6):
+        twist = float(rng.choice([0.0, 90.0, -90.0, rng.uniform(-180, 180)]))
+        length = float(rng.choice([0.0, rng.uniform(-0.4, 0.4)]))
+        rows.append((length, twist, float(rng.choice([0.0, rng.uniform(-0.4, 0.4)]))))
+    # The tool stands off the last axis's origin; the body's own offset does that for the others.
+    return tuple(rows), rng.uniform(-np.pi, np.pi, 6)
+
+
+def cube_corner() -> FloatArray:
+    """12 dots (12, 3), four on each of three faces that meet at the tip of a corner, 9 cm an edge [m]."""
+    square = np.array([(25, 25), (75, 30), (70, 80), (28, 70)]) / 1000
+    corner = np.vstack([np.insert(square, axis, 0.0, axis=1) for axis in range(3)])
+    # The edges fall away from the tip, which looks along the flange's z.
+    z = -np.ones(3) / np.sqrt(3.0)
+    x = np.cross([1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.asarray(corner @ np.array([x, np.cross(z, x), z]).T + np.array([0.0, 0.0, 0.12]))
+
+
+def seven_dots() -> FloatArray:
+    """Seven dots (7, 3) in one plane: the front face of :func:`two_faces`."""
+    return two_faces()[:7]
+
+
+ARMS: dict[str, Callable[[np.random.Generator], tuple[tuple[Row, ...], FloatArray]]] = {
+    "rx90": _posed(RX90_ROWS, (10, -60, 120, 20, 40, 15)),
+    "offset": _posed(OFFSET_ROWS, (10, -60, 100, -30, 50, 15)),
+    "ur": _posed(UR_ROWS, (10, -70, 90, -80, -70, 15)),
+    "random": _random_arm,
+}
+"""Rows and home of each family, one drawn with equal probability."""
+BODIES: dict[str, Callable[[], FloatArray]] = {
+    "two_faces": two_faces,
+    "corner": cube_corner,
+    "plate4": flat_plate,
+    "plate7": seven_dots,
+}
+"""Markers of each body: 14, 12, 4 and 7."""
+SHARES = (0.35, 0.35, 0.15, 0.15)
+"""How often each body is drawn."""

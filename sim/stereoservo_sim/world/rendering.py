@@ -1,0 +1,257 @@
+"""What a simulated camera sees, as grey levels: background, arm, marker body, lens blur, sensor noise.
+
+The marker body is drawn by area coverage: spans of every dot and plate are found exactly on sixteen lines
+a pixel row, so that centroids are true to a few thousandths of a pixel. (A rasteriser's images are biased
+by up to half a pixel, and even antialiased ones by hundredths.) Behind a lens that bends, a dot is the exact image of
+its rim, so that it is also off its centre's image as a real one is; what stands behind the body is bent as a picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.geometry.distortion import distort
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo_sim.world.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
+from stereoservo_sim.world.body import MarkerBody
+from stereoservo_sim.world.camera_rig import PinholeCamera, project
+from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
+from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
+from stereoservo_sim.world.robots import shape_segments
+from stereoservo_sim.world.simulated_cell import SimulatedCell
+
+DOT_LEVEL = 225.0
+PLATE_LEVEL = 24.0
+BACK_LEVEL = 70.0
+_NOISE_MARGIN = 64
+Region = tuple[int, int, int, int]
+"""Left, top, right, bottom [px]; right and bottom are the first beyond."""
+Link = tuple[FloatArray, float, float]
+"""A link's outline (k, 2) [px], its grey level, and how near it comes [m]."""
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """``blur_px``: sigma of the lens blur; ``noise_grey``: sigma of the sensor noise [grey levels].
+
+    ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm anew for
+    every frame; ``plain`` is an even grey.
+    """
+
+    blur_px: float = 0.7
+    noise_grey: float = 2.0
+    background: str = "arm"
+
+
+class Renderer:
+    """Images of the simulated cell in one camera of its rig. Keeps the background and a field of noise.
+
+    Raises ValueError where the camera's lens leaves the image's corners dark.
+    """
+
+    def __init__(self, cell: SimulatedCell, camera: PinholeCamera, settings: RenderSettings) -> None:
+        self.cell = cell
+        self.camera = camera
+        self.settings = settings
+        self._bending = BentImage(camera)
+        self._backdrop = _backdrop(cell, self._bending.pinhole, settings.background)
+        shape = (camera.height + _NOISE_MARGIN, camera.width + _NOISE_MARGIN)
+        field = np.random.default_rng(20010101).standard_normal(shape) * settings.noise_grey
+        self._noise = field.astype(np.float32)
+
+    def render(
+        self, q: FloatArray, rng: np.random.Generator, workpiece: FloatArray | None = None
+    ) -> ImageArray:
+        """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise.
+
+        ``workpiece`` (4, 4): where it stands in the world; default: where it stood at first. Links that are nearer
+        than the workpiece are drawn over it where they are nearer than the body, too.
+        """
+        background, front = self._backdrop.image(q), []
+        if self.settings.background == "arm":
+            background = background.copy()
+            front = self._draw_arm(background, q)
+        elif self.settings.background == "pybullet":
+            front = self._draw_arm(background.copy(), q)  # only what stands before the body is drawn again
+        image = self._bending.image(background).astype(np.float32)
+        for region in self._draw_markers(image, q, front, workpiece):
+            if self.settings.blur_px > 0:
+                _blur(image, region, self.settings.blur_px)
+        return self._expose(image, rng)
+
+    def _draw_markers(
+        self,
+        image: npt.NDArray[np.float32],
+        q: FloatArray,
+        front: list[Link],
+        workpiece: FloatArray | None,
+    ) -> list[Region]:
+        """Body, workpiece and the links in ``front`` of the body, far ones first; the regions touched, none twice."""
+        layers: list[Callable[[], Region | None]] = [
+            lambda: draw_body(image, self.cell, self.camera, q),
+            *(partial(self._draw_link, image, outline, level) for outline, level, _ in front),
+        ]
+        part = self.cell.workpiece
+        if part is not None:
+            camera, pose = self.cell.in_world(self.camera, q), part.stand if workpiece is None else workpiece
+            depth = float(project(camera.P, part.marker_positions(pose))[1].min())
+            body_depth = float(project(camera.P, self.cell.marker_positions(q))[1].min())
+            depths = [body_depth, *(nearest + 0.03 for _, _, nearest in front)]
+            place = next((k for k, other in enumerate(depths) if other < depth), len(depths))
+            layers.insert(place, lambda: draw_faces(image, part.body, pose, camera))
+        return _apart([region for draw in layers if (region := draw()) is not None])
+
+    def _draw_link(self, image: npt.NDArray[np.float32], outline: FloatArray, level: float) -> None:
+        blend_polygon(image, self._bending.outline(outline), level)
+
+    def _draw_arm(self, image: ImageArray, q: FloatArray) -> list[Link]:
+        """Links behind the body are drawn, those in front of it returned as (outline (k, 2), grey level, depth).
+
+        ``image`` and outlines are those of the pinhole, before the lens bends them.
+        """
+        ends, radii = shape_segments(self.cell.robot, q)
+        camera = self.cell.in_world(self._bending.pinhole, q)
+        body_depth = float(project(camera.P, self.cell.marker_positions(q))[1].min())
+        links = []
+        for i, (segment, radius) in enumerate(zip(ends, radii, strict=True)):
+            centres, depths = project(camera.P, segment)
+            if depths.min() < 0.1:
+                continue
+            sizes = camera.K[0, 0] * radius / depths
+            links.append((float(depths.mean()), float(depths.min()), i, centres, sizes))
+        front: list[Link] = []
+        for _, nearest, i, centres, sizes in sorted(links, key=lambda link: -link[0]):
+            for scale, level in ((1.0, 96 + 6 * (i % 3)), (0.6, 122 + 6 * (i % 3))):
+                outline = _capsule_outline(centres, sizes * scale)
+                if nearest + 0.03 < body_depth:
+                    front.append((outline, float(level), nearest))
+                else:
+                    fixed = np.round(np.clip(outline, -4000, 4000) * 16).astype(np.int32)
+                    cv2.fillConvexPoly(image, fixed, int(level), cv2.LINE_AA, 4)
+        return front
+
+    def _expose(self, image: npt.NDArray[np.float32], rng: np.random.Generator) -> ImageArray:
+        if self.settings.noise_grey <= 0:
+            return np.asarray(cv2.add(image, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)
+        down, right = rng.integers(0, _NOISE_MARGIN, 2)
+        height, width = image.shape
+        noise = self._noise[down : down + height, right : right + width]
+        return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> Backdrop:
+    if background == "pybullet":
+        from stereoservo_sim.world.backdrop import (
+            PybulletBackdrop,  # the engine only where it is asked for
+        )
+
+        return PybulletBackdrop(cell, pinhole)
+    return RoomBackdrop(cell, pinhole) if background == "arm" else PlainBackdrop(pinhole)
+
+
+def draw_body(
+    image: npt.NDArray[np.float32], cell: SimulatedCell, camera: PinholeCamera, q: FloatArray
+) -> Region | None:
+    """Draw the marker body of ``cell`` with the arm at ``q`` (n,), as :func:`draw_faces` does."""
+    return draw_faces(image, cell.body, cell.body_pose(q), cell.in_world(camera, q))
+
+
+def draw_faces(
+    image: npt.NDArray[np.float32], body: MarkerBody, body_pose: FloatArray, camera: PinholeCamera
+) -> Region | None:
+    """Draw a body at ``body_pose`` (4, 4) into ``image`` (height, width), [grey levels], without blur and noise.
+
+    Faces turned away show their dull backs and are drawn first: the body is convex, so no face that looks
+    at the camera is hidden by another.
+
+    Returns:
+        The region touched (left, top, right, bottom) [px], or None where nothing was drawn.
+    """
+    faces = []
+    for face, flange_to_face in zip(body.faces, body.flange_to_face, strict=True):
+        pose = body_pose @ flange_to_face
+        sight = camera.centre - pose[:3, 3]
+        cosine = float(-pose[:3, 2] @ sight / np.linalg.norm(sight))
+        faces.append((cosine, face, camera.P @ pose[:, [0, 1, 3]]))
+    boxes = []
+    for cosine, face, H in sorted(faces, key=lambda item: item[0] > 0):
+        s = face.half_side
+        corners = np.array([[-s, -s, 1], [s, -s, 1], [s, s, 1], [-s, s, 1.0]]) @ H.T
+        if corners[:, 2].min() < 0.05:  # at the camera: nothing sensible to draw
+            continue
+        outline = corners[:, :2] / corners[:, 2:]
+        if camera.k1 != 0.0:
+            outline = bend_outline(camera, outline)
+        boxes.append((outline.min(axis=0), outline.max(axis=0)))
+        shade = 0.6 + 0.4 * abs(cosine)
+        blend_polygon(image, outline, (PLATE_LEVEL if cosine > 0 else BACK_LEVEL) * shade)
+        if cosine > 0:
+            for centre in face.positions:
+                _draw_dot(image, camera, H, centre, face.radius, DOT_LEVEL * shade)
+    return _region(boxes, camera)
+
+
+def _draw_dot(
+    image: npt.NDArray[np.float32],
+    camera: PinholeCamera,
+    H: FloatArray,
+    centre: FloatArray,
+    radius: float,
+    level: float,
+) -> None:
+    """A disc at ``centre`` (2,) [m] of the plane that ``H`` (3, 3) takes to ideal pixels."""
+    if camera.k1 == 0.0:
+        blend_ellipse(image, circle_image(H, centre, radius), level)
+        return
+    rim = (centre + radius * unit_circle()) @ H[:, :2].T + H[:, 2]
+    outline = distort(camera.lens, rim[:, :2] / rim[:, 2:])
+    if np.isfinite(outline).all():  # else the lens does not show it
+        blend_polygon(image, outline, level)
+
+
+def circle_image(H: FloatArray, centre: FloatArray, radius: float) -> FloatArray:
+    """Conic (3, 3), negative inside, that is the image under ``H`` (3, 3) of a circle in the plane [m]."""
+    x, y = centre
+    circle = np.array([[1, 0, -x], [0, 1, -y], [-x, -y, x * x + y * y - radius**2]])
+    inverse = np.linalg.inv(H)
+    conic = inverse.T @ circle @ inverse
+    return np.asarray(conic / np.abs(conic[0, 0]), dtype=np.float64)
+
+
+def _region(boxes: list[tuple[FloatArray, FloatArray]], camera: PinholeCamera) -> Region | None:
+    if not boxes:
+        return None
+    low = np.floor(np.min([box[0] for box in boxes], axis=0)) - 3
+    high = np.ceil(np.max([box[1] for box in boxes], axis=0)) + 4
+    left, top = np.clip(low, 0, [camera.width, camera.height]).astype(int)
+    right, bottom = np.clip(high, 0, [camera.width, camera.height]).astype(int)
+    return (left, top, right, bottom) if right > left and bottom > top else None
+
+
+def _apart(regions: list[Region]) -> list[Region]:
+    """The same regions; where two overlap, the one around both, so that nothing is blurred twice."""
+    if len(regions) == 2:
+        (l0, t0, r0, b0), (l1, t1, r1, b1) = regions
+        if l0 < r1 and l1 < r0 and t0 < b1 and t1 < b0:
+            return [(min(l0, l1), min(t0, t1), max(r0, r1), max(b0, b1))]
+    return regions
+
+
+def _blur(image: npt.NDArray[np.float32], region: Region, sigma: float) -> None:
+    left, top, right, bottom = region
+    part = image[top:bottom, left:right]
+    part[...] = cv2.GaussianBlur(part, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+
+
+def _capsule_outline(centres: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Convex outline (k, 2) of the images of a capsule's two end spheres, (2, 2) and (2,) [px]."""
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = (centres[:, None] + sizes[:, None, None] * ring).reshape(-1, 2)
+    return cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)

@@ -1,0 +1,218 @@
+"""Serial arms from classic Denavit-Hartenberg rows: forward kinematics, shapes, and the same arm as URDF.
+
+This is the simulation's truth. Nothing of it reaches the service, which learns the arm from images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import JointSpec
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A capsule fixed to link ``link`` (0 is the base), in that link's joint frame: ends and radius [m]."""
+
+    link: int
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A revolute arm: ``dh`` rows (a [m], alpha [rad], d [m]), one a joint; ``joints`` the machine's
+    limits.
+    """
+
+    name: str
+    dh: tuple[tuple[float, float, float], ...]
+    joints: tuple[JointSpec, ...]
+    masses: tuple[float, ...]
+    shapes: tuple[Capsule, ...]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, base first."""
+        return tuple(joint.name for joint in self.joints)
+
+
+def _tail(a: float, alpha: float, d: float) -> FloatArray:
+    """What follows the joint's rotation in a classic row: Tz(d) Tx(a) Rx(alpha), (4, 4)."""
+    c, s = np.cos(alpha), np.sin(alpha)
+    return np.array([[1, 0, 0, a], [0, c, -s, 0], [0, s, c, d], [0, 0, 0, 1.0]])
+
+
+@lru_cache(maxsize=8)
+def _tails(robot: Robot) -> FloatArray:
+    return np.stack([_tail(*row) for row in robot.dh])
+
+
+def joint_frames(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Link poses in the world, (n, 4, 4), z along each joint's axis and turned by ``q``; and the flange,
+    (4, 4).
+
+    Args:
+        robot: the arm.
+        q: (n,) joint positions [rad].
+    """
+    tails = _tails(robot)
+    frames = np.empty((len(robot.dh), 4, 4))
+    pose = np.eye(4)
+    for i, tail in enumerate(tails):
+        c, s = np.cos(q[i]), np.sin(q[i])
+        turned = pose.copy()
+        turned[:, 0] = c * pose[:, 0] + s * pose[:, 1]
+        turned[:, 1] = c * pose[:, 1] - s * pose[:, 0]
+        frames[i] = turned
+        pose = turned @ tail
+    return frames, pose
+
+
+def flange_pose(robot: Robot, q: FloatArray) -> FloatArray:
+    """Pose of the flange in the world, (4, 4), z along the last joint's axis, for ``q`` (n,) [rad]."""
+    return joint_frames(robot, q)[1]
+
+
+def shape_segments(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The arm's capsules in the world at ``q``: end points (k, 2, 3) [m], radii (k,) [m]."""
+    frames, _ = joint_frames(robot, q)
+    ends = np.empty((len(robot.shapes), 2, 3))
+    for i, shape in enumerate(robot.shapes):
+        frame = np.eye(4) if shape.link == 0 else frames[shape.link - 1]
+        for k, point in enumerate((shape.start, shape.end)):
+            ends[i, k] = frame[:3, :3] @ np.array(point) + frame[:3, 3]
+    return ends, np.array([shape.radius for shape in robot.shapes])
+
+
+def urdf(robot: Robot) -> str:
+    """The arm as URDF text: links ``link_0`` (base) .. ``link_n`` and ``flange``; joints by the robot's
+    names.
+    """
+    lines = [f'<robot name="{robot.name}">']
+    for i, mass in enumerate((10.0, *robot.masses)):
+        lines.append(f'  <link name="link_{i}">')
+        lines += _inertial(mass, [shape for shape in robot.shapes if shape.link == i])
+        for shape in robot.shapes:
+            if shape.link == i:
+                lines += _cylinder(shape)
+        lines.append("  </link>")
+    previous = np.eye(4)
+    for i, joint in enumerate(robot.joints):
+        lines += [
+            f'  <joint name="{joint.name}" type="revolute">',
+            f'    <parent link="link_{i}"/><child link="link_{i + 1}"/>',
+            f"    {_origin(previous)}",
+            '    <axis xyz="0 0 1"/>',
+            f'    <limit lower="{joint.position_min!r}" upper="{joint.position_max!r}" effort="1000"'
+            f' velocity="{joint.velocity_max!r}"/>',
+            '    <dynamics damping="0" friction="0"/>',
+            "  </joint>",
+        ]
+        previous = _tail(*robot.dh[i])
+    lines += [
+        '  <link name="flange">',
+        *_inertial(0.1, []),
+        "  </link>",
+        '  <joint name="flange_mount" type="fixed">',
+        f'    <parent link="link_{len(robot.joints)}"/><child link="flange"/>',
+        f"    {_origin(previous)}",
+        "  </joint>",
+        "</robot>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: FloatArray) -> str:
+    return " ".join(f"{float(value):.17g}" for value in values)
+
+
+def _origin(pose: FloatArray) -> str:
+    R = pose[:3, :3]
+    roll, pitch, yaw = (
+        np.arctan2(R[2, 1], R[2, 2]),
+        -np.arcsin(np.clip(R[2, 0], -1, 1)),
+        np.arctan2(R[1, 0], R[0, 0]),
+    )
+    return f'<origin xyz="{_numbers(pose[:3, 3])}" rpy="{_numbers(np.array([roll, pitch, yaw]))}"/>'
+
+
+def _inertial(mass: float, shapes: list[Capsule]) -> list[str]:
+    """Mass in the middle of the shapes, inertia of a solid box around them: sensible, not identified."""
+    points = np.array([p for s in shapes for p in (s.start, s.end)]) if shapes else np.zeros((1, 3))
+    radius = max((s.radius for s in shapes), default=0.02)
+    size = points.max(axis=0) - points.min(axis=0) + 2 * radius
+    inertia = mass / 12 * (size @ size - size**2)
+    return [
+        "    <inertial>",
+        f'      <origin xyz="{_numbers((points.max(axis=0) + points.min(axis=0)) / 2)}"/>',
+        f'      <mass value="{mass!r}"/>',
+        f'      <inertia ixx="{inertia[0]:.6g}" iyy="{inertia[1]:.6g}" izz="{inertia[2]:.6g}"'
+        ' ixy="0" ixz="0" iyz="0"/>',
+        "    </inertial>",
+    ]
+
+
+def _cylinder(shape: Capsule) -> list[str]:
+    start, end = np.array(shape.start), np.array(shape.end)
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    x, y, z = axis / length
+    pitch, yaw = float(np.arctan2(np.hypot(x, y), z)), float(np.arctan2(y, x))
+    return [
+        "    <visual>",
+        f'      <origin xyz="{_numbers((start + end) / 2)}" rpy="0 {pitch!r} {yaw!r}"/>',
+        f'      <geometry><cylinder radius="{shape.radius!r}" length="{length!r}"/></geometry>',
+        "    </visual>",
+    ]
+
+
+def _revolute(name: str, low_deg: float, high_deg: float) -> JointSpec:
+    return JointSpec(
+        name=name,
+        kind="revolute",
+        position_min=float(np.deg2rad(low_deg)),
+        position_max=float(np.deg2rad(high_deg)),
+        velocity_max=1.0,
+        acceleration_max=4.0,
+    )
+
+
+RX90 = Robot(
+    name="rx90",
+    dh=tuple(
+        (a, float(np.deg2rad(alpha)), d)
+        for a, alpha, d in (
+            (0.0, -90, 0.42),
+            (0.40, 0, 0.0),
+            (0.0, 90, 0.0),
+            (0.0, -90, 0.80),
+            (0.0, 90, 0.0),
+            (0.0, 0, 0.085),
+        )
+    ),
+    joints=(
+        _revolute("j1", -160, 160),
+        _revolute("j2", -137, 137),
+        _revolute("j3", -142, 142),
+        _revolute("j4", -270, 270),
+        _revolute("j5", -105, 120),
+        _revolute("j6", -270, 270),
+    ),
+    masses=(20.0, 15.0, 8.0, 6.0, 2.0, 1.5),
+    shapes=(
+        Capsule(0, (0, 0, 0.0), (0, 0, 0.10), 0.13),
+        Capsule(1, (0, 0, 0.10), (0, 0, 0.42), 0.09),
+        Capsule(2, (0, 0, 0), (0.40, 0, 0), 0.07),
+        Capsule(3, (0, 0, -0.07), (0, 0, 0.07), 0.07),
+        Capsule(4, (0, 0, 0), (0, 0, 0.76), 0.055),
+        Capsule(5, (0, 0, -0.045), (0, 0, 0.045), 0.05),
+        Capsule(6, (0, 0, 0), (0, 0, 0.12), 0.03),
+    ),
+)
+"""Six revolute joints after the Stäubli RX 90 of the thesis (its section 5.5)."""

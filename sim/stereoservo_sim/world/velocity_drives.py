@@ -1,0 +1,139 @@
+"""Simulated velocity drives: ramps, limits, the command time-out, and what moves the joints."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import JointSpec
+
+STIFFNESS = 500.0
+"""Of an ideal joint's drive at a wall [N m/rad or N/m]."""
+REST_VELOCITY = 1e-9
+"""Below this [rad/s or m/s] a physics engine's joint stands still."""
+
+
+class Plant(Protocol):
+    """What the drives move. ``positions``, ``velocities``, ``efforts`` of the motors [N m or N], (n,): the truth."""
+
+    positions: FloatArray
+    velocities: FloatArray
+    efforts: FloatArray
+
+    def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
+        """Move on by ``h`` [s] towards the drives' set-points at its end, (n,), (n,)."""
+        ...
+
+    def close(self) -> None:
+        """Release what it holds."""
+        ...
+
+
+class IdealPlant:
+    """Joints that are where their drives want them, without mass; effort comes of walls alone.
+
+    ``walls`` (2, n): no joint goes below the first or above the second; its drive then pushes with ``STIFFNESS``.
+    """
+
+    def __init__(self, positions: FloatArray) -> None:
+        self.positions = positions.copy()
+        self.velocities = np.zeros_like(positions)
+        self.efforts = np.zeros_like(positions)
+        self.walls = np.array([np.full_like(positions, -np.inf), np.full_like(positions, np.inf)])
+
+    def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
+        """Take the set-points, as far as the walls let."""
+        self.positions = np.clip(set_positions, self.walls[0], self.walls[1])
+        beyond = set_positions - self.positions
+        self.velocities = np.where(beyond != 0.0, 0.0, set_velocities)
+        self.efforts = STIFFNESS * beyond
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def ramp(
+    q: FloatArray, v: FloatArray, target: FloatArray, acceleration: FloatArray, h: float
+) -> tuple[FloatArray, FloatArray]:
+    """Exact motion over ``h`` [s] with velocities ramped to ``target`` at ``acceleration``; all (n,)."""
+    gap = target - v
+    duration = np.minimum(np.abs(gap) / acceleration, h)
+    reached = v + np.sign(gap) * acceleration * duration
+    reached = np.where(duration < h, target, reached)
+    return q + 0.5 * (v + reached) * duration + reached * (h - duration), reached
+
+
+class DriveBank:
+    """Velocity drives of all joints on a fixed time grid, with a common command time-out.
+
+    The set-points are advanced in steps of ``step_ns``, never beyond the asked time. After ``timeout_ns``
+    without a command the drives brake by themselves; once they stand, time that passes is skipped, so
+    that catching up after a stall costs at most the time-out and the brake ramp.
+    """
+
+    def __init__(
+        self, joints: tuple[JointSpec, ...], plant: Plant, *, now_ns: int, step_ns: int, timeout_ns: int
+    ) -> None:
+        self.plant = plant
+        self.t_ns = now_ns
+        self._step_ns = step_ns
+        self._timeout_ns = timeout_ns
+        self._low = np.array([j.position_min for j in joints])
+        self._high = np.array([j.position_max for j in joints])
+        self._velocity = np.array([j.velocity_max for j in joints])
+        self._acceleration = np.array([j.acceleration_max for j in joints])
+        self._q = plant.positions.copy()
+        self._v = np.zeros(len(joints))
+        self._target = np.zeros(len(joints))
+        self._deadline_ns = now_ns
+        self.timed_out = False
+
+    @property
+    def set_positions(self) -> FloatArray:
+        """Where the drives want the joints (n,)."""
+        return self._q
+
+    def _plant_rests(self) -> bool:
+        return bool(np.all(np.abs(self.plant.velocities) < REST_VELOCITY))
+
+    def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+        """Take a velocity command (n,) given at ``t_ns``; gives what is sent to the drives, and why it
+        differs.
+        """
+        self.advance(t_ns)
+        sent = np.clip(velocities, -self._velocity, self._velocity)
+        reasons = () if np.array_equal(sent, velocities) else ("drive_velocity_limit",)
+        self._target = sent
+        self._deadline_ns = t_ns + self._timeout_ns
+        self.timed_out = False
+        return sent, reasons
+
+    def brake(self, t_ns: int) -> None:
+        """Ramp to rest from ``t_ns`` on."""
+        self.advance(t_ns)
+        self._target = np.zeros_like(self._target)
+
+    def advance(self, now_ns: int) -> None:
+        """Move on to the last grid point not after ``now_ns``."""
+        while now_ns - self.t_ns >= self._step_ns:
+            if self.t_ns >= self._deadline_ns and np.any(self._target):
+                self._target = np.zeros_like(self._target)
+                self.timed_out = True
+            if not np.any(self._target) and not np.any(self._v) and self._plant_rests():
+                self.t_ns += (now_ns - self.t_ns) // self._step_ns * self._step_ns
+                return
+            steps = 1
+            if isinstance(self.plant, IdealPlant):
+                # The ramp is exact over any time: one step up to the next event.
+                end = now_ns if self.t_ns >= self._deadline_ns else min(now_ns, self._deadline_ns)
+                steps = max((end - self.t_ns) // self._step_ns, 1)
+            h = steps * self._step_ns * 1e-9
+            self._q, self._v = ramp(self._q, self._v, self._target, self._acceleration, h)
+            stopped = (self._q < self._low) | (self._q > self._high)
+            if np.any(stopped):  # the mechanical end stop
+                self._q = np.clip(self._q, self._low, self._high)
+                self._v = np.where(stopped, 0.0, self._v)
+            self.plant.follow(self._q, self._v, h)
+            self.t_ns += steps * self._step_ns

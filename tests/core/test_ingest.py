@@ -1,0 +1,335 @@
+"""Stamps that cannot be right and a loop that stood still: refused, told, stopped, and nothing of them kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.state import decode_state, encode_state
+from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Goal, Jog, Resume, RunGoal
+
+HOUR_NS = 3_600_000_000_000
+DISPLACED = np.array([0.25, -0.2, 0.15, 0.4, -0.3, 0.5])
+JOINT = "j4"
+TIMEOUT_S = 0.1  # of the bench's joints
+COAST_S = 0.5
+WATCHDOG_S = 0.1  # of the bench's drives
+GAPS_S = (0.005, 0.011, 0.02, 0.05, 0.099, 0.101, 0.15, 0.3, 0.6, 1.0, 3.0, 10.0)
+
+
+def codes(outputs: Any) -> list[str]:
+    return [reason.code for reason in outputs.status.reasons]
+
+
+def step_of(bench: Any) -> np.ndarray:
+    """Change of a command that the acceleration limit allows in one period (6,)."""
+    return bench.settings.limits.acceleration_max / bench.settings.rate_hz * (1.0 + 1e-9)
+
+
+def jogging(bench: Any, lease_s: float = 60.0) -> Any:
+    """The bench at full speed of one joint."""
+    bench.ready()
+    assert bench.reply(Jog({JOINT: 1.0}, lease_s)).accepted
+    assert bench.run(0.4).command[3] == pytest.approx(1.0)
+    return bench
+
+
+def servoing(bench: Any) -> Any:
+    bench.ready()
+    target = FeatureTarget(bench.features(bench.q + DISPLACED))
+    assert bench.reply(RunGoal(Goal("0000abcd", target, law="cartesian3"))).accepted
+    assert np.abs(bench.run(0.4).command).max() > 0.1
+    return bench
+
+
+def kept(bench: Any) -> tuple[Any, ...]:
+    """All that the core remembers of joint samples."""
+    state = bench.core.state
+    return (
+        state.history.count, state.history.t_ns.tobytes(), state.history.positions.tobytes(),
+        state.velocities.tobytes(), state.last_joints_ns, state.last_joints_seq, state.contact.seen_ns,
+    )  # fmt: skip
+
+
+def kept_of_cameras(bench: Any) -> tuple[Any, ...]:
+    return tuple(
+        (e.last_seq, e.seen_ns.tobytes(), e.accepted_ns, e.frames, e.innovation.tobytes())
+        for e in bench.core.state.cameras
+    )
+
+
+# -- joints -------------------------------------------------------------------------------------------------
+
+
+def test_a_jog_never_passes_its_limit_after_one_sample_of_the_future(bench: Any) -> None:
+    jogging(bench)
+    bench.joints_stamped_late_ns = HOUR_NS
+    bench.step()
+    bench.joints_stamped_late_ns = 0
+    for _ in range(700):
+        bench.step()
+        assert bench.q[3] < bench.settings.limits.position_max[3]
+    assert np.abs(bench.log[-1][1].command).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "threshold"), [(1, 0.0), (20_000_000, 0.0), (HOUR_NS, 0.0), (-120_000_000, TIMEOUT_S)]
+)
+def test_a_joint_stamp_outside_the_window_stops_the_arm_and_nothing_of_it_is_kept(
+    bench: Any, late_ns: int, threshold: float
+) -> None:
+    servoing(bench)
+    if late_ns < 0:  # newer than what is known, and too old all the same
+        bench.joints_on = False
+        bench.run(0.18)
+    before = kept(bench)
+    bench.joints_on, bench.joints_stamped_late_ns = True, late_ns
+    outputs = bench.step()
+    assert kept(bench) == before
+    aborted = next(e for e in bench.events if e.kind == "goal_aborted")
+    (reason,) = aborted.reasons
+    assert (reason.code, reason.level, reason.unit) == ("JOINT_STAMP", "hold", "s")
+    assert reason.value == pytest.approx(-late_ns * 1e-9)
+    assert reason.threshold == threshold
+    assert "resume" in reason.hint
+    assert codes(outputs)[-2:] == ["JOINT_STAMP", "STOPPED"]
+    bench.joints_stamped_late_ns = 0
+    outputs = bench.run(1.0)
+    assert np.abs(outputs.command).max() == 0.0
+    assert codes(outputs)[-2:] == ["JOINT_STAMP", "STOPPED"]  # latched, and still told
+    assert [e.kind for e in bench.events].count("stopped") == 1
+    assert not bench.reply(Jog({JOINT: 0.2}, 0.5)).accepted
+    assert bench.reply(Resume()).accepted
+    assert bench.reply(Jog({JOINT: 0.2}, 0.5)).accepted
+    outputs = bench.run(0.2)
+    assert outputs.command[3] == pytest.approx(0.2)
+    assert "JOINT_STAMP" not in codes(outputs)
+
+
+def test_an_old_sample_that_is_told_again_and_again_is_silence(bench: Any) -> None:
+    servoing(bench)
+    before = kept(bench)
+    bench.joints_stamped_late_ns = -HOUR_NS
+    outputs = bench.run(0.3)
+    assert kept(bench) == before
+    assert "JOINTS_STALE" in codes(outputs)
+    assert not {"JOINT_STAMP", "STOPPED"} & set(codes(outputs))
+    assert np.abs(bench.run(0.5).command).max() == 0.0
+
+
+def test_a_clock_that_stays_wrong_never_lets_the_arm_move(bench: Any) -> None:
+    servoing(bench)
+    bench.joints_stamped_late_ns = HOUR_NS
+    bench.run(0.5)
+    for _ in range(5):
+        bench.step(Resume())
+        bench.step(Jog({JOINT: 1.0}, 5.0))
+        assert np.abs(bench.run(0.1).command).max() == 0.0
+    assert {"JOINT_STAMP", "JOINTS_STALE", "STOPPED"} <= set(codes(bench.log[-1][1]))
+
+
+def test_a_wrong_stamp_before_the_drives_are_on_is_told_and_stops_nothing(bench: Any) -> None:
+    bench.joints_stamped_late_ns = HOUR_NS
+    outputs = bench.run(0.1)
+    assert codes(outputs)[-1] == "JOINT_STAMP"
+    assert bench.core.state.history.count == 0
+    bench.joints_stamped_late_ns = 0
+    bench.ready()
+    assert "JOINT_STAMP" not in codes(bench.log[-1][1])
+    assert bench.reply(Jog({JOINT: 0.2}, 0.5)).accepted
+
+
+def test_a_sample_at_either_end_of_its_window_is_used(bench: Any) -> None:
+    jogging(bench)
+    bench.joints_on = False
+    bench.run(0.05)
+    bench.joints_on, bench.joints_stamped_late_ns = True, -round(0.05e9)
+    count = bench.core.state.history.count
+    assert "JOINT_STAMP" not in codes(bench.step())
+    assert bench.core.state.history.count == count + 1
+    bench.joints_stamped_late_ns = 0
+    assert "JOINT_STAMP" not in codes(bench.step())
+    assert bench.core.state.history.count == count + 2
+
+
+# -- cameras ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["law", "calibration"])
+def test_a_frame_of_the_future_stops_what_works_by_images_and_is_not_kept(bench: Any, source: str) -> None:
+    if source == "law":
+        servoing(bench)
+    else:
+        bench.ready()
+        assert bench.reply(Calibrate("00000011")).accepted
+        bench.run(0.5)
+    bench.run(0.1)
+    while not bench.pending:
+        bench.step()
+    bench.pending = [msgspec.structs.replace(o, t_shutter_ns=o.t_shutter_ns + HOUR_NS) for o in bench.pending]
+    before = kept_of_cameras(bench)
+    bench.cameras_on[:] = [False, False]
+    event = bench.until(lambda e: e.kind in ("goal_aborted", "calibration_aborted"), 0.5)
+    assert kept_of_cameras(bench) == before
+    (reason,) = event.reasons
+    assert (reason.code, reason.subject, reason.threshold) == ("CAMERA_STAMP", "left", 0.0)
+    assert reason.value == pytest.approx(-3599.98, abs=0.02)
+    bench.cameras_on[:] = [True, True]
+    outputs = bench.run(1.0)
+    assert np.abs(outputs.command).max() == 0.0
+    assert codes(outputs)[-2:] == ["CAMERA_STAMP", "STOPPED"]
+    assert bench.reply(Resume()).accepted
+    assert bench.reply(
+        RunGoal(Goal("0000abce", FeatureTarget(bench.features(bench.q + 0.3 * DISPLACED))))
+    ).accepted
+    assert bench.until(lambda e: e.kind == "goal_reached", 25.0)
+    assert "CAMERA_STAMP" not in codes(bench.log[-1][1])
+
+
+def test_frames_of_the_future_are_told_and_stop_no_jog(bench: Any) -> None:
+    jogging(bench)
+    bench.stamped_late_ns = HOUR_NS
+    outputs = bench.run(0.3)
+    assert outputs.command[3] == pytest.approx(1.0)
+    told = [(r.code, r.subject) for r in outputs.status.reasons]
+    assert {("CAMERA_STAMP", "left"), ("CAMERA_STAMP", "right")} <= set(told)
+    target = FeatureTarget(bench.features(bench.q))
+    bench.step(Jog({}, 0.01))
+    bench.run(1.5)
+    bench.reply(RunGoal(Goal("0000abcf", target, law="cartesian3")))
+    assert np.abs(bench.run(0.5).command).max() == 0.0
+
+
+def test_frames_that_come_too_late_are_counted_and_the_law_coasts_on_the_others(bench: Any) -> None:
+    servoing(bench)
+    late = round((COAST_S + 0.2) * 1e9)
+
+    def delay_right() -> None:
+        bench.pending = [
+            msgspec.structs.replace(o, t_shutter_ns=min(o.t_shutter_ns, bench.now_ns - late))
+            if o.camera == "right" else o
+            for o in bench.pending
+        ]  # fmt: skip
+
+    for _ in range(100):
+        outputs = bench.step()
+        delay_right()
+    (reason,) = (r for r in outputs.status.reasons if r.code == "CAMERA_LATE")
+    assert (reason.subject, reason.level, reason.threshold) == ("right", "info", COAST_S)
+    assert COAST_S < reason.value <= COAST_S + 0.25
+    assert bench.core.state.refused_frames[1].count >= 20
+    assert bench.core.state.refused_frames[0].count == 0
+    assert not bench.core.state.stopped
+    assert bench.until(lambda e: e.kind in ("goal_reached", "goal_aborted"), 25.0).kind == "goal_reached"
+    assert "CAMERA_LATE" not in codes(bench.run(0.2))
+
+
+# -- gaps of the loop ---------------------------------------------------------------------------------------
+
+
+def after_a_gap(bench: Any, gap_s: float, *commands: Any, **inputs: Any) -> Any:
+    bench.now_ns += round(gap_s * 1e9) - round(1e9 / bench.settings.rate_hz)
+    return bench.step(*commands, **inputs)
+
+
+@pytest.mark.parametrize("measured", [False, True], ids=["nominal period", "measured period"])
+@pytest.mark.parametrize("gap_s", GAPS_S)
+@pytest.mark.parametrize("rest", [False, True], ids=["moving", "from rest"])
+def test_first_command_after_a_gap_is_one_acceleration_step_from_what_the_drives_do(
+    bench: Any, gap_s: float, rest: bool, measured: bool
+) -> None:
+    """Drives whose command stays out for ``WATCHDOG_S`` come to rest by themselves; until then they do the last one."""
+    jogging(bench)
+    if rest:  # the gap begins when the arm does
+        bench.step(Jog({JOINT: 0.0}, 60.0))
+        bench.run(0.5)
+        bench.step(Jog({JOINT: 1.0}, 60.0))
+    previous = bench.log[-1][1].command
+    inputs = {"period_ns": round(gap_s * 1e9)} if measured else {}
+    outputs = after_a_gap(bench, gap_s, **inputs)
+    stopped = gap_s > WATCHDOG_S
+    start = np.zeros(6) if stopped else previous
+    assert np.all(np.abs(outputs.command - start) <= step_of(bench))
+    assert bench.core.state.stopped == stopped
+    if stopped:
+        assert codes(outputs)[-2:] == ["LOOP_GAP", "STOPPED"]
+        reason = outputs.status.reasons[-2]
+        assert (reason.value, reason.threshold) == (pytest.approx(gap_s), WATCHDOG_S)
+        assert np.abs(bench.run(0.5).command).max() == 0.0
+        assert bench.reply(Resume()).accepted
+        assert bench.reply(Jog({JOINT: 1.0}, 1.0)).accepted
+        assert np.all(np.abs(bench.log[-1][1].command) <= step_of(bench))
+        assert bench.run(0.4).command[3] == pytest.approx(1.0)
+
+
+def test_a_gap_ends_the_goal_with_its_reason_and_is_no_fault_of_the_joints(bench: Any) -> None:
+    """The drives went on for their watchdog's time and then braked: travel that nobody had commanded."""
+    jogging(bench)
+    bench.q = bench.q + np.eye(6)[3] * (WATCHDOG_S + 1.0 / (2 * 4.0))
+    after_a_gap(bench, 0.6)
+    assert bench.run(0.5).status.lifecycle == "active"
+    assert bench.reply(Resume()).accepted
+    target = FeatureTarget(bench.features(bench.q - 0.5 * DISPLACED))
+    assert bench.reply(RunGoal(Goal("0000abcd", target, law="cartesian3"))).accepted
+    bench.run(0.4)
+    after_a_gap(bench, 0.6)
+    aborted = [e for e in bench.events if e.kind == "goal_aborted"]
+    assert [e.reasons[0].code for e in aborted] == ["LOOP_GAP"]
+    assert "priority" in aborted[0].reasons[0].hint
+
+
+@pytest.mark.parametrize(
+    ("watchdog_s", "gap_s", "stops"),
+    [(0.4, 0.35, False), (0.4, 0.45, True), (60.0, 0.45, False), (60.0, 0.55, True), (0.001, 0.015, False)],
+)
+def test_the_longest_gap_is_what_the_drives_bear_and_half_a_second_at_most(
+    benches: Any, watchdog_s: float, gap_s: float, stops: bool
+) -> None:
+    bench = benches(1)
+    limits = msgspec.structs.replace(bench.settings.limits, command_timeout_s=watchdog_s)
+    bench.settings = msgspec.structs.replace(bench.settings, limits=limits)
+    bench.core = ServoCore(bench.settings)
+    jogging(bench)
+    bench.q = bench.q + bench.log[-1][1].command * (
+        gap_s - 0.01
+    )  # drives that do the last command all the time
+    after_a_gap(bench, gap_s)
+    assert bench.core.state.stopped == stops
+    assert bench.run(0.2).status.lifecycle == "active"
+
+
+def test_a_gap_while_the_drives_are_off_or_are_being_enabled_stops_nothing(bench: Any) -> None:
+    bench.run(0.1)
+    after_a_gap(bench, 5.0)
+    bench.step(Enable())
+    after_a_gap(bench, 3.0)  # drives take their time to come up
+    assert not bench.core.state.stopped
+    assert bench.reply(Jog({JOINT: 0.2}, 0.5)).accepted
+
+
+def test_a_clock_that_goes_backwards_stops_the_arm(bench: Any) -> None:
+    jogging(bench)
+    after_a_gap(bench, -1.0)
+    assert codes(bench.log[-1][1])[-2:] == ["LOOP_GAP", "STOPPED"]
+
+
+def test_refusals_and_gaps_are_the_same_in_a_replay(bench: Any) -> None:
+    servoing(bench)
+    twin = ServoCore(bench.settings, decode_state(encode_state(bench.core.state)))
+    start = len(bench.log)
+    bench.joints_stamped_late_ns = HOUR_NS
+    bench.run(0.05)
+    bench.joints_stamped_late_ns = 0
+    bench.step(Resume())
+    bench.stamped_late_ns = HOUR_NS
+    bench.run(0.2)
+    after_a_gap(bench, 0.6)
+    for inputs, outputs in bench.log[start:]:
+        again = twin.step(inputs)
+        assert again.command.tobytes() == outputs.command.tobytes()
+        assert again.status.reasons == outputs.status.reasons
+    assert encode_state(twin.state) == encode_state(bench.core.state)

@@ -1,0 +1,201 @@
+"""A recording replays bit for bit; a damaged one says how far it is good."""
+
+from __future__ import annotations
+
+import dataclasses
+import uuid
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.control.law import LawStep, Options, Scene, Task
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.state import STATE_VERSION, StateVersionError, decode_state, encode_state
+from stereoservo.messages.goals import DEFAULT_LAW, FeatureTarget, Goal, RunGoal
+from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.recording.replay import RecordingError, replay
+from stereoservo.recording.step_records import Fingerprint, encode_step, fingerprint
+
+
+def record(
+    bench: Any,
+    path: Path,
+    *,
+    seconds: float = 6.0,
+    gap_at: int = -1,
+    tamper_at: int = -1,
+    foreign: bool = False,
+    laws: dict[str, str] | None = None,
+) -> int:
+    """Fly a goal and record it; returns the number of steps."""
+    bench.ready()
+    print_of = fingerprint()
+    if foreign:
+        print_of = msgspec.structs.replace(print_of, processor="another")
+    if laws is not None:
+        print_of = msgspec.structs.replace(print_of, laws=laws)
+    target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
+    goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(target)))
+    with FlightRecorder(path, bench.settings, print_of) as recorder:
+        for k in range(round(seconds * bench.settings.rate_hz)):
+            if k % 100 == 0:
+                recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
+            outputs = bench.step(*([RunGoal(goal)] if k == 5 else []))
+            inputs = bench.log[-1][0]
+            if k == gap_at:
+                recorder.gap(50, inputs.now_ns)
+            if gap_at <= k < gap_at + 50 and gap_at >= 0:
+                continue
+            if k == tamper_at:
+                inputs = msgspec.structs.replace(
+                    inputs,
+                    joints=msgspec.structs.replace(
+                        inputs.joints, positions=inputs.joints.positions * (1 + 1e-12)
+                    ),
+                )
+            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
+        return recorder.steps
+
+
+@pytest.mark.parametrize(
+    ("change", "identical"),
+    [
+        ({"points": "stereoservo 0.0.9 0123456789abcdef"}, True),  # not used
+        ({"mine": "mine 1.0 0123456789abcdef"}, True),  # not used
+        ({DEFAULT_LAW: "stereoservo 0.0.9 0123456789abcdef"}, None),
+        (None, True),  # recorded before laws were
+    ],
+)
+def test_only_a_law_that_ran_makes_a_recording_another_programs(
+    benches: Any, tmp_path: Path, change: dict[str, str] | None, identical: bool | None
+) -> None:
+    bench = benches(3, noise_px=0.1)
+    laws = {} if change is None else fingerprint().laws | change
+    record(bench, tmp_path / "flight.mcap", seconds=1.0, laws=laws)
+    assert bench.settings.law == DEFAULT_LAW
+    assert replay(tmp_path / "flight.mcap").identical is identical
+
+
+def test_a_recording_without_the_field_is_read(benches: Any, tmp_path: Path) -> None:
+    tree = msgspec.to_builtins(fingerprint())
+    assert set(tree.pop("laws")) == set(LAWS)
+    assert msgspec.convert(tree, Fingerprint).laws == {}
+
+
+def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
+    benches: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def step(scene: Scene, task: Task, options: Options) -> LawStep:
+        raise ZeroDivisionError("by zero")
+
+    bench = benches(3, noise_px=0.1)
+    bench.ready()
+    laws = {**LAWS, DEFAULT_LAW: dataclasses.replace(LAWS[DEFAULT_LAW], step=step)}
+    monkeypatch.setattr("stereoservo.core.sources.law.LAWS", laws)
+    target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
+    goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(target)))
+    events = [event for k in range(50) for event in bench.step(*([RunGoal(goal)] if k == 5 else [])).events]
+    (aborted,) = [event for event in events if event.kind == "goal_aborted"]
+    assert aborted.reasons[0].code == "LAW_FAILED"
+    assert "ZeroDivisionError: by zero" in aborted.reasons[0].hint
+    assert not np.any(bench.core.state.command)
+
+
+def test_replay_is_identical(benches: Any, tmp_path: Path) -> None:
+    bench = benches(3, noise_px=0.1)
+    steps = record(bench, tmp_path / "flight.mcap")
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is True
+    assert (result.steps, result.gaps, result.max_relative_error) == (steps, 0, 0.0)
+    assert result.checkpoints == 6
+
+
+def test_replay_notices_one_changed_bit_of_an_input(benches: Any, tmp_path: Path) -> None:
+    record(benches(3, noise_px=0.1), tmp_path / "flight.mcap", tamper_at=250)
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is False
+    assert result.first_difference is not None
+    assert result.first_difference > 250
+
+
+def test_replay_goes_on_after_a_gap_from_the_next_checkpoint(benches: Any, tmp_path: Path) -> None:
+    steps = record(benches(4), tmp_path / "flight.mcap", gap_at=220)
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is True
+    assert result.gaps == 1
+    assert steps - 100 <= result.steps < steps
+
+
+def test_replay_on_another_machine_reports_the_largest_error(benches: Any, tmp_path: Path) -> None:
+    record(benches(3), tmp_path / "flight.mcap", seconds=2.0, foreign=True)
+    result = replay(tmp_path / "flight.mcap")
+    assert result.identical is None
+    assert result.max_relative_error == 0.0
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.999])
+def test_truncated_recording_says_how_far_it_is_good(benches: Any, tmp_path: Path, share: float) -> None:
+    path = tmp_path / "flight.mcap"
+    record(benches(3), path, seconds=4.0)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    with pytest.raises(RecordingError, match=r"truncated|header") as caught:
+        replay(path)
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == whole[: int(len(whole) * share)]
+
+
+def test_flipped_bytes_are_noticed(benches: Any, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record(benches(3), path, seconds=4.0)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(bytes(data))
+    with pytest.raises(RecordingError):
+        replay(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89MCAP0\r\n"])
+def test_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.mcap").write_bytes(content)
+    with pytest.raises(RecordingError):
+        replay(tmp_path / "x.mcap")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        replay(tmp_path / "missing.mcap")
+
+
+def of_version(version: int) -> bytes:
+    """A state of another version, which holds other fields, too."""
+    return msgspec.msgpack.encode({"version": version, "step": 3, "something_else": [1, 2]})
+
+
+def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    older = msgspec.structs.replace(fingerprint(), stereoservo="0.0.1")
+    with FlightRecorder(path, bench.settings, older) as recorder:
+        recorder.checkpoint(3, of_version(STATE_VERSION - 1), 1)
+    with pytest.raises(RecordingError) as caught:
+        replay(path)
+    said = str(caught.value)
+    assert f"state is of version {STATE_VERSION - 1}, this program works with version {STATE_VERSION}" in said
+    assert "written by stereoservo 0.0.1" in said
+    assert "Replay it with the version that wrote it, or record anew" in said
+    assert "not damaged" in said
+    with pytest.raises(StateVersionError) as error:
+        decode_state(of_version(STATE_VERSION + 1))
+    assert error.value.version == STATE_VERSION + 1
+
+
+def test_settings_of_another_version_are_told_from_damage(bench: Any, tmp_path: Path) -> None:
+    for version, said in (("0.0.1", "written by stereoservo 0.0.1"), (None, "damaged")):
+        print_of = fingerprint()
+        if version is not None:
+            print_of = msgspec.structs.replace(print_of, stereoservo=version)
+        path = tmp_path / f"{version}.mcap"
+        with FlightRecorder(path, {"rate": 1}, print_of):  # type: ignore[arg-type]
+            pass
+        with pytest.raises(RecordingError, match=said):
+            replay(path)

@@ -1,0 +1,195 @@
+"""Trial motions: planned from visibility alone, spread positions, motions too small, leases; and the check motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.sources.calibration import enough_inside, extrapolated, plan_sides
+from stereoservo.core.sources.check import check_targets
+from stereoservo.core.state import decode_state, encode_state
+from stereoservo.messages.goals import Calibrate, Enable, Home, RenewGoal
+
+GOAL = "00000011"
+ENDS = ("calibration_finished", "calibration_aborted", "check_finished")
+
+
+def with_trials(bench: Any, **changes: Any) -> Any:
+    """The bench's core with other trial settings."""
+    trials = msgspec.structs.replace(bench.settings.trials, **changes)
+    bench.settings = msgspec.structs.replace(bench.settings, trials=trials)
+    bench.core = ServoCore(bench.settings)
+    return bench
+
+
+def calibrated(bench: Any, seconds: float = 300.0, **command: Any) -> tuple[Any, list[Any]]:
+    bench.run(0.1)
+    bench.step(Enable())
+    assert bench.reply(Calibrate(GOAL, **command)).accepted
+    end = bench.until(lambda e: e.kind in ENDS, seconds)
+    return end, [e for e in bench.events if e.kind == "calibration_sample"]
+
+
+def moved(samples: list[Any], joint: int, base: np.ndarray) -> np.ndarray:
+    return np.array([e.joints[joint] - base[joint] for e in samples if e.trial == joint])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_without_ranges_every_joint_goes_as_far_as_the_markers_stay_in_view(benches: Any, seed: int) -> None:
+    bench = with_trials(benches(seed, noise_px=0.05), range=np.full(6, np.nan), stops=7)
+    base = bench.settings.trials.base
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    assert not [e for e in bench.events if e.kind == "warning" and "loses" in e.message]
+    for joint in range(6):
+        offsets = moved(samples, joint, base)
+        assert 6 <= len(offsets) <= 9
+        assert offsets.min() < -0.1
+        assert offsets.max() > 0.1
+        assert np.abs(offsets).max() <= 0.6 + 1e-3
+        # It went to the border, to the largest range, or to a limit: one more step would leave a view.
+        for side in (offsets.max(), offsets.min()):
+            q = base.copy()
+            q[joint] += 1.6 * side
+            pixels = bench.truth.pixels(q)
+            inside = np.all((pixels > 19) & (pixels < np.array([620, 460])), axis=-1)
+            assert abs(1.6 * side) > 0.6 or (inside.sum(axis=-1) < 8).any(), (joint, side)
+    sights = [s for e in samples for s in e.samples]
+    assert min(s.ids.size for s in sights) >= 6
+
+
+def test_a_probe_at_the_border_turns_to_the_other_side(bench: Any) -> None:
+    settings = with_trials(bench, range=np.full(6, np.nan)).settings
+    base = np.full((1, 2, 8, 2), 200.0)
+    base[..., 0] = 615.0  # at the right border: 640 less 3 % is 620
+    probe = base + np.array([4.0, 0.0])
+    reach, steps, counts = plan_sides(base, probe, 0.02, np.array([0.6, 0.5]), settings, settings.trials)
+    assert counts == (0, 4)
+    assert reach[0] == 0.0
+    assert steps[1] == pytest.approx(0.125)
+    reach, steps, counts = plan_sides(
+        base - [300, 0], probe - [300, 0], 0.02, np.full(2, 1.6), settings, settings.trials
+    )
+    assert reach == pytest.approx([(619.8 - 315) / 200, (315 - 19.2) / 200])
+    assert counts == (2, 2)
+    assert steps == pytest.approx(reach / 2)
+
+
+def test_extrapolation_is_exact_on_straight_tracks_and_counts_what_was_seen(bench: Any) -> None:
+    settings = bench.settings
+    track = np.array([[[[100.0, 100.0]] * 8] * 2])
+    speed = np.array([50.0, 20.0])
+    ahead = extrapolated(track + 0.2 * speed, 0.2, track, 0.0, 0.5)
+    assert ahead == pytest.approx(track + 0.5 * speed)
+    outside = track.copy()
+    outside[0, 1, :2, 0] = 5.0
+    assert enough_inside(outside, settings, settings.trials)  # six of eight stay
+    outside[0, 1, :3, 0] = 5.0
+    assert not enough_inside(outside, settings, settings.trials)
+    outside[0, 1, :3] = np.nan  # not seen at the last stop: not counted
+    assert enough_inside(outside, settings, settings.trials)
+
+
+def test_a_joint_that_hardly_moves_the_markers_is_named_with_a_cure(benches: Any) -> None:
+    bench = with_trials(
+        benches(0, noise_px=0.05), range=np.array([0.1] * 5 + [0.03]), min_range=0.02, frames=1
+    )
+    end, _ = calibrated(bench)
+    assert end.kind == "calibration_aborted"
+    reason = end.reasons[0]
+    assert (reason.code, reason.subject, reason.unit) == ("TRIAL_TOO_SMALL", "j6", "sigmas")
+    assert reason.value < reason.threshold == 40.0
+    assert "raise calibration.range.j6" in reason.hint
+
+
+def test_a_spread_joint_visits_its_positions_at_every_stop_of_the_joints_before_it(bench: Any) -> None:
+    offsets = np.linspace(-0.15, 0.15, 3)
+    bench = with_trials(bench, spread_joint=5, spread_offsets=offsets)
+    base = bench.settings.trials.base
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    for joint in range(5):
+        stops = np.array([e.joints - base for e in samples if e.trial == joint])
+        assert len(stops) == 4 * 3
+        assert np.abs(np.delete(stops, [joint, 5], axis=1)).max() < 2e-3
+        for offset in offsets:
+            assert (np.abs(stops[:, 5] - offset) < 2e-3).sum() == 4
+    own = moved(samples, 5, base)
+    assert len(own) == 4 + 3  # its own stops, and the turned bases
+    travel = np.abs(np.diff([e.joints[5] for e in samples if e.trial in range(5)])).sum()
+    assert travel < 1.6 * 5 * 4 * 0.3  # there and back, not back to the first each time
+
+
+def test_a_keep_out_on_the_way_ends_a_side_before_it(bench: Any) -> None:
+    base = bench.settings.trials.base
+    box = np.tile([-np.inf, np.inf], (6, 1))[None]
+    box[0, 3] = base[3] + 0.075, base[3] + 0.08  # thinner than a step of 0.05
+    limits = msgspec.structs.replace(bench.settings.limits, keep_outs=box, keep_out_names=("post",))
+    bench.settings = msgspec.structs.replace(bench.settings, limits=limits)
+    bench.core = ServoCore(bench.settings)
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    assert moved(samples, 3, base).max() == pytest.approx(0.05, abs=2e-3)
+    assert [
+        e for e in bench.events if e.kind == "warning" and "j4" in e.message and "keep-out post" in e.message
+    ]
+
+
+def test_state_in_mid_calibration_survives_serialisation(bench: Any) -> None:
+    with_trials(bench, range=np.full(6, np.nan))
+    bench.run(0.1)
+    bench.step(Enable())
+    bench.reply(Calibrate(GOAL))
+    bench.run(3.0)
+    twin = ServoCore(bench.settings, decode_state(encode_state(bench.core.state)))
+    start = len(bench.log)
+    bench.run(3.0)
+    for inputs, outputs in bench.log[start:]:
+        assert twin.step(inputs).command.tobytes() == outputs.command.tobytes()
+
+
+@pytest.mark.parametrize(
+    "command", [Calibrate(GOAL, lease_s=0.5), Home(GOAL, lease_s=0.5), Calibrate(GOAL, True, 0.5)]
+)
+def test_motion_of_a_client_that_died_ends_with_its_lease(bench: Any, command: Any) -> None:
+    bench.q = bench.q - 1.5 * np.sign(bench.q)
+    bench.ready()
+    assert bench.reply(command).accepted
+    for _ in range(4):
+        bench.run(0.4)
+        assert bench.reply(RenewGoal(GOAL)).accepted
+    bench.until(lambda e: "LEASE_EXPIRED" in {r.code for r in e.reasons}, 1.0)
+    assert np.abs(bench.run(1.0).command).max() == 0.0
+
+
+def test_check_motion_takes_less_than_a_quarter_of_the_time(benches: Any) -> None:
+    took = {}
+    for check in (True, False):
+        bench = with_trials(benches(0), stops=9, range=np.full(6, 0.15)).ready()
+        start = bench.now_ns
+        end, samples = calibrated(bench, check=check)
+        assert end.kind == ("check_finished" if check else "calibration_finished")
+        took[check] = bench.now_ns - start
+        if check:
+            offsets = np.array([e.joints for e in samples]) - bench.settings.trials.base
+            assert len(offsets) == 7
+            assert (offsets.max(axis=0) > 0.04).all()
+            assert (offsets.min(axis=0) < -0.04).all()
+    assert took[True] < 0.25 * took[False]
+
+
+def test_check_needs_a_model_and_keeps_inside_the_limits(bench: Any) -> None:
+    bench.run(0.1)
+    bench.step(Enable())
+    refused = bench.reply(Calibrate(GOAL, reset_zeros=True))
+    assert (refused.accepted, refused.reasons[0].code) == (False, "RESET_WITHOUT_CHECK")
+    refused = bench.reply(Calibrate(GOAL, check=True))
+    assert refused.reasons[0].code == "NO_MODEL"
+    limits = msgspec.structs.replace(bench.settings.limits, position_max=bench.settings.trials.base + 0.02)
+    settings = msgspec.structs.replace(bench.settings, limits=limits)
+    targets = check_targets(settings, bench.truth.model)
+    assert (targets < limits.position_max - limits.position_margin).all()

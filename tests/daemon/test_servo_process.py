@@ -1,0 +1,411 @@
+"""The servo process's cycle, driven in this process: driver faults, silence, stop, events, records."""
+
+import ast
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoservo.core.cycle import Event
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import core_settings
+from stereoservo.daemon.ipc_messages import (
+    OBSERVATION_CAPACITY,
+    OBSERVATION_LAYOUT,
+    STATE_LAYOUT,
+    Ask,
+    Heartbeat,
+    Hello,
+    ServoState,
+    encode,
+    event_decoder,
+    state_decoder,
+    steps_decoder,
+)
+from stereoservo.daemon.pacing import ClockPacing
+from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_slot, create_stop_slot
+from stereoservo.daemon.seqpacket import PacketChannel
+from stereoservo.daemon.servo import GATEWAY_SILENCE_S, ServoProcess
+from stereoservo.daemon.servo_links import ProcessLinks
+from stereoservo.messages.cell_file import check_cell
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.goals import Command, Enable, Jog, Request, Reset, Resume
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import (
+    CameraDescription,
+    CommandReport,
+    DriverError,
+    JointDriverDescription,
+    JointSpec,
+    JointState,
+)
+from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, decode_step
+
+RATE_HZ = 250.0
+JOINTS = tuple(JointSpec(f"j{k}", "revolute", -2.0, 2.0, 1.0, 4.0) for k in (1, 2))
+
+
+class StubArm:
+    """Two joints that follow at once; keeps every call."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.calls: list[str] = []
+        self.written: list[FloatArray] = []
+        self.positions = np.zeros(2)
+        self.fail: dict[str, DriverError] = {}
+        self.seq = 0
+        self.reading_s = 0.0
+        """How long a read takes: its sample is stamped at its end."""
+
+    def _call(self, name: str) -> None:
+        self.calls.append(name)
+        if name in self.fail:
+            raise self.fail[name]
+
+    def describe(self) -> JointDriverDescription:
+        return JointDriverDescription("stub", JOINTS, RATE_HZ, "clock", 0.1, 100.0)
+
+    def configure(self) -> None:
+        self._call("configure")
+
+    def activate(self) -> None:
+        self._call("activate")
+
+    def read_state(self) -> JointState:
+        self._call("read_state")
+        self.clock.advance_to(self.clock.now_ns() + round(self.reading_s * 1e9))
+        self.seq += 1
+        velocity = self.written[-1] if self.written else np.zeros(2)
+        self.positions = self.positions + velocity / RATE_HZ
+        return JointState(self.seq, self.clock.now_ns(), self.positions.copy(), velocity)
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        self._call("write_velocity")
+        self.written.append(qd.copy())
+        return CommandReport(self.seq, self.clock.now_ns(), qd, qd, ("capped",))
+
+    def stop(self) -> None:
+        self.calls.append("stop")
+        self.written.append(np.zeros(2))
+
+    def deactivate(self) -> None:
+        self._call("deactivate")
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+class Bench:
+    """A servo process, its arm, and a gateway's ends of its links, on virtual time."""
+
+    def __init__(self, directory: Path, *, dry_run: bool = False) -> None:
+        self.directories = CellDirectories("bench", directory, directory)
+        create_stop_slot(self.directories.stop_slot)
+        create_slot(self.directories.observation_slot("left"), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
+        cell = check_cell(
+            {
+                "schema": 1,
+                "cell": {"name": "bench"},
+                "joints": {"driver": "stub"},
+                "camera": [{"name": "left", "driver": "stub"}],
+                "safety": {
+                    "limit": [
+                        {"joint": j.name, "min": -2.0, "max": 2.0, "velocity": 1.0, "acceleration": 4.0}
+                        for j in JOINTS
+                    ]
+                },
+            }
+        )
+        self.clock = VirtualClock()
+        self.arm = StubArm(self.clock)
+        camera = CameraDescription("stub", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2))
+        core = ServoCore(core_settings(cell, self.arm.describe(), (camera,)))
+        self.links = ProcessLinks(self.directories, ("left",))
+        self.process = ServoProcess(core, self.arm, self.links, self.clock, rate_hz=RATE_HZ, dry_run=dry_run)
+        self.pacing = ClockPacing(round(1e9 / RATE_HZ), now=self.clock.now_ns, sleep=self.clock.sleep)
+        self.control: PacketChannel | None = None
+        self.events: list[Event] = []
+        self._requests = 0
+
+    def connect(self, last_event: int = 0) -> None:
+        self.control = PacketChannel.connect(self.directories.control_socket)
+        self.control.send(encode(Hello(last_event)))
+
+    def run(self, cycles: int, *, beat: bool = True) -> None:
+        for _ in range(cycles):
+            if beat and self.control is not None:
+                self.control.send(encode(Heartbeat()))
+            self.process.cycle(self.pacing)
+            if self.control is not None:
+                self.events += [event_decoder.decode(data) for data in self.control.receive()]
+
+    def ask(self, command: Command) -> Event:
+        assert self.control is not None
+        self._requests += 1
+        self.control.send(encode(Ask(Request(self._requests, "test", command))))
+        self.run(1)
+        return next(e for e in self.events if e.kind == "reply" and e.request == self._requests)
+
+    def state(self) -> ServoState:
+        with SlotReader(self.directories.state_slot, STATE_LAYOUT) as reader:
+            data = reader.poll()
+        assert data is not None
+        return state_decoder.decode(data)
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.events if event.kind != "reply"]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    bench.connect()
+    bench.process.configure()
+    bench.run(5)
+    yield bench
+    bench.links.close()
+
+
+def enabled(bench: Bench) -> None:
+    assert bench.ask(Enable()).accepted
+    bench.run(3)
+    assert bench.state().driver_active
+
+
+def jog(bench: Bench, cycles: int = 20) -> None:
+    """Jog for some cycles, renewing the lease."""
+    for _ in range(cycles):
+        assert bench.ask(Jog({"j1": 0.5}, 0.1)).accepted
+
+
+def test_a_request_is_answered_and_moves_the_arm(bench: Bench) -> None:
+    enabled(bench)
+    jog(bench)
+    assert bench.arm.written[-1][0] > 0.1
+    assert bench.arm.positions[0] > 0.0
+    bench.run(25)
+    assert bench.state().differences == ("capped",)
+
+
+def test_a_sample_that_is_stamped_while_it_is_read_is_not_of_the_future(bench: Bench) -> None:
+    bench.arm.reading_s = 0.0005
+    enabled(bench)
+    jog(bench)
+    assert bench.arm.written[-1][0] > 0.3
+    assert "JOINT_STAMP" not in [reason.code for reason in bench.state().status.reasons]
+
+
+def test_a_process_that_stood_still_starts_from_rest_and_waits_for_resume(bench: Bench) -> None:
+    enabled(bench)
+    jog(bench, 40)
+    assert bench.arm.written[-1][0] == pytest.approx(0.5)
+    bench.clock.advance_to(bench.clock.now_ns() + 600_000_000)
+    bench.run(1)
+    assert np.abs(bench.arm.written[-1]).max() <= 4.0 / RATE_HZ
+    (stopped,) = (e for e in bench.events if e.kind == "stopped")
+    assert [reason.code for reason in stopped.reasons] == ["LOOP_GAP"]
+    assert not bench.ask(Jog({"j1": 0.5}, 0.1)).accepted
+    assert bench.ask(Resume()).accepted
+    assert bench.ask(Jog({"j1": 0.5}, 0.1)).accepted
+    assert 0.0 < bench.arm.written[-1][0] <= 4.0 / RATE_HZ
+
+
+def test_nothing_is_written_before_enable(bench: Bench) -> None:
+    bench.run(10)
+    assert "write_velocity" not in bench.arm.calls
+    assert not bench.ask(Jog({"j1": 0.5})).accepted
+
+
+def test_gateway_silence_holds_a_moving_arm_and_only_then(bench: Bench) -> None:
+    enabled(bench)
+    bench.run(round(2 * GATEWAY_SILENCE_S * RATE_HZ), beat=False)
+    assert "held" not in bench.kinds()
+    assert not bench.state().gateway
+    jog(bench)
+    assert bench.state().gateway
+    for _ in range(2):  # jog's own lease would end it as well: keep the core moving by hand
+        bench.process.core.state.source.until_ns = 1 << 62  # type: ignore[union-attr]
+    bench.run(round(0.9 * GATEWAY_SILENCE_S * RATE_HZ), beat=False)
+    assert bench.arm.written[-1].any()
+    bench.run(round(0.8 * GATEWAY_SILENCE_S * RATE_HZ), beat=False)
+    assert bench.kinds().count("held") == 1
+    (held,) = [event for event in bench.events if event.kind == "held"]
+    assert "its gateway said nothing for 0.5 s" in held.message  # nobody asked for it: say why
+    assert not bench.arm.written[-1].any()
+
+
+def test_the_stop_slot_brakes_within_the_next_cycles_and_is_acknowledged(bench: Bench) -> None:
+    enabled(bench)
+    jog(bench)
+    slot = StopSlot(bench.directories.stop_slot)
+    word = slot.raise_stop()
+    assert not slot.acknowledged(word)
+    bench.run(1)
+    assert slot.acknowledged(word)
+    assert "stopped" in bench.kinds()
+    speed = abs(bench.arm.written[-1][0])
+    bench.run(round(speed / 4.0 * RATE_HZ) + 2)
+    assert not bench.arm.written[-1].any()
+    assert not bench.ask(Jog({"j1": 0.5})).accepted
+
+
+@pytest.mark.parametrize("call", ["read_state", "write_velocity"])
+def test_a_failing_driver_is_stopped_at_once_and_faults_the_cell(bench: Bench, call: str) -> None:
+    enabled(bench)
+    jog(bench)
+    bench.arm.calls.clear()
+    bench.arm.fail[call] = DriverError("connection_lost", "the cable is out")
+    bench.run(2)
+    assert bench.arm.calls[bench.arm.calls.index(call) + 1] == "stop"
+    bench.run(20)
+    assert not bench.state().driver_active
+    assert bench.state().status.lifecycle == "fault"
+    (fault,) = [event for event in bench.events if event.kind == "fault"]
+    assert "the cable is out" in fault.message
+    writes = bench.arm.calls.count("write_velocity")
+    bench.run(20)
+    assert bench.arm.calls.count("write_velocity") == writes
+
+
+def test_a_faulty_driver_is_not_hammered_and_reset_reconnects_it(bench: Bench) -> None:
+    enabled(bench)
+    bench.arm.fail["read_state"] = DriverError("connection_lost", "gone")
+    bench.run(5)
+    bench.arm.calls.clear()
+    bench.run(50)
+    assert bench.arm.calls.count("read_state") <= 3
+    bench.arm.fail.clear()
+    assert bench.ask(Reset()).accepted
+    bench.run(25)
+    assert "configure" in bench.arm.calls
+    assert bench.state().status.lifecycle == "inactive"
+    enabled(bench)
+
+
+def test_a_driver_that_refuses_to_activate_leaves_the_cell_in_fault(bench: Bench) -> None:
+    bench.arm.fail["activate"] = DriverError("brake", "brake 2 does not release")
+    bench.ask(Enable())
+    bench.run(10)
+    assert bench.state().status.lifecycle == "fault"
+    assert "brake 2" in next(event.message for event in bench.events if event.kind == "fault")
+    assert "write_velocity" not in bench.arm.calls
+
+
+def test_a_dry_run_computes_and_never_touches_the_drives(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, dry_run=True)
+    bench.connect()
+    bench.process.configure()
+    bench.run(5)
+    assert bench.ask(Enable()).accepted
+    bench.run(3)
+    jog(bench)
+    assert bench.state().status.command[0] > 0.0
+    bench.process.shut_down()
+    assert set(bench.arm.calls) == {"configure", "read_state", "close"}
+    bench.links.close()
+
+
+def test_shutdown_brakes_first_and_then_stops_switches_off_and_closes(bench: Bench) -> None:
+    enabled(bench)
+    jog(bench)
+    bench.process.come_to_rest(bench.pacing, lambda: False)
+    speeds = [abs(w[0]) for w in bench.arm.written[-8:]]
+    assert speeds[-1] == 0.0
+    assert speeds == sorted(speeds, reverse=True)
+    bench.process.shut_down()
+    assert bench.arm.calls[-3:] == ["stop", "deactivate", "close"]
+
+
+def test_a_restarted_gateway_gets_the_events_that_it_missed_and_no_other(bench: Bench) -> None:
+    enabled(bench)
+    known = bench.events[-1].seq
+    assert bench.control is not None
+    bench.control.close()
+    bench.control = None
+    StopSlot(bench.directories.stop_slot).raise_stop()
+    bench.run(3)
+    bench.events.clear()
+    bench.connect(last_event=known)
+    bench.run(2)
+    assert [event.kind for event in bench.events] == ["stopped"]
+    bench.events.clear()
+    bench.connect(last_event=0)
+    bench.run(2)
+    assert [event.seq for event in bench.events] == list(range(1, known + 2))
+
+
+def test_records_begin_with_a_checkpoint_and_a_full_socket_makes_a_counted_gap(bench: Bench) -> None:
+    steps = PacketChannel.connect(bench.directories.steps_socket)
+    bench.run(4)
+    start, checkpoint, *records = [steps_decoder.decode(data) for data in steps.receive()]
+    assert isinstance(start, RecordingStart)
+    assert start.settings.joint_names == ("j1", "j2")
+    assert isinstance(checkpoint, RecordedCheckpoint)
+    numbers = [decode_step(r.data).step for r in records if isinstance(r, RecordedStep)]
+    assert numbers == list(range(checkpoint.step + 1, checkpoint.step + 5))
+    while bench.process._stream.dropped == 0:
+        bench.run(50)
+    dropped_first = bench.process._stream.dropped
+    drained = []
+    while some := steps.receive(1000):
+        drained += [steps_decoder.decode(data) for data in some]
+    assert not any(isinstance(r, RecordedCheckpoint) and r.lost for r in drained)
+    last = max(decode_step(r.data).step for r in drained if isinstance(r, RecordedStep))
+    bench.run(2)
+    gap, after, *_ = [steps_decoder.decode(data) for data in steps.receive()]
+    assert isinstance(gap, RecordedCheckpoint)
+    assert gap.lost == dropped_first
+    assert isinstance(after, RecordedStep)
+    assert decode_step(after.data).step == last + gap.lost + 1
+    steps.close()
+
+
+def module_level_imports(name: str) -> set[str]:
+    """Modules that ``name`` imports when it is imported."""
+    spec = importlib.util.find_spec(name)
+    assert spec is not None
+    assert spec.origin is not None
+    found: set[str] = set()
+    for node in ast.parse(Path(spec.origin).read_text()).body:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            found.add(node.module)
+            package = importlib.util.find_spec(node.module)
+            if (
+                node.module.startswith("stereoservo")
+                and package is not None
+                and package.submodule_search_locations
+            ):
+                candidates = {f"{node.module}.{alias.name}" for alias in node.names}
+                found |= {module for module in candidates if importlib.util.find_spec(module)}
+    return found
+
+
+def test_the_servo_process_reaches_neither_json_nor_logging_nor_images() -> None:
+    """Of its own modules; what numba imports is there before the loop starts."""
+    forbidden = {
+        "json",
+        "logging",
+        "zenoh",
+        "cv2",
+        "scipy",
+        "mcap",
+        "rich",
+        "typer",
+        "pybullet",
+        "multiprocessing",
+    }
+    seen: set[str] = set()
+    waiting = {"stereoservo.daemon.servo"}
+    while waiting:
+        name = waiting.pop()
+        seen.add(name)
+        imports = module_level_imports(name)
+        assert not {module.split(".")[0] for module in imports} & forbidden, f"{name} imports {imports}"
+        waiting |= {module for module in imports if module.startswith("stereoservo")} - seen
+    assert "stereoservo.core.servo_core" in seen

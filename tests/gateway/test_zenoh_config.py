@@ -1,0 +1,152 @@
+"""zenoh configurations: what listens where, and what is refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from stereoservo.client.session import SessionError, client_config, open_session
+from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, stop_config
+from stereoservo.messages.cell_file import CellFile, CellFileError, check_cell
+
+
+def cell(**section: Any) -> CellFile:
+    return check_cell(
+        {
+            "schema": 1,
+            "cell": {"name": "demo"},
+            "joints": {"driver": "fake"},
+            "camera": [{"name": "left", "driver": "fake"}],
+            "safety": {"limit": []},
+            "zenoh": section,
+        }
+    )
+
+
+SOCKET = Path("/tmp/x/zenoh.sock")
+TLS = {"root_ca_certificate": "ca.pem", "listen_private_key": "key.pem", "listen_certificate": "cert.pem"}
+
+
+def test_by_default_the_router_listens_on_a_unix_socket_and_discovers_nobody() -> None:
+    config = gateway_config(cell(), Path("/"), SOCKET)
+    assert config["mode"] == "router"
+    assert config["listen"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock"]
+    assert config["scouting"]["multicast"]["enabled"] is False
+    assert config["scouting"]["gossip"]["enabled"] is False
+    assert config["transport"]["shared_memory"]["enabled"] is False
+
+
+@pytest.mark.parametrize(
+    "config", [gateway_config(cell(), Path("/"), SOCKET), client_config("tcp/127.0.0.1:1")]
+)
+def test_zenoh_knows_every_key_of_ours(config: dict[str, Any]) -> None:
+    read = zenoh.Config.from_json5(json.dumps(config))
+    assert json.loads(read.get_json("transport/link/tx/queue/congestion_control/drop/wait_before_drop")) == 0
+    assert json.loads(read.get_json("scouting/multicast/enabled")) is False
+
+
+def configured(mode: str, endpoint: str, tls: dict[str, Any] | None) -> dict[str, Any]:
+    """The gateway's configuration of a cell with one endpoint, to listen on or to connect to."""
+    section = {"mode": mode, "endpoints": [endpoint]} | ({} if tls is None else {"tls": tls})
+    return gateway_config(cell(**section), Path("/"), SOCKET)
+
+
+@pytest.mark.parametrize("mode", ["router", "client"])
+@pytest.mark.parametrize(
+    ("endpoint", "tls", "text"),
+    [
+        ("tcp/0.0.0.0:7447", None, "every host"),
+        ("tcp/[::]:7447", None, "every host"),
+        ("tcp/10.0.0.1:7447", None, "every host"),
+        ("tcp/192.168.0.5:7447", TLS, "every host"),
+        ("tcp/router:7447", TLS, "every host"),
+        ("tcp/127.0.0.1.evil.org:7447", None, "every host"),
+        ("tcp/localhost.evil:7447", None, "every host"),
+        ("tcp/128.0.0.1:7447", None, "every host"),
+        ("tcp/[::ffff:10.0.0.1]:7447", None, "every host"),
+        ("tls/0.0.0.0:7447", None, r"needs \[zenoh.tls\]"),
+        ("tls/router:7447", None, r"needs \[zenoh.tls\]"),
+        ("udp/127.0.0.1:7447", None, "valid are"),
+        ("quic/127.0.0.1:7447", TLS, "valid are"),
+        ("nonsense", None, "valid are"),
+        ("tcp/127.0.0.1", None, "valid are"),
+        ("tcp/evil@127.0.0.1:7447", None, "valid are"),
+        ("tls/router:7447#enable_mtls=false", TLS, "valid are .* without . or # parameters"),
+        ("tls/0.0.0.0:7447#enable_mtls=false;x=:1", TLS, "valid are"),
+        ("unixsock-stream//run/a.sock#x=1", None, "valid are"),
+        ("tls/0.0.0.0:7447", TLS | {"enable_mtls": False}, r"zenoh\.tls\.enable_mtls = false"),
+        ("tls/router:7447", TLS | {"enable_mtls": False}, r"zenoh\.tls\.enable_mtls = false"),
+        ("tls/localhost.evil:7447", TLS | {"enable_mtls": False}, r"zenoh\.tls\.enable_mtls = false"),
+    ],
+)
+def test_beyond_this_host_both_sides_show_certificates(
+    mode: str, endpoint: str, tls: dict[str, Any] | None, text: str
+) -> None:
+    with pytest.raises(SessionError, match=text):
+        configured(mode, endpoint, tls)
+
+
+@pytest.mark.parametrize("mode", ["router", "client"])
+@pytest.mark.parametrize(
+    ("endpoint", "tls"),
+    [
+        ("tcp/127.0.0.1:7447", None),
+        ("tcp/127.8.0.1:7447", None),
+        ("tcp/localhost:7447", None),
+        ("tcp/[::1]:7447", None),
+        ("unixsock-stream//run/a.sock", None),
+        ("tls/router.site-a:7447", TLS),
+        ("tls/[fd00::1]:7447", TLS),
+        ("tls/localhost:7447", TLS | {"enable_mtls": False}),
+    ],
+)
+def test_this_host_and_mutual_tls_are_fine(mode: str, endpoint: str, tls: dict[str, Any] | None) -> None:
+    config = configured(mode, endpoint, tls)
+    assert endpoint in config["listen" if mode == "router" else "connect"]["endpoints"]
+
+
+@pytest.mark.parametrize("word", ["false", 0, "no"])
+def test_mutual_tls_is_switched_off_by_one_word_only(word: object) -> None:
+    with pytest.raises(CellFileError, match="enable_mtls"):
+        configured("router", "tls/0.0.0.0:7447", TLS | {"enable_mtls": word})
+
+
+def test_client_mode_needs_a_router_to_connect_to() -> None:
+    with pytest.raises(SessionError, match=r"needs zenoh\.endpoints"):
+        gateway_config(cell(mode="client"), Path("/"), SOCKET)
+    config = gateway_config(cell(mode="client", endpoints=["tls/10.0.0.1:7447"], tls=TLS), Path("/"), SOCKET)
+    assert config["mode"] == "client"
+    assert config["listen"]["endpoints"] == []
+
+
+def test_a_router_with_endpoints_still_listens_on_its_own_socket_for_this_host() -> None:
+    config = gateway_config(cell(endpoints=["tcp/127.0.0.1:7447"]), Path("/"), SOCKET)
+    assert config["listen"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock", "tcp/127.0.0.1:7447"]
+    assert endpoint_of(cell(endpoints=["tcp/127.0.0.1:7447"]), SOCKET) == "unixsock-stream//tmp/x/zenoh.sock"
+
+
+def test_tls_paths_are_relative_to_the_cell_file_on_either_side() -> None:
+    server = gateway_config(cell(endpoints=["tls/0.0.0.0:7447"], tls=TLS), Path("/etc/cell"), SOCKET)
+    assert server["transport"]["link"]["tls"]["listen_certificate"] == "/etc/cell/cert.pem"
+    assert server["transport"]["link"]["tls"]["enable_mtls"] is True
+    client = stop_config(cell(mode="client", endpoints=["tls/r:7447"], tls=TLS), Path("/etc/cell"), SOCKET)
+    assert client["transport"]["link"]["tls"]["connect_private_key"] == "/etc/cell/key.pem"
+    zenoh.Config.from_json5(json.dumps(server))
+    zenoh.Config.from_json5(json.dumps(client))
+
+
+@pytest.mark.process
+def test_nobody_at_the_endpoint_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=r"cannot connect to unixsock-stream/.*none\.sock"):
+        open_session(client_config(f"unixsock-stream/{tmp_path}/none.sock"))
+
+
+def test_a_clients_tls_files_are_looked_for_before_it_connects(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=r"ca\.pem: no such file; a TLS directory holds"):
+        client_config("tls/10.0.0.1:7447", tmp_path)
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        (tmp_path / name).touch()
+    tls = client_config("tls/10.0.0.1:7447", tmp_path)["transport"]["link"]["tls"]
+    assert tls["connect_private_key"] == str(tmp_path / "key.pem")

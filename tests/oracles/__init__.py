@@ -1,0 +1,1 @@
+"""Readable references in numpy that the product is tested against; nothing of the product imports them."""

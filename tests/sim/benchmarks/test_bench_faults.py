@@ -1,0 +1,80 @@
+"""`stereoservo bench faults`: its rows and tables. The faults themselves are tested in drives/test_fault_table.py."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from stereoservo.cli import main as cli
+from stereoservo_sim.benchmarks import faults, faults_wall
+from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
+
+
+@pytest.fixture
+def one_case(monkeypatch):
+    drive_error = next(case for case in ODRIVE_CASES if case.name == "drive error")
+    monkeypatch.setattr(faults, "CASES", {"odrive": (drive_error,)})
+
+
+WALL = {
+    "rows": [
+        {
+            "fault": "node silent",
+            "rest_ms": {"repetitions": 2, "median": 31.5, "max": 33.25},
+            "detected_ms": None,
+            "bound_ms_in_bit_time": 60.0,
+            "never_at_rest": 0,
+            "codes": ["silent"],
+            "restarts": 0,
+            "stalled": ["silent: no TPDO1"],
+        }
+    ],
+    "emulator_loop": {"turns": 9, "stalls": 1, "latest_ns": 2_500_000, "longest_gap_ns": 4_000_000},
+    "load": [1.0, 1.0, 1.0],
+}
+
+
+def test_rows_and_tables(one_case, monkeypatch):
+    asked = []
+    monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: asked.append(repetitions) or WALL)
+    figures = faults.run_faults(2, 5, lambda stage, done, total: None)
+    (row,) = figures["rows"]
+    assert asked == [1]
+    assert figures["ok"]
+    assert (row["trials"], row["codes"]) == (2, {"drive_fault": 2})
+    assert 0.0 < row["detected_ms_median"] < row["rest_ms_median"] <= row["rest_ms_max"] <= row["bound_ms"]
+    assert json.loads(json.dumps(figures, allow_nan=False))["rows"][0]["fault"] == "drive error"
+    console = Console(width=200, file=io.StringIO(), markup=False)
+    faults.show_faults(figures, console)
+    text = console.file.getvalue()
+    for word in ("drive error", "drive_fault 2", "31.5 / 33.2", "2.50 ms late", "12.5 ms"):
+        assert word in text
+
+
+def test_a_problem_is_printed_and_the_table_not_ok(one_case, monkeypatch):
+    impossible = FaultCase(name="too strict", orders=("fault 3 0x20",), codes=("drive_fault",), bound_ms=1.0)
+    monkeypatch.setattr(faults, "CASES", {"odrive": (impossible,)})
+    monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: WALL)
+    figures = faults.run_faults(1, 0, lambda stage, done, total: None)
+    assert not figures["ok"]
+    (problem,) = figures["rows"][0]["problems"]
+    assert problem.startswith("at rest after")
+
+
+@pytest.mark.slow
+def test_a_fault_in_real_time_is_measured(one_case, monkeypatch, capsys):
+    ordered = [case for case in faults_wall.ORDERED if case[0] == "node silent"]
+    monkeypatch.setattr(faults_wall, "ORDERED", tuple(ordered))
+    monkeypatch.setattr(faults_wall, "DONE_TO_THE_MASTER", ("master killed",))
+    assert cli.invoke(["bench", "faults", "--repetitions", "1", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    silent, killed = answer["wall"]["rows"]
+    for row in (silent, killed):
+        assert row["rest_ms"]["repetitions"] == 1
+        assert row["never_at_rest"] == row["restarts"] == 0
+    assert silent["codes"] == ["silent"]
+    assert killed["codes"] == []
+    assert answer["wall"]["emulator_loop"]["turns"] > 0

@@ -1,0 +1,183 @@
+"""docs/extending.md: every recipe's blocks are executed as they stand on the page."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from rich.console import Console
+
+from core.conftest import make_bench
+from stereoservo.control.law import Law
+from stereoservo.core import monitor, move
+from stereoservo.core.state import Holding, Source
+from stereoservo.ports import plugins
+from stereoservo.ports.clock import VirtualClock
+from stereoservo.ports.devices import CameraDriver, Detector, DriverContext, JointDriver
+from stereoservo_sim.experiments.catalogue import EXPERIMENTS, find_experiment
+
+PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+SECTIONS = dict(
+    re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+)
+PLUGINS = {
+    "A control law": Law,
+    "A joint driver": JointDriver,
+    "A camera driver": CameraDriver,
+    "A detector": Detector,
+}
+
+
+def blocks(heading: str) -> list[tuple[str, str]]:
+    """Module name and source of each Python block below a heading; its first line names the file that it belongs in."""
+    found = re.findall(r"^```python\n(# (\S+)\.py.*?\n.*?)^```", SECTIONS[heading], re.MULTILINE | re.DOTALL)
+    return [(module_name(path), source) for source, path in found]
+
+
+def module_name(path: str) -> str:
+    """Dotted name of a file of the page, which is below its package where it is one of this project."""
+    package = {"core": "stereoservo.", "experiments": "stereoservo_sim."}.get(path.partition("/")[0], "")
+    return package + path.replace("/", ".")
+
+
+def entry_point(heading: str) -> tuple[str, str, str]:
+    """Group, name and object of a recipe's entry point."""
+    pattern = r'^    \[project\.entry-points\."(.*?)"\]\n    (\S+) = "(.*?)"$'
+    (entry,) = re.findall(pattern, SECTIONS[heading], re.MULTILINE)
+    return entry
+
+
+def executed(name: str, source: str) -> ModuleType:
+    """A module that holds a block."""
+    module = ModuleType(name)
+    sys.modules[name] = module  # msgspec looks annotations up there
+    exec(compile(source, str(PAGE), "exec"), vars(module))
+    return module
+
+
+def contract_suite(heading: str) -> type:
+    """The contract suite of a recipe, on the recipe's own module."""
+    module, suite = blocks(heading)
+    try:
+        executed(*module)
+        (found,) = (value for name, value in vars(executed(*suite)).items() if name.startswith("Test"))
+    finally:
+        for name, _ in (module, suite):
+            sys.modules.pop(name, None)
+    return found
+
+
+TestLaw = contract_suite("A control law")
+TestJointDriver = contract_suite("A joint driver")
+TestCameraDriver = contract_suite("A camera driver")
+TestDetector = contract_suite("A detector")
+
+
+def entry(heading: str, monkeypatch: pytest.MonkeyPatch) -> tuple[ModuleType, Any]:
+    """The module of a recipe and its entry of the project's table, which is left as it is."""
+    (name, source), (_, line) = blocks(heading)
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    module = executed(name, source)
+    monkeypatch.setitem(sys.modules, name, module)
+    names: dict[str, Any] = {}
+    exec(compile(line, str(PAGE), "exec"), names)
+    return module, names["ENTRY"]
+
+
+def test_every_recipe_has_its_blocks():
+    assert list(SECTIONS) == [
+        "A control law", "A motion source", "A monitor", "A joint driver", "A camera driver", "A detector",
+        "An experiment",
+    ]  # fmt: skip
+    assert all(blocks(heading) for heading in SECTIONS)
+    assert sum(len(blocks(heading)) for heading in SECTIONS) == PAGE.read_text().count("```python")
+
+
+@pytest.mark.parametrize("heading", PLUGINS)
+def test_a_plugin_is_found_by_the_entry_point_of_its_recipe(heading, tmp_path, monkeypatch):
+    group, name, target = entry_point(heading)
+    module, source = blocks(heading)[0]
+    assert target.partition(":")[0] == module
+    info = tmp_path / "acme-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
+    (tmp_path / f"{module}.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    found = plugins.load(group, name)
+    monkeypatch.delitem(sys.modules, module)
+    if PLUGINS[heading] is not Law:
+        found = found({}, DriverContext(VirtualClock(), "c", tmp_path, tmp_path, camera="left"))
+    assert isinstance(found, PLUGINS[heading])
+    assert (
+        plugins.list_plugins(group)[[p.name for p in plugins.list_plugins(group)].index(name)].distribution
+        == "acme 1.0"
+    )
+
+
+def test_the_motion_source_swings_a_joint_waits_in_hold_and_ends(monkeypatch):
+    module, row = entry("A motion source", monkeypatch)
+    bench = make_bench(0).ready()
+    source = module.Nodding(2, 0.2, bench.now_ns, bench.now_ns + 1_000_000_000)
+    monkeypatch.setitem(move.MOTION_SOURCES, *row.popitem())
+    bench.core.state.source = source
+    start, commands = bench.q.copy(), []
+    for _ in range(75):
+        outputs = bench.step()
+        assert outputs.status.source == "nod"
+        commands.append(outputs.status.command)
+    swing = np.array(commands)
+    assert 0.15 < swing[:, 2].max() <= 0.2
+    assert -0.2 <= swing[:, 2].min() < -0.15
+    assert not np.delete(swing, 2, axis=1).any()
+    bench.run(1.0)
+    assert isinstance(bench.core.state.source, Holding)
+    assert not bench.core.state.command.any()
+    np.testing.assert_allclose(bench.q, start, atol=0.02)
+    # Its tag is one of its own in the checkpoint.
+    data = msgspec.msgpack.encode(source)
+    assert isinstance(msgspec.msgpack.decode(data, type=Source | module.Nodding), module.Nodding)
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_the_monitor_stops_an_arm_that_runs_away(monkeypatch, watched):
+    _, row = entry("A monitor", monkeypatch)
+    if watched:
+        monkeypatch.setattr(monitor, "MONITORS", (*monitor.MONITORS, row))
+    bench = make_bench(0).ready()
+    bench.run(0.2)
+    assert not bench.core.state.stopped
+    for _ in range(10):  # 1.5 rad/s where 1 rad/s is the limit
+        bench.q = bench.q + np.array([0.0, 0.0, 0.0, 0.0, 0.015, 0.0])
+        bench.step()
+    stops = [event.reasons[0] for event in bench.events if event.kind == "stopped"]
+    found = [reason for reason in stops if reason.code == "OVERSPEED"]
+    assert len(found) == int(watched)
+    for reason in found:
+        assert (reason.subject, reason.unit, reason.threshold) == ("j5", "rad/s", 1.2)
+        assert reason.value > reason.threshold
+
+
+def test_the_experiment_runs_by_its_declaration_and_is_drawn(monkeypatch, tmp_path):
+    module, row = entry("An experiment", monkeypatch)
+    assert module.__name__ == f"stereoservo_sim.experiments.{row.module}"
+    monkeypatch.setitem(EXPERIMENTS, row.name, row)
+    chosen = find_experiment("stereo-depth")
+    answer = chosen.report(chosen.run(1, {"seeds": 100}, lambda *stage: None))
+    assert json.loads(json.dumps(answer)) == answer
+    for row in answer["rows"]:  # median of |N(0, σ)| is 0.6745 σ, its sampling sigma over 100 seeds 0.079 σ
+        assert abs(row["error_mm"]["median"] / row["sigma_mm"] - 0.6745) < 4 * 0.079
+    assert chosen.run(1, {"seeds": 100}, lambda *stage: None) == answer
+    (figure,) = chosen.draw(answer, tmp_path)
+    assert figure.stat().st_size > 1000
+    with open(tmp_path / "table.txt", "w", encoding="utf-8") as file:
+        chosen.show(answer, Console(file=file, markup=False))
+    assert "stereo-depth: 100 seeds" in (tmp_path / "table.txt").read_text(encoding="utf-8")
