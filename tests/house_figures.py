@@ -59,14 +59,16 @@ def traced(call: Callable[[], Any]) -> CallPath:
     """The product's files that ``call`` enters. Compiled kernels that Python calls count as functions."""
     files: set[str] = set()
     last, hops = "", 0
-    inside = tuple(f"{folder}/" for folder in PRODUCT)
+    installed = {f"{_installed(folder.name)}/": folder.relative_to(ROOT) for folder in PRODUCT}
+    inside = tuple(installed)
 
     def enter(frame: FrameType, event: str, argument: Any) -> None:
         nonlocal last, hops
         name = frame.f_code.co_filename
         if event != "call" or not name.startswith(inside):
             return
-        files.add(str(Path(name).relative_to(ROOT)))
+        root = next(root for root in inside if name.startswith(root))
+        files.add(str(installed[root] / name.removeprefix(root)))
         hops += bool(last) and name != last
         last = name
 
@@ -77,6 +79,14 @@ def traced(call: Callable[[], Any]) -> CallPath:
     finally:
         sys.setprofile(before)
     return CallPath(frozenset(files), hops)
+
+
+def _installed(package: str) -> Path:
+    """The folder from which a package is imported: this tree's, or that of an installed wheel."""
+    spec = importlib.util.find_spec(package)
+    assert spec is not None
+    assert spec.origin is not None
+    return Path(spec.origin).parent
 
 
 def _load(name: str, path: Path) -> ModuleType:
@@ -143,15 +153,10 @@ def vision_path() -> CallPath:
         scenes = importlib.import_module("house_detectors.scenes")
     finally:
         sys.path.pop(0)
-    from stereoservo.daemon.ipc_messages import (
-        OBSERVATION_CAPACITY,
-        OBSERVATION_LAYOUT,
-        PRIOR_CAPACITY,
-        PRIOR_LAYOUT,
-        encode,
-    )
-    from stereoservo.daemon.seqlock import SlotReader, SlotWriter
-    from stereoservo.daemon.vision import CameraPipeline
+    from stereoservo.daemon.ipc_messages import PRIOR_CAPACITY, PRIOR_LAYOUT, encode
+    from stereoservo.daemon.seqlock import SlotWriter
+    from stereoservo.daemon.vision import CameraPipeline, VisionSlots
+    from stereoservo.messages.directories import CellDirectories
 
     shot = scenes.random_shot(np.random.default_rng(5))
 
@@ -160,20 +165,18 @@ def vision_path() -> CallPath:
             return (shot.frame,)
 
     with tempfile.TemporaryDirectory() as folder:
-        seen, expected = Path(folder) / "observations", Path(folder) / "priors"
-        priors = SlotWriter(expected, PRIOR_CAPACITY, PRIOR_LAYOUT)
-        pipeline = CameraPipeline(
-            Driver(),  # type: ignore[arg-type]
-            scenes.make_detector(),
-            SlotWriter(seen, OBSERVATION_CAPACITY, OBSERVATION_LAYOUT),
-            SlotReader(expected, PRIOR_LAYOUT),
-            scenes.Still(),
-        )
+        directories = CellDirectories("house", Path(folder), Path(folder))
+        priors = SlotWriter(directories.prior_slot("left"), PRIOR_CAPACITY, PRIOR_LAYOUT)
+        links = VisionSlots(directories, "left")
+        pipeline = CameraPipeline(Driver(), scenes.make_detector(), links, scenes.Still())  # type: ignore[arg-type]
         pipeline.poll()
         priors.write(encode(shot.prior()))
         pipeline.poll()
         priors.write(encode(shot.prior()))
-        return traced(pipeline.poll)
+        path = traced(pipeline.poll)
+        links.close()
+        priors.close()
+        return path
 
 
 def path_figures() -> list[Figure]:

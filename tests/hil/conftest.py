@@ -116,6 +116,15 @@ def calibrated(cell_file: Path, roots: Path) -> Path:
 
 
 @pytest.fixture
+def kept_state(calibrated: Path, directories: CellDirectories, tmp_path: Path) -> Iterator[None]:
+    """Puts the calibrated cell's state back after a test that changes its model. To be the first argument."""
+    saved = shutil.copytree(directories.state, tmp_path / "state")
+    yield
+    shutil.rmtree(directories.state)
+    shutil.copytree(saved, directories.state)
+
+
+@pytest.fixture
 def start(
     cell_file: Path, directories: CellDirectories, roots: Path
 ) -> Iterator[Callable[..., DaemonProcess]]:

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.process
 
 
 def test_bumped_camera_is_found_anew_in_mid_goal_and_taught_goals_stay_good(
-    own: Client, directories: CellDirectories
+    kept_state: None, own: Client, directories: CellDirectories
 ) -> None:
     joints = dict(own.status().joints)
     away = JointTarget({name: q + 0.1 for name, q in joints.items()})
