@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.faces import NOT_CHOSEN, FaceChoice, choose_face, kept_faces, law_scene, sights_along
-from stereoservo.control.faces_kernel import CLEARLY_BETTER, LASTING, triangle_sight
+from stereoservo.control.face_choice import (
+    CLEARLY_BETTER,
+    LASTING,
+    NOT_CHOSEN,
+    FaceChoice,
+    choose_face,
+    law_scene,
+    triangle_sight,
+)
+from stereoservo.control.faces import kept_faces, sights_along
 from stereoservo.control.law import Options
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.primitives_kernel import minors

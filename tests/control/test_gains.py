@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereoservo.control.filters import GainCurve, adaptive_gain, gain_at
+from stereoservo.core.sources.law import GainCurve, adaptive_gain, gain_at
 
 gains = st.floats(0.05, 50.0)
 errors = st.floats(0.0, 3000.0)

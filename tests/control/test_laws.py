@@ -7,12 +7,12 @@ from scipy.spatial.transform import Rotation
 from oracles.image import image_velocity
 from oracles.points import points_velocity
 from oracles.trajectory import trajectory_velocity
-from stereoservo.control.cartesian import cartesian_step
-from stereoservo.control.image_servoing import image_step, limit_into
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.law_warmup import warm_up_laws
+from stereoservo.control.laws.cartesian3 import cartesian_step
 from stereoservo.control.laws.points import points_step
+from stereoservo.control.laws.stereo import image_step, limit_into
 from stereoservo.control.laws.trajectory import trajectory_step
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points

@@ -1,4 +1,4 @@
-"""Cartesian control in numpy: the readable reference of `control.cartesian.cartesian_step`."""
+"""Cartesian control in numpy: the readable reference of `control.laws.cartesian3.cartesian_step`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from oracles.face_visibility import Way, way_in_sight
 from oracles.step_correction import corrected_step
-from stereoservo.control.cartesian import STEP_OF_BOUND
 from stereoservo.control.face_visibility import APPROACH
+from stereoservo.control.laws.cartesian3 import STEP_OF_BOUND
 from stereoservo.geometry.homogeneous import plane_of_points
 from stereoservo.geometry.screws import exp_twist
 from stereoservo.kinematics.composition import Composition

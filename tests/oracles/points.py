@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.image_servoing import held_gain
 from stereoservo.control.law import JacobianChoice, Options, Scene, Task
+from stereoservo.control.laws.stereo import held_gain
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
 

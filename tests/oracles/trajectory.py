@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from oracles.image import image_jacobian_at
 from oracles.step_correction import step_operators
-from stereoservo.control.image_servoing import held_gain
 from stereoservo.control.law import JacobianChoice, Options, Scene, Task
+from stereoservo.control.laws.stereo import held_gain
 from stereoservo.control.laws.trajectory import JOINT_SHARE
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK
 from stereoservo.geometry.cameras import project_many

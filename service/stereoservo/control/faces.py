@@ -1,10 +1,9 @@
-"""Faces of a marker body: which markers lie in one plane, which side is out, and on which three a law works now.
+"""Faces of a marker body: which markers lie in one plane, and which side of it is out.
 
-A law needs three markers that are seen; a body that turns far shows others then. Nothing here is metric: markers are
-points of height ``a∞ᵀM = 1`` in the projective frame, and what "in one plane" means is told by the images. A marker is
-in the plane of three others when the determinant of the four is within a few of its own standard deviations, those that
-pixels of a deviation ``sigma_px`` leave. Where the plates themselves are less flat than the cameras are sharp, state a
-``sigma_px`` that covers it.
+Nothing here is metric: markers are points of height ``a∞ᵀM = 1`` in the projective frame, and what "in one plane" means
+is decided by the images. A marker is in the plane of three others when the determinant of the four is within a few of
+its own standard deviations, those that pixels of a deviation ``sigma_px`` leave. Where the plates themselves are less
+flat than the cameras are sharp, state a ``sigma_px`` that covers it.
 
 A face has no other marker on one of its sides; that is where the body is, the other one is out, unless the cameras
 that see its markers say otherwise (an inner corner). Planes are signed minors of three markers in outward order: with
@@ -13,26 +12,16 @@ camera centres O of height 1, ``aᵀO > 0`` where the front is seen (7.4.2).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.faces_kernel import (
-    all_triples,
-    choose_face_step,
-    coplanar_groups,
-    covering_groups,
-    faces_fronting,
-    marker_covariances,
-    marker_distances,
-    marker_information,
-    trial_views,
-    triangle_altitudes,
-    turned_average,
-)
-from stereoservo.control.law import Scene, Task
-from stereoservo.control.primitives_kernel import minors
+from stereoservo.control.primitives_kernel import dot, minors
+from stereoservo.kinematics.kernels import exp_twist, invert4
 from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.motion_frame import average_over_turns
 
 FLAT_PX = 0.05
 """A good ``sigma_px`` for the markers of a calibrated model on plates flat to some tenths of a millimetre.
@@ -43,6 +32,14 @@ IN_PLANE = 4.0
 """Standard deviations up to which a marker is in a plane."""
 SPANS = 10.0
 """Altitude of a triangle, in standard deviations, from which on it tells a plane."""
+AVERAGING_ROUNDS = 3
+"""How often an arm's turns are averaged over, one joint after another."""
+
+
+TRIAL_TURN = 0.3
+"""How far [rad], and a third of it [m], joints are moved to and fro for the views that calibration had."""
+NEAREST, FARTHEST = 0.5, 2.0
+"""Depths, relative to those now, that a marker may have in such a view."""
 
 
 class Faces(NamedTuple):
@@ -61,25 +58,6 @@ class Faces(NamedTuple):
     def markers(self) -> list[tuple[int, ...]]:
         """Indices of the markers of each face."""
         return [tuple(int(i) for i in np.flatnonzero(row)) for row in self.members]
-
-
-class FaceChoice(NamedTuple):
-    """On what a law shall work now.
-
-    ``face``: its index, -1 where the three markers are of several; ``triple`` (3,): their indices, in outward order.
-    ``cameras``: how many see them, 0: none does, and no law can work. ``kept`` (c,): 1 for the cameras that have the
-    face's front now and at the goal, whose sight of it is kept. ``changed``: other markers than before.
-    """
-
-    face: int
-    triple: IntArray
-    cameras: int
-    kept: FloatArray
-    changed: bool
-
-
-NOT_CHOSEN = FaceChoice(-2, np.zeros(3, np.int64), 0, np.zeros(0), False)
-"""What stands in for the choice before the first."""
 
 
 def find_faces(
@@ -162,31 +140,6 @@ def _side(
     return int(np.sign(votes)) if votes != 0 else int(facts[5] > 0) - int(facts[4] > 0)
 
 
-def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT_CHOSEN) -> FaceChoice:
-    """The three markers on which a law shall work now.
-
-    Of one face, seen in most cameras; among these, of largest image area in units of the noise, which prefers what is
-    spread, near and frontal. A face whose front some camera has at the goal too counts for more. Only markers that have
-    a point now (finite) and at the goal (``target_known``). The former choice stays until a marker of it is hidden,
-    more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
-    do.
-    """
-    face, triple, cameras, kept = choose_face_step(
-        *faces, scene.points, scene.pixels, scene.weights, task.target_points, task.target_known,
-        scene.camera_centres, before.face, before.triple,
-    )  # fmt: skip
-    changed = before.cameras > 0 and (cameras == 0 or set(triple.tolist()) != set(before.triple.tolist()))
-    return FaceChoice(face, triple, cameras, kept, changed)
-
-
-def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
-    """The scene for a law that keeps sight of its face: without the cameras that lose it at the goal or have it not.
-
-    Their way cannot be the face's front; what they see of the markers stays.
-    """
-    return scene._replace(camera_centres=np.ascontiguousarray(scene.camera_centres[choice.kept > 0.0]))
-
-
 class Sights(NamedTuple):
     """What shows along a way of K samples: ``fronts`` (K, f, c) 1 where a camera has a face's front.
 
@@ -237,3 +190,319 @@ def kept_faces(faces: Faces, points: FloatArray, targets: FloatArray, camera_cen
     then = faces_fronting(np.ascontiguousarray(targets), faces.triples, faces.sided, eye, camera_centres)[0]
     lasting = ((now > 0.0) & (then > 0.0)).any(axis=1) & (faces.sided > 0.0)
     return np.ascontiguousarray(faces.triples[lasting])
+
+
+# -- kernels, without BLAS ------------------------------------------------------------------------------------
+
+
+@kernel
+def _turns(operator: FloatArray) -> bool:
+    """Whether a joint's operator (4, 4), of eigenvalues ±i or none, is a revolute one's."""
+    trace = 0.0
+    for i in range(4):
+        for k in range(4):
+            trace += operator[i, k] * operator[k, i]
+    return trace < -1.0
+
+
+@kernel
+def trial_views(points: FloatArray, matrices: FloatArray, operators: FloatArray) -> FloatArray:
+    """``P exp(±s Ĥ_j)`` (k, 3, 4) besides the cameras ``P`` themselves, where all markers stay well before them."""
+    cameras, n = matrices.shape[0], operators.shape[0]
+    views = np.empty((cameras * (2 * n + 1), 3, 4))
+    count = 0
+    moved = np.empty((3, 4))
+    for step in range(2 * n + 1):
+        H = np.eye(4)
+        if step > 0:
+            j = (step - 1) // 2
+            size = TRIAL_TURN if _turns(operators[j]) else TRIAL_TURN / 3.0
+            H = exp_twist((size if step % 2 == 1 else -size) * operators[j])
+        for c in range(cameras):
+            for r in range(3):
+                for k in range(4):
+                    moved[r, k] = 0.0
+                    for i in range(4):
+                        moved[r, k] += matrices[c, r, i] * H[i, k]
+            good = True
+            for p in range(points.shape[0]):
+                ratio = dot(moved[2], points[p]) / dot(matrices[c, 2], points[p])
+                good = good and NEAREST < ratio < FARTHEST
+            if good:
+                for r in range(3):
+                    for k in range(4):
+                        views[count, r, k] = moved[r, k]
+                count += 1
+    return views[:count].copy()
+
+
+@kernel
+def marker_information(points: FloatArray, matrices: FloatArray, sigma_px: float) -> FloatArray:
+    """``JᵀJ / σ²`` (m, 4, 4) of the markers' coordinates, ``J`` of their pixels in the views (k, 3, 4)."""
+    markers, views = points.shape[0], matrices.shape[0]
+    information = np.zeros((markers, 4, 4))
+    row = np.empty(4)
+    for p in range(markers):
+        for c in range(views):
+            P, M = matrices[c], points[p]
+            depth = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
+            for r in range(2):
+                x = P[r, 0] * M[0] + P[r, 1] * M[1] + P[r, 2] * M[2] + P[r, 3] * M[3]
+                for i in range(4):
+                    row[i] = (P[r, i] - x / depth * P[2, i]) / (depth * sigma_px)
+                for i in range(4):
+                    for k in range(4):
+                        information[p, i, k] += row[i] * row[k]
+    return information
+
+
+@kernel
+def marker_covariances(points: FloatArray, information: FloatArray) -> FloatArray:
+    """Covariances (m, 4, 4) for planes through the points; NaN where the views do not fix one.
+
+    The information is blind along the point itself, its scale: so much of it is added there, which no plane sees that
+    passes through the point.
+    """
+    covariances = np.empty(information.shape)
+    filled = np.empty((4, 4))
+    for p in range(points.shape[0]):
+        trace = information[p, 0, 0] + information[p, 1, 1] + information[p, 2, 2] + information[p, 3, 3]
+        square = 0.0
+        for i in range(4):
+            square += points[p, i] * points[p, i]
+        for i in range(4):
+            for k in range(4):
+                filled[i, k] = (information[p, i, k] + trace * points[p, i] * points[p, k] / square) / trace
+        inverse = invert4(filled)
+        good = True
+        for i in range(4):
+            good = good and 0.0 < inverse[i, i] < 1e12
+        for i in range(4):
+            for k in range(4):
+                covariances[p, i, k] = inverse[i, k] / trace if good else math.nan
+    return covariances
+
+
+@kernel
+def turned_average(information: FloatArray, operators: FloatArray) -> FloatArray:
+    """The markers' mean information, averaged over the turns that an arm's revolute ``operators`` (n, 4, 4) make.
+
+    As a form on differences of points (height 0), which displacements only turn: with two axes or more that are not
+    parallel it becomes the same in all directions, as no single view is. (4, 4).
+    """
+    mean = np.zeros((4, 4))
+    for p in range(information.shape[0]):
+        for i in range(4):
+            for k in range(4):
+                mean[i, k] += information[p, i, k] / information.shape[0]
+    for _ in range(AVERAGING_ROUNDS):
+        for j in range(operators.shape[0]):
+            if _turns(operators[j]):
+                average_over_turns(mean, operators[j])
+    return mean
+
+
+@kernel
+def _form(a: FloatArray, S: FloatArray, b: FloatArray) -> float:
+    total = 0.0
+    for i in range(4):
+        for k in range(4):
+            total += a[i] * S[i, k] * b[k]
+    return total
+
+
+@kernel
+def off_plane(points: FloatArray, covariances: FloatArray, i: int, j: int, k: int) -> FloatArray:
+    """``det[M_i M_j M_k M_l]`` in deviations of itself (m,), for every marker l; 0 for the three themselves."""
+    markers = points.shape[0]
+    out = np.zeros(markers)
+    four = np.empty(4, np.int64)
+    four[0], four[1], four[2] = i, j, k
+    for other in range(markers):
+        if other in (i, j, k):
+            continue
+        four[3] = other
+        # the determinant is linear in each point: its derivative is the plane of the other three
+        variance = 0.0
+        determinant = 0.0
+        for left_out in range(4):
+            x, y, z = (
+                four[0 if left_out > 0 else 1],
+                four[1 if left_out > 1 else 2],
+                four[2 if left_out > 2 else 3],
+            )
+            plane = minors(points[x], points[y], points[z])
+            covariance = covariances[four[left_out]]
+            for r in range(4):
+                for c in range(4):
+                    variance += plane[r] * covariance[r, c] * plane[c]
+            determinant = dot(plane, points[four[left_out]])
+        out[other] = determinant / math.sqrt(variance)
+    return out
+
+
+@kernel
+def all_triples(markers: int) -> IntArray:
+    """Every three of so many markers (t, 3), ascending."""
+    out = np.empty((markers * (markers - 1) * (markers - 2) // 6, 3), np.int64)
+    t = 0
+    for i in range(markers):
+        for j in range(i + 1, markers):
+            for k in range(j + 1, markers):
+                out[t, 0], out[t, 1], out[t, 2] = i, j, k
+                t += 1
+    return out
+
+
+@kernel
+def coplanar_groups(
+    points: FloatArray,
+    covariances: FloatArray,
+    triples: IntArray,
+    altitudes: FloatArray,
+    distances: FloatArray,
+    seen: FloatArray,
+    limit: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Groups of markers in one plane, from the triples that tell their planes best on.
+
+    Triples (t, 3) with ``altitudes`` (t,), the largest first; those inside a group of four that was found are passed
+    over. Members (g, m) 1 or 0; facts (g, 7): the triple, markers in it, others above and below, and whether no camera
+    of ``seen`` (c, m) sees only part; roundness (g,): altitude over the longest of ``distances`` (m, m) in it.
+    """
+    count, markers = triples.shape[0], points.shape[0]
+    members = np.zeros((count, markers), np.int64)
+    facts = np.zeros((count, 7), np.int64)
+    roundness = np.zeros(count)
+    larger = np.zeros(count, np.int64)  # groups of four and more
+    inside = np.zeros(markers, np.int64)
+    groups, many = 0, 0
+    for t in range(count):
+        i, j, k = triples[t]
+        known = False
+        for nth in range(many):
+            g = larger[nth]
+            if members[g, i] + members[g, j] + members[g, k] == 3:
+                known = True
+                break
+        if known:
+            continue
+        deviations = off_plane(points, covariances, i, j, k)
+        facts[groups, 0], facts[groups, 1], facts[groups, 2] = i, j, k
+        for p in range(markers):
+            if abs(deviations[p]) <= limit:
+                members[groups, p] = 1
+                inside[facts[groups, 3]] = p
+                facts[groups, 3] += 1
+            elif deviations[p] > 0.0:
+                facts[groups, 4] += 1
+            else:
+                facts[groups, 5] += 1
+        longest = 0.0
+        for first in range(facts[groups, 3]):
+            for second in range(facts[groups, 3]):
+                longest = max(longest, distances[inside[first], inside[second]])
+        facts[groups, 6] = 1
+        for c in range(seen.shape[0]):
+            sights = 0
+            for nth in range(facts[groups, 3]):
+                if seen[c, inside[nth]] > 0.0:
+                    sights += 1
+            if 0 < sights < facts[groups, 3]:
+                facts[groups, 6] = 0
+        roundness[groups] = altitudes[t] / longest
+        if facts[groups, 3] > 3:
+            larger[many] = groups
+            many += 1
+        groups += 1
+    return members[:groups], facts[:groups], roundness[:groups]
+
+
+@kernel
+def covering_groups(members: IntArray, facts: IntArray) -> IntArray:
+    """Which groups, in the order of their rank, are faces: they bring markers that none before has.
+
+    First those of four and more with nothing on one side, then those of four and more at all, three new markers each;
+    then any with nothing on one side, one new marker each.
+    """
+    groups, markers = members.shape
+    left = np.ones(markers, np.int64)
+    chosen = np.empty(groups, np.int64)
+    found = 0
+    for step in range(3):
+        for g in range(groups):
+            bounds = facts[g, 4] == 0 or facts[g, 5] == 0
+            if (step == 0 and not bounds) or (step < 2 and facts[g, 3] < 4) or (step == 2 and not bounds):
+                continue
+            new = 0
+            for p in range(markers):
+                new += left[p] * members[g, p]
+            if new >= (3 if step < 2 else 1):
+                chosen[found] = g
+                found += 1
+                for p in range(markers):
+                    left[p] *= 1 - members[g, p]
+    return chosen[:found]
+
+
+@kernel
+def marker_distances(points: FloatArray, form: FloatArray) -> FloatArray:
+    """Distances (m, m) of markers, heights 1, by a form (4, 4) on their differences."""
+    markers = points.shape[0]
+    out = np.zeros((markers, markers))
+    way = np.empty(4)
+    for i in range(markers):
+        for k in range(markers):
+            for x in range(4):
+                way[x] = points[k, x] - points[i, x]
+            out[i, k] = math.sqrt(max(0.0, _form(way, form, way)))
+    return out
+
+
+@kernel
+def triangle_altitudes(points: FloatArray, form: FloatArray, triples: IntArray) -> FloatArray:
+    """Least altitudes (t,) of triangles, by a form (4, 4) on differences of points."""
+    out = np.empty(triples.shape[0])
+    along, off = np.empty(4), np.empty(4)
+    for t in range(triples.shape[0]):
+        out[t] = math.inf
+        for corner in range(3):
+            i, j, k = triples[t, corner], triples[t, (corner + 1) % 3], triples[t, (corner + 2) % 3]
+            for x in range(4):
+                off[x] = points[j, x] - points[i, x]
+                along[x] = points[k, x] - points[j, x]
+            length = _form(along, form, along)
+            mixed = _form(along, form, off)
+            left = _form(off, form, off) - (mixed * mixed / length if length > 0.0 else 0.0)
+            out[t] = min(out[t], math.sqrt(max(0.0, left)))
+    return out
+
+
+@kernel
+def faces_fronting(
+    points: FloatArray,
+    triples: IntArray,
+    sided: FloatArray,
+    displacements: FloatArray,
+    camera_centres: FloatArray,
+) -> FloatArray:
+    """1 (K, f, c) where a face of the body, moved by ``displacements`` (K, 4, 4), shows its front; else 0.
+
+    ``points`` (m, 4) now, of height 1 like ``camera_centres`` (c, 4); ``triples`` (f, 3) in outward order; a face whose
+    outward side is not known, ``sided`` (f,) 0, counts as seen from both.
+    """
+    samples, faces, cameras = displacements.shape[0], triples.shape[0], camera_centres.shape[0]
+    out = np.ones((samples, faces, cameras))
+    moved = np.empty((3, 4))
+    for s in range(samples):
+        for f in range(faces):
+            if not sided[f] > 0.0:
+                continue
+            for corner in range(3):
+                for i in range(4):
+                    moved[corner, i] = dot(displacements[s, i], points[triples[f, corner]])
+            plane = minors(moved[0], moved[1], moved[2])
+            for c in range(cameras):
+                if not dot(plane, camera_centres[c]) > 0.0:
+                    out[s, f, c] = 0.0
+    return out

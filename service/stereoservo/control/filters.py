@@ -17,7 +17,6 @@ State is plain arrays, functions are pure.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -243,35 +242,3 @@ def arrived(clock: ClientClock, stamp_s: float, arrival_s: float) -> ClientClock
         risen = clock.offset_s + clock.drift * max(0.0, arrival_s - clock.arrival_s)
         offset = min(offset, risen)
     return msgspec.structs.replace(clock, offset_s=offset, arrival_s=arrival_s)
-
-
-SLOPE_UNIT_PX = 100.0
-"""Slopes are stated in 1/s per so many pixels."""
-
-
-class GainCurve(NamedTuple):
-    """``near`` and ``far`` [1/s], ``slope`` > 0 [1/s per 100 px]: how fast the gain leaves ``near``."""
-
-    near: float
-    far: float
-    slope: float
-
-
-def gain_at(curve: GainCurve, error_px: float | None) -> float:
-    """The gain [1/s] at an error [px], the largest distance over markers and cameras; None: not measured.
-
-    What is not known, or no number, takes the smaller of the two gains.
-    """
-    return adaptive_gain(curve.near, curve.far, curve.slope, math.nan if error_px is None else error_px)
-
-
-@kernel
-def adaptive_gain(near: float, far: float, slope: float, error_px: float) -> float:
-    """`gain_at` as a kernel; NaN: not measured. Equal gains are constant, a negative error counts as none."""
-    if math.isnan(error_px):
-        return min(near, far)
-    span = abs(near - far)
-    if span == 0.0 or error_px <= 0.0:
-        return near
-    gain = far + (near - far) * math.exp(-slope * (error_px / SLOPE_UNIT_PX) / span)
-    return max(min(near, far), min(max(near, far), gain))

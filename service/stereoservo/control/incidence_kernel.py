@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.image_servoing import pixel_gradients
+from stereoservo.control.laws.stereo import pixel_gradients
 from stereoservo.kinematics.composition import displace
 from stereoservo.kinematics.kernels import transform_points
 from stereoservo.numerics.arrays import FloatArray, IntArray

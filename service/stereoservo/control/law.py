@@ -6,7 +6,7 @@ Arrays only; a law is a pure function of them. `control.law_registry.LAWS` holds
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from math import inf
 from typing import Literal, NamedTuple
@@ -150,13 +150,11 @@ class Law:
     properties: LawProperties | None = None
     colour: str = "#7f7f7f"
     rank: int = 1000
+    planned: bool = field(init=False)
+    """Whether the law follows a plan, and waits for one."""
+    needs_goal_pose: bool = field(init=False)
+    """Whether a goal of this law must determine a pose: for the step, or for the plan."""
 
-    @property
-    def planned(self) -> bool:
-        """Whether the law follows a plan, and waits for one."""
-        return self.path == "planned"
-
-    @property
-    def needs_goal_pose(self) -> bool:
-        """Whether a goal of this law must determine a pose: for the step, or for the plan."""
-        return self.needs_pose or self.planned
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "planned", self.path == "planned")
+        object.__setattr__(self, "needs_goal_pose", self.needs_pose or self.planned)

@@ -59,6 +59,10 @@ class LawRegistry(Mapping[str, Law]):
         self._loaded()
         return self._errors
 
+    def usable(self) -> dict[str, Law]:
+        """The laws themselves: what a loop looks its law up in. A law that is disabled leaves it."""
+        return self._loaded()
+
     def disable(self, name: str, error: str) -> None:
         """Take a law out of use in this process, for the reason ``error``."""
         if self._loaded().pop(name, None) is not None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
 
 import numpy as np
 
+from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.prediction import ModelArrays, Prediction
 from stereoservo.core.settings import CoreSettings
@@ -27,7 +28,8 @@ class Derived:
     """Values that follow from the settings and the model in use: kept from step to step, but no part of the state.
 
     ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
-    ``frame_timeout_s``: age from which on a frame is refused. ``prior_every``: steps between priors. ``load_limits``:
+    ``frame_timeout_s``: age from which on a frame is refused. ``prior_every``: steps between priors. ``laws``: those
+    that are installed, by name. ``load_limits``:
     collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
     """
 
@@ -35,6 +37,7 @@ class Derived:
     longest_gap_s: float
     frame_timeout_s: float
     prior_every: int
+    laws: Mapping[str, Law]
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
 

@@ -47,7 +47,7 @@ def execute_goals(context: StepContext) -> Source:
         or state.queued_until_ns
         or state.ahead is not None
         or state.waiting
-        or MOTION_SOURCES[type(state.source)].waits(state.source)
+        or MOTION_SOURCES[type(state.source)].waits(state.source, context)
     ):
         _advance(context)
         answer_waiting(context)
@@ -166,7 +166,7 @@ def _next_plan(context: StepContext) -> None:
     source = state.source
     if state.reanchoring is not None:
         return
-    if isinstance(source, ServoGoal) and awaits_plan(source):
+    if isinstance(source, ServoGoal) and awaits_plan(source, context):
         if bool((np.abs(state.command) < AT_REST).all()) and bool(
             (np.abs(state.velocities) < 10 * AT_REST).all()
         ):

@@ -67,11 +67,11 @@ def _none(source: Source) -> None:
     return None
 
 
-def _never(source: Source) -> bool:
+def _never(source: Source, context: StepContext) -> bool:
     return False
 
 
-def _always(source: Source) -> bool:
+def _always(source: Source, context: StepContext) -> bool:
     return True
 
 
@@ -107,7 +107,7 @@ class MotionSource:
     measures: bool = False
     acknowledge_s: Callable[[Any], float | None] = _none
     activate: Callable[[Any, StepContext], None] | None = None
-    waits: Callable[[Any], bool] = _never
+    waits: Callable[[Any, StepContext], bool] = _never
     report: Callable[[Any, StepContext], PlanReport] | None = None
     progress: Callable[[Any, StepContext], Progress] | None = None
     progress_reasons: Callable[[Any, StepContext, tuple[Reason, ...]], tuple[Reason, ...]] | None = None

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import Derived, Ingested, StepContext
 from stereoservo.core.cycle import Event, StepInputs, StepOutputs
 from stereoservo.core.estimate import estimate, load_limits
@@ -53,6 +54,7 @@ class ServoCore:
             nominal_period_ns=nominal_period_ns(settings),
             longest_gap_s=longest_gap_s(settings),
             frame_timeout_s=frame_timeout_s(settings),
+            laws=LAWS.usable(),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
             arrays=None if model is None else model_arrays(model, settings),
             load_limits=load_limits(settings, model),

@@ -7,7 +7,8 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from stereoservo.control.faces import FaceChoice, Faces
+from stereoservo.control.face_choice import FaceChoice
+from stereoservo.control.faces import Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
 from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.core.monitor_state import (

@@ -16,9 +16,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from stereoservo.control.cartesian import cartesian_step
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.law_warmup import warm_up_incidences, warm_up_laws
+from stereoservo.control.laws.cartesian3 import cartesian_step
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.monitors.moving_camera import rehearse as rehearse_mobile

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from stereoservo.control.image_servoing import NO_COMPONENTS, NO_STATUS, held_gain, limited
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.laws.image import image
 from stereoservo.control.laws.points import points_step
+from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS, held_gain, limited
 from stereoservo.numerics.arrays import FloatArray
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.cartesian import (
+from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.laws.cartesian3 import (
     ROTATION,
     cartesian_reasons,
     cartesian_step,
 )
-from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.messages.reasons import Reason
 from stereoservo.planning.primitives import TRANSLATION
 

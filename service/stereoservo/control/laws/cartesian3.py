@@ -1,17 +1,491 @@
-"""Cartesian control in three components (thesis 8.42): translation, hinge, and turn of the face in its plane."""
+"""Cartesian control in three components (thesis 8.42): translation, hinge, and turn of the face in its plane.
+
+The centre goes on a straight line while the face is turned about it. Here is what `cartesian2` shares, which makes hinge
+and turn one rotation (8.55). A component that would turn the face out of a camera's view waits for the other
+(`control.face_visibility`); a velocity that is held for a while makes exactly the motion that was meant
+(`control.step_correction`).
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from stereoservo.control.cartesian import cartesian_reasons, cartesian_step
+from stereoservo.control.face_visibility import APPROACH, way_in_sight
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.primitives_kernel import (
+    apply,
+    apply_transposed,
+    as_rotation,
+    complement,
+    dot,
+    freedoms_of,
+    minors,
+    norm,
+    primitive,
+    scale_primitive,
+    set_plane_rows,
+    set_point_rows,
+    unit,
+)
+from stereoservo.control.step_correction import corrected_step, exponential_into
+from stereoservo.kinematics.kernels import multiply4_into
 from stereoservo.messages.reasons import Reason
-from stereoservo.planning.primitives import HINGE, PLANAR, TRANSLATION
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.primitives import (
+    DEGENERATE_RATIO,
+    HINGE,
+    PLANAR,
+    REACH_RATIO,
+    TRANSLATION,
+)
+from stereoservo.planning.three_point_decomposition import (
+    COINCIDENT,
+    DONE,
+    FLAT_FACE,
+    MOVES,
+    NO_FACE,
+    NOT_REACHABLE,
+    WAITS,
+)
 
 COMPONENTS, UNITS = (TRANSLATION, HINGE, PLANAR), ("", "rad", "rad")
+ROTATION = "rotation of the body about its centre"
+STEP_OF_BOUND = 0.9
+"""Of the way to a visibility bound, how much one step may make."""
+BLOCKED = 1e-3
+"""Share of what is left below which a component that waits stands."""
 
-COMPONENTS, UNITS = (TRANSLATION, HINGE, PLANAR), ("", "rad", "rad")
+
+@kernel
+def _shifted(A: FloatArray, centre: FloatArray) -> FloatArray:
+    """Points moved in parallel so that their middle is the centre."""
+    out = np.empty((3, 4))
+    for k in range(4):
+        shift = centre[k] - (A[0, k] + A[1, k] + A[2, k]) / 3.0
+        for i in range(3):
+            out[i, k] = A[i, k] + shift
+    return out
+
+
+@kernel
+def is_flat(A: FloatArray, face: FloatArray) -> bool:
+    """Whether the points (3, 4), of plane (4,), are collinear or not finite."""
+    first = norm(A[1] - A[0])
+    second = norm(A[2] - A[0])
+    return not norm(face) > FLAT_FACE * first * second * norm(A[0])
+
+
+@kernel
+def decompose_into(
+    operators: FloatArray,
+    basis: FloatArray,
+    points: FloatArray,
+    targets: FloatArray,
+    centre: FloatArray,
+    centre_target: FloatArray,
+    screws: FloatArray,
+    generators: FloatArray,
+    amount: FloatArray,
+    status: IntArray,
+) -> None:
+    """Translation, hinge and planar turn (7.18 to 7.24) into screws (3, n), generators (3, 4, 4), amount, status (3,).
+
+    ``basis`` (n, r) of the arm's freedoms; ``points``, ``targets`` (3, 4) span faces. Amounts are >= 0, angles in
+    [0, π]. Screws and generators of components that are done or not reachable are left as they are: hand in zeros.
+    """
+    n = operators.shape[0]
+    system = np.zeros((8, n))
+    unit_centre = unit(centre)
+    displacement = np.empty(4)
+    for k in range(4):
+        displacement[k] = centre_target[k] - centre[k]
+    for i in range(3):
+        amount[i] = 0.0
+        status[i] = DONE
+
+    tau = norm(displacement)
+    if tau > COINCIDENT * norm(centre):
+        amount[0] = tau
+        status[0] = NOT_REACHABLE
+        direction = unit(displacement)
+        a1, a2 = complement(unit_centre, direction)
+        set_plane_rows(operators, a1, system, 0)
+        set_plane_rows(operators, a2, system, 4)
+        screw, H = np.zeros(n), np.zeros((4, 4))
+        if primitive(operators, basis, system, screw, H):
+            step = apply(H, centre)
+            scale = math.copysign(norm(step), dot(step, direction))
+            if abs(scale) > DEGENERATE_RATIO * norm(centre):
+                scale_primitive(screw, H, 1.0 / scale)
+                amount[0] = dot(displacement, apply(H, centre))
+                _keep(screw, H, 0, screws, generators, status)
+
+    A_c = _shifted(points, centre)
+    A_r = _shifted(targets, centre)
+    a = unit(minors(A_c[0], A_c[1], A_c[2]))
+    a_t = unit(minors(A_r[0], A_r[1], A_r[2]))
+    together = dot(a, a_t)
+    difference = np.empty(4)
+    for k in range(4):
+        difference[k] = a_t[k] - together * a[k]
+    hinged = True
+    axis_point = np.empty(4)
+    if norm(difference) > COINCIDENT:
+        axis_point = minors(a, unit(difference), unit_centre)
+    elif together > 0.0:
+        hinged = False
+    else:
+        longest = -1.0
+        for i in range(3):
+            length = norm(A_c[i] - centre)
+            if length > longest:
+                longest = length
+                for k in range(4):
+                    axis_point[k] = A_c[i, k]
+    if hinged:
+        amount[1] = math.acos(min(1.0, max(-1.0, together)))
+        status[1] = NOT_REACHABLE
+        along = dot(axis_point, unit_centre)
+        second_point = np.empty(4)
+        for k in range(4):
+            second_point[k] = axis_point[k] - along * unit_centre[k]
+        set_point_rows(operators, unit_centre, system, 0)
+        set_point_rows(operators, unit(second_point), system, 4)
+        screw, H = np.zeros(n), np.zeros((4, 4))
+        if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
+            theta = _hinge_angle(H, a, a_t)
+            if theta < 0.0:
+                scale_primitive(screw, H, -1.0)
+                theta = -theta
+            amount[1] = theta
+            _keep(screw, H, 1, screws, generators, status)
+            sine, versine = math.sin(-theta), 2.0 * math.sin(0.5 * theta) ** 2
+            for i in range(3):
+                once = apply(H, A_r[i])
+                twice = apply(H, once)
+                for k in range(4):
+                    A_r[i, k] += sine * once[k] + versine * twice[k]
+
+    set_plane_rows(operators, a, system, 0)
+    set_point_rows(operators, unit_centre, system, 4)
+    status[2] = NOT_REACHABLE
+    screw, H = np.zeros(n), np.zeros((4, 4))
+    if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
+        theta = _planar_angle(H, A_c, A_r)
+        if theta < 0.0:
+            scale_primitive(screw, H, -1.0)
+            theta = -theta
+        amount[2] = theta
+        _keep(screw, H, 2, screws, generators, status)
+
+
+@kernel
+def _keep(
+    screw: FloatArray, H: FloatArray, i: int, screws: FloatArray, generators: FloatArray, status: IntArray
+) -> None:
+    status[i] = MOVES
+    for j in range(screw.shape[0]):
+        screws[i, j] = screw[j]
+    for k in range(4):
+        for m in range(4):
+            generators[i, k, m] = H[k, m]
+
+
+@kernel
+def _hinge_angle(H: FloatArray, a: FloatArray, a_t: FloatArray) -> float:
+    u = apply_transposed(H, a)
+    v = apply_transposed(H, u)
+    uu, vv, uv, ur, vr = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(4):
+        right = a_t[k] - a[k] - v[k]
+        uu += u[k] * u[k]
+        vv += v[k] * v[k]
+        uv -= u[k] * v[k]
+        ur -= u[k] * right
+        vr += v[k] * right
+    return math.atan2(ur * vv - uv * vr, uv * ur - uu * vr)
+
+
+@kernel
+def _planar_angle(H: FloatArray, A: FloatArray, A_r: FloatArray) -> float:
+    uu, vv, uv, ur, vr = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(A.shape[0]):
+        u = apply(H, A[i])
+        v = apply(H, u)
+        for k in range(4):
+            right = A_r[i, k] - A[i, k] - v[k]
+            uu += u[k] * u[k]
+            vv += v[k] * v[k]
+            uv += u[k] * v[k]
+            ur += u[k] * right
+            vr += v[k] * right
+    return math.atan2(ur * vv - uv * vr, uv * ur - uu * vr)
+
+
+@kernel
+def _one_rotation(
+    operators: FloatArray,
+    basis: FloatArray,
+    screws: FloatArray,
+    generators: FloatArray,
+    amount: FloatArray,
+    status: IntArray,
+    screw: FloatArray,
+    V: FloatArray,
+) -> tuple[float, int]:
+    """Angle and status of hinge and planar turn as one rotation (8.50 to 8.52); its screw and generator ``V``."""
+    n, rank = basis.shape
+    found = MOVES
+    if status[1] == NOT_REACHABLE or status[2] == NOT_REACHABLE:
+        found = NOT_REACHABLE
+    H_r, H_p = generators[1], generators[2]
+    s_r, c_r = math.sin(0.5 * amount[1]), math.cos(0.5 * amount[1])
+    s_p, c_p = math.sin(0.5 * amount[2]), math.cos(0.5 * amount[2])
+    if status[1] != MOVES:
+        s_r, c_r = 0.0, 1.0
+    first, second = np.empty((4, 4)), np.empty((4, 4))
+    multiply4_into(H_r, H_p, first)
+    multiply4_into(H_p, H_r, second)
+    cosine = c_r * c_p + 0.5 * s_r * s_p * (first[0, 0] + first[1, 1] + first[2, 2] + first[3, 3])
+    for i in range(4):
+        for k in range(4):
+            V[i, k] = s_r * c_p * H_r[i, k] + c_r * s_p * H_p[i, k] + s_r * s_p * (first[i, k] - second[i, k])
+    square = 0.0
+    for i in range(4):
+        for k in range(4):
+            square -= 0.5 * V[i, k] * V[k, i]
+    if not square > 0.0:
+        for j in range(n):
+            screw[j] = 0.0
+        for i in range(4):
+            for k in range(4):
+                V[i, k] = 0.0
+        return 0.0, DONE if found == MOVES else found
+    sine = math.sqrt(square)
+    factor = 1.0 / sine if cosine >= 0.0 else -1.0 / sine
+    size, left = 0.0, 0.0
+    for i in range(4):
+        for k in range(4):
+            V[i, k] *= factor
+            size += V[i, k] * V[i, k]
+    products = np.empty(n)
+    for j in range(n):
+        screw[j] = 0.0
+        products[j] = 0.0
+        for i in range(4):
+            for k in range(4):
+                products[j] += operators[j, i, k] * V[i, k]
+    for r in range(rank):
+        share = 0.0
+        for j in range(n):
+            share += basis[j, r] * products[j]
+        for j in range(n):
+            screw[j] += share * basis[j, r]
+    for i in range(4):
+        for k in range(4):
+            s = -V[i, k]
+            for j in range(n):
+                s += screw[j] * operators[j, i, k]
+            left += s * s
+    if left > REACH_RATIO * REACH_RATIO * size:
+        found = NOT_REACHABLE
+    return 2.0 * math.atan2(sine, abs(cosine)), found
+
+
+@kernel
+def _moved_into(G: FloatArray, amount: float, points: FloatArray, work: FloatArray) -> None:
+    """Points (k, 4) displaced by ``exp(amount G)``, in place; ``work`` (3, 4, 4): scratch."""
+    H = work[2]
+    exponential_into(G, amount, work[0], work[1], H)
+    for p in range(points.shape[0]):
+        x, y, z, w = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
+        for i in range(4):
+            points[p, i] = H[i, 0] * x + H[i, 1] * y + H[i, 2] * z + H[i, 3] * w
+
+
+@kernel
+def cartesian_step(
+    operators: FloatArray,
+    composition: int,
+    points: FloatArray,
+    targets: FloatArray,
+    centre: FloatArray,
+    centre_target: FloatArray,
+    camera_centres: FloatArray,
+    gains: FloatArray,
+    dt_s: float,
+    rotation_rate: float,
+    translation_rate: float,
+    single: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Joint velocity (n,), task error (k,), allowed (k,) and status (k,) of both laws in one call.
+
+    The components are translation, hinge and turn (8.42), or, ``single``, translation and one rotation (8.55).
+
+    ``operators`` (n, 4, 4) at the current configuration (5.21), ``points`` and ``targets`` (3, 4) of one face,
+    ``centre`` and ``centre_target`` (4,), ``camera_centres`` (c, 4): all of height ``a∞ᵀM = 1``. ``gains`` (k,)
+    [1/s]; ``dt_s`` [s] and the rates as in `control.law.Options`. Task error: τ in lengths of the frame's coordinates,
+    angles [rad], all >= 0; allowed: what of it visibility lets the components plan for; status: `ComponentStatus`. A
+    component that the arm cannot make, or that visibility holds back, does not hold up the others.
+    """
+    n, cameras = operators.shape[0], camera_centres.shape[0]
+    count = 2 if single else 3
+    velocity, errors, allowed = np.zeros(n), np.zeros(count), np.zeros(count)
+    shown = np.full(count, NO_FACE)
+    face = minors(points[0], points[1], points[2])
+    target_face = minors(targets[0], targets[1], targets[2])
+    centres = 0.0
+    for k in range(4):
+        centres += abs(centre[k]) + abs(centre_target[k])
+    if is_flat(points, face) or is_flat(targets, target_face) or not math.isfinite(centres):
+        return velocity, errors, allowed, shown
+    basis = freedoms_of(operators)
+    screws, generators = np.zeros((3, n)), np.zeros((3, 4, 4))
+    amount = np.zeros(3)
+    status = np.full(3, DONE)
+    decompose_into(
+        operators, basis, points, targets, centre, centre_target, screws, generators, amount, status
+    )
+    side = 1.0
+    if cameras > 0:
+        middle = np.zeros(4)
+        for c in range(cameras):
+            for k in range(4):
+                middle[k] += camera_centres[c, k] / cameras
+        side = 1.0 if dot(target_face, middle) >= 0.0 else -1.0
+    displacement = np.zeros(4)
+    if status[0] == MOVES:
+        for k in range(4):
+            displacement[k] = centre_target[k] - centre[k]
+
+    hinge_first = False
+    whole = 0.0
+    if single:
+        screw, V = np.empty(n), np.empty((4, 4))
+        whole, found = _one_rotation(operators, basis, screws, generators, amount, status, screw, V)
+        angle, share, turn, clear = way_in_sight(face, V, displacement, camera_centres, side, whole)
+        if not clear and status[1] == MOVES:
+            other = way_in_sight(face, generators[1], displacement, camera_centres, side, amount[1])
+            if other[3]:
+                hinge_first = True
+                angle, share, turn, clear = other
+        if not hinge_first:
+            status[1] = found
+            for j in range(n):
+                screws[1, j] = screw[j]
+            for i in range(4):
+                for k in range(4):
+                    generators[1, i, k] = V[i, k]
+    else:
+        turned = amount[1] if status[1] == MOVES else 0.0
+        angle, share, turn, clear = way_in_sight(
+            face, generators[1], displacement, camera_centres, side, turned
+        )
+    if angle < 0.0:
+        scale_primitive(screws[1], generators[1], -1.0)
+    if single or status[1] == MOVES:
+        amount[1] = abs(angle)
+
+    steps = np.zeros(count)
+    for i in range(count):
+        errors[i] = amount[i]
+        shown[i] = status[i]
+        driven = False
+        for j in range(n):
+            driven = driven or screws[i, j] != 0.0
+        if driven:
+            allowed[i] = amount[i]
+        limit = math.inf
+        if i == 0 and status[0] == MOVES:
+            allowed[0] = amount[0] * min(1.0, APPROACH * share)
+            if share < 1.0:
+                limit = STEP_OF_BOUND * share * amount[0]
+        if i == 1 and status[1] == MOVES:
+            allowed[1] = min(amount[1], APPROACH * turn)
+            if turn < amount[1]:
+                limit = STEP_OF_BOUND * turn
+        if status[i] == MOVES and allowed[i] < amount[i]:
+            shown[i] = WAITS
+        rate = translation_rate if i == 0 else rotation_rate
+        if dt_s > 0.0:
+            steps[i] = min(-math.expm1(-gains[i] * dt_s) * allowed[i], rate * dt_s, limit)
+        else:
+            steps[i] = min(gains[i] * allowed[i], rate)
+        for j in range(n):
+            velocity[j] += steps[i] * screws[i, j]
+    if dt_s > 0.0:
+        held, wanted = np.empty((4, 4)), np.empty((4, 4))
+        for k in range(4):
+            for i in range(3):
+                held[i, k] = points[i, k]
+            held[3, k] = centre[k]
+        for i in range(4):
+            for k in range(4):
+                wanted[i, k] = held[i, k]
+        work = np.empty((3, 4, 4))
+        for back in range(count):
+            i = count - 1 - back
+            if steps[i] != 0.0:
+                _moved_into(generators[i], steps[i], wanted, work)
+        step = corrected_step(operators, composition, held, wanted, velocity)
+        for j in range(n):
+            velocity[j] = step[j] / dt_s
+    if hinge_first:
+        errors[1] = whole
+        shown[1] = WAITS
+    return velocity, errors, allowed, shown
+
+
+@kernel
+def cartesian3_step(
+    operators: FloatArray,
+    points: FloatArray,
+    targets: FloatArray,
+    centre: FloatArray,
+    centre_target: FloatArray,
+    camera_centres: FloatArray,
+    gains: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """The instantaneous law in three components: `cartesian_step` with ``dt_s`` 0 and no rate limits (8.42)."""
+    return cartesian_step(
+        operators, 0, points, targets, centre, centre_target, camera_centres, gains, 0.0, math.inf, math.inf, False
+    )  # fmt: skip
+
+
+def cartesian_reasons(
+    components: tuple[str, ...],
+    units: tuple[str, ...],
+    task_error: FloatArray,
+    allowed: FloatArray,
+    status: IntArray,
+) -> tuple[Reason, ...]:
+    """What a step has to tell: components that the arm cannot make, or that wait. Empty when all move."""
+    reasons = []
+    codes = status.tolist()
+    stuck = all(code == WAITS for code in codes[:2]) and bool((allowed[:2] <= BLOCKED * task_error[:2]).all())
+    for i, (component, in_unit) in enumerate(zip(components, units, strict=True)):
+        left, may = float(task_error[i]), float(allowed[i])
+        if codes[i] == NOT_REACHABLE:
+            hint = "the arm lacks this freedom here: leave the singularity by joints, or give another goal"
+            # an angle can only be measured by the operator that the arm lacks
+            value = left if component in (TRANSLATION, ROTATION) else None
+            reasons.append(Reason("NOT_REACHABLE", "slow", component, value, None, in_unit, hint))
+        elif codes[i] == WAITS and stuck:
+            hint = (
+                "translation and turn wait for each other, or a camera would see the face's back: use the law "
+                "trajectory, whose way may bend, or another centre"
+            )
+            reasons.append(Reason("VISIBILITY_BLOCKED", "hold", component, left, may, in_unit, hint))
+        elif codes[i] == WAITS:
+            hint = "waits for the other components, so that the cameras keep seeing the face"
+            reasons.append(Reason("VISIBILITY_WAIT", "info", component, left, may, in_unit, hint))
+        elif codes[i] == NO_FACE:
+            hint = "the three points of the face lie on one line, or are not known: choose others"
+            reasons.append(Reason("NO_FACE", "hold", component, None, None, "", hint))
+    return tuple(reasons)
 
 
 def cartesian3(scene: Scene, task: Task, options: Options) -> LawStep:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.control.image_servoing import image_reasons, image_velocity_step
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.laws.stereo import image_reasons, image_velocity_step
 
 
 def image(scene: Scene, task: Task, options: Options) -> LawStep:

@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from stereoservo.control.image_servoing import (
+from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.laws.stereo import (
     DESIRED,
     MEAN,
     held_gain,
@@ -19,7 +20,6 @@ from stereoservo.control.image_servoing import (
     pixel_gradients,
     velocities_into,
 )
-from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import add_equation, damped_solve

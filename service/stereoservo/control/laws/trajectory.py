@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from stereoservo.control.image_servoing import image_equations_into, image_reasons, limited
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.laws.stereo import image_equations_into, image_reasons, limited
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, step_into
 from stereoservo.kinematics.kernels import project_points, transform_points_into
 from stereoservo.numerics.arrays import FloatArray

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.cartesian import cartesian3_step
+from stereoservo.control.laws.cartesian3 import cartesian3_step
 from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.target_checks import (
     MIN_MARKERS,

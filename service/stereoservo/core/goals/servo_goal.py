@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.faces import FLAT_PX, NOT_CHOSEN, find_faces
+from stereoservo.control.face_choice import NOT_CHOSEN
+from stereoservo.control.faces import FLAT_PX, find_faces
 from stereoservo.control.law import JacobianChoice
 from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.core.context import RefusalError, StepContext

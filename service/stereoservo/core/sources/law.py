@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from math import log
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.faces import choose_face, law_scene
-from stereoservo.control.filters import GainCurve, gain_at
-from stereoservo.control.image_servoing import ILL_CONDITIONED
+from stereoservo.control.face_choice import choose_face, law_scene
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
+from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.target_checks import MIN_MARKERS
@@ -22,6 +21,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
@@ -46,7 +46,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     ended = run_ended(source, context, error_px, seen, may_end=not streamed)
     if ended is not None:
         return ended
-    law = LAWS[source.law]
+    law = context.derived.laws[source.law]
     scene, task = choose(source, context, *scene_and_task(source, context, arrays, usable))
     if law.planned:
         if source.plan is None and source.pose_known:
@@ -78,9 +78,9 @@ def activate_run(source: LawRun, context: StepContext) -> None:
     source.renew_lease(context.now_ns)
 
 
-def awaits_plan(source: ServoGoal) -> bool:
+def awaits_plan(source: ServoGoal, context: StepContext) -> bool:
     """Whether a goal follows a plan that is still to be made."""
-    return LAWS[source.law].planned and source.plan is None
+    return context.derived.laws[source.law].planned and source.plan is None
 
 
 def away_from_limits(context: StepContext) -> FloatArray:
@@ -184,6 +184,38 @@ def centre_of(source: ServoGoal, joints: FloatArray, arrays: ModelArrays, points
         return middle
     moved: FloatArray = transform_points(chain_at(arrays, joints)[0], source.centre_body[None])[0]
     return moved
+
+
+SLOPE_UNIT_PX = 100.0
+"""Slopes are stated in 1/s per so many pixels."""
+
+
+class GainCurve(NamedTuple):
+    """``near`` and ``far`` [1/s], ``slope`` > 0 [1/s per 100 px]: how fast the gain leaves ``near``."""
+
+    near: float
+    far: float
+    slope: float
+
+
+def gain_at(curve: GainCurve, error_px: float | None) -> float:
+    """The gain [1/s] at an error [px], the largest distance over markers and cameras; None: not measured.
+
+    What is not known, or no number, takes the smaller of the two gains.
+    """
+    return adaptive_gain(curve.near, curve.far, curve.slope, math.nan if error_px is None else error_px)
+
+
+@kernel
+def adaptive_gain(near: float, far: float, slope: float, error_px: float) -> float:
+    """`gain_at` as a kernel; NaN: not measured. Equal gains are constant, a negative error counts as none."""
+    if math.isnan(error_px):
+        return min(near, far)
+    span = abs(near - far)
+    if span == 0.0 or error_px <= 0.0:
+        return near
+    gain = far + (near - far) * math.exp(-slope * (error_px / SLOPE_UNIT_PX) / span)
+    return max(min(near, far), min(max(near, far), gain))
 
 
 def options(
@@ -306,7 +338,7 @@ def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
     """Share [0, 1] of the goal's path that is done, and the seconds left; None where that is not known."""
     if source.error_px is None:
         return None, None
-    if LAWS[source.law].planned:
+    if context.derived.laws[source.law].planned:
         if source.plan is None:
             return None, None
         length_s = float(source.plan.times[-1])
@@ -328,14 +360,14 @@ def run_progress(source: LawRun, context: StepContext) -> Progress:
 
 def _decay_s(source: LawRun, error_px: float) -> float:
     """Time in which an error decays to the tolerance at the slower of the goal's gains."""
-    return log(max(error_px / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+    return math.log(max(error_px / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
 
 
 def servo_progress_reasons(
     source: ServoGoal, context: StepContext, reported: tuple[Reason, ...]
 ) -> tuple[Reason, ...]:
     """The progress reasons of a goal in set-points."""
-    local = source.law if LAWS[source.law].path == "free" else ""
+    local = source.law if context.derived.laws[source.law].path == "free" else ""
     traits = _ProgressTraits(source.wanted, source.stream is not None, local)
     return progress_reasons(source, context, reported, traits)
 

@@ -1,0 +1,186 @@
+"""Choice of the three markers on which a law works now: of one face, seen in most cameras, largest in the images."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from stereoservo.control.faces import Faces
+from stereoservo.control.law import Scene, Task
+from stereoservo.control.primitives_kernel import dot, minors
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+
+LEAST_ALTITUDE = 10.0
+"""Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
+CLEARLY_BETTER = 2.0
+"""Ratio of image areas from which on another triangle takes over."""
+LASTING = 8.0
+"""How many times its area a triangle counts that shows its front at the goal too."""
+
+
+class FaceChoice(NamedTuple):
+    """On what a law shall work now.
+
+    ``face``: its index, -1 where the three markers are of several; ``triple`` (3,): their indices, in outward order.
+    ``cameras``: how many see them, 0: none does, and no law can work. ``kept`` (c,): 1 for the cameras that have the
+    face's front now and at the goal, whose sight of it is kept. ``changed``: other markers than before.
+    """
+
+    face: int
+    triple: IntArray
+    cameras: int
+    kept: FloatArray
+    changed: bool
+
+
+NOT_CHOSEN = FaceChoice(-2, np.zeros(3, np.int64), 0, np.zeros(0), False)
+"""What stands in for the choice before the first."""
+
+
+def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT_CHOSEN) -> FaceChoice:
+    """The three markers on which a law shall work now.
+
+    Of one face, seen in most cameras; among these, of largest image area in units of the noise, which prefers what is
+    spread, near and frontal. A face whose front some camera has at the goal too counts for more. Only markers that have
+    a point now (finite) and at the goal (``target_known``). The former choice stays until a marker of it is hidden,
+    more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
+    do.
+    """
+    face, triple, cameras, kept = choose_face_step(
+        *faces, scene.points, scene.pixels, scene.weights, task.target_points, task.target_known,
+        scene.camera_centres, before.face, before.triple,
+    )  # fmt: skip
+    changed = before.cameras > 0 and (cameras == 0 or set(triple.tolist()) != set(before.triple.tolist()))
+    return FaceChoice(face, triple, cameras, kept, changed)
+
+
+def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
+    """The scene for a law that keeps sight of its face: without the cameras that lose it at the goal or have it not.
+
+    Their way cannot be the face's front; what they see of the markers stays.
+    """
+    return scene._replace(camera_centres=np.ascontiguousarray(scene.camera_centres[choice.kept > 0.0]))
+
+
+@kernel
+def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
+    """Cameras that see a triangle well, and its areas there, in squared deviations of its worst marker, summed."""
+    count, area = 0, 0.0
+    for c in range(weights.shape[0]):
+        weight = min(weights[c, i], weights[c, j], weights[c, k])
+        if not weight > 0.0:
+            continue
+        ux, uy = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
+        vx, vy = pixels[c, k, 0] - pixels[c, i, 0], pixels[c, k, 1] - pixels[c, i, 1]
+        wx, wy = vx - ux, vy - uy
+        double = abs(ux * vy - uy * vx)
+        longest = math.sqrt(max(ux * ux + uy * uy, vx * vx + vy * vy, wx * wx + wy * wy))
+        if double * weight >= LEAST_ALTITUDE * longest and longest > 0.0:
+            count += 1
+            area += 0.5 * double * weight * weight
+    return count, area
+
+
+@kernel
+def choose_triangle(
+    members: FloatArray,
+    lasting: FloatArray,
+    usable: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    face_now: int,
+    triple_now: IntArray,
+) -> tuple[int, IntArray, int]:
+    """Face (-1: across faces), its three markers and the cameras that see them (0: there are none).
+
+    See `choose_face`; the order of the markers is not yet outward. ``lasting`` (f,), ``usable`` (m,).
+    """
+    faces, markers = members.shape
+    best = np.zeros(3, np.int64)
+    best_face, best_count, best_area = -1, 0, 0.0
+    # faces first; across faces only where none is seen
+    for f in range(faces + 1):
+        if f == faces and best_count > 0:
+            break
+        for i in range(markers):
+            if not (usable[i] > 0.0 and (f == faces or members[f, i] > 0.0)):
+                continue
+            for j in range(i + 1, markers):
+                if not (usable[j] > 0.0 and (f == faces or members[f, j] > 0.0)):
+                    continue
+                for k in range(j + 1, markers):
+                    if not (usable[k] > 0.0 and (f == faces or members[f, k] > 0.0)):
+                        continue
+                    count, area = triangle_sight(i, j, k, pixels, weights)
+                    if f < faces and lasting[f] > 0.0:
+                        area *= LASTING
+                    if count > best_count or (count == best_count and area > best_area):
+                        best_face, best_count, best_area = (f if f < faces else -1), count, area
+                        best[0], best[1], best[2] = i, j, k
+    if face_now >= -1 and (face_now >= 0 or best_face < 0):
+        good = True
+        for corner in range(3):
+            good = good and usable[triple_now[corner]] > 0.0
+        if good:
+            count, area = triangle_sight(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
+            if face_now >= 0 and lasting[face_now] > 0.0:
+                area *= LASTING
+            if count > 0 and count >= best_count and best_area <= CLEARLY_BETTER * area:
+                return face_now, triple_now.copy(), count
+    return best_face, best, best_count
+
+
+@kernel
+def choose_face_step(
+    triples: IntArray,
+    members: FloatArray,
+    sided: FloatArray,
+    body: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    targets: FloatArray,
+    target_known: FloatArray,
+    camera_centres: FloatArray,
+    face_now: int,
+    triple_now: IntArray,
+) -> tuple[int, IntArray, int, FloatArray]:
+    """`choose_face` on arrays: face, outward triple (3,), cameras and kept (c,)."""
+    faces, markers = members.shape
+    cameras = camera_centres.shape[0]
+    usable = np.zeros(markers)
+    for p in range(markers):
+        height = points[p, 0] + points[p, 1] + points[p, 2] + points[p, 3]
+        if target_known[p] > 0.0 and math.isfinite(height):
+            usable[p] = 1.0
+    lasting = np.zeros(faces)
+    for f in range(faces):
+        plane = minors(targets[triples[f, 0]], targets[triples[f, 1]], targets[triples[f, 2]])
+        for c in range(cameras):
+            if sided[f] > 0.0 and dot(plane, camera_centres[c]) > 0.0:
+                lasting[f] = 1.0
+    face, triple, count = choose_triangle(members, lasting, usable, pixels, weights, face_now, triple_now)
+    kept = np.zeros(cameras)
+    if count == 0:
+        return -2, triple_now.copy(), 0, kept
+    i, j, k = triple
+    side = 0.0
+    if face >= 0 and sided[face] > 0.0:
+        outward = minors(body[triples[face, 0]], body[triples[face, 1]], body[triples[face, 2]])
+        side = dot(outward, minors(body[i], body[j], body[k]))
+    else:  # the side that most cameras see
+        plane = minors(points[i], points[j], points[k])
+        for c in range(cameras):
+            if weights[c, i] > 0.0 and weights[c, j] > 0.0 and weights[c, k] > 0.0:
+                side += 1.0 if dot(plane, camera_centres[c]) > 0.0 else -1.0
+    if side < 0.0:
+        triple[1], triple[2] = k, j
+    now = minors(points[triple[0]], points[triple[1]], points[triple[2]])
+    then = minors(targets[triple[0]], targets[triple[1]], targets[triple[2]])
+    for c in range(cameras):
+        if dot(now, camera_centres[c]) > 0.0 and dot(then, camera_centres[c]) > 0.0:
+            kept[c] = 1.0
+    return face, triple, count, kept
