@@ -5,7 +5,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stereoservo.control.faces_kernel import (
+
+from stereoservo.control.faces import (
+    find_faces,
     marker_covariances,
     marker_distances,
     marker_information,
@@ -13,8 +15,6 @@ from stereoservo.control.faces_kernel import (
     triangle_altitudes,
     turned_average,
 )
-
-from stereoservo.control.faces import find_faces
 from stereoservo.control.primitives_kernel import minors
 from stereoservo.geometry.homogeneous import plane_of_points
 

@@ -8,8 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.core import monitor
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.monitors import joints
+from stereoservo.core.monitors import collision
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings, CoreSettings
 from stereoservo.core.state import CoreState, decode_state, encode_state, initial_state
@@ -51,7 +52,7 @@ def fly(
     gap_ns: int = 0,
 ) -> list[tuple[int, Any]]:
     """Feed samples (t, n) to the watch while every joint is commanded to move, the first after a gap; the reasons."""
-    limits = joints.collision_thresholds(settings, None)
+    limits = collision.collision_thresholds(settings, None)
     count = len(efforts if efforts is not None else following)  # type: ignore[arg-type]
     found = []
     for k in range(count):
@@ -60,7 +61,7 @@ def fly(
             k, state.contact.seen_ns + STEP_NS + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
         )  # fmt: skip
-        reason = joints.detect_collision(state, settings, limits, sample)
+        reason = monitor.detect_collision(state, settings, limits, sample)
         if reason is not None:
             found.append((k, reason))
     return found
@@ -156,7 +157,8 @@ def test_drives_that_tell_nothing_are_not_watched(settings: CoreSettings) -> Non
     state = enabled(settings)
     sample = JointState(1, 1, np.zeros(N), np.zeros(N))
     assert (
-        joints.detect_collision(state, settings, joints.collision_thresholds(settings, None), sample) is None
+        monitor.detect_collision(state, settings, collision.collision_thresholds(settings, None), sample)
+        is None
     )
     assert state.contact.efforts is None
     assert state.contact.following_errors is None
@@ -209,7 +211,7 @@ def test_a_following_error_that_stays_after_the_time_to_leave_is_a_contact_again
     lags = np.tile(0.03 * np.eye(N)[2], (400, 1))
     assert [k for k, _ in fly(state, settings, following=lags[:5])] == [4]
     again = [k for k, _ in fly(state, settings, following=lags)]
-    assert again[0] * STEP_NS * 1e-9 == pytest.approx(joints.LEAVE_S, abs=0.03)
+    assert again[0] * STEP_NS * 1e-9 == pytest.approx(monitor.LEAVE_S, abs=0.03)
 
 
 # -- thresholds ---------------------------------------------------------------------------------------------
@@ -225,7 +227,7 @@ LOADS = JointLoads(
 def test_learnt_thresholds_by_hand(bench: Any) -> None:
     """Limits of 1 rad/s: joints tried at 0.5 count double. 1.5 times the sum over the movers, and 1 % of 50 N m."""
     settings = with_contact(bench.settings, stated())
-    efforts, following = joints.collision_thresholds(settings, LOADS)
+    efforts, following = collision.collision_thresholds(settings, LOADS)
     assert efforts == pytest.approx(
         [
             1.5 * (8 + 2) + 0.5,
@@ -244,14 +246,14 @@ def test_floors_are_among_joints_of_one_unit(bench: Any) -> None:
     units = ("N m", "N m", "N m", "of rated", "of rated", "of rated")
     loads = JointLoads(np.full(N, 1.0), np.zeros((N, N)), np.array([4.0, 50.0, 20.0, 0.3, 0.2, 0.0]))
     watched = msgspec.structs.replace(stated(), effort_units=units)
-    efforts, _ = joints.collision_thresholds(with_contact(bench.settings, watched), loads)
+    efforts, _ = collision.collision_thresholds(with_contact(bench.settings, watched), loads)
     assert efforts == pytest.approx([0.5, 0.5, 0.5, 0.003, 0.003, 0.003])
 
 
 def test_stated_thresholds_come_before_learnt_ones(bench: Any) -> None:
     settings = with_contact(bench.settings, stated(effort={0: 3.0}, following={5: 0.5}))
-    efforts, following = joints.collision_thresholds(settings, LOADS)
-    learnt = joints.collision_thresholds(with_contact(bench.settings, stated()), LOADS)
+    efforts, following = collision.collision_thresholds(settings, LOADS)
+    learnt = collision.collision_thresholds(with_contact(bench.settings, stated()), LOADS)
     assert efforts[0] == 3.0
     assert following[5] == 0.5
     np.testing.assert_array_equal(efforts[1:], learnt[0][1:])
@@ -270,15 +272,15 @@ def test_stated_thresholds_come_before_learnt_ones(bench: Any) -> None:
 )
 def test_nothing_learnt_is_no_threshold(bench: Any, loads: JointLoads | None) -> None:
     settings = with_contact(bench.settings, stated())
-    efforts, following = joints.collision_thresholds(settings, loads)
+    efforts, following = collision.collision_thresholds(settings, loads)
     assert np.isinf(efforts).all()
     assert np.isinf(following).all()
 
 
 def test_switched_off_means_off(bench: Any) -> None:
     off = msgspec.structs.replace(stated(effort={1: 10.0}), enabled=False)
-    assert joints.collision_thresholds(with_contact(bench.settings, off), LOADS) is None
-    assert joints.collision_thresholds(with_contact(bench.settings, None), LOADS) is None
+    assert collision.collision_thresholds(with_contact(bench.settings, off), LOADS) is None
+    assert collision.collision_thresholds(with_contact(bench.settings, None), LOADS) is None
 
 
 # -- in the core --------------------------------------------------------------------------------------------

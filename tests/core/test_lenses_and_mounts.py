@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.prediction import ideal_observation, model_arrays
+from stereoservo.core.model_arrays import model_arrays
+from stereoservo.core.prediction import ideal_observation
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.messages.goals import FeatureTarget, Goal, Jog, JointTarget, RunGoal, Teach

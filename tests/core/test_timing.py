@@ -7,8 +7,8 @@ import pytest
 
 from stereoservo.core.ingest import remember_joints
 from stereoservo.core.monitor_state import CameraTiming
-from stereoservo.core.monitors.model import MODEL_PX, advice, fold_timing, offset_s
-from stereoservo.core.prediction import motion_at
+from stereoservo.core.prediction import MODEL_PX, fold_timing, motion_at
+from stereoservo.core.report import advice, offset_s
 from stereoservo.core.state import HISTORY, JointHistory
 from stereoservo.ports.devices import JointState
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
-from stereoservo.core.prediction import ModelArrays, Prediction
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.messages.goals import PlanReport

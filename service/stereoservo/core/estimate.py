@@ -10,18 +10,19 @@ import numpy as np
 
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
+from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitors import camera_relocalization, moving_camera
-from stereoservo.core.monitors.joints import collision_thresholds
-from stereoservo.core.monitors.model import fold_residuals, masked_ids, start_model_monitor
+from stereoservo.core.monitors.collision import collision_thresholds
+from stereoservo.core.monitors.diagnosis import start_model_monitor
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
     accept_sights,
+    fold_residuals,
     frame_sights,
     ideal_observation,
     joint_correction,
     joints_at,
     marker_weights,
-    model_arrays,
     motion_at,
     pixels_now,
     predict,
@@ -175,3 +176,14 @@ def _unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
     if state.reanchoring is None:
         return False
     return settings.cameras[camera].name in camera_relocalization.unknown_cameras(state)
+
+
+def masked_ids(state: CoreState) -> tuple[int, ...]:
+    """Ids of markers that are not used."""
+    if state.model is None:
+        return ()
+    return tuple(
+        marker
+        for marker, masked in zip(state.model.marker_ids, state.watching.masked, strict=True)
+        if masked > 0.0
+    )

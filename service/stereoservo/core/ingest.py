@@ -10,7 +10,6 @@ import numpy as np
 
 from stereoservo.core.context import Ingested, StepContext
 from stereoservo.core.cycle import StepInputs
-from stereoservo.core.monitors.joints import forget_travel
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import HISTORY, CoreState, JointHistory, Refused
@@ -235,3 +234,10 @@ def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: floa
         "not used; check the camera's connection and this computer's load; a camera that is always so late needs a "
         "larger safety.coast_s",
     )  # fmt: skip
+
+
+def forget_travel(state: CoreState) -> None:
+    """Begin anew: what the drives did of late was not what they were sent."""
+    state.missing_travel[:] = 0.0
+    state.untold_travel[:] = 0.0
+    state.last_positions = None

@@ -6,26 +6,55 @@ stage acts at once: what one monitor stops, the next ones see stopped. To add on
 Requests are answered here, after the stop and before all other monitors: hold, resume, enable, teach and jog change
 what is monitored in this very step, and a goal that is accepted in a step in which something is found ends in that step
 with an event of its own.
+
+The detection that runs in every step is in this module: contact, joints that do not follow, and whether innovations,
+unfiltered, still look like noise. A round is one frame of every camera that delivers. Its chi-square, with the
+covariances of detector, timing and model, is cheap; only where it is improbable does `monitors.fault_isolation` ask
+which single change explains it: a moved camera, cameras moved as one, a slipped marker, a drifted joint zero. A
+diagnosis needs two rounds of the last three.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
+
+import numpy as np
 
 from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.monitor_state import MOVED, ModelDiagnosis
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitor_state import (
+    LATE_S,
+    MOVED,
+    STALE_PERIODS,
+    CameraMonitor,
+    ModelDiagnosis,
+    ModelMonitor,
+)
 from stereoservo.core.monitors import camera_relocalization, moving_camera
-from stereoservo.core.monitors.joints import monitor_collision, monitor_following
-from stereoservo.core.monitors.model import diagnosis_reason, emit_diagnosis, finish_round, mask_marker
+from stereoservo.core.monitors.collision import learn_loads, stated_thresholds, worst_contact
+from stereoservo.core.monitors.diagnosis import camera_moved_findings, emit_diagnosis, mask_marker
+from stereoservo.core.monitors.fault_isolation import bench_now, diagnosed
 from stereoservo.core.move import MOTION_SOURCES
-from stereoservo.core.prediction import SUSPECT_FRAMES, TRUSTED_FRAMES
+from stereoservo.core.prediction import (
+    MODEL_SIGMA_PX,
+    SUSPECT_FRAMES,
+    TRUSTED_FRAMES,
+    camera_chi2,
+    gate_threshold,
+    used_rows,
+)
+from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
+from stereoservo.core.state import CalibrationMotion, Contact, CoreState
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import JointState
 
 Findings = Iterable[Finding]
 
@@ -93,6 +122,178 @@ def _monitor_inputs(context: StepContext) -> Findings:
     return (Finding("stop", reason, reason.hint, f"stop: {reason.hint}"),)
 
 
+MEAN_S = 0.25
+"""Time constant of the moving mean in motion: a full brake ramp is done in it, gravity hardly changes."""
+REST_S = 0.05
+"""And at rest, where brakes open and people lean on the arm: nothing is watched."""
+LEAVE_S = 1.0
+"""Of motion after a contact, in which what it brought may go again: a retreat is no contact."""
+MOVING = 1e-3  # [rad/s or m/s] of commanded velocity
+GAP_S = 0.5  # without a sample for so long, means are of another time
+
+
+def detect_collision(
+    state: CoreState,
+    settings: CoreSettings,
+    limits: tuple[FloatArray, FloatArray] | None,
+    sample: JointState | None,
+) -> Reason | None:
+    """Account for one step; the reason where a joint (worst first) is in contact.
+
+    ``state.command`` is still that of the last step. ``limits``: thresholds (n,), (n,) of efforts and following errors.
+    """
+    contact = state.contact
+    if sample is None or sample.t_ns <= contact.seen_ns:
+        return None
+    elapsed_s = (sample.t_ns - contact.seen_ns) * 1e-9 if contact.seen_ns else np.inf
+    contact.seen_ns = sample.t_ns
+    contact.efforts = None if sample.efforts is None else sample.efforts.copy()
+    contact.following_errors = None if sample.following_errors is None else sample.following_errors.copy()
+    speed = np.abs(state.command)
+    if elapsed_s > GAP_S or state.lifecycle != Lifecycle.ACTIVE:
+        _forget(contact, sample)
+        return None
+    efforts, following = _readings(contact, sample)
+    if state.stopped or not bool((speed > MOVING).any()):
+        if contact.leave_s > 0.0:
+            _absorb(contact, efforts, following)
+        _clear(contact)
+        contact.mean_efforts = _nearer(contact.mean_efforts, efforts, elapsed_s / (elapsed_s + REST_S))
+        return None
+    contact.leave_s = max(0.0, contact.leave_s - elapsed_s)
+    excess, lag = _excess(contact, efforts, following)
+    learning = isinstance(state.source, CalibrationMotion)
+    unlimited = np.full(speed.size, np.inf)
+    effort_limits, following_limits = (
+        stated_thresholds(settings) if learning else limits or (unlimited, unlimited)
+    )
+    beyond = np.abs(excess) > effort_limits
+    share = np.where(beyond, 0.0, elapsed_s / (elapsed_s + MEAN_S))  # a contact is no new mean
+    contact.mean_efforts = _nearer(contact.mean_efforts, efforts, share)
+    contact.effort_excess = _pushed(contact.effort_excess, excess)
+    contact.following_excess = _pushed(contact.following_excess, lag)
+    if isinstance(state.source, CalibrationMotion):
+        learn_loads(state.source.id, contact, speed, efforts, following)
+    if limits is None:
+        return None
+    reason = worst_contact(contact, settings, effort_limits, following_limits, learning)
+    if reason is not None:
+        contact.low = np.array([np.minimum(contact.mean_efforts, efforts), np.minimum(following, 0.0)])
+        contact.high = np.array([np.maximum(contact.mean_efforts, efforts), np.maximum(following, 0.0)])
+        contact.leave_s = LEAVE_S
+        _clear(contact)
+    return reason
+
+
+def _readings(contact: Contact, sample: JointState) -> tuple[FloatArray, FloatArray]:
+    """Efforts and following errors; as expected where the driver has none, or one that is not a number."""
+    efforts = contact.mean_efforts if sample.efforts is None else sample.efforts
+    following = np.zeros_like(efforts) if sample.following_errors is None else sample.following_errors
+    return (
+        np.where(np.isfinite(efforts), efforts, contact.mean_efforts),
+        np.where(np.isfinite(following), following, 0.0),
+    )
+
+
+def _excess(contact: Contact, efforts: FloatArray, following: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Signed distances from what is expected: the mean and zero, or anything that a contact brought of late."""
+    mean = contact.mean_efforts
+    if contact.leave_s <= 0.0:
+        return efforts - mean, following
+    low, high = np.minimum(mean, contact.low[0]), np.maximum(mean, contact.high[0])
+    behind, ahead = np.minimum(contact.low[1], 0.0), np.maximum(contact.high[1], 0.0)
+    return (
+        efforts - np.minimum(np.maximum(efforts, low), high),
+        following - np.minimum(np.maximum(following, behind), ahead),
+    )
+
+
+def _nearer(mean: FloatArray, value: FloatArray, share: float | FloatArray) -> FloatArray:
+    nearer: FloatArray = mean + share * (value - mean)
+    return nearer
+
+
+def _pushed(window: FloatArray, newest: FloatArray) -> FloatArray:
+    return np.concatenate([window[1:], newest[None]])
+
+
+def _clear(contact: Contact) -> None:
+    contact.effort_excess = np.zeros_like(contact.effort_excess)
+    contact.following_excess = np.zeros_like(contact.following_excess)
+
+
+def _absorb(contact: Contact, efforts: FloatArray, following: FloatArray) -> None:
+    """What comes while the arm brakes and stands after a contact belongs to it."""
+    contact.low = np.minimum(contact.low, np.array([efforts, following]))
+    contact.high = np.maximum(contact.high, np.array([efforts, following]))
+
+
+def _forget(contact: Contact, sample: JointState) -> None:
+    """The mean begins anew: the drives were off, or nothing was heard for long."""
+    efforts, _ = _readings(contact, sample)
+    contact.mean_efforts = efforts.copy()
+    contact.leave_s = 0.0
+    _clear(contact)
+
+
+MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
+LAG_S = 0.15  # a healthy drive lags by less than this at full speed
+
+
+def detect_following_error(
+    state: CoreState, settings: CoreSettings, q: FloatArray, dt_s: float
+) -> Reason | None:
+    """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
+
+    ``state.command`` is still that of the last step. A joint's missing travel is its commanded minus its measured one,
+    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed. Without a new joint sample nothing is concluded:
+    stale samples are the safety stage's affair.
+    """
+    state.untold_travel = state.untold_travel + state.command * dt_s
+    if state.last_joints_ns == state.last_followed_ns:
+        return None
+    state.last_followed_ns = state.last_joints_ns
+    last = q if state.last_positions is None else state.last_positions
+    keep = max(0.0, 1.0 - dt_s / MEMORY_S)
+    state.missing_travel = keep * (state.missing_travel + state.untold_travel - (q - last))
+    state.untold_travel[:] = 0.0
+    state.last_positions = q.copy()
+    allowed = LAG_S * settings.limits.velocity_max
+    joint = int((np.abs(state.missing_travel) / allowed).argmax())
+    missing, limit = float(state.missing_travel[joint]), float(allowed[joint])
+    if abs(missing) <= limit:
+        return None
+    name = settings.joint_names[joint]
+    unit = "rad" if settings.joint_kinds[joint] == "revolute" else "m"
+    state.missing_travel[:] = 0.0
+    return Reason(
+        "JOINT_NOT_FOLLOWING", "fault", name, abs(missing), limit, unit,
+        f"joint {name} lacks {missing:+.3f} {unit} of the travel it was sent (up to {limit:.3f} is lag): "
+        "check its encoder, brake and drive; then reset and enable",
+    )  # fmt: skip
+
+
+def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
+    """The arm has met something: it stops with its drives on, as if a person had stopped it."""
+    reason = detect_collision(
+        context.state, context.settings, context.derived.load_limits, context.ingested.joints
+    )
+    if reason is None:
+        return ()
+    return (Finding("stop", reason, reason.hint, f"contact: {reason.hint}"),)
+
+
+def monitor_following(context: StepContext) -> tuple[Finding, ...]:
+    """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
+    state = context.state
+    if not context.settings.watch_following or state.history.count == 0:
+        return ()
+    reason = detect_following_error(state, context.settings, context.q, context.ingested.elapsed_s)
+    if reason is None or state.lifecycle != Lifecycle.ACTIVE:
+        return ()  # an arm that is off may be moved by hand
+    return (Finding("fault", reason, reason.hint, reason.hint),)
+
+
 def _monitor_teaching(context: StepContext) -> Findings:
     """A goal that is being taught, which motion ends."""
     if context.state.teaching is not None:
@@ -112,7 +313,7 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
     if any(state.mobile) and moving_camera.takes(context):
         return
     if state.reanchoring is None and state.watching.verdict.kind in (*MOVED, "cameras_or_arm"):
-        yield from _camera_moved(state.watching.verdict, context, fresh=verdict is not None)
+        yield from camera_moved_findings(state.watching.verdict, context, fresh=verdict is not None)
     if verdict is None or (state.reanchoring is not None and state.reanchoring.phase == "verify"):
         return
     emit_diagnosis(verdict, context)
@@ -124,28 +325,125 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
         context.emit("warning", message=f"marker {subject} is not used any more", name=subject)
 
 
-def _camera_moved(verdict: ModelDiagnosis, context: StepContext, *, fresh: bool) -> Iterator[Finding]:
-    """Look at rest, and find it anew where it has moved; without leave for that the model is suspect, and what relies
-    on it ends.
+AGREE, OF = 2, 3
+"""Rounds of the last ones that must say the same."""
+BACK_ROUNDS = 30
+"""Rounds in which a masked marker must stand where it should, to be used again."""
+LATEST_S = 0.15
+"""By which at most, where nothing but noise is left then."""
+LATEST_MODEL_PX = 0.1
+"""What the model may be off by besides, at the latest."""
+
+
+def finish_round(context: StepContext) -> ModelDiagnosis | None:
+    """Finish a round where one is complete; the new verdict where it has changed."""
+    watching, arrays = context.state.watching, context.arrays
+    if arrays is None or not (watching.due or all(not s.looked for s in watching.sightings)):
+        return None
+    if context.state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+        return None  # joints that a faulty drive tells are no measure of cameras
+    watching.due = False
+    known = []
+    for c, (camera, sighting) in enumerate(zip(context.settings.cameras, watching.sightings, strict=True)):
+        age_s = (context.now_ns - sighting.t_ns) * 1e-9
+        recent = not sighting.looked or age_s * camera.rate_hz <= STALE_PERIODS
+        mobile = context.state.mobile[c]
+        if recent and sighting.t_ns > 0 and not (mobile is not None and mobile.moving):
+            known.append(c)
+        sighting.looked = True
+    if not known:
+        return None
+    watching.rounds += 1
+    watching.last = [*watching.last[1 - OF :], _judged(watching, known, arrays, context.settings)]
+    _unmask_returned(watching, known, context)
+    return _changed(watching)
+
+
+def _judged(
+    watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings
+) -> ModelDiagnosis:
+    """What one round says, of the cameras ``known``."""
+    suspicious = False
+    for c in known:
+        sighting = watching.sightings[c]
+        used = used_rows(watching, sighting)
+        likely = _likely(sighting.innovation, sighting.spread, used, settings)
+        suspicious |= not (likely or _late(sighting, used, settings))
+    if not suspicious:
+        return ModelDiagnosis()
+    return diagnosed(bench_now(watching, known, arrays, settings))
+
+
+def _likely(
+    innovation: FloatArray, spread: FloatArray, used: FloatArray, settings: CoreSettings,
+    model_px: float = MODEL_SIGMA_PX,
+) -> bool:  # fmt: skip
+    """Whether innovations (k, 2) look like noise, all together and each of them."""
+    chi2, _, _, largest = camera_chi2(innovation, spread, used, model_px)
+    return chi2 <= _improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
+
+
+def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
+    """Whether a frame that was taken a little earlier or later than stated explains its innovations.
+
+    Pictures are late where a computer is busy; a camera that was moved shows it at rest, too.
     """
-    state = context.state
-    reason = diagnosis_reason(verdict)
-    assert reason is not None
-    source = MOTION_SOURCES[type(state.source)]
-    if source.measures:  # a calibration, or a check, finds out itself whether it was the arm
-        if fresh and verdict.kind in MOVED:
-            yield Finding("abort", reason, verdict.text)
-        return
-    if verdict.moved_px <= context.settings.tolerance_px or state.readiness == ModelReadiness.SUSPECT:
-        return
-    if context.settings.reanchor:
-        camera_relocalization.begin(verdict, context)
-        return
-    state.readiness = ModelReadiness.SUSPECT
-    hint = f"{verdict.text}; it is not found anew by itself ([servo] reanchor): calibrate"
-    context.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
-    if source.runs_law:
-        yield Finding("abort", reason, hint)
+    moved = sighting.velocity * used[:, None]
+    square = float((moved * moved).sum())
+    if square <= 0.0:
+        return False
+    late_s = float((moved * sighting.innovation).sum()) / square
+    if abs(late_s) > LATEST_S:
+        return False
+    rest = sighting.innovation - late_s * sighting.velocity
+    model_px = MODEL_SIGMA_PX if abs(late_s) <= LATE_S else LATEST_MODEL_PX
+    return _likely(rest, sighting.spread, used, settings, model_px)
+
+
+def _improbable(freedoms: float) -> float:
+    """Chi-square that is exceeded as rarely as five standard deviations (Wilson and Hilferty 1931)."""
+    part = 2.0 / (9.0 * max(freedoms, 1.0))
+    return freedoms * (1.0 - part + 5.0 * math.sqrt(part)) ** 3
+
+
+def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:
+    """What two rounds must agree in."""
+    return (verdict.kind, *verdict.subjects)
+
+
+def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
+    """The verdict that two of the last three rounds agree in, where it is another than before."""
+    keys = [_key(verdict) for verdict in watching.last]
+    for verdict in reversed(watching.last):
+        if keys.count(_key(verdict)) < (OF if verdict.kind == "ok" else AGREE):
+            continue
+        if _key(verdict) == _key(watching.verdict):
+            watching.verdict = verdict
+            return None
+        watching.verdict = verdict
+        return verdict
+    return None
+
+
+def _unmask_returned(watching: ModelMonitor, known: list[int], context: StepContext) -> None:
+    """A masked marker that stands where it should again, to every camera that sees it, is used again."""
+    arrays = context.arrays
+    assert arrays is not None
+    for i in np.flatnonzero(watching.masked > 0.0):
+        seen = [watching.sightings[c] for c in known if watching.sightings[c].seen[i] > 0.0]
+        if not seen:
+            continue
+        only = np.zeros(len(arrays.rows))
+        only[i] = 1.0
+        good = all(
+            camera_chi2(s.innovation, s.spread, only, MODEL_SIGMA_PX)[0] <= _improbable(2.0) for s in seen
+        )
+        watching.back[i] = watching.back[i] + 1 if good else 0
+        if watching.back[i] >= BACK_ROUNDS:
+            watching.masked[i] = 0.0
+            marker = arrays.marker_ids[int(i)]
+            message = f"marker {marker} is where it should be again: it is used again"
+            context.emit("health", message=message, name="ok")
 
 
 def _monitor_model(context: StepContext) -> Iterator[Finding]:

@@ -13,6 +13,13 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 LOST_FRAMES = 3
 """Frames in a row that nothing explains, after which nobody knows where a moving camera is."""
 
+
+STALE_PERIODS = 2.5
+"""Frames that are older than so many periods of their camera are left out of a round."""
+LATE_S = 0.02
+"""By which a busy computer may get a stamp wrong."""
+
+
 VerdictKind = Literal[
     "ok",
     "camera_moved",

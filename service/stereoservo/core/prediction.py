@@ -17,21 +17,20 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 
+from stereoservo.core.model_arrays import ModelArrays, with_unit_height
+from stereoservo.core.monitor_state import CameraMonitor, CameraTiming, ModelMonitor
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import HISTORY, CameraEstimate, JointHistory
-from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import (
     chain_forward,
-    distort_expected,
+    distort_pixel,
+    distortion_jacobian,
     image_jacobian,
-    invert4,
-    multiply4_into,
     project_points,
     transform_points,
     triangulate,
-    undistort_sights,
+    undistort_pixel,
 )
-from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
@@ -46,107 +45,6 @@ UNKNOWN_NS = 100_000_000
 SUSPECT_FRAMES = 8  # refused ones in a row, of one camera
 TRUSTED_FRAMES = 30  # agreeing ones in a row, of every camera
 AGREEING_PX = 1.5
-
-
-@dataclass(frozen=True)
-class ModelArrays:
-    """A model as the kernels take it, in the order of the core's cameras and the model's markers."""
-
-    generators: FloatArray
-    kinds: np.ndarray[tuple[int], np.dtype[np.uint8]]
-    zero: FloatArray
-    tip_first: bool
-    matrices: FloatArray
-    lenses: FloatArray
-    marker_points: FloatArray
-    plane_at_infinity: FloatArray
-    camera_centres: FloatArray
-    metric_basis: FloatArray | None
-    """Six twists (6, 4, 4) that span all displacements, where the model is metric."""
-    marker_ids: tuple[int, ...]
-    index: dict[int, int]
-    scene_ids: tuple[int, ...]
-    scene_points: FloatArray
-    scene_pixels: FloatArray
-    """Static points in the images (c, s, 2): they never move there."""
-    rows: dict[int, int]
-    """Rows of `FrameSights`: the markers, then the static points."""
-
-
-def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
-    """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
-    if model.joint_names != settings.joint_names:
-        raise ValueError(
-            f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
-        )
-    if model.joint_kinds != settings.joint_kinds:
-        raise ValueError(f"model has joint kinds {model.joint_kinds}; the cell has {settings.joint_kinds}")
-    if any(camera.mount != model.mount for camera in settings.cameras):
-        mounts = ", ".join(f"{camera.name} {camera.mount}" for camera in settings.cameras)
-        raise ValueError(
-            f"model was learnt with cameras mounted {model.mount}; the cell's are {mounts}: calibrate again, or "
-            "correct camera.mount in the cell file"
-        )
-    by_name = {camera.name: camera for camera in model.cameras}
-    for camera in settings.cameras:
-        known = by_name.get(camera.name)
-        if known is None:
-            raise ValueError(f"model knows cameras {', '.join(by_name)}; the cell also has {camera.name!r}")
-        if (known.width, known.height) != (camera.width, camera.height):
-            raise ValueError(
-                f"model was made with {known.width}x{known.height} images of camera {camera.name!r}; "
-                f"it now delivers {camera.width}x{camera.height}"
-            )
-    matrices = np.ascontiguousarray(
-        [by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64
-    )
-    centres = np.array([camera_centre(P) for P in matrices])
-    scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
-    scene_pixels, _ = project_points(matrices, scene)
-    return ModelArrays(
-        generators=np.ascontiguousarray(model.generators, dtype=np.float64),
-        kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
-        zero=np.ascontiguousarray(model.zero, dtype=np.float64),
-        tip_first=model.tip_first,
-        matrices=matrices,
-        lenses=np.array([by_name[camera.name].lens for camera in settings.cameras], dtype=np.float64),
-        marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),
-        plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
-        camera_centres=with_unit_height(centres, model.plane_at_infinity),
-        metric_basis=_metric_basis(model),
-        marker_ids=model.marker_ids,
-        index={marker: i for i, marker in enumerate(model.marker_ids)},
-        scene_ids=model.scene_ids,
-        scene_points=scene,
-        scene_pixels=scene_pixels,
-        rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
-    )
-
-
-def _metric_basis(model: CellModel) -> FloatArray | None:
-    """Translations along, and rotations about, three axes through the markers' middle, in the projective frame."""
-    H = model.projective_to_euclidean
-    if H is None:
-        return None
-    inverse = invert4(np.ascontiguousarray(H, dtype=np.float64))
-    euclidean = transform_points(np.ascontiguousarray(H), np.ascontiguousarray(model.marker_points))
-    middle = (euclidean[:, :3] / euclidean[:, 3:]).sum(axis=0) / float(len(euclidean))
-    size = float(np.sqrt(((euclidean[:, :3] / euclidean[:, 3:] - middle) ** 2).sum(axis=-1).max()))
-    basis = np.zeros((6, 4, 4))
-    for k in range(3):
-        basis[k, k, 3] = size
-        i, j = (k + 1) % 3, (k + 2) % 3
-        basis[3 + k, j, i], basis[3 + k, i, j] = 1.0, -1.0
-        basis[3 + k, j, 3], basis[3 + k, i, 3] = -middle[i], middle[j]
-    for k in range(6):  # H⁻¹ T̂ H, by explicit loops
-        basis[k] = _product(inverse, _product(basis[k], H))
-    return basis
-
-
-def _product(A: FloatArray, B: FloatArray) -> FloatArray:
-    product = np.empty((4, 4))
-    multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
-    return product
 
 
 @dataclass(frozen=True)
@@ -308,6 +206,95 @@ def frame_sights(
     return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity)
 
 
+def fold_residuals(watching: ModelMonitor, camera: int, sights: FrameResiduals, q: FloatArray) -> None:
+    """A new frame of one camera, with the arm at ``q`` (n,) then."""
+    sighting = watching.sightings[camera]
+    watching.due = watching.due or not sighting.looked
+    sighting.innovation = sights.innovation
+    sighting.spread = sights.spread
+    sighting.seen = sights.seen.astype(np.float64)
+    sighting.velocity = sights.velocity
+    sighting.q = q
+    sighting.t_ns = sights.t_shutter_ns
+    sighting.fresh, sighting.looked = True, False
+    used = used_rows(watching, sighting)
+    chi2, squares, worst, _ = camera_chi2(sighting.innovation, sighting.spread, used, MODEL_SIGMA_PX)
+    count = float(used.sum())
+    sighting.chi2 = chi2 / max(2.0 * count, 1.0)
+    sighting.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
+    sighting.worst = int(worst)
+    sighting.worst_px = 0.0 if worst < 0 else float(np.sqrt((sighting.innovation[worst] ** 2).sum()))
+    rows = used > 0.0
+    fold_timing(
+        sighting.timing,
+        sighting.innovation[rows],
+        sights.velocity[rows],
+        sights.noise[rows],
+        sights.t_shutter_ns,
+    )
+
+
+def used_rows(watching: ModelMonitor, sighting: CameraMonitor) -> FloatArray:
+    """(k,) 1 for what is seen and has not slipped."""
+    used = sighting.seen.copy()
+    used[: len(watching.masked)] *= 1.0 - watching.masked
+    return used
+
+
+FORGETTING_S = 30.0
+"""Time constant, in seconds of seen motion, with which old frames are forgotten."""
+MOVING_PX_S = 20.0
+"""Mean pixel speed below which a frame says nothing of time."""
+MODEL_PX = 0.3
+"""What the model may be off by, beside the noise [px]."""
+
+
+def fold_timing(
+    timing: CameraTiming, innovations: FloatArray, velocities: FloatArray, variances: FloatArray, t_ns: int
+) -> None:
+    """Take in a frame: ``innovations`` [px] and ``velocities`` [px/s] (k, 2), ``variances`` (k,) [px²] a coordinate.
+
+    The markers of a frame share what the model is off by: they count as one sight, not as k.
+    """
+    k = variances.shape[0]
+    speed = product = square = 0.0
+    for i in range(k):
+        vu, vv = float(velocities[i, 0]), float(velocities[i, 1])
+        speed += math.sqrt(vu * vu + vv * vv)
+        weight = 1.0 / (float(variances[i]) + MODEL_PX * MODEL_PX)
+        product += weight * (vu * float(innovations[i, 0]) + vv * float(innovations[i, 1]))
+        square += weight * (vu * vu + vv * vv)
+    if k == 0 or speed < MOVING_PX_S * k:
+        return
+    elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns else 0.0
+    keep = math.exp(-elapsed_s / FORGETTING_S)
+    timing.product = keep * timing.product + product / k
+    timing.square = keep * timing.square + square / k
+    timing.seen_ns = t_ns
+
+
+@kernel
+def camera_chi2(
+    innovation: FloatArray, spread: FloatArray, used: FloatArray, model_px: float
+) -> tuple[float, float, int, float]:
+    """Chi-square of a frame's innovations (k, 2) where ``used`` (k,) > 0, sum of their squares [px²], the row of the
+    largest squared distance (-1: none) and this distance.
+    """
+    total, squares, largest = 0.0, 0.0, 0.0
+    worst = -1
+    for i in range(used.size):
+        if not used[i] > 0.0:
+            continue
+        x, y = innovation[i, 0], innovation[i, 1]
+        m = model_px * model_px
+        d2 = distance2(x, y, spread[i, 0, 0] + m, spread[i, 0, 1], spread[i, 1, 1] + m)
+        total += d2
+        squares += x * x + y * y
+        if worst < 0 or d2 > largest:
+            worst, largest = i, d2
+    return total, squares, worst, largest
+
+
 def accept_sights(
     estimate: CameraEstimate, sights: FrameResiduals, used: BoolArray, settings: CoreSettings
 ) -> None:
@@ -379,12 +366,6 @@ def points_now(
         found, ok = triangulate(arrays.matrices, pixels, weights, 3)
         points = np.where(ok[:, None], with_unit_height(found, arrays.plane_at_infinity), points)
     return points
-
-
-def with_unit_height(points: FloatArray, plane_at_infinity: FloatArray) -> FloatArray:
-    """Points (m, 4) scaled to a∞ᵀM = 1, so that differences and middles mean something (errata, orbital height)."""
-    height = (points * plane_at_infinity).sum(axis=-1)
-    return points / np.where(height == 0.0, 1.0, height)[:, None]
 
 
 def priors(
@@ -529,3 +510,51 @@ def fold_in(
         squares += innovation[i, 0] * innovation[i, 0] + innovation[i, 1] * innovation[i, 1]
         accepted += 1
     return accepted, refused, squares
+
+
+@kernel
+def _propagate(a: float, b: float, d: float, C: FloatArray, out: FloatArray) -> None:
+    """``out = J C Jᵀ`` for the symmetric ``J = (a b; b d)`` and (2, 2) ``C``."""
+    uu, uv = a * C[0, 0] + b * C[1, 0], a * C[0, 1] + b * C[1, 1]
+    vu, vv = b * C[0, 0] + d * C[1, 0], b * C[0, 1] + d * C[1, 1]
+    out[0, 0], out[0, 1] = uu * a + uv * b, uu * b + uv * d
+    out[1, 0], out[1, 1] = vu * a + vv * b, vu * b + vv * d
+
+
+@kernel
+def undistort_sights(
+    lens: FloatArray, pixels: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Ideal pixels (k, 2) with covariances (k, 2, 2) [px²] of raw ones, and which (k,) the lens can have made."""
+    n = pixels.shape[0]
+    ideal = np.empty((n, 2))
+    spread = np.empty((n, 2, 2))
+    seen = np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        u, v = undistort_pixel(lens, pixels[i, 0], pixels[i, 1])
+        ideal[i, 0], ideal[i, 1] = u, v
+        a, b, d = distortion_jacobian(lens, u, v)
+        determinant = a * d - b * b
+        seen[i] = math.isfinite(u) and math.isfinite(v) and determinant > 0.0
+        _propagate(d / determinant, -b / determinant, a / determinant, covariances[i], spread[i])
+    return ideal, spread, seen
+
+
+@kernel
+def distort_expected(
+    lens: FloatArray, pixels: FloatArray, velocities: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Raw pixels (k, 2), velocities (k, 2), covariances (k, 2, 2) of ideal ones, and which (k,) lie within the fold."""
+    n = pixels.shape[0]
+    raw = np.empty((n, 2))
+    speed = np.empty((n, 2))
+    spread = np.empty((n, 2, 2))
+    seen = np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        raw[i, 0], raw[i, 1] = distort_pixel(lens, pixels[i, 0], pixels[i, 1])
+        a, b, d = distortion_jacobian(lens, pixels[i, 0], pixels[i, 1])
+        speed[i, 0] = a * velocities[i, 0] + b * velocities[i, 1]
+        speed[i, 1] = b * velocities[i, 0] + d * velocities[i, 1]
+        _propagate(a, b, d, covariances[i], spread[i])
+        seen[i] = math.isfinite(raw[i, 0]) and math.isfinite(raw[i, 1])
+    return raw, speed, spread, seen

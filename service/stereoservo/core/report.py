@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import Event, Status, StepOutputs
+from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
 from stereoservo.core.limit import SafetyResult
+from stereoservo.core.monitor_state import CameraTiming, ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
-from stereoservo.core.monitors.model import diagnosis_reason, health_status, shown_diagnosis
+from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import priors
+from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import Contact, CoreState
 from stereoservo.messages.reasons import Level, Reason
-from stereoservo.messages.status import Lifecycle, ModelReadiness
+from stereoservo.messages.status import CameraHealth, Health, Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Prior
 
@@ -83,9 +87,10 @@ def _reasons(context: StepContext, motion: SourceOutput, limited: SafetyResult) 
     if any(state.mobile):
         found.extend(moving_camera.reasons(state, context.settings))
     if state.reanchoring is None:
-        diagnosed = diagnosis_reason(shown_diagnosis(state))
-        if diagnosed is not None:
-            found.append(diagnosed)
+        diagnosis = shown_diagnosis(state)
+        reason = None if diagnosis.kind == "ok" else diagnosis_reason(diagnosis)
+        if reason is not None:
+            found.append(reason)
     explain = MOTION_SOURCES[type(state.source)].progress_reasons
     if explain is not None and not context.paused:
         found.extend(explain(state.source, context, tuple(found)))
@@ -143,3 +148,69 @@ def _level(reasons: tuple[Reason, ...]) -> str:
     """The worst level of the reasons; information is none."""
     worst = max([LEVELS.index(reason.level) for reason in reasons], default=0)
     return "ok" if worst == 0 else LEVELS[worst]
+
+
+def shown_diagnosis(state: CoreState) -> ModelDiagnosis:
+    """The verdict as it is shown: a marker that is left out remains one that has slipped."""
+    verdict, masked = state.watching.verdict, masked_ids(state)
+    if verdict.kind != "ok" or not masked:
+        return verdict
+    listed = tuple(str(marker) for marker in masked)
+    text = f"marker {', '.join(listed)} has slipped and is not used; fix it where it was, or calibrate"
+    return ModelDiagnosis("marker_slipped", listed, text=text)
+
+
+def health_status(state: CoreState, settings: CoreSettings, reanchoring: str) -> Health:
+    """What the status says of the model's health."""
+    if state.model is None or state.readiness == ModelReadiness.NONE:
+        return Health()
+    watching, verdict = state.watching, shown_diagnosis(state)
+    ids = (*state.model.marker_ids, *state.model.scene_ids)
+    return Health(
+        verdict=verdict.kind,
+        subjects=verdict.subjects,
+        size=verdict.size,
+        deviation=verdict.deviation,
+        unit=verdict.unit,
+        text=verdict.text,
+        cameras={
+            camera.name: CameraHealth(
+                sighting.chi2,
+                sighting.rms_px,
+                ids[sighting.worst] if sighting.worst >= 0 else -1,
+                sighting.worst_px,
+                "" if moves is None else moves.place,
+                advice(sighting.timing),
+            )
+            for camera, sighting, moves in zip(
+                settings.cameras, watching.sightings, state.mobile, strict=True
+            )
+        },
+        masked=masked_ids(state),
+        reanchoring=reanchoring,
+    )
+
+
+KNOWN_S = 0.002
+"""Standard deviation at which the offset is told."""
+WRONG_S = 0.004
+"""Offset that is worth a word: at 100 px/s it moves a marker by 0.4 px."""
+
+
+def offset_s(timing: CameraTiming) -> tuple[float, float]:
+    """How much later than stated the shutter opens [s], and its standard deviation; (0, inf) before any motion."""
+    if timing.square <= 0.0:
+        return 0.0, math.inf
+    return timing.product / timing.square, 1.0 / math.sqrt(timing.square)
+
+
+def advice(timing: CameraTiming) -> str:
+    """What is to be said of it to people; empty where the stamps are right, or nothing is known yet."""
+    late, deviation = offset_s(timing)
+    if deviation > KNOWN_S or abs(late) < max(WRONG_S, 4.0 * deviation):
+        return ""
+    way = "less" if late > 0 else "more"
+    return (
+        f"its shutter opens {1e3 * abs(late):.1f} ms {'later' if late > 0 else 'earlier'} than stated "
+        f"(± {1e3 * deviation:.1f}): {1e3 * abs(late):.0f} ms {way} latency_s would be right"
+    )

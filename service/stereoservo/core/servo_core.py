@@ -31,9 +31,9 @@ from stereoservo.core.ingest import (
     nominal_period_ns,
 )
 from stereoservo.core.limit import limit, safety_limits
+from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitor import monitor
 from stereoservo.core.move import move
-from stereoservo.core.prediction import model_arrays
 from stereoservo.core.report import report
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, initial_state

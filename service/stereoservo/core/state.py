@@ -24,8 +24,8 @@ from stereoservo.messages.goals import Goal, Request
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
-from stereoservo.planning.planner import Planning
 
 STATE_VERSION = 7
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz

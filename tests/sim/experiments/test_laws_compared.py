@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from stereoservo.core.prediction import with_unit_height
+from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
 from stereoservo_sim.experiments.laws import goal_sketches

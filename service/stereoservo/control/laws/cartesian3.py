@@ -1,6 +1,6 @@
 """Cartesian control in three components (thesis 8.42): translation, hinge, and turn of the face in its plane.
 
-The centre goes on a straight line while the face is turned about it. Here is what `cartesian2` shares, which makes hinge
+The centre goes on a straight line while the face is turned about it. `cartesian2` shares what is here; it makes hinge
 and turn one rotation (8.55). A component that would turn the face out of a camera's view waits for the other
 (`control.face_visibility`); a velocity that is held for a while makes exactly the motion that was meant
 (`control.step_correction`).

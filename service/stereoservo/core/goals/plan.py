@@ -14,7 +14,8 @@ from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.target_checks import BodyState, in_view
-from stereoservo.core.prediction import ModelArrays, chain_at
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at
 from stereoservo.core.sources.law import centre_of, composition_of
 from stereoservo.core.state import PlanJob, Purpose, ServoGoal
 from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points
@@ -22,13 +23,9 @@ from stereoservo.messages import goals
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.planning.path_search import MISSING_FREEDOMS, plan_on
 from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanRequest
-from stereoservo.planning.planner import (
-    MISSING_FREEDOMS,
-    PlanRequestError,
-    plan_on,
-    start_planning,
-)
+from stereoservo.planning.planner import PlanRequestError, start_planning
 
 SLICE = 8
 """Samples of the arm's way that a step works on."""

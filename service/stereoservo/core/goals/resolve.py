@@ -30,7 +30,7 @@ from stereoservo.core.goals.target_checks import (
     mirrored,
     turned_to,
 )
-from stereoservo.core.prediction import ModelArrays, with_unit_height
+from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.kinematics.kernels import (
     exp_twist,

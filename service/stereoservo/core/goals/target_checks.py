@@ -9,7 +9,7 @@ import numpy as np
 
 from stereoservo.control.faces import Faces, sights_along
 from stereoservo.core.context import RefusalError
-from stereoservo.core.prediction import ModelArrays
+from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import distort_pixel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray

@@ -15,12 +15,12 @@ from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.cycle import ModelUpdate, Sample
 from stereoservo.core.goals.execute import drop_lookahead_plan, end_followers, end_source
 from stereoservo.core.goals.servo_goal import place_now
+from stereoservo.core.model_arrays import ModelArrays, model_arrays
 from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
-from stereoservo.core.monitors.fault_isolation import LEAST_PX, doubt, named
+from stereoservo.core.monitors.fault_isolation import LEAST_PX, bench_now, doubt, named
 from stereoservo.core.monitors.goal_reprojection import carry_goal, carry_run
-from stereoservo.core.monitors.model import bench_now
 from stereoservo.core.move import goal_of
-from stereoservo.core.prediction import ModelArrays, joints_at, model_arrays
+from stereoservo.core.prediction import joints_at
 from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
 from stereoservo.core.state import CoreState, LawRun, PoseMeasurement
 from stereoservo.messages.goals import Goal, ReanchorRefused

@@ -10,10 +10,13 @@ import math
 from functools import lru_cache
 from typing import Literal
 
+import numpy as np
+
 from stereoservo.calibration.change.change_detection import ChangeDiagnosis, IsolatedChange, diagnose
 from stereoservo.calibration.change.hypothesis_test import Thresholds, alarm_thresholds
-from stereoservo.core.monitor_state import ModelDiagnosis, VerdictKind
-from stereoservo.core.prediction import ModelArrays, chain_at
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitor_state import ModelDiagnosis, ModelMonitor, VerdictKind
+from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, used_rows
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
 from stereoservo.numerics.arrays import FloatArray
@@ -242,3 +245,16 @@ def _joint_deviation(bench: Bench, joint: int) -> float:
     weights = bench.weights[:, : len(bench.points)]
     information = float((weights[..., None] ** 2 * jacobian[..., joint] ** 2).sum())
     return 1.0 / math.sqrt(information) if information > 0.0 else 0.0
+
+
+def bench_now(watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
+    """The newest frames of the cameras ``known``."""
+    weights = np.zeros((len(known), len(arrays.rows)))
+    innovation = np.zeros((len(known), len(arrays.rows), 2))
+    for row, c in enumerate(known):
+        sighting = watching.sightings[c]
+        variance = 0.5 * (sighting.spread[:, 0, 0] + sighting.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
+        weights[row] = used_rows(watching, sighting) / np.sqrt(variance)
+        innovation[row] = sighting.innovation
+    newest = max(known, key=lambda c: watching.sightings[c].t_ns)
+    return Bench(arrays, settings, known, watching.sightings[newest].q, innovation, weights)

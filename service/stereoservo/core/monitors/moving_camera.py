@@ -16,7 +16,8 @@ import numpy as np
 
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
 from stereoservo.core.context import Emit, RefusalError, StepContext
-from stereoservo.core.monitor_state import MOVED, MobileCamera, ModelDiagnosis, standing_camera
+from stereoservo.core.model_arrays import ModelArrays, with_unit_height
+from stereoservo.core.monitor_state import MOVED, STALE_PERIODS, MobileCamera, ModelDiagnosis, standing_camera
 from stereoservo.core.monitors.camera_relocalization import AT_REST, begin, carry_all, unknown_cameras
 from stereoservo.core.monitors.fault_isolation import (
     FEWEST_ON_ARM,
@@ -25,7 +26,6 @@ from stereoservo.core.monitors.fault_isolation import (
     named,
     thresholds_of,
 )
-from stereoservo.core.monitors.model import STALE_PERIODS
 from stereoservo.core.monitors.moving_camera_fit import (
     FEWEST,
     FREEDOMS,
@@ -41,13 +41,11 @@ from stereoservo.core.move import goal_of
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
     FrameResiduals,
-    ModelArrays,
     Prediction,
     chain_at,
     gate_threshold,
     pixels_now,
     predict,
-    with_unit_height,
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CameraEstimate, CoreState, Holding, camera_estimate

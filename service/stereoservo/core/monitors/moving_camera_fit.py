@@ -10,7 +10,7 @@ import numpy as np
 
 from stereoservo.calibration.change.change_detection_kernel import ROUNDS, fit_displacement
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
-from stereoservo.core.monitors.model import LATE_S
+from stereoservo.core.monitor_state import LATE_S
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import Sample
-from stereoservo.core.monitors.joints import learnt_loads
+from stereoservo.core.monitors.collision import learnt_loads
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.joint_move import ARRIVED
 from stereoservo.core.sources.measure_at_pose import (

@@ -31,7 +31,8 @@ from stereoservo.core.goals.resolve import (
 )
 from stereoservo.core.goals.servo_goal import no_plan, run_fields, used_cameras
 from stereoservo.core.goals.target_checks import BodyState
-from stereoservo.core.prediction import ModelArrays, points_now, with_unit_height
+from stereoservo.core.model_arrays import ModelArrays, with_unit_height
+from stereoservo.core.prediction import points_now
 from stereoservo.core.sources.law import composition_of, options, run_ended
 from stereoservo.core.state import IncidenceGoal
 from stereoservo.geometry.homogeneous import GeometryError

@@ -6,7 +6,8 @@ import numpy as np
 
 from stereoservo.core.context import RefusalError, SourceOutput, StepContext
 from stereoservo.core.goals.resolve import joint_index
-from stereoservo.core.prediction import ModelArrays, chain_at
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at
 from stereoservo.core.settings import CoreSettings, LimitSettings
 from stereoservo.core.state import JointMove
 from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points

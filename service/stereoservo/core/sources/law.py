@@ -14,7 +14,8 @@ from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.target_checks import MIN_MARKERS
-from stereoservo.core.prediction import ModelArrays, chain_at, points_now
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at, points_now
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
 from stereoservo.kinematics.composition import Composition

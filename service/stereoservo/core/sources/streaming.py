@@ -28,7 +28,7 @@ from stereoservo.core.goals.resolve import (
     refined_pose,
 )
 from stereoservo.core.goals.target_checks import MIN_MARKERS, BodyState, in_view
-from stereoservo.core.prediction import ModelArrays
+from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.state import ServoGoal, Stream
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.goals import FeatureTarget, PointTarget, UpdateGoal

@@ -18,7 +18,8 @@ import msgspec
 import numpy as np
 
 from stereoservo.core.cycle import Event, ModelUpdate, StepInputs
-from stereoservo.core.prediction import model_arrays, predict
+from stereoservo.core.model_arrays import model_arrays
+from stereoservo.core.prediction import predict
 from stereoservo.daemon.lockstep import LockstepCell
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.model import CellModel

@@ -10,7 +10,7 @@ import numpy as np
 from stereoservo.control.incidence import SecondTask, image_task, incidence_step, incidence_task
 from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.prediction import with_unit_height
+from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.core.sources.streaming import FEED_FORWARD_DAMPING
 from stereoservo.geometry.alignment import AlignmentFrame, align
 from stereoservo.kinematics.composition import displace

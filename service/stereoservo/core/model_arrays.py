@@ -1,0 +1,120 @@
+"""A model as the kernels of a step take it, in the order of the cell's cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.core.settings import CoreSettings
+from stereoservo.geometry.cameras import camera_centre
+from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
+from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class ModelArrays:
+    """A model as the kernels take it, in the order of the core's cameras and the model's markers."""
+
+    generators: FloatArray
+    kinds: np.ndarray[tuple[int], np.dtype[np.uint8]]
+    zero: FloatArray
+    tip_first: bool
+    matrices: FloatArray
+    lenses: FloatArray
+    marker_points: FloatArray
+    plane_at_infinity: FloatArray
+    camera_centres: FloatArray
+    metric_basis: FloatArray | None
+    """Six twists (6, 4, 4) that span all displacements, where the model is metric."""
+    marker_ids: tuple[int, ...]
+    index: dict[int, int]
+    scene_ids: tuple[int, ...]
+    scene_points: FloatArray
+    scene_pixels: FloatArray
+    """Static points in the images (c, s, 2): they never move there."""
+    rows: dict[int, int]
+    """Rows of `FrameSights`: the markers, then the static points."""
+
+
+def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
+    """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
+    if model.joint_names != settings.joint_names:
+        raise ValueError(
+            f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
+        )
+    if model.joint_kinds != settings.joint_kinds:
+        raise ValueError(f"model has joint kinds {model.joint_kinds}; the cell has {settings.joint_kinds}")
+    if any(camera.mount != model.mount for camera in settings.cameras):
+        mounts = ", ".join(f"{camera.name} {camera.mount}" for camera in settings.cameras)
+        raise ValueError(
+            f"model was learnt with cameras mounted {model.mount}; the cell's are {mounts}: calibrate again, or "
+            "correct camera.mount in the cell file"
+        )
+    by_name = {camera.name: camera for camera in model.cameras}
+    for camera in settings.cameras:
+        known = by_name.get(camera.name)
+        if known is None:
+            raise ValueError(f"model knows cameras {', '.join(by_name)}; the cell also has {camera.name!r}")
+        if (known.width, known.height) != (camera.width, camera.height):
+            raise ValueError(
+                f"model was made with {known.width}x{known.height} images of camera {camera.name!r}; "
+                f"it now delivers {camera.width}x{camera.height}"
+            )
+    matrices = np.ascontiguousarray(
+        [by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64
+    )
+    centres = np.array([camera_centre(P) for P in matrices])
+    scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
+    scene_pixels, _ = project_points(matrices, scene)
+    return ModelArrays(
+        generators=np.ascontiguousarray(model.generators, dtype=np.float64),
+        kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
+        zero=np.ascontiguousarray(model.zero, dtype=np.float64),
+        tip_first=model.tip_first,
+        matrices=matrices,
+        lenses=np.array([by_name[camera.name].lens for camera in settings.cameras], dtype=np.float64),
+        marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),
+        plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
+        camera_centres=with_unit_height(centres, model.plane_at_infinity),
+        metric_basis=_metric_basis(model),
+        marker_ids=model.marker_ids,
+        index={marker: i for i, marker in enumerate(model.marker_ids)},
+        scene_ids=model.scene_ids,
+        scene_points=scene,
+        scene_pixels=scene_pixels,
+        rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
+    )
+
+
+def _metric_basis(model: CellModel) -> FloatArray | None:
+    """Translations along, and rotations about, three axes through the markers' middle, in the projective frame."""
+    H = model.projective_to_euclidean
+    if H is None:
+        return None
+    inverse = invert4(np.ascontiguousarray(H, dtype=np.float64))
+    euclidean = transform_points(np.ascontiguousarray(H), np.ascontiguousarray(model.marker_points))
+    middle = (euclidean[:, :3] / euclidean[:, 3:]).sum(axis=0) / float(len(euclidean))
+    size = float(np.sqrt(((euclidean[:, :3] / euclidean[:, 3:] - middle) ** 2).sum(axis=-1).max()))
+    basis = np.zeros((6, 4, 4))
+    for k in range(3):
+        basis[k, k, 3] = size
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[3 + k, j, i], basis[3 + k, i, j] = 1.0, -1.0
+        basis[3 + k, j, 3], basis[3 + k, i, 3] = -middle[i], middle[j]
+    for k in range(6):  # H⁻¹ T̂ H, by explicit loops
+        basis[k] = _product(inverse, _product(basis[k], H))
+    return basis
+
+
+def _product(A: FloatArray, B: FloatArray) -> FloatArray:
+    product = np.empty((4, 4))
+    multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
+    return product
+
+
+def with_unit_height(points: FloatArray, plane_at_infinity: FloatArray) -> FloatArray:
+    """Points (m, 4) scaled to a∞ᵀM = 1, so that differences and middles mean something (errata, orbital height)."""
+    height = (points * plane_at_infinity).sum(axis=-1)
+    return points / np.where(height == 0.0, 1.0, height)[:, None]

@@ -1,0 +1,104 @@
+"""What follows from a diagnosis of the images: its event and reason, a marker left out, cameras relocalized."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from stereoservo.core.context import Finding, StepContext
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitor_state import (
+    MOVED,
+    ModelDiagnosis,
+    nothing_sighted,
+)
+from stereoservo.core.monitors import camera_relocalization
+from stereoservo.core.monitors.fault_isolation import LEAST_PX
+from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import CoreState
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import ModelReadiness
+
+FEWEST_LEFT = 4
+"""Markers of a camera that must remain where others are masked."""
+
+
+def start_model_monitor(
+    state: CoreState, arrays: ModelArrays, settings: CoreSettings, masked: tuple[int, ...] = ()
+) -> None:
+    """Watch over a new model. ``masked``: ids of markers that stay unused."""
+    m = len(arrays.marker_ids)
+    watching = nothing_sighted(len(settings.cameras), len(arrays.rows), len(settings.joint_names), m)
+    for marker in masked:
+        if marker in arrays.index:
+            watching.masked[arrays.index[marker]] = 1.0
+    state.watching = watching
+
+
+def emit_diagnosis(verdict: ModelDiagnosis, context: StepContext) -> None:
+    """Say a new verdict in an event."""
+    message = verdict.text or "the images agree with the model again"
+    reason = diagnosis_reason(verdict)
+    context.emit(
+        "health", message=message, name=verdict.kind, reasons=() if reason is None else (reason,),
+        cameras=verdict.subjects if verdict.kind in MOVED else (),
+    )  # fmt: skip
+
+
+def diagnosis_reason(verdict: ModelDiagnosis) -> Reason | None:
+    """A verdict as a reason; None where all is well."""
+    subject, value = ", ".join(verdict.subjects), verdict.size
+    if verdict.kind in MOVED:
+        return Reason("CAMERA_MOVED", "hold", subject, verdict.moved_px, None, "px", verdict.text)
+    if verdict.kind == "cameras_or_arm":
+        return Reason("CAMERAS_OR_ARM", "hold", subject, verdict.moved_px, LEAST_PX, "px", verdict.text)
+    if verdict.kind == "marker_slipped":
+        return Reason("MARKER_SLIPPED", "info", subject, verdict.moved_px, None, "px", verdict.text)
+    if verdict.kind == "joint_zero":
+        return Reason(
+            "JOINT_ZERO_DRIFTED", "info", subject, value, verdict.deviation, verdict.unit, verdict.text
+        )
+    if verdict.kind == "unclear":
+        return Reason("IMAGES_UNEXPLAINED", "info", subject, verdict.moved_px, None, "px", verdict.text)
+    return None
+
+
+def mask_marker(verdict: ModelDiagnosis, context: StepContext) -> bool:
+    """Use a slipped marker no more, where every camera has enough others; whether it is so."""
+    state, arrays = context.state, context.arrays
+    assert arrays is not None
+    slipped = [arrays.index[int(marker)] for marker in verdict.subjects if int(marker) in arrays.index]
+    masked = state.watching.masked.copy()
+    masked[slipped] = 1.0
+    seen = [s.seen[: masked.size] for s in state.watching.sightings if bool((s.seen > 0.0).any())]
+    if not slipped or min((float((s * (1.0 - masked)).sum()) for s in seen), default=0.0) < FEWEST_LEFT:
+        return False
+    state.watching.masked = masked
+    state.watching.back[slipped] = 0
+    for estimate in state.cameras:
+        estimate.seen_ns[slipped] = 0
+    return True
+
+
+def camera_moved_findings(verdict: ModelDiagnosis, context: StepContext, *, fresh: bool) -> Iterator[Finding]:
+    """The findings where a camera has moved: relocalization begins at rest; where it is not allowed, the model is
+    suspect and the goals that rely on it end.
+    """
+    state = context.state
+    reason = diagnosis_reason(verdict)
+    assert reason is not None
+    source = MOTION_SOURCES[type(state.source)]
+    if source.measures:  # a calibration, or a check, finds out itself whether it was the arm
+        if fresh and verdict.kind in MOVED:
+            yield Finding("abort", reason, verdict.text)
+        return
+    if verdict.moved_px <= context.settings.tolerance_px or state.readiness == ModelReadiness.SUSPECT:
+        return
+    if context.settings.reanchor:
+        camera_relocalization.begin(verdict, context)
+        return
+    state.readiness = ModelReadiness.SUSPECT
+    hint = f"{verdict.text}; it is not found anew by itself ([servo] reanchor): calibrate"
+    context.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
+    if source.runs_law:
+        yield Finding("abort", reason, hint)
