@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.planning.detours import CANDIDATES, turnings
 from stereoservo.planning.motion_frame import turn
+from stereoservo.planning.path_search import CANDIDATES, turnings
 from stereoservo.planning.planner import plan
 
 

@@ -1,4 +1,8 @@
-"""Search for a feasible path: a state machine whose stages can stop after any sample.
+"""Search for a feasible path among alternatives: a state machine whose stages can stop after any sample.
+
+The alternatives, cheapest first: other profiles, senses and kinds of turning, bent centre lines. A bend takes the
+centre aside by ``4σ(1 − σ) b``, ``b`` a displacement (a point of the plane at infinity): away from the cameras or
+towards them, to the right or left and down or up in the images.
 
 ``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: the arm along it. Where the arm
 cannot follow the path that was asked for, ``UNCONSTRAINED_IK`` follows it once more without limits, which gives the
@@ -10,25 +14,25 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from stereoservo.kinematics.composition import Composition
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.planning.constraint_margins import (
-    JOINT_LIMIT,
-    KEEP_OUT,
-    KINDS,
-    NOT_REACHABLE,
-    Constraints,
-    check_joints,
-    empty_table,
-    moved,
-)
-from stereoservo.planning.detours import CANDIDATES, Candidate, name_of, other_profile, path_of
-from stereoservo.planning.motion_frame import conjugated, turn_between
-from stereoservo.planning.path import LINEAR, pose_on_path
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.motion_frame import (
+    EXPONENTIAL,
+    FIRST,
+    LAST,
+    LINEAR,
+    NUMBERS,
+    conjugate_all,
+    pose_on_path,
+    turn,
+    turn_between,
+)  # fmt: skip
 from stereoservo.planning.path_ik import (
     SEEDS,
     Arm,
@@ -40,10 +44,20 @@ from stereoservo.planning.path_ik import (
     pixel_distance,
     seed_joints,
 )
-from stereoservo.planning.plan import ClosestApproach, Plan, PlanRequest
+from stereoservo.planning.plan import ClosestApproach, Plan, PlanRequest, Profile
 from stereoservo.planning.primitives import HINGE, PLANAR, RIGID_FREEDOMS, TRANSLATION
 from stereoservo.planning.time_scaling import sample_times
-from stereoservo.planning.visibility_constraints import writable_copy
+from stereoservo.planning.visibility_constraints import (
+    JOINT_LIMIT,
+    KEEP_OUT,
+    KINDS,
+    NOT_REACHABLE,
+    Constraints,
+    check_joints,
+    empty_table,
+    moved,
+    writable_copy,
+)
 
 SAMPLES = 65
 """Of a path: half a turn in steps of three degrees."""
@@ -64,6 +78,51 @@ GOAL_BEYOND = 90
 
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
 """What the ``index`` of an approach NOT_REACHABLE names."""
+
+AWAY = (0.0, 0.12, 0.25, 0.45, 0.7, -0.12, -0.25)
+"""Bends away from the cameras, as shares of their distance from the centre."""
+ASIDE = (0.0, 0.07, -0.07, 0.15, -0.15, 0.25, -0.25)
+"""Bends to the right and down, likewise."""
+PROFILES: tuple[Profile, ...] = ("linear", "translation-first", "rotation-first", "planar-first")
+PROFILE_COST = 0.06
+TURN_COSTS = (0.0, 0.08, 0.2, 0.3, 0.4)
+"""Of the kinds of turning, in the order of `turnings`, in the measure of the bends."""
+NO_ANGLE = 1e-9
+PARALLEL = 1e-7
+"""Sine below which two normals are one."""
+SHAPES: dict[Profile, tuple[float, float, float]] = {
+    "linear": (LINEAR, LINEAR, LINEAR),
+    "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
+    "translation-first": (FIRST, LAST, LAST),
+    "rotation-first": (LAST, FIRST, FIRST),
+    "planar-first": (LAST, LAST, FIRST),
+}
+"""Of each profile: how translation, hinge and planar rotation go (`motion_frame`)."""
+
+
+class Candidate(NamedTuple):
+    """One path to try: ``turning`` of `turnings`, ``profile`` 0 the one asked for, ``bend`` away, right, down."""
+
+    turning: int
+    profile: int
+    bend: tuple[float, float, float]
+
+
+def _ordered() -> tuple[Candidate, ...]:
+    listed: list[tuple[float, int, Candidate]] = []
+    for away in AWAY:
+        for right in ASIDE:
+            for down in ASIDE:
+                size = math.sqrt(away * away + right * right + down * down)
+                for turning, cost in enumerate(TURN_COSTS):
+                    for profile in range(len(PROFILES) + 1):
+                        total = size + cost + (PROFILE_COST if profile else 0.0)
+                        listed.append((total, len(listed), Candidate(turning, profile, (away, right, down))))
+    return tuple(candidate for _, _, candidate in sorted(listed))
+
+
+CANDIDATES = _ordered()
+"""All paths, the straight one with the profile that was asked for first."""
 
 
 class Stage(IntEnum):
@@ -333,7 +392,7 @@ def _finish(p: Planning) -> None:
     p.plan = Plan(
         times=times,
         joints=p.all_joints.copy(),
-        displacements=np.stack([conjugated(p.frame, H, p.inverse) for H in p.all_displacements]),
+        displacements=conjugate_all(p.frame, p.all_displacements, p.inverse),
         shares=np.arange(SAMPLES) / (SAMPLES - 1.0),
         way="straight in the joints" if p.stage == Stage.STRAIGHT_IN_JOINTS else name_of(candidate, profile),
         approaches=_approaches(p),
@@ -377,14 +436,7 @@ def approach(planning: Planning, kind: int) -> ClosestApproach:
         joint = index if kind == JOINT_LIMIT else 0
         unit = "rad" if planning.turns[joint] > 0.0 else "m"
     return ClosestApproach(
-        what=KINDS[kind],
-        index=index,
-        value=float(row[2]),
-        limit=float(row[3]),
-        unit=unit,
-        room=float(row[1]),
-        share=float(row[6]),
-        marker=int(row[5]),
+        KINDS[kind], index, float(row[2]), float(row[3]), unit, float(row[1]), float(row[6]), int(row[5])
     )
 
 
@@ -397,3 +449,149 @@ def face_normal(points: FloatArray, faces: IntArray) -> FloatArray | None:
     normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
     unit: FloatArray = normal / math.sqrt(float((normal * normal).sum()))
     return unit
+
+
+# -- alternative paths ----------------------------------------------------------------------------------------
+
+
+@kernel
+def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArray:
+    """Unit displacements (3, 3): away from ``camera_centres`` (c, 3), right and down in ``camera`` (3, 4)."""
+    P = camera[:, :3]
+    rows = np.zeros((3, 3))
+    rows[1], rows[2] = _cross(P[1], P[2]), _cross(P[2], P[0])
+    sign = 1.0 if _dot(P[0], rows[1]) >= 0.0 else -1.0
+    for i in range(3):
+        for c in range(camera_centres.shape[0]):
+            rows[0, i] += camera_centres[c, i]
+        rows[0, i] *= -1.0
+        rows[1, i] *= sign
+        rows[2, i] *= sign
+    for k in range(3):
+        length = math.sqrt(_dot(rows[k], rows[k]))
+        if length > 0.0:
+            for i in range(3):
+                rows[k, i] /= length
+    return rows
+
+
+def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
+    """Hinge axis and angle, planar axis and angle (8,) of each kind of turning, for a rotation ``(axis, angle)`` (4,).
+
+    Hinge and planar rotation of the face of ``normal`` (3,), the shorter ones; one rotation about the centre; the hinge
+    the other way round; the planar rotation the other way round; the one rotation the other way round (7.4.1, 7.4.2).
+    """
+    axis, angle = rotation[:3], float(rotation[3])
+    whole = 2.0 * math.pi
+    single = _turning(axis, angle, axis, 0.0)
+    single_back = _turning(axis, angle - whole, axis, 0.0)
+    if normal is None:
+        return single, single, single_back, single, single_back
+    hinge, theta_r, theta_p = _hinge_and_planar(rotation, normal)
+    return (
+        _turning(hinge, theta_r, normal, theta_p),
+        single,
+        _turning(hinge, theta_r - whole, normal, theta_p),
+        _turning(hinge, theta_r, normal, theta_p - math.copysign(whole, theta_p)),
+        single_back,
+    )
+
+
+def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Shapes for components of ``amounts``; where only one kind of shape has anything to do, nothing waits: linear."""
+    own = SHAPES[profile]
+    at_work = {shape for shape, amount in zip(own, amounts, strict=True) if amount != 0.0}
+    if profile == "exponential" or len(at_work) > 1:
+        return own
+    return SHAPES["linear"]
+
+
+def path_of(
+    candidate: Candidate,
+    profile: Profile,
+    turning: FloatArray,
+    displacement: FloatArray,
+    directions: FloatArray,
+) -> FloatArray:
+    """The numbers (17,) of `pose_on_path` for one candidate."""
+    path = np.zeros(NUMBERS)
+    path[:8] = turning
+    path[8:11] = displacement
+    for amount, direction in zip(candidate.bend, directions, strict=True):
+        path[11:14] += amount * direction
+    amounts = (float(np.abs(displacement).max()), float(turning[3]), float(turning[7]))
+    path[14:] = shapes(profile, amounts)
+    return path
+
+
+def other_profile(asked: Profile, nth: int) -> Profile | None:
+    """The profile number ``nth`` of a candidate; None where it is the one asked for again."""
+    if nth == 0:
+        return asked
+    profile = PROFILES[nth - 1]
+    return None if profile == asked else profile
+
+
+def name_of(candidate: Candidate, profile: Profile) -> str:
+    """Description of a path for people."""
+    kinds = ("", "one rotation", "the other way round", "planar rotation the other way round")
+    kind = (*kinds, "one rotation the other way round")[candidate.turning]
+    words = (("away from the cameras", "towards the cameras"), ("right", "left"), ("down", "up"))
+    bends = [
+        f"{positive if amount > 0.0 else negative} by {abs(amount):g}"
+        for amount, (positive, negative) in zip(candidate.bend, words, strict=True)
+        if amount != 0.0
+    ]
+    return ", ".join(part for part in (profile, kind, "bent " + " and ".join(bends) if bends else "") if part)
+
+
+def _turning(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: float) -> FloatArray:
+    out = np.empty(8)
+    out[:3], out[3], out[4:7], out[7] = hinge, theta_r, normal, theta_p
+    return out
+
+
+@kernel
+def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatArray, float, float]:
+    """Hinge axis (3,), hinge and planar angle of a rotation ``(axis, angle)`` (4,) of the face of ``normal`` (3,)."""
+    R = turn(rotation[:3], rotation[3])
+    after = np.empty(3)
+    for i in range(3):
+        after[i] = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
+    axis = _cross(normal, after)
+    sine = math.sqrt(_dot(axis, axis))
+    cosine = _dot(normal, after)
+    if sine > PARALLEL:
+        hinge = axis / sine
+    else:
+        # one plane, or back on face: half a turn about any line in it
+        least = 0
+        for i in range(1, 3):
+            if abs(normal[i]) < abs(normal[least]):
+                least = i
+        other = np.zeros(3)
+        other[least] = 1.0
+        hinge = _cross(normal, other)
+        hinge /= math.sqrt(_dot(hinge, hinge))
+    theta_r = math.atan2(sine, cosine) if sine > PARALLEL or cosine < 0.0 else 0.0
+    back = turn(hinge, -theta_r)
+    # the planar rotation R_p = R_r⁻¹ R, read on a direction in the face
+    inside = _cross(normal, hinge)
+    image = np.empty(3)
+    turned = np.empty(3)
+    for i in range(3):
+        for k in range(3):
+            turned[k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
+        image[i] = _dot(turned, hinge)
+    theta_p = math.atan2(_dot(image, inside), _dot(image, hinge))
+    return hinge, theta_r, theta_p if abs(theta_p) > NO_ANGLE else 0.0
+
+
+@kernel
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@kernel
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
