@@ -14,7 +14,7 @@ import numpy as np
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.cycle import ModelUpdate, Sample
 from stereoservo.core.goals.execute import drop_lookahead_plan, end_followers, end_source
-from stereoservo.core.goals.servo_goal import place_now
+from stereoservo.core.goals.marker_body import place_now
 from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
 from stereoservo.core.monitors.fault_isolation import LEAST_PX, doubt, named
 from stereoservo.core.monitors.goal_reprojection import carry_goal, carry_run

@@ -14,7 +14,7 @@ from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Tas
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.goals.target_checks import MIN_MARKERS
+from stereoservo.core.goals.marker_body import MIN_MARKERS
 from stereoservo.core.prediction import ModelArrays, chain_at, points_now
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
