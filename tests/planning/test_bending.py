@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereoservo.planning.motion_frame import turn
-from stereoservo.planning.path_search import CANDIDATES, turnings
-from stereoservo.planning.planner import plan
+from stereoservo.planning.path_search import CANDIDATES
+from stereoservo.planning.planner import plan, turnings
 
 
 def least_rooms(cells, world, joints):

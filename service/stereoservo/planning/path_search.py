@@ -30,7 +30,6 @@ from stereoservo.planning.motion_frame import (
     NUMBERS,
     conjugate_all,
     pose_on_path,
-    turn,
     turn_between,
 )  # fmt: skip
 from stereoservo.planning.path_ik import (
@@ -87,9 +86,6 @@ PROFILES: tuple[Profile, ...] = ("linear", "translation-first", "rotation-first"
 PROFILE_COST = 0.06
 TURN_COSTS = (0.0, 0.08, 0.2, 0.3, 0.4)
 """Of the kinds of turning, in the order of `turnings`, in the measure of the bends."""
-NO_ANGLE = 1e-9
-PARALLEL = 1e-7
-"""Sine below which two normals are one."""
 SHAPES: dict[Profile, tuple[float, float, float]] = {
     "linear": (LINEAR, LINEAR, LINEAR),
     "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
@@ -133,6 +129,10 @@ class Stage(IntEnum):
     UNCONSTRAINED_IK = 2
     STRAIGHT_IN_JOINTS = 3
     MULTISTART_IK = 4
+
+
+CLOSED_FORM, STRAIGHT_IN_JOINTS = int(Stage.CLOSED_FORM), int(Stage.STRAIGHT_IN_JOINTS)
+"""As kernels know them."""
 
 
 class Planning(msgspec.Struct, eq=False):
@@ -276,22 +276,39 @@ def start_arm(planning: Planning, stage: Stage) -> None:
 
 def _samples(p: Planning, until: int) -> tuple[int, int]:
     """Samples of the present stage: kind of limit broken or −1, and up to where."""
-    if p.stage == Stage.CLOSED_FORM:
-        broken, reached = check_path(p.path, p.sample, until, SAMPLES, p.constraints, p.residual, p.table)
-        return int(broken), int(reached)
-    arm = Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias)
-    record = PathRecord(p.all_joints, p.all_displacements, p.table)
-    if p.stage == Stage.STRAIGHT_IN_JOINTS:
-        broken, reached = follow_joint_line(p.joint_step, p.sample, until, p.constraints, arm, record)
-    else:
-        unconstrained = p.stage == Stage.UNCONSTRAINED_IK
-        # an arm that lacks freedoms leaves the path between its ends
-        tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
-        broken, reached = follow_path(
-            p.path, p.sample, until, _unlimited(p.constraints) if unconstrained else p.constraints, p.residual,
-            arm, len(p.joints) > p.rank, tolerance, record,
-        )  # fmt: skip
+    unconstrained = p.stage == Stage.UNCONSTRAINED_IK
+    # an arm that lacks freedoms leaves the path between its ends
+    tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
+    broken, reached = _go_on(
+        int(p.stage), p.path, p.joint_step, p.sample, until,
+        _unlimited(p.constraints) if unconstrained else p.constraints, p.residual,
+        Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias), len(p.joints) > p.rank,
+        tolerance, PathRecord(p.all_joints, p.all_displacements, p.table),
+    )  # fmt: skip
     return int(broken), int(reached)
+
+
+@kernel
+def _go_on(
+    stage: int,
+    path: FloatArray,
+    joint_step: FloatArray,
+    first: int,
+    last: int,
+    constraints: Constraints,
+    residual: FloatArray,
+    arm: Arm,
+    redundant: bool,
+    tolerance: float,
+    record: PathRecord,
+) -> tuple[int, int]:
+    """Samples ``first`` to before ``last`` of a ``stage``: kind of limit broken or −1, and where (`path_ik`)."""
+    if stage == CLOSED_FORM:
+        samples = record.joints.shape[0]
+        return check_path(path, first, last, samples, constraints, residual, record.table)
+    if stage == STRAIGHT_IN_JOINTS:
+        return follow_joint_line(joint_step, first, last, constraints, arm, record)
+    return follow_path(path, first, last, constraints, residual, arm, redundant, tolerance, record)
 
 
 def _unlimited(constraints: Constraints) -> Constraints:
@@ -328,8 +345,7 @@ def _end(p: Planning) -> None:
         p.followed += 1
         start_arm(p, Stage.FOLLOW_PATH)
         return
-    s = p.constraints
-    distance, marker = pixel_distance(s.cameras, s.must_stay_visible, moved(p.displacement, s.body), p.goal)
+    distance, marker = _distance_from_goal(p.displacement, p.constraints, p.goal)
     missed = not distance <= TOLERANCE_PX
     if p.stage == Stage.UNCONSTRAINED_IK:
         _continue_from_goal_joints(p, missed)
@@ -340,6 +356,15 @@ def _end(p: Planning) -> None:
         _fail(p, NOT_REACHABLE)
     else:
         _finish(p)
+
+
+@kernel
+def _distance_from_goal(
+    displacement: FloatArray, constraints: Constraints, goal: FloatArray
+) -> tuple[float, int]:
+    """`pixel_distance` of the body after its ``displacement`` (4, 4) from the ``goal`` (m, 3)."""
+    s = constraints
+    return pixel_distance(s.cameras, s.must_stay_visible, moved(displacement, s.body), goal)
 
 
 def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
@@ -381,23 +406,36 @@ def _straight_to(p: Planning, joints: FloatArray) -> None:
 
 def _finish(p: Planning) -> None:
     r = p.request
-    times = sample_times(
-        p.all_joints,
-        writable_copy(r.speed_scale * r.limits.velocity_max),
-        writable_copy(r.speed_scale * r.limits.acceleration_max),
-        r.profile == "exponential",
-    )
+    times, displacements = _in_time(
+        p.all_joints, p.all_displacements, p.frame, p.inverse, r.speed_scale * r.limits.velocity_max,
+        r.speed_scale * r.limits.acceleration_max, r.profile == "exponential",
+    )  # fmt: skip
     candidate = CANDIDATES[p.candidate]
     profile = other_profile(r.profile, candidate.profile) or r.profile
     p.plan = Plan(
         times=times,
         joints=p.all_joints.copy(),
-        displacements=conjugate_all(p.frame, p.all_displacements, p.inverse),
+        displacements=displacements,
         shares=np.arange(SAMPLES) / (SAMPLES - 1.0),
         way="straight in the joints" if p.stage == Stage.STRAIGHT_IN_JOINTS else name_of(candidate, profile),
         approaches=_approaches(p),
     )
     p.finished = True
+
+
+@kernel
+def _in_time(
+    joints: FloatArray,
+    displacements: FloatArray,
+    frame: FloatArray,
+    inverse: FloatArray,
+    velocity_max: FloatArray,
+    acceleration_max: FloatArray,
+    even: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) out of the motion ``frame``."""
+    times = sample_times(joints, velocity_max, acceleration_max, even)
+    return times, conjugate_all(frame, displacements, inverse)
 
 
 def _straight(candidate: Candidate) -> bool:
@@ -454,49 +492,6 @@ def face_normal(points: FloatArray, faces: IntArray) -> FloatArray | None:
 # -- alternative paths ----------------------------------------------------------------------------------------
 
 
-@kernel
-def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArray:
-    """Unit displacements (3, 3): away from ``camera_centres`` (c, 3), right and down in ``camera`` (3, 4)."""
-    P = camera[:, :3]
-    rows = np.zeros((3, 3))
-    rows[1], rows[2] = _cross(P[1], P[2]), _cross(P[2], P[0])
-    sign = 1.0 if _dot(P[0], rows[1]) >= 0.0 else -1.0
-    for i in range(3):
-        for c in range(camera_centres.shape[0]):
-            rows[0, i] += camera_centres[c, i]
-        rows[0, i] *= -1.0
-        rows[1, i] *= sign
-        rows[2, i] *= sign
-    for k in range(3):
-        length = math.sqrt(_dot(rows[k], rows[k]))
-        if length > 0.0:
-            for i in range(3):
-                rows[k, i] /= length
-    return rows
-
-
-def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
-    """Hinge axis and angle, planar axis and angle (8,) of each kind of turning, for a rotation ``(axis, angle)`` (4,).
-
-    Hinge and planar rotation of the face of ``normal`` (3,), the shorter ones; one rotation about the centre; the hinge
-    the other way round; the planar rotation the other way round; the one rotation the other way round (7.4.1, 7.4.2).
-    """
-    axis, angle = rotation[:3], float(rotation[3])
-    whole = 2.0 * math.pi
-    single = _turning(axis, angle, axis, 0.0)
-    single_back = _turning(axis, angle - whole, axis, 0.0)
-    if normal is None:
-        return single, single, single_back, single, single_back
-    hinge, theta_r, theta_p = _hinge_and_planar(rotation, normal)
-    return (
-        _turning(hinge, theta_r, normal, theta_p),
-        single,
-        _turning(hinge, theta_r - whole, normal, theta_p),
-        _turning(hinge, theta_r, normal, theta_p - math.copysign(whole, theta_p)),
-        single_back,
-    )
-
-
 def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
     """Shapes for components of ``amounts``; where only one kind of shape has anything to do, nothing waits: linear."""
     own = SHAPES[profile]
@@ -543,55 +538,3 @@ def name_of(candidate: Candidate, profile: Profile) -> str:
         if amount != 0.0
     ]
     return ", ".join(part for part in (profile, kind, "bent " + " and ".join(bends) if bends else "") if part)
-
-
-def _turning(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: float) -> FloatArray:
-    out = np.empty(8)
-    out[:3], out[3], out[4:7], out[7] = hinge, theta_r, normal, theta_p
-    return out
-
-
-@kernel
-def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatArray, float, float]:
-    """Hinge axis (3,), hinge and planar angle of a rotation ``(axis, angle)`` (4,) of the face of ``normal`` (3,)."""
-    R = turn(rotation[:3], rotation[3])
-    after = np.empty(3)
-    for i in range(3):
-        after[i] = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
-    axis = _cross(normal, after)
-    sine = math.sqrt(_dot(axis, axis))
-    cosine = _dot(normal, after)
-    if sine > PARALLEL:
-        hinge = axis / sine
-    else:
-        # one plane, or back on face: half a turn about any line in it
-        least = 0
-        for i in range(1, 3):
-            if abs(normal[i]) < abs(normal[least]):
-                least = i
-        other = np.zeros(3)
-        other[least] = 1.0
-        hinge = _cross(normal, other)
-        hinge /= math.sqrt(_dot(hinge, hinge))
-    theta_r = math.atan2(sine, cosine) if sine > PARALLEL or cosine < 0.0 else 0.0
-    back = turn(hinge, -theta_r)
-    # the planar rotation R_p = R_r⁻¹ R, read on a direction in the face
-    inside = _cross(normal, hinge)
-    image = np.empty(3)
-    turned = np.empty(3)
-    for i in range(3):
-        for k in range(3):
-            turned[k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
-        image[i] = _dot(turned, hinge)
-    theta_p = math.atan2(_dot(image, inside), _dot(image, hinge))
-    return hinge, theta_r, theta_p if abs(theta_p) > NO_ANGLE else 0.0
-
-
-@kernel
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-@kernel
-def _dot(a: FloatArray, b: FloatArray) -> float:
-    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -7,6 +7,8 @@ of view, or hidden, or the present pose itself. `plan_on` then tries one candida
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stereoservo.kinematics.kernels import invert4
@@ -18,6 +20,7 @@ from stereoservo.planning.motion_frame import (
     motion_frame,
     plane_at_infinity,
     pose_on_path,
+    turn,
     turn_between,
 )
 from stereoservo.planning.path_ik import freedoms
@@ -26,12 +29,10 @@ from stereoservo.planning.path_search import (
     SAMPLES,
     TOLERANCE_PX,
     Planning,
-    bend_directions,
     face_normal,
     next_candidate,
     plan_on,
     stay,
-    turnings,
 )
 from stereoservo.planning.plan import PlanLimits, PlanRequest
 from stereoservo.planning.visibility_constraints import (
@@ -59,6 +60,10 @@ TURNS = 1e-6
 """Size of a joint's rotation block, in the motion frame, from which on it turns."""
 COLLINEAR = 1e-6
 """Square of the sine, seen from the middle, below which all markers are on one line."""
+
+NO_ANGLE = 1e-9
+PARALLEL = 1e-7
+"""Sine below which two normals are one."""
 
 
 class PlanRequestError(ValueError):
@@ -223,3 +228,98 @@ def _spans_a_plane(body: FloatArray) -> bool:
     along = edges[int(squares.argmax())]
     across = squares * float(squares.max()) - (edges * along[None, :]).sum(axis=1) ** 2
     return bool(float(across.max()) > COLLINEAR * float(squares.max()) ** 2)
+
+
+@kernel
+def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArray:
+    """Unit displacements (3, 3): away from ``camera_centres`` (c, 3), right and down in ``camera`` (3, 4)."""
+    P = camera[:, :3]
+    rows = np.zeros((3, 3))
+    rows[1], rows[2] = _cross(P[1], P[2]), _cross(P[2], P[0])
+    sign = 1.0 if _dot(P[0], rows[1]) >= 0.0 else -1.0
+    for i in range(3):
+        for c in range(camera_centres.shape[0]):
+            rows[0, i] += camera_centres[c, i]
+        rows[0, i] *= -1.0
+        rows[1, i] *= sign
+        rows[2, i] *= sign
+    for k in range(3):
+        length = math.sqrt(_dot(rows[k], rows[k]))
+        if length > 0.0:
+            for i in range(3):
+                rows[k, i] /= length
+    return rows
+
+
+def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
+    """Hinge axis and angle, planar axis and angle (8,) of each kind of turning, for a rotation ``(axis, angle)`` (4,).
+
+    Hinge and planar rotation of the face of ``normal`` (3,), the shorter ones; one rotation about the centre; the hinge
+    the other way round; the planar rotation the other way round; the one rotation the other way round (7.4.1, 7.4.2).
+    """
+    axis, angle = rotation[:3], float(rotation[3])
+    whole = 2.0 * math.pi
+    single = _turning(axis, angle, axis, 0.0)
+    single_back = _turning(axis, angle - whole, axis, 0.0)
+    if normal is None:
+        return single, single, single_back, single, single_back
+    hinge, theta_r, theta_p = _hinge_and_planar(rotation, normal)
+    return (
+        _turning(hinge, theta_r, normal, theta_p),
+        single,
+        _turning(hinge, theta_r - whole, normal, theta_p),
+        _turning(hinge, theta_r, normal, theta_p - math.copysign(whole, theta_p)),
+        single_back,
+    )
+
+
+def _turning(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: float) -> FloatArray:
+    out = np.empty(8)
+    out[:3], out[3], out[4:7], out[7] = hinge, theta_r, normal, theta_p
+    return out
+
+
+@kernel
+def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatArray, float, float]:
+    """Hinge axis (3,), hinge and planar angle of a rotation ``(axis, angle)`` (4,) of the face of ``normal`` (3,)."""
+    R = turn(rotation[:3], rotation[3])
+    after = np.empty(3)
+    for i in range(3):
+        after[i] = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
+    axis = _cross(normal, after)
+    sine = math.sqrt(_dot(axis, axis))
+    cosine = _dot(normal, after)
+    if sine > PARALLEL:
+        hinge = axis / sine
+    else:
+        # one plane, or back on face: half a turn about any line in it
+        least = 0
+        for i in range(1, 3):
+            if abs(normal[i]) < abs(normal[least]):
+                least = i
+        other = np.zeros(3)
+        other[least] = 1.0
+        hinge = _cross(normal, other)
+        hinge /= math.sqrt(_dot(hinge, hinge))
+    theta_r = math.atan2(sine, cosine) if sine > PARALLEL or cosine < 0.0 else 0.0
+    back = turn(hinge, -theta_r)
+    # the planar rotation R_p = R_r⁻¹ R, read on a direction in the face
+    inside = _cross(normal, hinge)
+    image = np.empty(3)
+    turned = np.empty(3)
+    for i in range(3):
+        for k in range(3):
+            turned[k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
+        image[i] = _dot(turned, hinge)
+    theta_p = math.atan2(_dot(image, inside), _dot(image, hinge))
+    return hinge, theta_r, theta_p if abs(theta_p) > NO_ANGLE else 0.0
+
+
+@kernel
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@kernel
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -95,7 +95,8 @@ def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | N
         require_motion_allowed(context)
         if _known(goal.id, context):
             return "already accepted", None  # a client's retry
-        refuse_pixels(goal.target, state, context.settings)
+        if any(camera is not None for camera in state.mobile):
+            refuse_pixels(goal.target, state, context.settings)
         busy = MOTION_SOURCES[type(state.source)].subject(state.source) or state.queue
         if goal.mode == "queue" and busy:
             return _enqueue(goal, context), None
@@ -223,7 +224,8 @@ def _prepare_servoing(
 def _trusted_place(context: StepContext, place: BodyState | None) -> BodyState:
     """The body at ``place``, or where it is. Raises RefusalError without a model that holds."""
     trusted_model(context)
-    refuse_while_moved(context.state)
+    if context.state.reanchoring is not None:
+        refuse_while_moved(context.state)
     return place_now(context) if place is None else place
 
 

@@ -119,11 +119,10 @@ def _view(
 class GoalPose:
     """Marker points at the goal (m, 4) of height a∞ᵀM = 1, and how well they explain the set-points [px].
 
-    ``pixels`` (c, m, 2): their ideal images; ``displacement`` (4, 4) takes the body there from where it was.
+    ``displacement`` (4, 4) takes the body there from where it was.
     """
 
     points: FloatArray
-    pixels: FloatArray
     displacement: FloatArray
     rms_px: float
     worst_px: float
@@ -160,7 +159,6 @@ def refined_pose(
     worst = int(distance.max(axis=0).argmax())
     return GoalPose(
         moved,
-        pixels,
         D,
         float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0))),
         float(distance.max()),

@@ -6,7 +6,7 @@ planned; free ones go their own way, so that only the goal itself can be refused
 
 from __future__ import annotations
 
-from math import log
+import math
 
 import numpy as np
 
@@ -217,10 +217,23 @@ def _exponential_s(job: PlanJob, context: StepContext) -> float:
     """Time in which the error decays to its tolerance at the goal's gain."""
     source, arrays = job.source, context.arrays
     assert arrays is not None
-    pixels, _ = project_points(arrays.matrices, job.points)
-    distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
-    error = float((distance * source.wanted * source.used[:, None]).max())
-    return log(max(error / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+    asked = source.wanted * source.used[:, None]
+    error = float(_largest_error(arrays.matrices, job.points, source.set_points, asked))
+    return math.log(max(error / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+
+
+@kernel
+def _largest_error(
+    matrices: FloatArray, points: FloatArray, set_points: FloatArray, weights: FloatArray
+) -> float:
+    """Largest distance [px] of ``points`` (m, 4) from ``set_points`` (c, m, 2), times ``weights`` (c, m)."""
+    pixels, _ = project_points(matrices, points)
+    errors = np.empty(weights.shape)
+    for c in range(weights.shape[0]):
+        for i in range(weights.shape[1]):
+            u, v = pixels[c, i, 0] - set_points[c, i, 0], pixels[c, i, 1] - set_points[c, i, 1]
+            errors[c, i] = math.sqrt(u * u + v * v) * weights[c, i]
+    return float(errors.max())
 
 
 def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> goals.Approach:
