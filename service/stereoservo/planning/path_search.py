@@ -31,7 +31,7 @@ from stereoservo.planning.motion_frame import (
     conjugate_all,
     pose_on_path,
     turn_between,
-)  # fmt: skip
+)
 from stereoservo.planning.path_ik import (
     SEEDS,
     Arm,
@@ -85,7 +85,7 @@ ASIDE = (0.0, 0.07, -0.07, 0.15, -0.15, 0.25, -0.25)
 PROFILES: tuple[Profile, ...] = ("linear", "translation-first", "rotation-first", "planar-first")
 PROFILE_COST = 0.06
 TURN_COSTS = (0.0, 0.08, 0.2, 0.3, 0.4)
-"""Of the kinds of turning, in the order of `turnings`, in the measure of the bends."""
+"""Of the kinds of turning, in the order of `planner.turnings`, in the measure of the bends."""
 SHAPES: dict[Profile, tuple[float, float, float]] = {
     "linear": (LINEAR, LINEAR, LINEAR),
     "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
@@ -97,7 +97,7 @@ SHAPES: dict[Profile, tuple[float, float, float]] = {
 
 
 class Candidate(NamedTuple):
-    """One path to try: ``turning`` of `turnings`, ``profile`` 0 the one asked for, ``bend`` away, right, down."""
+    """One path: ``turning`` of `planner.turnings`, ``profile`` 0 the one asked for, ``bend`` away, right, down."""
 
     turning: int
     profile: int
