@@ -12,8 +12,17 @@ from stereoservo.geometry.displacements import conjugate, exp_rotation, exp_tran
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.planning.cartesian_path import CartesianPath
-from stereoservo.planning.motion_frame import motion_frame
-from stereoservo.planning.path import DECAY, ENDS, EXPONENTIAL, FIRST, HANDS_OVER, LAST, progress, shapes
+from stereoservo.planning.motion_frame import (
+    DECAY,
+    ENDS,
+    EXPONENTIAL,
+    FIRST,
+    HANDS_OVER,
+    LAST,
+    motion_frame,
+    progress,
+)
+from stereoservo.planning.path_search import shapes
 from stereoservo.planning.plan import Profile
 
 KEEPS_PLANE = 1e-6

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.planning.detours import CANDIDATES, turnings
 from stereoservo.planning.motion_frame import turn
-from stereoservo.planning.planner import plan
+from stereoservo.planning.path_search import CANDIDATES
+from stereoservo.planning.planner import plan, turnings
 
 
 def least_rooms(cells, world, joints):

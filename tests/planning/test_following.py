@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stereoservo.planning.constraint_margins import NOT_REACHABLE, empty_table, moved
 from stereoservo.planning.path_ik import Arm, PathRecord, follow_path, freedoms, reach
 from stereoservo.planning.planner import plan, start_planning
 from stereoservo.planning.tracking import sample_plan
+from stereoservo.planning.visibility_constraints import NOT_REACHABLE, empty_table, moved
 
 
 def along(planning, samples, tolerance=2.0):

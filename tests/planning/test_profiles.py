@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from oracles.displacement_path import progress_rate
-from stereoservo.planning.path import SHAPES, progress, shapes
+from stereoservo.planning.motion_frame import progress
+from stereoservo.planning.path_search import SHAPES, shapes
 
 
 @pytest.mark.parametrize("shape", sorted({s for three in SHAPES.values() for s in three}))

@@ -18,8 +18,8 @@ from oracles.path_visibility import (
 from stereoservo.geometry.distortion import distort
 from stereoservo.geometry.homogeneous import plane_of_points
 from stereoservo.planning.cartesian_path import cartesian_path
-from stereoservo.planning.constraint_margins import Constraints, check_joints, check_view, empty_table
 from stereoservo.planning.three_point_decomposition import decompose
+from stereoservo.planning.visibility_constraints import Constraints, check_joints, check_view, empty_table
 
 
 def hidden_scene(virtual, rng):

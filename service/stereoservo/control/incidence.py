@@ -36,7 +36,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import image_jacobian, invert4
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.planning.constraint_margins import limit_pull
+from stereoservo.planning.visibility_constraints import limit_pull
 
 KINDS = (
     "point-on-point",

@@ -14,7 +14,7 @@ import numpy as np
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import right_singular
-from stereoservo.planning.constraint_margins import limit_pull
+from stereoservo.planning.visibility_constraints import limit_pull
 
 LOST = 1e-3
 """Singular value, relative to the largest, below which a freedom is lost; the operators are estimates."""

@@ -7,18 +7,23 @@ from typing import Any
 import numpy as np
 
 from stereoservo.core.context import RefusalError, StepContext
-from stereoservo.core.goals.accept import accept, answer_waiting, prepare, report_without_plan, trusted_model
+from stereoservo.core.goals.accept import (
+    accept,
+    answer_waiting,
+    prepare,
+    report_without_plan,
+    require_motion_allowed,
+    trusted_model,
+)
 from stereoservo.core.goals.execute import (
     begin,
     cancel_queue,
     end_followers,
     end_queue,
     end_source,
-    require_motion_allowed,
 )
+from stereoservo.core.goals.marker_body import BodyState, place_now
 from stereoservo.core.goals.plan import begin_plan, go_on_planning, plan_report
-from stereoservo.core.goals.servo_goal import place_now
-from stereoservo.core.goals.target_checks import BodyState
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.sources.law import awaits_plan
 from stereoservo.core.state import (

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from stereoservo.geometry.displacements import exp_rotation, exp_translation
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.planning.path import progress, shapes
+from stereoservo.planning.motion_frame import progress
+from stereoservo.planning.path_search import shapes
 from stereoservo.planning.plan import Profile
 from stereoservo.planning.three_point_decomposition import ComponentStatus, Decomposition
 

@@ -1,9 +1,14 @@
-"""Frame in which all motions of an arm are Euclidean rotations and translations, from its operators alone.
+"""Frame in which all motions of an arm are Euclidean rotations and translations, from its operators alone; paths in it.
 
 The operators leave the plane at infinity and, in it, one quadratic form: ``SᵀQ + QS = 0`` for their action ``S`` on
 displacements (5.59). Its square root makes the frame. Nothing else is known or needed: the length of its unit is chosen
 (the cameras are one away from the centre), and for an arm that turns about one direction only, or not at all, any frame
-that its motions agree with serves, since the others are out of its reach. Kernels, for the loop.
+that its motions agree with serves, since the others are out of its reach.
+
+A path of a body is a hinge rotation, a planar one and a translation of its centre, each with a profile ``μ(σ)``,
+monotone from 0 to 1 on [0, 1] (7.26, 7.4.3). Linear: at an even pace. Exponential: as a feedback loop does,
+``(1 − e^{−kσ})/(1 − e^{−k})``, scaled to end at 1 (errata). First and last: the component moves in the first or in the
+last seven tenths; in the middle one hands over to the other, slowly enough for accelerations. Kernels, for the loop.
 """
 
 from __future__ import annotations
@@ -26,6 +31,16 @@ AVERAGED = 5
 INVERSE_ITERATIONS = 3
 SHIFT = 1e-10
 """Relative, of the inverse iteration."""
+
+LINEAR, FIRST, LAST, EXPONENTIAL = 0.0, 1.0, 2.0, 3.0
+"""Shapes of one component."""
+
+DECAY = 4.0
+"""How many time constants an exponential motion lasts: what is left of it when linear scaling ends it is 2 %."""
+HANDS_OVER, ENDS = 0.3, 0.7
+"""Where a component that goes first begins to slow down, and has ended."""
+NUMBERS = 17
+"""That describe a path: hinge (4), planar rotation (4), translation (3), bend (3), profiles of the three (3)."""
 
 
 @kernel
@@ -63,6 +78,15 @@ def conjugated(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
     out = np.empty((4, 4))
     multiply4_into(A, G, first)
     multiply4_into(first, B, out)
+    return out
+
+
+@kernel
+def conjugate_all(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
+    """``A G_j B`` (k, 4, 4) of ``G`` (k, 4, 4)."""
+    out = np.empty(G.shape)
+    for j in range(G.shape[0]):
+        out[j] = conjugated(A, G[j], B)
     return out
 
 
@@ -311,3 +335,42 @@ def turn_between(X: FloatArray, Y: FloatArray) -> FloatArray:
         out[0], out[1], out[2] = x / sine, y / sine, z / sine
     out[3] = 2.0 * math.atan2(sine, w)
     return out
+
+
+@kernel
+def _first(sigma: float) -> float:
+    rate = 2.0 / (HANDS_OVER + ENDS)
+    if sigma <= HANDS_OVER:
+        return rate * sigma
+    if sigma >= ENDS:
+        return 1.0
+    x = (sigma - HANDS_OVER) / (ENDS - HANDS_OVER)
+    return rate * (HANDS_OVER + (ENDS - HANDS_OVER) * 0.5 * (x + math.sin(math.pi * x) / math.pi))
+
+
+@kernel
+def progress(shape: float, sigma: float) -> float:
+    """``μ(σ)`` of one component."""
+    sigma = min(1.0, max(0.0, sigma))
+    if shape == FIRST:
+        return _first(sigma)
+    if shape == LAST:
+        return 1.0 - _first(1.0 - sigma)
+    if shape == EXPONENTIAL:
+        return math.expm1(-DECAY * sigma) / math.expm1(-DECAY)
+    return sigma
+
+
+@kernel
+def pose_on_path(path: FloatArray, path_parameter: float) -> FloatArray:
+    """Displacement (4, 4) from the present pose, in the motion frame."""
+    R_r = turn(path[0:3], path[3] * progress(path[15], path_parameter))
+    R_p = turn(path[4:7], path[7] * progress(path[16], path_parameter))
+    along, aside = progress(path[14], path_parameter), 4.0 * path_parameter * (1.0 - path_parameter)
+    H = np.zeros((4, 4))
+    H[3, 3] = 1.0
+    for i in range(3):
+        H[i, 3] = along * path[8 + i] + aside * path[11 + i]
+        for k in range(3):
+            H[i, k] = R_r[i, 0] * R_p[0, k] + R_r[i, 1] * R_p[1, k] + R_r[i, 2] * R_p[2, k]
+    return H

@@ -17,8 +17,14 @@ from stereoservo.kinematics.kernels import multiply4_into
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import add_equation, damped_solve, right_singular
-from stereoservo.planning.constraint_margins import Constraints, check_joints, check_view, limit_pull, moved
-from stereoservo.planning.path import pose_on_path
+from stereoservo.planning.motion_frame import pose_on_path
+from stereoservo.planning.visibility_constraints import (
+    Constraints,
+    check_joints,
+    check_view,
+    limit_pull,
+    moved,
+)
 
 ARRIVED = 1e-7
 """Distance of a point from its place, as a share of the cameras' distance: below a thousandth of a pixel."""

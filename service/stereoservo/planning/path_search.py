@@ -1,4 +1,8 @@
-"""Search for a feasible path: a state machine whose stages can stop after any sample.
+"""Search for a feasible path among alternatives: a state machine whose stages can stop after any sample.
+
+The alternatives, cheapest first: other profiles, senses and kinds of turning, bent centre lines. A bend takes the
+centre aside by ``4σ(1 − σ) b``, ``b`` a displacement (a point of the plane at infinity): away from the cameras or
+towards them, to the right or left and down or up in the images.
 
 ``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: the arm along it. Where the arm
 cannot follow the path that was asked for, ``UNCONSTRAINED_IK`` follows it once more without limits, which gives the
@@ -10,25 +14,24 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from stereoservo.kinematics.composition import Composition
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.planning.constraint_margins import (
-    JOINT_LIMIT,
-    KEEP_OUT,
-    KINDS,
-    NOT_REACHABLE,
-    Constraints,
-    check_joints,
-    empty_table,
-    moved,
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.motion_frame import (
+    EXPONENTIAL,
+    FIRST,
+    LAST,
+    LINEAR,
+    NUMBERS,
+    conjugate_all,
+    pose_on_path,
+    turn_between,
 )
-from stereoservo.planning.detours import CANDIDATES, Candidate, name_of, other_profile, path_of
-from stereoservo.planning.motion_frame import conjugated, turn_between
-from stereoservo.planning.path import LINEAR, pose_on_path
 from stereoservo.planning.path_ik import (
     SEEDS,
     Arm,
@@ -40,10 +43,20 @@ from stereoservo.planning.path_ik import (
     pixel_distance,
     seed_joints,
 )
-from stereoservo.planning.plan import ClosestApproach, Plan, PlanRequest
+from stereoservo.planning.plan import ClosestApproach, Plan, PlanRequest, Profile
 from stereoservo.planning.primitives import HINGE, PLANAR, RIGID_FREEDOMS, TRANSLATION
 from stereoservo.planning.time_scaling import sample_times
-from stereoservo.planning.visibility_constraints import writable_copy
+from stereoservo.planning.visibility_constraints import (
+    JOINT_LIMIT,
+    KEEP_OUT,
+    KINDS,
+    NOT_REACHABLE,
+    Constraints,
+    check_joints,
+    empty_table,
+    moved,
+    writable_copy,
+)
 
 SAMPLES = 65
 """Of a path: half a turn in steps of three degrees."""
@@ -65,6 +78,48 @@ GOAL_BEYOND = 90
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
 """What the ``index`` of an approach NOT_REACHABLE names."""
 
+AWAY = (0.0, 0.12, 0.25, 0.45, 0.7, -0.12, -0.25)
+"""Bends away from the cameras, as shares of their distance from the centre."""
+ASIDE = (0.0, 0.07, -0.07, 0.15, -0.15, 0.25, -0.25)
+"""Bends to the right and down, likewise."""
+PROFILES: tuple[Profile, ...] = ("linear", "translation-first", "rotation-first", "planar-first")
+PROFILE_COST = 0.06
+TURN_COSTS = (0.0, 0.08, 0.2, 0.3, 0.4)
+"""Of the kinds of turning, in the order of `planner.turnings`, in the measure of the bends."""
+SHAPES: dict[Profile, tuple[float, float, float]] = {
+    "linear": (LINEAR, LINEAR, LINEAR),
+    "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
+    "translation-first": (FIRST, LAST, LAST),
+    "rotation-first": (LAST, FIRST, FIRST),
+    "planar-first": (LAST, LAST, FIRST),
+}
+"""Of each profile: how translation, hinge and planar rotation go (`motion_frame`)."""
+
+
+class Candidate(NamedTuple):
+    """One path: ``turning`` of `planner.turnings`, ``profile`` 0 the one asked for, ``bend`` away, right, down."""
+
+    turning: int
+    profile: int
+    bend: tuple[float, float, float]
+
+
+def _ordered() -> tuple[Candidate, ...]:
+    listed: list[tuple[float, int, Candidate]] = []
+    for away in AWAY:
+        for right in ASIDE:
+            for down in ASIDE:
+                size = math.sqrt(away * away + right * right + down * down)
+                for turning, cost in enumerate(TURN_COSTS):
+                    for profile in range(len(PROFILES) + 1):
+                        total = size + cost + (PROFILE_COST if profile else 0.0)
+                        listed.append((total, len(listed), Candidate(turning, profile, (away, right, down))))
+    return tuple(candidate for _, _, candidate in sorted(listed))
+
+
+CANDIDATES = _ordered()
+"""All paths, the straight one with the profile that was asked for first."""
+
 
 class Stage(IntEnum):
     """What the next samples are of."""
@@ -74,6 +129,10 @@ class Stage(IntEnum):
     UNCONSTRAINED_IK = 2
     STRAIGHT_IN_JOINTS = 3
     MULTISTART_IK = 4
+
+
+CLOSED_FORM, STRAIGHT_IN_JOINTS = int(Stage.CLOSED_FORM), int(Stage.STRAIGHT_IN_JOINTS)
+"""As kernels know them."""
 
 
 class Planning(msgspec.Struct, eq=False):
@@ -217,22 +276,39 @@ def start_arm(planning: Planning, stage: Stage) -> None:
 
 def _samples(p: Planning, until: int) -> tuple[int, int]:
     """Samples of the present stage: kind of limit broken or −1, and up to where."""
-    if p.stage == Stage.CLOSED_FORM:
-        broken, reached = check_path(p.path, p.sample, until, SAMPLES, p.constraints, p.residual, p.table)
-        return int(broken), int(reached)
-    arm = Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias)
-    record = PathRecord(p.all_joints, p.all_displacements, p.table)
-    if p.stage == Stage.STRAIGHT_IN_JOINTS:
-        broken, reached = follow_joint_line(p.joint_step, p.sample, until, p.constraints, arm, record)
-    else:
-        unconstrained = p.stage == Stage.UNCONSTRAINED_IK
-        # an arm that lacks freedoms leaves the path between its ends
-        tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
-        broken, reached = follow_path(
-            p.path, p.sample, until, _unlimited(p.constraints) if unconstrained else p.constraints, p.residual,
-            arm, len(p.joints) > p.rank, tolerance, record,
-        )  # fmt: skip
+    unconstrained = p.stage == Stage.UNCONSTRAINED_IK
+    # an arm that lacks freedoms leaves the path between its ends
+    tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
+    broken, reached = _go_on(
+        int(p.stage), p.path, p.joint_step, p.sample, until,
+        _unlimited(p.constraints) if unconstrained else p.constraints, p.residual,
+        Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias), len(p.joints) > p.rank,
+        tolerance, PathRecord(p.all_joints, p.all_displacements, p.table),
+    )  # fmt: skip
     return int(broken), int(reached)
+
+
+@kernel
+def _go_on(
+    stage: int,
+    path: FloatArray,
+    joint_step: FloatArray,
+    first: int,
+    last: int,
+    constraints: Constraints,
+    residual: FloatArray,
+    arm: Arm,
+    redundant: bool,
+    tolerance: float,
+    record: PathRecord,
+) -> tuple[int, int]:
+    """Samples ``first`` to before ``last`` of a ``stage``: kind of limit broken or −1, and where (`path_ik`)."""
+    if stage == CLOSED_FORM:
+        samples = record.joints.shape[0]
+        return check_path(path, first, last, samples, constraints, residual, record.table)
+    if stage == STRAIGHT_IN_JOINTS:
+        return follow_joint_line(joint_step, first, last, constraints, arm, record)
+    return follow_path(path, first, last, constraints, residual, arm, redundant, tolerance, record)
 
 
 def _unlimited(constraints: Constraints) -> Constraints:
@@ -269,8 +345,7 @@ def _end(p: Planning) -> None:
         p.followed += 1
         start_arm(p, Stage.FOLLOW_PATH)
         return
-    s = p.constraints
-    distance, marker = pixel_distance(s.cameras, s.must_stay_visible, moved(p.displacement, s.body), p.goal)
+    distance, marker = _distance_from_goal(p.displacement, p.constraints, p.goal)
     missed = not distance <= TOLERANCE_PX
     if p.stage == Stage.UNCONSTRAINED_IK:
         _continue_from_goal_joints(p, missed)
@@ -281,6 +356,15 @@ def _end(p: Planning) -> None:
         _fail(p, NOT_REACHABLE)
     else:
         _finish(p)
+
+
+@kernel
+def _distance_from_goal(
+    displacement: FloatArray, constraints: Constraints, goal: FloatArray
+) -> tuple[float, int]:
+    """`pixel_distance` of the body after its ``displacement`` (4, 4) from the ``goal`` (m, 3)."""
+    s = constraints
+    return pixel_distance(s.cameras, s.must_stay_visible, moved(displacement, s.body), goal)
 
 
 def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
@@ -322,23 +406,36 @@ def _straight_to(p: Planning, joints: FloatArray) -> None:
 
 def _finish(p: Planning) -> None:
     r = p.request
-    times = sample_times(
-        p.all_joints,
-        writable_copy(r.speed_scale * r.limits.velocity_max),
-        writable_copy(r.speed_scale * r.limits.acceleration_max),
-        r.profile == "exponential",
-    )
+    times, displacements = _in_time(
+        p.all_joints, p.all_displacements, p.frame, p.inverse, r.speed_scale * r.limits.velocity_max,
+        r.speed_scale * r.limits.acceleration_max, r.profile == "exponential",
+    )  # fmt: skip
     candidate = CANDIDATES[p.candidate]
     profile = other_profile(r.profile, candidate.profile) or r.profile
     p.plan = Plan(
         times=times,
         joints=p.all_joints.copy(),
-        displacements=np.stack([conjugated(p.frame, H, p.inverse) for H in p.all_displacements]),
+        displacements=displacements,
         shares=np.arange(SAMPLES) / (SAMPLES - 1.0),
         way="straight in the joints" if p.stage == Stage.STRAIGHT_IN_JOINTS else name_of(candidate, profile),
         approaches=_approaches(p),
     )
     p.finished = True
+
+
+@kernel
+def _in_time(
+    joints: FloatArray,
+    displacements: FloatArray,
+    frame: FloatArray,
+    inverse: FloatArray,
+    velocity_max: FloatArray,
+    acceleration_max: FloatArray,
+    even: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) out of the motion ``frame``."""
+    times = sample_times(joints, velocity_max, acceleration_max, even)
+    return times, conjugate_all(frame, displacements, inverse)
 
 
 def _straight(candidate: Candidate) -> bool:
@@ -377,14 +474,7 @@ def approach(planning: Planning, kind: int) -> ClosestApproach:
         joint = index if kind == JOINT_LIMIT else 0
         unit = "rad" if planning.turns[joint] > 0.0 else "m"
     return ClosestApproach(
-        what=KINDS[kind],
-        index=index,
-        value=float(row[2]),
-        limit=float(row[3]),
-        unit=unit,
-        room=float(row[1]),
-        share=float(row[6]),
-        marker=int(row[5]),
+        KINDS[kind], index, float(row[2]), float(row[3]), unit, float(row[1]), float(row[6]), int(row[5])
     )
 
 
@@ -397,3 +487,54 @@ def face_normal(points: FloatArray, faces: IntArray) -> FloatArray | None:
     normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
     unit: FloatArray = normal / math.sqrt(float((normal * normal).sum()))
     return unit
+
+
+# -- alternative paths ----------------------------------------------------------------------------------------
+
+
+def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Shapes for components of ``amounts``; where only one kind of shape has anything to do, nothing waits: linear."""
+    own = SHAPES[profile]
+    at_work = {shape for shape, amount in zip(own, amounts, strict=True) if amount != 0.0}
+    if profile == "exponential" or len(at_work) > 1:
+        return own
+    return SHAPES["linear"]
+
+
+def path_of(
+    candidate: Candidate,
+    profile: Profile,
+    turning: FloatArray,
+    displacement: FloatArray,
+    directions: FloatArray,
+) -> FloatArray:
+    """The numbers (17,) of `pose_on_path` for one candidate."""
+    path = np.zeros(NUMBERS)
+    path[:8] = turning
+    path[8:11] = displacement
+    for amount, direction in zip(candidate.bend, directions, strict=True):
+        path[11:14] += amount * direction
+    amounts = (float(np.abs(displacement).max()), float(turning[3]), float(turning[7]))
+    path[14:] = shapes(profile, amounts)
+    return path
+
+
+def other_profile(asked: Profile, nth: int) -> Profile | None:
+    """The profile number ``nth`` of a candidate; None where it is the one asked for again."""
+    if nth == 0:
+        return asked
+    profile = PROFILES[nth - 1]
+    return None if profile == asked else profile
+
+
+def name_of(candidate: Candidate, profile: Profile) -> str:
+    """Description of a path for people."""
+    kinds = ("", "one rotation", "the other way round", "planar rotation the other way round")
+    kind = (*kinds, "one rotation the other way round")[candidate.turning]
+    words = (("away from the cameras", "towards the cameras"), ("right", "left"), ("down", "up"))
+    bends = [
+        f"{positive if amount > 0.0 else negative} by {abs(amount):g}"
+        for amount, (positive, negative) in zip(candidate.bend, words, strict=True)
+        if amount != 0.0
+    ]
+    return ", ".join(part for part in (profile, kind, "bent " + " and ".join(bends) if bends else "") if part)

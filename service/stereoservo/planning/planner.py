@@ -1,20 +1,28 @@
 """Path planner: the path of a body and of the joints, before anything moves, in slices of work that a loop can afford.
 
 `start_planning` checks a request, converts it into a motion frame and decides what can be decided at once: a goal out
-of view, or hidden, or the present pose itself. `plan_on` then tries one candidate path after the other (`detours`,
-`path_search`). The state between two slices is plain data; how the work is sliced changes no bit of the result.
+of view, or hidden, or the present pose itself. `plan_on` then tries one candidate path after the other
+(`path_search`). The state between two slices is plain data; how the work is sliced changes no bit of the result.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from stereoservo.kinematics.kernels import invert4, transform_points
+from stereoservo.kinematics.kernels import invert4
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.planning.constraint_margins import empty_table, moved
-from stereoservo.planning.detours import bend_directions, turnings
-from stereoservo.planning.motion_frame import conjugated, motion_frame, plane_at_infinity, turn_between
-from stereoservo.planning.path import NUMBERS, pose_on_path
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.motion_frame import (
+    NUMBERS,
+    conjugate_all,
+    motion_frame,
+    plane_at_infinity,
+    pose_on_path,
+    turn,
+    turn_between,
+)
 from stereoservo.planning.path_ik import freedoms
 from stereoservo.planning.path_search import (
     MISSING_FREEDOMS,
@@ -27,7 +35,13 @@ from stereoservo.planning.path_search import (
     stay,
 )
 from stereoservo.planning.plan import PlanLimits, PlanRequest
-from stereoservo.planning.visibility_constraints import read_constraints, writable_copy
+from stereoservo.planning.visibility_constraints import (
+    empty_table,
+    in_frame,
+    moved,
+    read_constraints,
+    writable_copy,
+)
 
 __all__ = [
     "MISSING_FREEDOMS",
@@ -47,6 +61,10 @@ TURNS = 1e-6
 COLLINEAR = 1e-6
 """Square of the sine, seen from the middle, below which all markers are on one line."""
 
+NO_ANGLE = 1e-9
+PARALLEL = 1e-7
+"""Sine below which two normals are one."""
+
 
 class PlanRequestError(ValueError):
     """A request that no plan can answer: numbers that are not finite, no limits, markers or a face on one line."""
@@ -64,21 +82,17 @@ def start_planning(request: PlanRequest) -> Planning:
     """State from which `plan_on` continues, or finished where all is decided at once. Raises PlanRequestError."""
     r = request
     _check(r)
-    operators, centre, camera_centres = (
-        writable_copy(r.operators),
-        writable_copy(r.centre),
-        writable_copy(r.camera_centres),
-    )
+    operators = writable_copy(r.operators)
     stacked = writable_copy(
         np.concatenate([r.points, r.targets, r.camera_centres, r.centre[None], r.centre_target[None]])
     )
-    frame = motion_frame(operators, plane_at_infinity(operators, stacked), centre, camera_centres)
-    inverse = invert4(frame)
+    m, n = len(r.points), len(r.joints)
+    frame, inverse, local = _into_frame(operators, stacked, 2 * m)
     if not np.isfinite(inverse).all():
         raise PlanRequestError(
             "operators and points leave no plane at infinity: points of height a∞ᵀM = 1, no three on a line, are needed"
         )
-    body, goal = _in_frame(inverse, r.points), _in_frame(inverse, r.targets)
+    body, goal, camera_centres = local[:m].copy(), local[m : 2 * m].copy(), local[2 * m : -2].copy()
     if not _spans_a_plane(body):
         raise PlanRequestError(
             f"{len(body)} markers on one line fix no pose: three that span a plane are needed"
@@ -86,30 +100,27 @@ def start_planning(request: PlanRequest) -> Planning:
     for face in np.asarray(r.faces).reshape(-1, 3):
         if not _spans_a_plane(body[face]):
             raise PlanRequestError(f"the markers {face.tolist()} of a face are on one line")
-    centre_translation = _in_frame(inverse, r.centre_target[None])[0]
-    rotation = turn_between(body, goal)
-    whole = np.zeros(NUMBERS)
-    whole[:3], whole[3], whole[6], whole[8:11] = rotation[:3], rotation[3], 1.0, centre_translation
-    at_goal = pose_on_path(whole, 1.0)
-    constraints, refusal = read_constraints(r, frame, inverse, body, goal)
+    centre_translation = local[-1].copy()
+    rotation, residual, own, rank = _whole_displacement(
+        body, goal, centre_translation, frame, inverse, operators
+    )
+    constraints, refusal = read_constraints(r, frame, camera_centres, body, goal)
     kinds = np.stack(turnings(rotation, face_normal(body, constraints.faces)))
-    local = np.stack([conjugated(inverse, G, frame) for G in operators])
-    n = len(r.joints)
     planning = Planning(
         request=request,
         frame=frame,
         inverse=inverse,
         constraints=constraints,
         goal=goal,
-        residual=goal - moved(at_goal, body),
+        residual=residual,
         directions=bend_directions(constraints.cameras[0], constraints.camera_centres),
         turnings=kinds,
         useful=_useful(kinds),
         centre_translation=centre_translation,
-        start_operators=local,
-        rank=int(freedoms(local)),
+        start_operators=own,
+        rank=int(rank),
         path=np.zeros(NUMBERS),
-        operators=local.copy(),
+        operators=own.copy(),
         joints=np.array(r.joints, dtype=np.float64),
         displacement=np.eye(4),
         bias=np.zeros(n),
@@ -117,7 +128,7 @@ def start_planning(request: PlanRequest) -> Planning:
         all_displacements=np.zeros((SAMPLES, 4, 4)),
         table=empty_table(),
         joint_step=np.zeros(n),
-        turns=(np.abs(local[:, :3, :3]).max(axis=(1, 2)) > TURNS).astype(np.float64),
+        turns=(np.abs(own[:, :3, :3]).max(axis=(1, 2)) > TURNS).astype(np.float64),
     )
     if refusal is not None:
         planning.finished, planning.failure = True, (refusal,)
@@ -161,8 +172,44 @@ def _check_limits(limits: PlanLimits) -> None:
         raise PlanRequestError("lenses and view_margin_px of a plan's limits must be finite")
 
 
-def _in_frame(inverse: FloatArray, points: FloatArray) -> FloatArray:
-    return writable_copy(transform_points(inverse, writable_copy(points))[:, :3])
+@kernel
+def _into_frame(
+    operators: FloatArray, points: FloatArray, first: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Motion frame and its inverse (4, 4), and ``points`` (k, 4) of height 1 as (k, 3) in it.
+
+    Of the points, the camera centres begin at ``first``; the last but one is the centre, the last the centre's target.
+    """
+    k = points.shape[0]
+    frame = motion_frame(
+        operators, plane_at_infinity(operators, points), points[k - 2], points[first : k - 2]
+    )
+    inverse = invert4(frame)
+    return frame, inverse, in_frame(inverse, points)
+
+
+@kernel
+def _whole_displacement(
+    body: FloatArray,
+    goal: FloatArray,
+    translation: FloatArray,
+    frame: FloatArray,
+    inverse: FloatArray,
+    operators: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """What takes ``body`` (m, 3) to ``goal`` (m, 3): rotation as axis and angle (4,), and what is left (m, 3) beside it
+    and the ``translation`` (3,) of the centre. And the arm's ``operators`` (n, 4, 4) in the motion frame, and its
+    number of freedoms.
+    """
+    rotation = turn_between(body, goal)
+    whole = np.zeros(NUMBERS)
+    for i in range(4):
+        whole[i] = rotation[i]
+    whole[6] = 1.0
+    for i in range(3):
+        whole[8 + i] = translation[i]
+    own = conjugate_all(inverse, operators, frame)
+    return rotation, goal - moved(pose_on_path(whole, 1.0), body), own, freedoms(own)
 
 
 def _useful(kinds: FloatArray) -> tuple[bool, ...]:
@@ -181,3 +228,98 @@ def _spans_a_plane(body: FloatArray) -> bool:
     along = edges[int(squares.argmax())]
     across = squares * float(squares.max()) - (edges * along[None, :]).sum(axis=1) ** 2
     return bool(float(across.max()) > COLLINEAR * float(squares.max()) ** 2)
+
+
+@kernel
+def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArray:
+    """Unit displacements (3, 3): away from ``camera_centres`` (c, 3), right and down in ``camera`` (3, 4)."""
+    P = camera[:, :3]
+    rows = np.zeros((3, 3))
+    rows[1], rows[2] = _cross(P[1], P[2]), _cross(P[2], P[0])
+    sign = 1.0 if _dot(P[0], rows[1]) >= 0.0 else -1.0
+    for i in range(3):
+        for c in range(camera_centres.shape[0]):
+            rows[0, i] += camera_centres[c, i]
+        rows[0, i] *= -1.0
+        rows[1, i] *= sign
+        rows[2, i] *= sign
+    for k in range(3):
+        length = math.sqrt(_dot(rows[k], rows[k]))
+        if length > 0.0:
+            for i in range(3):
+                rows[k, i] /= length
+    return rows
+
+
+def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
+    """Hinge axis and angle, planar axis and angle (8,) of each kind of turning, for a rotation ``(axis, angle)`` (4,).
+
+    Hinge and planar rotation of the face of ``normal`` (3,), the shorter ones; one rotation about the centre; the hinge
+    the other way round; the planar rotation the other way round; the one rotation the other way round (7.4.1, 7.4.2).
+    """
+    axis, angle = rotation[:3], float(rotation[3])
+    whole = 2.0 * math.pi
+    single = _turning(axis, angle, axis, 0.0)
+    single_back = _turning(axis, angle - whole, axis, 0.0)
+    if normal is None:
+        return single, single, single_back, single, single_back
+    hinge, theta_r, theta_p = _hinge_and_planar(rotation, normal)
+    return (
+        _turning(hinge, theta_r, normal, theta_p),
+        single,
+        _turning(hinge, theta_r - whole, normal, theta_p),
+        _turning(hinge, theta_r, normal, theta_p - math.copysign(whole, theta_p)),
+        single_back,
+    )
+
+
+def _turning(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: float) -> FloatArray:
+    out = np.empty(8)
+    out[:3], out[3], out[4:7], out[7] = hinge, theta_r, normal, theta_p
+    return out
+
+
+@kernel
+def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatArray, float, float]:
+    """Hinge axis (3,), hinge and planar angle of a rotation ``(axis, angle)`` (4,) of the face of ``normal`` (3,)."""
+    R = turn(rotation[:3], rotation[3])
+    after = np.empty(3)
+    for i in range(3):
+        after[i] = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
+    axis = _cross(normal, after)
+    sine = math.sqrt(_dot(axis, axis))
+    cosine = _dot(normal, after)
+    if sine > PARALLEL:
+        hinge = axis / sine
+    else:
+        # one plane, or back on face: half a turn about any line in it
+        least = 0
+        for i in range(1, 3):
+            if abs(normal[i]) < abs(normal[least]):
+                least = i
+        other = np.zeros(3)
+        other[least] = 1.0
+        hinge = _cross(normal, other)
+        hinge /= math.sqrt(_dot(hinge, hinge))
+    theta_r = math.atan2(sine, cosine) if sine > PARALLEL or cosine < 0.0 else 0.0
+    back = turn(hinge, -theta_r)
+    # the planar rotation R_p = R_r⁻¹ R, read on a direction in the face
+    inside = _cross(normal, hinge)
+    image = np.empty(3)
+    turned = np.empty(3)
+    for i in range(3):
+        for k in range(3):
+            turned[k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
+        image[i] = _dot(turned, hinge)
+    theta_p = math.atan2(_dot(image, inside), _dot(image, hinge))
+    return hinge, theta_r, theta_p if abs(theta_p) > NO_ANGLE else 0.0
+
+
+@kernel
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@kernel
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

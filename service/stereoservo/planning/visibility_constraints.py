@@ -1,28 +1,38 @@
-"""Constraints of a plan's request in the motion frame: faces and markers that must stay visible, and their margins.
+"""Constraints of a path in a `motion_frame`: images, faces, depth, joints, keep-outs; clearance of a pose to them.
 
 Margins hold along the path. Where the present pose or the goal itself has less, they are lowered to that: a pose that
 is allowed may be left and reached.
+
+The closest approach to each kind of limit is a row of a table (6, 7): relative clearance, clearance, value, limit,
+index, marker, path parameter; rows in the order of ``KINDS``. Kernels, for the loop.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.kinematics.kernels import transform_points
+from stereoservo.kinematics.kernels import distort_pixel, transform_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.planning.constraint_margins import (
-    FACE_HIDDEN,
-    KINDS,
-    Constraints,
-    border_clearance,
-    check_view,
-    elevation,
-    empty_table,
+from stereoservo.numerics.compilation import kernel
+from stereoservo.planning.plan import ClosestApproach, Limit, PlanRequest
+
+KINDS: tuple[Limit, ...] = (
+    "JOINT_LIMIT",
+    "KEEP_OUT",
+    "FIELD_OF_VIEW",
+    "FACE_HIDDEN",
+    "BEHIND_CAMERA",
+    "NOT_REACHABLE",
 )
-from stereoservo.planning.plan import ClosestApproach, PlanRequest
+JOINT_LIMIT, KEEP_OUT, FIELD_OF_VIEW, FACE_HIDDEN, BEHIND_CAMERA, NOT_REACHABLE = range(6)
+
+NEAREST_DEPTH = 0.05
+"""Least depth of a marker, as a path_parameter of the depth that the centre has now."""
+ROUNDING = 1e-9
 
 GRAZING = math.radians(3.0)
 """Least elevation of a camera over a face that must stay visible, unless the ends of the path have less."""
@@ -32,21 +42,246 @@ YIELD_PX, YIELD_ANGLE = 0.02, 1e-4
 """What margins leave below what the ends have [px], [rad]: more than the arm may be off there."""
 
 
+class Constraints(NamedTuple):
+    """What a path has to respect, constant while a body moves, in a motion frame.
+
+    With c cameras, m markers, f faces, n joints, k keep-outs: ``body`` (m, 3), ``must_stay_visible`` (m,), 1 or 0.
+    ``cameras`` (c, 3, 4), ``camera_centres`` (c, 3), ``sizes`` (c, 2) [px], ``lenses`` (c, 4), ``margins`` (c,) [px],
+    ``depths`` (c,) of the centre now. ``faces`` (f, 3), ``sides`` (f, c): the sign of the face's plane at the camera
+    where it must stay visible, else 0; ``grazing`` (f, c): least elevation [rad]. ``lower``, ``upper`` (n,),
+    ``keep_outs`` (k, n, 2).
+    """
+
+    body: FloatArray
+    must_stay_visible: FloatArray
+    cameras: FloatArray
+    camera_centres: FloatArray
+    sizes: FloatArray
+    lenses: FloatArray
+    margins: FloatArray
+    depths: FloatArray
+    faces: IntArray
+    sides: FloatArray
+    grazing: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    keep_outs: FloatArray
+
+
+def empty_table() -> FloatArray:
+    """A table of closest approaches before any pose: nothing near."""
+    table = np.zeros((len(KINDS), 7))
+    table[:, :2] = np.inf
+    table[:, 5] = -1.0
+    return table
+
+
+@kernel
+def _enter(
+    table: FloatArray,
+    kind: int,
+    scale: float,
+    value: float,
+    limit: float,
+    clearance: float,
+    index: int,
+    marker: int,
+    path_parameter: float,
+) -> bool:
+    """Whether a limit is broken; the table keeps the closest approach."""
+    if clearance / scale < table[kind, 0]:
+        table[kind, 0] = clearance / scale
+        table[kind, 1] = clearance
+        table[kind, 2] = value
+        table[kind, 3] = limit
+        table[kind, 4] = index
+        table[kind, 5] = marker
+        table[kind, 6] = path_parameter
+    return clearance < -ROUNDING * scale
+
+
+@kernel
+def moved(H: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (m, 3) displaced by ``H`` (4, 4)."""
+    out = np.empty(points.shape)
+    for p in range(points.shape[0]):
+        for i in range(3):
+            out[p, i] = H[i, 0] * points[p, 0] + H[i, 1] * points[p, 1] + H[i, 2] * points[p, 2] + H[i, 3]
+    return out
+
+
+@kernel
+def border_clearance(
+    camera: FloatArray, lens: FloatArray, size: FloatArray, x: float, y: float, z: float
+) -> tuple[float, float]:
+    """Distance of a point's raw pixel from the image's border [px], negative outside; and its depth.
+
+    Beyond the lens's fold, or not before the camera, it is as far outside as the image is wide.
+    """
+    d = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z + camera[2, 3]
+    if not d > 0.0:
+        return -size[0], d
+    u = (camera[0, 0] * x + camera[0, 1] * y + camera[0, 2] * z + camera[0, 3]) / d
+    v = (camera[1, 0] * x + camera[1, 1] * y + camera[1, 2] * z + camera[1, 3]) / d
+    u, v = distort_pixel(lens, u, v)
+    clearance = min(u + 0.5, size[0] - 0.5 - u, v + 0.5, size[1] - 0.5 - v)
+    if not math.isfinite(clearance) or clearance < -size[0]:
+        return -size[0], d
+    return clearance, d
+
+
+@kernel
+def elevation(points: FloatArray, faces: IntArray, f: int, side: float, camera_centre: FloatArray) -> float:
+    """Angle [rad] of ``camera_centre`` (3,) above face ``f`` of ``points`` (m, 3), on the side ``side`` ±1 of it."""
+    i0, i1, i2 = faces[f, 0], faces[f, 1], faces[f, 2]
+    ax = points[i1, 0] - points[i0, 0]
+    ay = points[i1, 1] - points[i0, 1]
+    az = points[i1, 2] - points[i0, 2]
+    bx = points[i2, 0] - points[i0, 0]
+    by = points[i2, 1] - points[i0, 1]
+    bz = points[i2, 2] - points[i0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    wx = camera_centre[0] - (points[i0, 0] + points[i1, 0] + points[i2, 0]) / 3.0
+    wy = camera_centre[1] - (points[i0, 1] + points[i1, 1] + points[i2, 1]) / 3.0
+    wz = camera_centre[2] - (points[i0, 2] + points[i1, 2] + points[i2, 2]) / 3.0
+    sine = (nx * wx + ny * wy + nz * wz) / math.sqrt(
+        (nx * nx + ny * ny + nz * nz) * (wx * wx + wy * wy + wz * wz)
+    )
+    return side * math.asin(min(1.0, max(-1.0, sine)))
+
+
+@kernel
+def check_view(
+    points: FloatArray, path_parameter: float, constraints: Constraints, table: FloatArray, bounded: bool
+) -> int:
+    """The first kind of limit that ``points`` (m, 3) break, or −1; their clearance is entered into the table (6, 7).
+
+    ``bounded``: with the margins; else those of the images and faces themselves.
+    """
+    s = constraints
+    broken = -1
+    for c in range(s.cameras.shape[0]):
+        for p in range(points.shape[0]):
+            if not s.must_stay_visible[p] > 0.0:
+                continue
+            clearance, depth = border_clearance(
+                s.cameras[c], s.lenses[c], s.sizes[c], points[p, 0], points[p, 1], points[p, 2]
+            )
+            relative_depth = depth / s.depths[c]
+            if (
+                _enter(
+                    table,
+                    4,
+                    1.0,
+                    relative_depth,
+                    NEAREST_DEPTH,
+                    relative_depth - NEAREST_DEPTH,
+                    c,
+                    p,
+                    path_parameter,
+                )
+                and broken < 0
+            ):
+                broken = 4
+            margin = s.margins[c] if bounded else 0.0
+            if (
+                _enter(table, 2, s.sizes[c, 0], clearance, margin, clearance - margin, c, p, path_parameter)
+                and broken < 0
+                and depth > 0.0
+            ):
+                broken = 2
+        for f in range(s.faces.shape[0]):
+            if s.sides[f, c] != 0.0:
+                angle = elevation(points, s.faces, f, s.sides[f, c], s.camera_centres[c])
+                limit = s.grazing[f, c] if bounded else 0.0
+                if (
+                    _enter(
+                        table, 3, 1.0, math.degrees(angle), math.degrees(limit), math.degrees(angle - limit),
+                        c, s.faces[f, 0], path_parameter,
+                    )
+                    and broken < 0
+                ):  # fmt: skip
+                    broken = 3
+    return broken
+
+
+@kernel
+def check_joints(
+    joints: FloatArray, path_parameter: float, constraints: Constraints, table: FloatArray
+) -> int:
+    """The first kind of limit that ``joints`` (n,) break, or −1; their clearance is entered into the table (6, 7)."""
+    s = constraints
+    n = joints.shape[0]
+    broken = -1
+    for j in range(n):
+        if math.isfinite(s.upper[j]):
+            clearance = s.upper[j] - joints[j]
+            if _enter(table, 0, 1.0, joints[j], s.upper[j], clearance, j, -1, path_parameter) and broken < 0:
+                broken = 0
+        if math.isfinite(s.lower[j]):
+            clearance = joints[j] - s.lower[j]
+            if _enter(table, 0, 1.0, joints[j], s.lower[j], clearance, j, -1, path_parameter) and broken < 0:
+                broken = 0
+    for k in range(s.keep_outs.shape[0]):
+        outside = -math.inf
+        for j in range(n):
+            outside = max(outside, s.keep_outs[k, j, 0] - joints[j], joints[j] - s.keep_outs[k, j, 1])
+        if (
+            math.isfinite(outside)
+            and _enter(table, 1, 1.0, outside, 0.0, outside, k, -1, path_parameter)
+            and broken < 0
+        ):
+            broken = 1
+    return broken
+
+
+@kernel
+def limit_pull(positions: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pull (n,) in [-1, 1] to the middle of each joint's range, and half ranges (n,).
+
+    The cube of the relative distance from the middle; no pull and a half range of 1 where ``lower`` and ``upper`` (n,)
+    are infinite, or leave no range.
+    """
+    n = positions.shape[0]
+    half = np.ones(n)
+    pull = np.zeros(n)
+    for j in range(n):
+        width = upper[j] - lower[j]
+        if width > 0.0 and math.isfinite(width):
+            half[j] = 0.5 * width
+            x = max(-1.0, min(1.0, (positions[j] - lower[j]) / half[j] - 1.0))
+            pull[j] = -x * x * x
+    return pull, half
+
+
+# -- constraints of a request ---------------------------------------------------------------------------------
+
+
 def writable_copy(values: npt.ArrayLike) -> FloatArray:
     """A writable, contiguous copy: kernels are compiled by these properties too, and no loop may wait for that."""
     return np.array(values, dtype=np.float64, order="C", copy=True)
 
 
-def read_constraints(
-    request: PlanRequest, frame: FloatArray, inverse: FloatArray, body: FloatArray, goal: FloatArray
-) -> tuple[Constraints, ClosestApproach | None]:
-    """Constraints of a path in the motion frame; and why there can be none: an end of it out of view, or hidden.
+@kernel
+def in_frame(inverse: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (m, 4) of height 1 as (m, 3) in the motion frame of ``inverse`` (4, 4)."""
+    moved_points = transform_points(inverse, points)
+    out = np.empty((points.shape[0], 3))
+    for p in range(points.shape[0]):
+        for i in range(3):
+            out[p, i] = moved_points[p, i]
+    return out
 
-    ``body`` (m, 3) now, ``goal`` (m, 3).
+
+def read_constraints(
+    request: PlanRequest, frame: FloatArray, camera_centres: FloatArray, body: FloatArray, goal: FloatArray
+) -> tuple[Constraints, ClosestApproach | None]:
+    """Constraints of a path in the motion ``frame``; and why there can be none: an end of it out of view, or hidden.
+
+    In the frame: ``camera_centres`` (c, 3), the ``body`` (m, 3) now, the ``goal`` (m, 3).
     """
     r, limits = request, request.limits
     cameras = np.stack([_moved_camera(P, frame) for P in r.matrices])
-    camera_centres = writable_copy(transform_points(inverse, writable_copy(r.camera_centres))[:, :3])
     faces = np.array(r.faces, dtype=np.int64, order="C", copy=True).reshape(-1, 3)
     sides, grazing = _required_visibility(body, goal, faces, camera_centres)
     constraints = Constraints(
@@ -78,15 +313,29 @@ def _moved_camera(P: FloatArray, frame: FloatArray) -> FloatArray:
     return writable_copy((P[:, :, None] * frame[None, :, :]).sum(axis=1))
 
 
+@kernel
 def _image_clearances(constraints: Constraints, points: FloatArray) -> FloatArray:
+    """Of each camera (c,): the least `border_clearance` of the ``points`` (m, 3) that must stay visible."""
     s = constraints
-    clearances = np.full(len(s.cameras), math.inf)
-    for c in range(len(s.cameras)):
-        for p in np.flatnonzero(s.must_stay_visible > 0.0):
-            x, y, z = (float(value) for value in points[p])
-            clearance, _ = border_clearance(s.cameras[c], s.lenses[c], s.sizes[c], x, y, z)
-            clearances[c] = min(clearances[c], clearance)
+    clearances = np.full(s.cameras.shape[0], math.inf)
+    for c in range(s.cameras.shape[0]):
+        for p in range(points.shape[0]):
+            if s.must_stay_visible[p] > 0.0:
+                clearance, _ = border_clearance(
+                    s.cameras[c], s.lenses[c], s.sizes[c], points[p, 0], points[p, 1], points[p, 2]
+                )
+                clearances[c] = min(clearances[c], clearance)
     return clearances
+
+
+@kernel
+def _elevations(points: FloatArray, faces: IntArray, camera_centres: FloatArray) -> FloatArray:
+    """`elevation` (f, c) of every camera over every face, on the side 1."""
+    out = np.empty((faces.shape[0], camera_centres.shape[0]))
+    for f in range(faces.shape[0]):
+        for c in range(camera_centres.shape[0]):
+            out[f, c] = elevation(points, faces, f, 1.0, camera_centres[c])
+    return out
 
 
 def _required_visibility(
@@ -94,9 +343,8 @@ def _required_visibility(
 ) -> tuple[FloatArray, FloatArray]:
     """Sides (f, c) of the faces and least elevations (f, c) [rad]; side 0 where a camera has no sight at both ends."""
     sides, grazing = np.zeros((len(faces), len(camera_centres))), np.zeros((len(faces), len(camera_centres)))
-    for f in range(len(faces)):
-        now = np.array([elevation(body, faces, f, 1.0, camera_centre) for camera_centre in camera_centres])
-        then = np.array([elevation(goal, faces, f, 1.0, camera_centre) for camera_centre in camera_centres])
+    elevations = _elevations(body, faces, camera_centres), _elevations(goal, faces, camera_centres)
+    for f, (now, then) in enumerate(zip(*elevations, strict=True)):
         side = _outside(body, faces[f])
         if side == 0.0:
             side = 1.0 if float((now + then).sum()) >= 0.0 else -1.0

@@ -16,7 +16,7 @@ import numpy as np
 
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.goals.resolve import goal_pose
+from stereoservo.core.goals.marker_body import goal_pose
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo.messages.goals import DEFAULT_LAW

@@ -12,7 +12,7 @@ import pytest
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core import limit
 from stereoservo.messages.goals import Target
-from stereoservo.planning.path import SHAPES
+from stereoservo.planning.path_search import SHAPES
 from stereoservo.planning.plan import Limit
 
 ROOT = Path(__file__).parents[3]

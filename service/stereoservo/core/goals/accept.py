@@ -17,12 +17,10 @@ from stereoservo.core.goals.execute import (
     end_queue,
     end_source,
     preempt,
-    require_motion_allowed,
 )
+from stereoservo.core.goals.marker_body import BodyState, place_now
 from stereoservo.core.goals.plan import begin_plan
-from stereoservo.core.goals.resolve import joint_index
-from stereoservo.core.goals.servo_goal import place_now, start_servoing
-from stereoservo.core.goals.target_checks import BodyState
+from stereoservo.core.goals.resolve import joint_index, start_servoing
 from stereoservo.core.monitors import camera_relocalization
 from stereoservo.core.monitors.camera_relocalization import refuse_while_moved
 from stereoservo.core.monitors.moving_camera import refuse_pixels
@@ -80,6 +78,9 @@ QUEUE_LENGTH = 16
 Accepted = tuple[str, PlanReport | None]
 """The message of an accepted request, and the report of its plan."""
 
+Prepared = tuple[JointMove | ServoGoal | IncidenceGoal, BodyState | None]
+"""The source that a goal comes to, and the place that it sets out from, where that counts."""
+
 _IDS: dict[type[Any], Callable[[Any], str]] = {
     RunGoal: attrgetter("goal.id"),
     **dict.fromkeys((RenewGoal, CancelGoal, UpdateGoal, AcknowledgeGoal, Home, Calibrate), attrgetter("id")),
@@ -94,7 +95,8 @@ def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | N
         require_motion_allowed(context)
         if _known(goal.id, context):
             return "already accepted", None  # a client's retry
-        refuse_pixels(goal.target, state, context.settings)
+        if any(camera is not None for camera in state.mobile):
+            refuse_pixels(goal.target, state, context.settings)
         busy = MOTION_SOURCES[type(state.source)].subject(state.source) or state.queue
         if goal.mode == "queue" and busy:
             return _enqueue(goal, context), None
@@ -103,6 +105,21 @@ def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | N
         state.planning = begin_plan(source, context, place, context.q, "reply", request.request)
         return None
     return accept(goal, source, report_without_plan(source, context), context)
+
+
+def require_motion_allowed(context: StepContext) -> None:
+    """Raises RefusalError where the arm may not move now."""
+    state = context.state
+    if state.lifecycle != Lifecycle.ACTIVE:
+        raise RefusalError(
+            "NOT_ACTIVE",
+            f"the cell is {state.lifecycle}; "
+            f"{'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first",
+        )
+    if state.stopped:
+        raise RefusalError("STOPPED", "the cell was stopped; resume it first")
+    if state.held:
+        raise RefusalError("HELD", "the cell is held; resume it first")
 
 
 def report_without_plan(source: Source, context: StepContext) -> PlanReport | None:
@@ -168,17 +185,9 @@ def accept(goal: Goal, source: Source, report: PlanReport | None, context: StepC
     return "accepted", report
 
 
-def prepare(
-    goal: Goal, context: StepContext, place: BodyState | None = None
-) -> tuple[JointMove | ServoGoal | IncidenceGoal, BodyState | None]:
-    """The source that a goal comes to, and the place that it sets out from, where that counts.
-
-    ``place``: of the body, None: where it is. Raises RefusalError.
-    """
+def prepare(goal: Goal, context: StepContext, place: BodyState | None = None) -> Prepared:
+    """A goal that sets out from a ``place`` of the body, None: from where it is. Raises RefusalError."""
     return _PREPARE[type(goal.target)](goal, goal.target, context, place)
-
-
-Prepared = tuple[JointMove | ServoGoal | IncidenceGoal, BodyState | None]
 
 
 def _prepare_joints(
@@ -215,7 +224,8 @@ def _prepare_servoing(
 def _trusted_place(context: StepContext, place: BodyState | None) -> BodyState:
     """The body at ``place``, or where it is. Raises RefusalError without a model that holds."""
     trusted_model(context)
-    refuse_while_moved(context.state)
+    if context.state.reanchoring is not None:
+        refuse_while_moved(context.state)
     return place_now(context) if place is None else place
 
 
@@ -412,20 +422,16 @@ def _free(context: StepContext) -> bool:
 
 
 def _answer(request: Request, context: StepContext) -> None:
+    command = request.command
     try:
-        accepted = _carry_out(request, request.command, context)
+        done = _HANDLERS[type(command)](command, request, context)
     except RefusalError as refusal:
         _reply_refused(request, refusal, context)
         return
-    if accepted is not None:
-        message, plan = accepted
+    if done is not None:
+        message, plan = (done, None) if isinstance(done, str) else done
         context.emit(
-            "reply",
-            request=request.request,
-            accepted=True,
-            message=message,
-            id=id_of(request.command),
-            plan=plan,
+            "reply", request=request.request, accepted=True, message=message, id=id_of(command), plan=plan
         )
 
 
@@ -434,11 +440,6 @@ def _reply_refused(request: Request, refusal: RefusalError, context: StepContext
         "reply", request=request.request, accepted=False, message=str(refusal), reasons=refusal.reasons,
         id=id_of(request.command),
     )  # fmt: skip
-
-
-def _carry_out(request: Request, command: Command, context: StepContext) -> Accepted | None:
-    done = _HANDLERS[type(command)](command, request, context)
-    return (done, None) if isinstance(done, str) else done
 
 
 def _run(command: RunGoal, request: Request, context: StepContext) -> Accepted | None:
@@ -564,10 +565,6 @@ def _jog(command: Jog, request: Request, context: StepContext) -> str:
     return f"jogging for {command.lease_s} s"
 
 
-def _teach(command: Teach, request: Request, context: StepContext) -> str:
-    return start_teaching(command, request, context)
-
-
 def _of_command(carry_out: Callable[[Any, StepContext], str]) -> Callable[[Any, Request, StepContext], str]:
     """A handler that needs nothing of the request but its command."""
     return lambda command, request, context: carry_out(command, context)
@@ -585,7 +582,7 @@ _HANDLERS: dict[type[Any], Callable[[Any, Request, StepContext], str | Accepted 
     AcknowledgeGoal: _of_command(acknowledge),
     CancelGoal: _of_command(cancel),
     ReanchorRefused: _of_command(camera_relocalization.refused),
-    Teach: _teach,
+    Teach: start_teaching,
     Jog: _jog,
     Home: _home,
     Calibrate: _calibrate,

@@ -1,10 +1,10 @@
-"""How goals begin and end: the active source, the queue behind it and the plans of both; whether the arm may move."""
+"""How goals begin and end: the active source, the queue behind it and the plans of both."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from stereoservo.core.context import RefusalError, SourceOutput, StepContext
+from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.move import MOTION_SOURCES, goal_of
 from stereoservo.core.state import (
     AwaitingAcknowledgement,
@@ -12,7 +12,6 @@ from stereoservo.core.state import (
     Source,
 )
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Lifecycle
 
 
 def begin(source: Source, context: StepContext) -> None:
@@ -114,18 +113,3 @@ def drop_plan(context: StepContext, reasons: tuple[Reason, ...], message: str) -
         context.emit("reply", request=job.request, accepted=False, id=goal.id, message=hint, reasons=told)
     elif job.purpose == "queue":
         context.emit("goal_cancelled", id=goal.id, message=message, reasons=reasons)
-
-
-def require_motion_allowed(context: StepContext) -> None:
-    """Raises RefusalError where the arm may not move now."""
-    state = context.state
-    if state.lifecycle != Lifecycle.ACTIVE:
-        raise RefusalError(
-            "NOT_ACTIVE",
-            f"the cell is {state.lifecycle}; "
-            f"{'reset, then ' if state.lifecycle == Lifecycle.FAULT else ''}enable it first",
-        )
-    if state.stopped:
-        raise RefusalError("STOPPED", "the cell was stopped; resume it first")
-    if state.held:
-        raise RefusalError("HELD", "the cell is held; resume it first")

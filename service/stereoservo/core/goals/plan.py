@@ -6,14 +6,14 @@ planned; free ones go their own way, so that only the goal itself can be refused
 
 from __future__ import annotations
 
-from math import log
+import math
 
 import numpy as np
 
 from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
-from stereoservo.core.goals.target_checks import BodyState, in_view
+from stereoservo.core.goals.marker_body import BodyState, view_of
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
 from stereoservo.core.sources.law import centre_of, composition_of
@@ -23,6 +23,7 @@ from stereoservo.messages import goals
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.path_search import MISSING_FREEDOMS, plan_on
 from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanRequest
 from stereoservo.planning.planner import PlanRequestError, start_planning
@@ -68,8 +69,7 @@ def _plan_request(
     keep_outs = limits.keep_outs.copy()
     keep_outs[:, :, 0] -= margin
     keep_outs[:, :, 1] += margin
-    pixels, _ = project_points(arrays.matrices, place.points)
-    kept = (in_view(place, pixels)[used] * source.wanted[used]).min(axis=0)
+    kept = (view_of(place, place.points)[1][used] * source.wanted[used]).min(axis=0)
     return PlanRequest(
         operators=chain_at(arrays, joints)[1],
         composition=composition_of(arrays),
@@ -184,22 +184,29 @@ def _pixels(
 ) -> dict[str, dict[int, tuple[tuple[float, float], ...]]]:
     """Raw pixels along the way, by camera and marker; a marker that a lens does not image is left out."""
     found: dict[str, dict[int, tuple[tuple[float, float], ...]]] = {}
-    ways = np.array(
-        [
-            project_points(
-                arrays.matrices, transform_points(np.ascontiguousarray(plan.displacements[k]), job.points)
-            )[0]
-            for k in at
-        ]
-    )
+    ways = _raw_way(arrays.matrices, arrays.lenses, plan.displacements[at], job.points)
     for c, camera in enumerate(context.settings.cameras):
         if job.source.used[c] == 0.0:
             continue
         found[camera.name] = {}
         for i, marker in enumerate(arrays.marker_ids):
-            way = tuple(distort_pixel(arrays.lenses[c], float(u), float(v)) for u, v in ways[:, c, i])
-            if bool(np.isfinite(np.array(way)).all()):
-                found[camera.name][marker] = way
+            if bool(np.isfinite(ways[:, c, i]).all()):
+                found[camera.name][marker] = tuple((float(u), float(v)) for u, v in ways[:, c, i])
+    return found
+
+
+@kernel
+def _raw_way(
+    matrices: FloatArray, lenses: FloatArray, displacements: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Raw pixels (k, c, m, 2) of ``points`` (m, 4) after ``displacements`` (k, 4, 4); NaN beyond a lens's fold."""
+    found = np.empty((displacements.shape[0], matrices.shape[0], points.shape[0], 2))
+    for k in range(displacements.shape[0]):
+        pixels, _ = project_points(matrices, transform_points(displacements[k], points))
+        for c in range(matrices.shape[0]):
+            for i in range(points.shape[0]):
+                u, v = distort_pixel(lenses[c], pixels[c, i, 0], pixels[c, i, 1])
+                found[k, c, i, 0], found[k, c, i, 1] = u, v
     return found
 
 
@@ -207,10 +214,23 @@ def _exponential_s(job: PlanJob, context: StepContext) -> float:
     """Time in which the error decays to its tolerance at the goal's gain."""
     source, arrays = job.source, context.arrays
     assert arrays is not None
-    pixels, _ = project_points(arrays.matrices, job.points)
-    distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
-    error = float((distance * source.wanted * source.used[:, None]).max())
-    return log(max(error / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+    asked = source.wanted * source.used[:, None]
+    error = float(_largest_error(arrays.matrices, job.points, source.set_points, asked))
+    return math.log(max(error / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+
+
+@kernel
+def _largest_error(
+    matrices: FloatArray, points: FloatArray, set_points: FloatArray, weights: FloatArray
+) -> float:
+    """Largest distance [px] of ``points`` (m, 4) from ``set_points`` (c, m, 2), times ``weights`` (c, m)."""
+    pixels, _ = project_points(matrices, points)
+    errors = np.empty(weights.shape)
+    for c in range(weights.shape[0]):
+        for i in range(weights.shape[1]):
+            u, v = pixels[c, i, 0] - set_points[c, i, 0], pixels[c, i, 1] - set_points[c, i, 1]
+            errors[c, i] = math.sqrt(u * u + v * v) * weights[c, i]
+    return float(errors.max())
 
 
 def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> goals.Approach:

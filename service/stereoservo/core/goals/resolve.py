@@ -1,10 +1,4 @@
-"""The pose of the marker body at a goal, from all of its set-points: the law run on paper, then least squares.
-
-Three triangulated points would do for (7.21)-(7.24), but every marker of the goal says something. The displacement from
-the present to the goal is found by integrating the Cartesian law itself, which converges from anywhere, and refined on
-the reprojection error of all set-points. What comes out is one rigid displacement of the calibrated structure, so also
-markers that the goal does not show have their place.
-"""
+"""What a goal asks for, in the model's frame: set-points, body at the goal, centre, options; its law's first state."""
 
 from __future__ import annotations
 
@@ -16,129 +10,55 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.laws.cartesian3 import cartesian3_step
-from stereoservo.core.context import RefusalError
-from stereoservo.core.goals.target_checks import (
+from stereoservo.control.face_choice import NOT_CHOSEN
+from stereoservo.control.law import JacobianChoice
+from stereoservo.control.law_registry import LAWS, UnknownLawError
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.marker_body import (
     MIN_MARKERS,
     BodyState,
+    body_at,
     determinant4,
     enough_in_view,
     enough_shown,
     in_front,
-    in_view,
     keeps_its_shape,
     mirrored,
     turned_to,
+    view_of,
 )
-from stereoservo.core.model_arrays import ModelArrays, with_unit_height
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at
 from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.core.state import ServoGoal
 from stereoservo.kinematics.kernels import (
-    exp_twist,
-    image_jacobian,
     invert4,
     multiply4_into,
-    project_points,
     transform_points,
     triangulate,
     undistort_pixel,
 )
-from stereoservo.messages.goals import DisplacementTarget, FeatureTarget, PointTarget
+from stereoservo.messages.goals import (
+    AdaptiveGain,
+    Centre,
+    DisplacementTarget,
+    FeatureTarget,
+    Goal,
+    JacobianName,
+    Pixel,
+    PlanReport,
+    PointTarget,
+)
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
-from stereoservo.numerics.linear import damped_least_squares
+from stereoservo.numerics.compilation import kernel
 
-LAW_STEPS = 80
-NEAR = 1e-5  # of a step in the basis: least squares goes on from there
-LAW_GAIN = 0.3  # of the way still to be made, a step
-REFINEMENTS = 12
-REFINE_DAMPING = 1e-12
-CONVERGED = 1e-13  # of a refinement's step in the basis
-
-
-@dataclass(frozen=True)
-class GoalPose:
-    """Marker points at the goal (m, 4) of height a∞ᵀM = 1, and how well they explain the set-points [px].
-
-    ``displacement`` (4, 4) takes the body there from where it was.
-    """
-
-    points: FloatArray
-    displacement: FloatArray
-    rms_px: float
-    worst_px: float
-    worst_marker: int
-
-
-def goal_pose(
-    arrays: ModelArrays,
-    operators: FloatArray,
-    points: FloatArray,
-    targets: FloatArray,
-    known: BoolArray,
-    face: IntArray,
-    set_points: FloatArray,
-    wanted: FloatArray,
-) -> GoalPose:
-    """Fit one rigid displacement of ``points`` (m, 4) to the set-points.
-
-    ``targets`` (m, 4): triangulated goal points where ``known`` (m,); ``face`` (3,) spans a face. ``operators``
-    (n, 4, 4): the arm's at present, a basis of displacements where the model knows no metric one.
-    """
-    basis = operators if arrays.metric_basis is None else arrays.metric_basis
-    D = np.zeros((4, 4))
-    for i in range(4):
-        D[i, i] = 1.0
-    moved = points
-    nobody = np.zeros((0, 4))  # on paper no camera has to keep sight of the face
-    gains = np.full(3, LAW_GAIN)
-    centre_target = targets[known].sum(axis=0) / float(known.sum())
-    for _ in range(LAW_STEPS):
-        centre = moved[known].sum(axis=0) / float(known.sum())
-        twist, _, _, _ = cartesian3_step(
-            basis, moved[face], targets[face], centre, centre_target, nobody, gains
-        )
-        D = _onwards(basis, twist, D)
-        moved = transform_points(D, points)
-        if float(np.abs(twist).max()) < NEAR:
-            break
-    return refined_pose(arrays, basis, points, D, set_points, wanted)
-
-
-def refined_pose(
-    arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
-    wanted: FloatArray, refinements: int = REFINEMENTS,
-) -> GoalPose:  # fmt: skip
-    """Least squares on all set-points, from a ``displacement`` (4, 4) near by; ``basis`` (k, 4, 4) of displacements."""
-    D = displacement
-    moved = transform_points(D, points)
-    weights = np.repeat(wanted.reshape(-1), 2)
-    for _ in range(refinements):
-        pixels, _ = project_points(arrays.matrices, moved)
-        jacobian = image_jacobian(basis, arrays.matrices, moved).reshape(-1, basis.shape[0])
-        step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, REFINE_DAMPING)
-        D = _onwards(basis, step, D)
-        moved = transform_points(D, points)
-        if float(np.abs(step).max()) < CONVERGED:
-            break
-    pixels, _ = project_points(arrays.matrices, moved)
-    distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
-    worst = int(distance.max(axis=0).argmax())
-    return GoalPose(
-        moved,
-        D,
-        float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0))),
-        float(distance.max()),
-        arrays.marker_ids[worst],
-    )
-
-
-def _onwards(basis: FloatArray, twist: FloatArray, D: FloatArray) -> FloatArray:
-    onwards = np.empty((4, 4))
-    multiply4_into(exp_twist((twist[:, None, None] * basis).sum(axis=0)), D, onwards)
-    return onwards
-
-
+JACOBIANS: dict[JacobianName, JacobianChoice] = {
+    "current": JacobianChoice.CURRENT,
+    "desired": JacobianChoice.DESIRED,
+    "mean": JacobianChoice.MEAN,
+    "fixed-depth": JacobianChoice.FIXED_DEPTH,
+}
 MIN_FACE_AREA_PX2 = 100.0
-MAX_GOAL_RESIDUAL_PX = 5.0
 SINGULAR = 1e-9
 """Determinant, relative to the fourth power of its largest entry, below which a matrix is no displacement."""
 COPLANAR = 1e-3
@@ -189,10 +109,7 @@ def of_this_model(model_epoch: int | None, epoch: int) -> None:
 def _features(target: FeatureTarget, place: BodyState, needs_pose: bool) -> ResolvedGoal:
     arrays = place.arrays
     set_points, wanted = raw_set_points(target, place)
-    seen_by_two = wanted.sum(axis=0) >= 2
-    targets, ok = triangulate(arrays.matrices, set_points, wanted, 5)
-    known = np.asarray(ok, dtype=bool) & seen_by_two
-    targets = np.where(known[:, None], with_unit_height(targets, arrays.plane_at_infinity), 0.0)
+    targets, known = _intersected(arrays.matrices, set_points, wanted, arrays.plane_at_infinity)
     shown = int((wanted.sum(axis=0) > 0).sum())
     if shown < MIN_MARKERS:
         raise RefusalError(
@@ -205,7 +122,7 @@ def _features(target: FeatureTarget, place: BodyState, needs_pose: bool) -> Reso
     displacement = np.zeros((4, 4))
     if pose_known:
         face = _face(set_points, wanted, known, arrays)
-        pose = _body_at(place, targets, known, face, set_points, wanted)
+        pose = body_at(place, targets, known, face, set_points, wanted)
         targets, displacement = pose.points, pose.displacement
     return ResolvedGoal(set_points, wanted, targets, displacement, known.astype(np.float64), pose_known, face)
 
@@ -222,33 +139,62 @@ def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray,
     )
     for name, markers in target.set_points.items():
         camera = camera_index(name, place.settings)
-        for marker, (u, v) in markers.items():
+        ideal = ideal_pixels(
+            arrays.lenses[camera], np.array(tuple(markers.values()), dtype=np.float64).reshape(-1, 2)
+        )
+        for (marker, raw), pixel in zip(markers.items(), ideal, strict=True):
             i = marker_index(marker, arrays)
-            set_points[camera, i] = ideal_pixel(
-                cameras[camera], arrays.lenses[camera], f"marker {marker}", u, v
-            )
-            wanted[camera, i] = 1.0
+            require_imaged(cameras[camera], f"marker {marker}", raw, pixel)
+            set_points[camera, i], wanted[camera, i] = pixel, 1.0
     return set_points, wanted
 
 
-def ideal_pixel(
-    camera: CameraSettings, lens: FloatArray, what: str, u: float, v: float
-) -> tuple[float, float]:
-    """Ideal pixel of the raw ``(u, v)`` of ``what``. Raises RefusalError outside the image and where none is."""
+@kernel
+def ideal_pixels(lens: FloatArray, raw: FloatArray) -> FloatArray:
+    """Ideal pixels (k, 2) of ``raw`` (k, 2); NaN where the lens images nothing."""
+    ideal = np.empty(raw.shape)
+    for i in range(raw.shape[0]):
+        ideal[i, 0], ideal[i, 1] = undistort_pixel(lens, raw[i, 0], raw[i, 1])
+    return ideal
+
+
+def require_imaged(camera: CameraSettings, what: str, raw: Pixel, ideal: FloatArray) -> None:
+    """Raises RefusalError where the ``raw`` pixel of ``what`` is outside the image, or ``ideal`` (2,) is NaN."""
+    u, v = raw
     if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
         raise RefusalError(
             "OUTSIDE_IMAGE",
             f"camera {camera.name!r}, {what}: ({u}, {v}) lies outside its {camera.width}x{camera.height} image",
             subject=camera.name,
         )
-    ideal = undistort_pixel(lens, u, v)
-    if not isfinite(ideal[0] + ideal[1]):
+    if not isfinite(float(ideal[0] + ideal[1])):
         raise RefusalError(
             "OUTSIDE_IMAGE",
             f"camera {camera.name!r}, {what}: ({u}, {v}) lies where the camera's lens images nothing",
             subject=camera.name,
         )
-    return ideal
+
+
+@kernel
+def _intersected(
+    matrices: FloatArray, set_points: FloatArray, wanted: FloatArray, plane: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Points (m, 4) of height 1 that two or more cameras show, else zeros; and which are known (m,).
+
+    ``plane`` (4,): at infinity.
+    """
+    points, known = triangulate(matrices, set_points, wanted, 5)
+    for i in range(points.shape[0]):
+        views = 0.0
+        for c in range(matrices.shape[0]):
+            views += wanted[c, i]
+        known[i] = known[i] and views >= 2.0
+        height = 0.0
+        for k in range(4):
+            height += points[i, k] * plane[k]
+        for k in range(4):
+            points[i, k] = points[i, k] / (1.0 if height == 0.0 else height) if known[i] else 0.0
+    return points, known
 
 
 def camera_index(name: str, settings: CoreSettings) -> int:
@@ -406,14 +352,14 @@ def _aim(place: BodyState, targets: FloatArray, known: BoolArray, *, only_known:
             "the points are those of the marker body's mirror image: are left and right, or ids, swapped?",
         )
     in_front(place, targets, known)
-    pixels, _ = project_points(arrays.matrices, targets)
+    pixels, _ = view_of(place, targets)
     wanted = np.repeat(known[None, :].astype(np.float64), len(arrays.matrices), axis=0)
     set_points = np.where(wanted[..., None] > 0.0, pixels, 0.0)
     face = _face(set_points, wanted, known, arrays)
-    pose = _body_at(place, targets, known, face, set_points, wanted)
+    pose = body_at(place, targets, known, face, set_points, wanted)
     keeps_its_shape(pose.points, targets, known)
-    pixels, _ = project_points(arrays.matrices, pose.points)
-    shown = in_view(place, pixels) * (wanted if only_known else 1.0)
+    pixels, shown = view_of(place, pose.points)
+    shown = shown * (wanted if only_known else 1.0)
     enough_in_view(place, pixels, shown, known)
     shown = shown * turned_to(place, pose.displacement)
     enough_shown(place, shown)
@@ -423,7 +369,7 @@ def _aim(place: BodyState, targets: FloatArray, known: BoolArray, *, only_known:
     )  # fmt: skip
 
 
-# -- the body -------------------------------------------------------------------------------------------------
+# -- the face -------------------------------------------------------------------------------------------------
 
 
 def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: ModelArrays) -> IntArray:
@@ -453,34 +399,6 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
     return found
 
 
-def _body_at(
-    place: BodyState, targets: FloatArray, known: BoolArray, face: IntArray,
-    set_points: FloatArray, wanted: FloatArray,
-) -> GoalPose:  # fmt: skip
-    """The body at the goal, displaced rigidly. Raises RefusalError where no displacement fits."""
-    arrays = place.arrays
-    pose = goal_pose(arrays, place.operators, place.points, targets, known, face, set_points, wanted)
-    if pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
-        return pose
-    said = (
-        f"marker {pose.worst_marker} is off by {pose.worst_px:.2f} px (rms {pose.rms_px:.2f} px; up to "
-        f"{MAX_GOAL_RESIDUAL_PX} px is accepted)"
-    )
-    value = pose.worst_px if isfinite(pose.worst_px) else None
-    if mirrored(place.points, targets, known):
-        raise RefusalError(
-            "MIRRORED_GOAL",
-            f"no displacement of the marker body explains the goal, it is its mirror image: {said}",
-            subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
-        )  # fmt: skip
-    raise RefusalError(
-        "NOT_RIGID",
-        f"no displacement of the marker body explains the set-points: {said}: are ids swapped, is it another body, or "
-        "is it mirrored?",
-        subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
-    )  # fmt: skip
-
-
 def _product(A: FloatArray, B: FloatArray) -> FloatArray:
     product = np.empty((4, 4))
     multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
@@ -493,3 +411,134 @@ _RESOLVE: dict[type[Any], Callable[[Any, BodyState, bool], ResolvedGoal]] = {
     DisplacementTarget: _displacement,
 }
 """How a target is resolved, by its kind."""
+
+
+# -- the law's first state ------------------------------------------------------------------------------------
+
+
+def start_servoing(
+    goal: Goal,
+    target: FeatureTarget | PointTarget | DisplacementTarget,
+    context: StepContext,
+    place: BodyState,
+) -> ServoGoal:
+    """The state of a law before its first step, for a body that sets out from ``place``.
+
+    Raises RefusalError naming what makes the goal unusable.
+    """
+    settings, model = context.settings, context.state.model
+    assert model is not None
+    name = goal.law or settings.law
+    try:
+        law = LAWS[name]
+    except UnknownLawError as error:
+        raise RefusalError("NO_SUCH_LAW", str(error), subject=name) from error
+    aim = aim_at(target, place, law.needs_goal_pose, model.epoch)
+    weights, body, centre_target = _centre(goal.centre, aim, place, context, model.epoch)
+    return ServoGoal(
+        **run_fields(goal, context, used_cameras(goal, aim.wanted, context)),
+        law=name,
+        jacobian=int(JACOBIANS[goal.jacobian or "mean"]),
+        set_points=aim.set_points,
+        wanted=aim.wanted,
+        rates=np.zeros_like(aim.set_points),
+        target_points=aim.points,
+        target_known=aim.known,
+        pose_known=aim.pose_known,
+        centre_weights=weights,
+        centre_body=body,
+        centre_target=centre_target,
+        faces=place.faces,
+        choice=NOT_CHOSEN._replace(triple=aim.face),
+    )
+
+
+def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, Any]:
+    """Fields of a `LawRun` before its first step: what the goal says, or else the cell."""
+    settings = context.settings
+    gain = goal.gain or settings.gain
+    near, far, slope = (
+        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
+    )
+    return {
+        "goal": goal,
+        "points": goal.points or settings.points,
+        "gain_near": near,
+        "gain_far": far,
+        "gain_slope": slope,
+        "tolerance_px": goal.tolerance_px or settings.tolerance_px,
+        "hold_frames": goal.hold_frames or settings.hold_frames,
+        "time_limit_s": goal.time_limit_s or settings.time_limit_s,
+        "started_ns": context.now_ns,
+        "lease_s": goal.lease_s,
+        "lease_until_ns": context.now_ns + int((goal.lease_s or 0.0) * 1e9),
+        "used": used,
+        "last_frames": sum(e.frames for e in context.state.cameras),
+    }
+
+
+def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatArray:
+    """(c,) 1 for cameras that the law may use. Raises RefusalError where they show too few ``wanted`` (c, m)."""
+    c = len(context.settings.cameras)
+    if goal.cameras is None:
+        return np.ones(c)
+    used = np.zeros(c)
+    for name in goal.cameras:
+        used[camera_index(name, context.settings)] = 1.0
+    shown = int((wanted * used[:, None]).max(axis=0).sum())
+    if shown < MIN_MARKERS:
+        raise RefusalError(
+            "TOO_FEW_MARKERS",
+            f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {MIN_MARKERS} "
+            "are needed",
+            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
+        )  # fmt: skip
+    return used
+
+
+def _centre(
+    centre: Centre | None, aim: ResolvedGoal, place: BodyState, context: StepContext, epoch: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; at the goal.
+
+    The point is stated in the chain's zero. Default: the affine middle of the goal's markers.
+    """
+    arrays = place.arrays
+    weights = np.zeros(len(arrays.marker_ids))
+    body = np.zeros(4)
+    if centre is None:
+        weights = aim.known / max(float(aim.known.sum()), 1.0)
+    elif bool(centre.markers) == (centre.point is not None):
+        raise RefusalError(
+            "CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none"
+        )
+    elif centre.point is not None:
+        if centre.model_epoch is None:
+            raise RefusalError(
+                "FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is"
+            )
+        of_this_model(centre.model_epoch, epoch)
+        now = normalize_scale(np.array(centre.point), arrays, "the centre")[None]
+        H = chain_at(arrays, context.q + context.state.correction)[0]
+        body = transform_points(invert4(H), now)[0]
+        return weights, body, transform_points(aim.displacement, now)[0]
+    else:
+        for marker in centre.markers:
+            weights[marker_index(marker, arrays)] = 1.0
+        weights = weights / float(weights.sum())
+    return weights, body, (weights[:, None] * aim.points).sum(axis=0)
+
+
+def unplanned_report(source: ServoGoal, context: StepContext) -> PlanReport:
+    """The report of a goal whose pose, and so its path, is not known beforehand."""
+    return no_plan(
+        source.law, "the pose at the goal is not known: fewer than three of its markers are shown by two cameras",
+        source.time_limit_s,
+    )  # fmt: skip
+
+
+def no_plan(law: str, why: str, seconds: float) -> PlanReport:
+    """A report without a plan: ``why`` there is none; it takes ``seconds`` at most."""
+    return PlanReport(
+        law=law, way=f"not planned: {why}", seconds=seconds, approaches=(), shares=(), joints={}, pixels={}
+    )

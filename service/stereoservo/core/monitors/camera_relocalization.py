@@ -14,7 +14,7 @@ import numpy as np
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.cycle import ModelUpdate, Sample
 from stereoservo.core.goals.execute import drop_lookahead_plan, end_followers, end_source
-from stereoservo.core.goals.servo_goal import place_now
+from stereoservo.core.goals.marker_body import place_now
 from stereoservo.core.model_arrays import ModelArrays, model_arrays
 from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
 from stereoservo.core.monitors.fault_isolation import LEAST_PX, bench_now, doubt, named

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 
 from stereoservo.core.context import RefusalError
+from stereoservo.core.goals.marker_body import MIN_MARKERS, BodyState
 from stereoservo.core.goals.resolve import aim_at
-from stereoservo.core.goals.target_checks import MIN_MARKERS, BodyState
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import IncidenceGoal, LawRun, ServoGoal

@@ -21,16 +21,19 @@ from stereoservo.control.incidence import (
 )
 from stereoservo.control.law import Scene
 from stereoservo.core.context import RefusalError, SourceOutput, StepContext
+from stereoservo.core.goals.marker_body import BodyState
 from stereoservo.core.goals.resolve import (
     camera_index,
-    ideal_pixel,
+    ideal_pixels,
     joint_index,
     marker_index,
+    no_plan,
     of_this_model,
     raw_set_points,
+    require_imaged,
+    run_fields,
+    used_cameras,
 )
-from stereoservo.core.goals.servo_goal import no_plan, run_fields, used_cameras
-from stereoservo.core.goals.target_checks import BodyState
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.prediction import points_now
 from stereoservo.core.sources.law import composition_of, options, run_ended
@@ -89,7 +92,6 @@ def start_incidence(
         set_points=set_points, wanted=wanted,
     )  # fmt: skip
     _drivable(source, context, place)
-    source.renew_lease(context.now_ns)
     return source
 
 
@@ -177,9 +179,10 @@ def _triangulated(feature: Feature, name: str, place: BodyState) -> FloatArray:
     pixels, weights = np.zeros((len(cameras), count, 2)), np.zeros((len(cameras), count))
     for camera_name, points in feature.pixels.items():
         c = camera_index(camera_name, place.settings)
-        for i, (u, v) in enumerate(points):
-            pixels[c, i] = ideal_pixel(cameras[c], arrays.lenses[c], f"{name}, point {i + 1}", u, v)
-            weights[c, i] = 1.0
+        pixels[c] = ideal_pixels(arrays.lenses[c], np.array(points, dtype=np.float64).reshape(-1, 2))
+        for i, raw in enumerate(points):
+            require_imaged(cameras[c], f"{name}, point {i + 1}", raw, pixels[c, i])
+        weights[c] = 1.0
     found, ok = triangulate(arrays.matrices, pixels, weights, 5)
     if not bool(np.asarray(ok).all()):
         raise RefusalError(

@@ -13,7 +13,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.goals.target_checks import MIN_MARKERS
+from stereoservo.core.goals.marker_body import MIN_MARKERS
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at, points_now
 from stereoservo.core.sources.streaming import feed_forward, follow

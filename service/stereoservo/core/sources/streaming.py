@@ -19,18 +19,17 @@ from stereoservo.control.filters import (
 )
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
-from stereoservo.core.goals.resolve import (
+from stereoservo.core.goals.marker_body import (
     MAX_GOAL_RESIDUAL_PX,
-    marker_index,
-    normalize_scale,
-    of_this_model,
-    raw_set_points,
+    MIN_MARKERS,
+    BodyState,
     refined_pose,
+    view_of,
 )
-from stereoservo.core.goals.target_checks import MIN_MARKERS, BodyState, in_view
+from stereoservo.core.goals.resolve import marker_index, normalize_scale, of_this_model, raw_set_points
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.state import ServoGoal, Stream
-from stereoservo.kinematics.kernels import project_points, transform_points
+from stereoservo.kinematics.kernels import transform_points
 from stereoservo.messages.goals import FeatureTarget, PointTarget, UpdateGoal
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
@@ -95,8 +94,8 @@ def _set_points(target: FeatureTarget | PointTarget, place: BodyState) -> tuple[
             np.array(coordinates), place.arrays, f"the point of marker {marker}", str(marker)
         )
         given[i] = 1.0
-    pixels, _ = project_points(place.arrays.matrices, points)
-    shown = in_view(place, pixels) * given[None, :]
+    pixels, shown = view_of(place, points)
+    shown = shown * given[None, :]
     return np.where(shown[..., None] > 0.0, pixels, 0.0), shown
 
 

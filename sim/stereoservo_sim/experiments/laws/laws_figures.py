@@ -14,7 +14,8 @@ from PIL import Image
 
 from stereoservo.control.law_registry import LAWS
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.planning.path import SHAPES, progress
+from stereoservo.planning.motion_frame import progress
+from stereoservo.planning.path_search import SHAPES
 from stereoservo_sim.experiments.laws import goal_sketches
 from stereoservo_sim.experiments.laws.goal_sketches import Drive
 from stereoservo_sim.experiments.laws.laws_compared import LawComparison, LawRun

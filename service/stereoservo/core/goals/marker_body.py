@@ -1,0 +1,398 @@
+"""The marker body of a goal: where it is, its pose at the goal, and whether the cameras can see it there.
+
+Three triangulated points would do for (7.21)-(7.24), but every marker of the goal says something. The displacement from
+the present to the goal is found by integrating the Cartesian law itself, which converges from anywhere, and refined on
+the reprojection error of all set-points. What comes out is one rigid displacement of the calibrated structure, so also
+markers that the goal does not show have their place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import isfinite
+
+import numpy as np
+
+from stereoservo.control.faces import FLAT_PX, Faces, find_faces, sights_along
+from stereoservo.control.laws.cartesian3 import cartesian3_step
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.settings import CoreSettings
+from stereoservo.kinematics.kernels import (
+    chain_forward,
+    distort_pixel,
+    exp_twist,
+    image_jacobian,
+    multiply4_into,
+    project_points,
+    transform_points,
+)
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import damped_least_squares
+
+MIN_MARKERS = 3
+RIGID_SHARE = 0.1
+"""Of the body's extent that goals in points or matrices may differ by from a rigid displacement, for their noise."""
+BODY_DEPTH = 0.02
+"""Volume of four markers, relative to the cube of their extent, from which a mirror image can be told."""
+MAX_GOAL_RESIDUAL_PX = 5.0
+LAW_STEPS = 80
+NEAR = 1e-5
+"""Of a step in the basis: least squares goes on from there."""
+LAW_GAIN = 0.3
+"""Of the way still to be made, a step."""
+REFINEMENTS = 12
+REFINE_DAMPING = 1e-12
+CONVERGED = 1e-13
+"""Of a refinement's step in the basis."""
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """From where a target counts: the body's ``points`` (m, 4) of height 1 and the arm's ``operators`` (n, 4, 4)."""
+
+    settings: CoreSettings
+    arrays: ModelArrays
+    points: FloatArray
+    operators: FloatArray
+    faces: Faces
+    """Of the body, where it is now."""
+
+
+def place_now(context: StepContext) -> BodyState:
+    """The body as the estimate has it now. Only with a model."""
+    arrays, prediction = context.arrays, context.prediction
+    assert arrays is not None
+    assert prediction is not None
+    points = _markers_at(
+        arrays.generators, arrays.kinds, arrays.zero, context.q + context.state.correction, arrays.tip_first,
+        arrays.marker_points,
+    )  # fmt: skip
+    seen = (
+        np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
+    )
+    faces = find_faces(points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators)
+    return BodyState(context.settings, arrays, points, prediction.operators, faces)
+
+
+@kernel
+def _markers_at(
+    generators: FloatArray,
+    kinds: KindArray,
+    zero: FloatArray,
+    q: FloatArray,
+    tip_first: bool,
+    marker_points: FloatArray,
+) -> FloatArray:
+    """``marker_points`` (m, 4) of a chain, moved with it to ``q`` (n,)."""
+    H, _ = chain_forward(generators, kinds, zero, q, tip_first)
+    return transform_points(H, marker_points)
+
+
+def view_of(place: BodyState, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ideal pixels (c, m, 2) of ``points`` (m, 4), and (c, m) 1 where they lie in the camera's image, 0 elsewhere."""
+    sizes = np.array([(camera.width, camera.height) for camera in place.settings.cameras], dtype=np.float64)
+    found: tuple[FloatArray, FloatArray] = _view(place.arrays.matrices, place.arrays.lenses, sizes, points)
+    return found
+
+
+@kernel
+def _view(
+    matrices: FloatArray, lenses: FloatArray, sizes: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    pixels, _ = project_points(matrices, points)
+    shown = np.zeros((matrices.shape[0], points.shape[0]))
+    for c in range(matrices.shape[0]):
+        for i in range(points.shape[0]):
+            u, v = distort_pixel(lenses[c], pixels[c, i, 0], pixels[c, i, 1])
+            if -0.5 <= u <= sizes[c, 0] - 0.5 and -0.5 <= v <= sizes[c, 1] - 0.5:
+                shown[c, i] = 1.0
+    return pixels, shown
+
+
+# -- its pose at the goal -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class GoalPose:
+    """Marker points at the goal (m, 4) of height a∞ᵀM = 1, and how well they explain the set-points [px].
+
+    ``displacement`` (4, 4) takes the body there from where it was.
+    """
+
+    points: FloatArray
+    displacement: FloatArray
+    rms_px: float
+    worst_px: float
+    worst_marker: int
+
+
+def goal_pose(
+    arrays: ModelArrays,
+    operators: FloatArray,
+    points: FloatArray,
+    targets: FloatArray,
+    known: BoolArray,
+    face: IntArray,
+    set_points: FloatArray,
+    wanted: FloatArray,
+) -> GoalPose:
+    """Fit one rigid displacement of ``points`` (m, 4) to the set-points.
+
+    ``targets`` (m, 4): triangulated goal points where ``known`` (m,); ``face`` (3,) spans a face. ``operators``
+    (n, 4, 4): the arm's at present, a basis of displacements where the model knows no metric one.
+    """
+    basis = operators if arrays.metric_basis is None else arrays.metric_basis
+    displacement = _displacement_by_law(basis, points, targets, known, face)
+    return refined_pose(arrays, basis, points, displacement, set_points, wanted)
+
+
+def refined_pose(
+    arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
+    wanted: FloatArray, refinements: int = REFINEMENTS,
+) -> GoalPose:  # fmt: skip
+    """Least squares on all set-points, from a ``displacement`` (4, 4) near by; ``basis`` (k, 4, 4) of displacements."""
+    D, moved, pixels = _refine(basis, arrays.matrices, points, displacement, set_points, wanted, refinements)
+    distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
+    worst = int(distance.max(axis=0).argmax())
+    return GoalPose(
+        moved,
+        D,
+        float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0))),
+        float(distance.max()),
+        arrays.marker_ids[worst],
+    )
+
+
+@kernel
+def _displacement_by_law(
+    basis: FloatArray, points: FloatArray, targets: FloatArray, known: BoolArray, face: IntArray
+) -> FloatArray:
+    """Displacement (4, 4) that the Cartesian law comes to: the face of ``points`` (m, 4) onto that of ``targets``."""
+    nobody = np.zeros((0, 4))  # on paper no camera has to keep sight of the face
+    gains = np.full(3, LAW_GAIN)
+    D = np.zeros((4, 4))
+    for i in range(4):
+        D[i, i] = 1.0
+    moved = points.copy()
+    centre_target = _middle(targets, known)
+    for _ in range(LAW_STEPS):
+        twist, _, _, _ = cartesian3_step(
+            basis, moved[face], targets[face], _middle(moved, known), centre_target, nobody, gains
+        )
+        D = _onwards(basis, twist, D)
+        moved = transform_points(D, points)
+        if _all_below(twist, NEAR):
+            break
+    return D
+
+
+@kernel
+def _middle(points: FloatArray, known: BoolArray) -> FloatArray:
+    """Mean (4,) of the ``known`` of ``points`` (m, 4)."""
+    middle = np.zeros(4)
+    count = 0.0
+    for p in range(points.shape[0]):
+        if known[p]:
+            count += 1.0
+            for i in range(4):
+                middle[i] += points[p, i]
+    return middle / count
+
+
+@kernel
+def _refine(
+    basis: FloatArray,
+    matrices: FloatArray,
+    points: FloatArray,
+    displacement: FloatArray,
+    set_points: FloatArray,
+    wanted: FloatArray,
+    refinements: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Least squares of `refined_pose`: displacement (4, 4), displaced points (m, 4) and their pixels (c, m, 2)."""
+    D = displacement
+    moved = transform_points(D, points)
+    weights = np.repeat(wanted.copy().reshape(-1), 2)
+    for _ in range(refinements):
+        pixels, _ = project_points(matrices, moved)
+        jacobian = image_jacobian(basis, matrices, moved).reshape(-1, basis.shape[0])
+        step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, REFINE_DAMPING)
+        D = _onwards(basis, step, D)
+        moved = transform_points(D, points)
+        if _all_below(step, CONVERGED):
+            break
+    return D, moved, project_points(matrices, moved)[0]
+
+
+@kernel
+def _onwards(basis: FloatArray, twist: FloatArray, D: FloatArray) -> FloatArray:
+    """``exp(Σ t_j Ĝ_j) D`` (4, 4) for a ``twist`` (k,) in the ``basis`` (k, 4, 4)."""
+    G, onwards = np.zeros((4, 4)), np.empty((4, 4))
+    for j in range(basis.shape[0]):
+        for i in range(4):
+            for k in range(4):
+                G[i, k] += twist[j] * basis[j, i, k]
+    multiply4_into(exp_twist(G), D, onwards)
+    return onwards
+
+
+@kernel
+def _all_below(values: FloatArray, limit: float) -> bool:
+    """Whether the sizes of all ``values`` (k,) are below ``limit``; not where one is NaN."""
+    return bool((np.abs(values) < limit).all())
+
+
+def body_at(
+    place: BodyState, targets: FloatArray, known: BoolArray, face: IntArray,
+    set_points: FloatArray, wanted: FloatArray,
+) -> GoalPose:  # fmt: skip
+    """The body at the goal, displaced rigidly. Raises RefusalError where no displacement fits."""
+    arrays = place.arrays
+    pose = goal_pose(arrays, place.operators, place.points, targets, known, face, set_points, wanted)
+    if pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
+        return pose
+    said = (
+        f"marker {pose.worst_marker} is off by {pose.worst_px:.2f} px (rms {pose.rms_px:.2f} px; up to "
+        f"{MAX_GOAL_RESIDUAL_PX} px is accepted)"
+    )
+    value = pose.worst_px if isfinite(pose.worst_px) else None
+    if mirrored(place.points, targets, known):
+        raise RefusalError(
+            "MIRRORED_GOAL",
+            f"no displacement of the marker body explains the goal, it is its mirror image: {said}",
+            subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
+        )  # fmt: skip
+    raise RefusalError(
+        "NOT_RIGID",
+        f"no displacement of the marker body explains the set-points: {said}: are ids swapped, is it another body, or "
+        "is it mirrored?",
+        subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
+    )  # fmt: skip
+
+
+# -- what it has to keep there --------------------------------------------------------------------------------
+
+
+def enough_in_view(place: BodyState, pixels: FloatArray, shown: FloatArray, known: BoolArray) -> None:
+    """Raises RefusalError where no camera has ``shown`` (c, m) enough of the ``known`` markers at the goal."""
+    best = int(shown.sum(axis=-1).argmax())
+    count = int(shown[best].sum())
+    if count >= MIN_MARKERS:
+        return
+    camera = place.settings.cameras[best]
+    lost = int(np.flatnonzero(known & (shown[best] == 0.0))[0])
+    u, v = (float(x) for x in pixels[best, lost])
+    raise RefusalError(
+        "FIELD_OF_VIEW",
+        f"at the goal camera {camera.name!r} shows {count} of its markers, the others less; {MIN_MARKERS} are needed: "
+        f"marker {place.arrays.marker_ids[lost]} would be at ({u:.0f}, {v:.0f}), its image is "
+        f"{camera.width}x{camera.height}",
+        subject=camera.name, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
+    )  # fmt: skip
+
+
+def keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> None:
+    """Raises RefusalError for points or matrices that stretch or shear the body, along the cameras' rays too."""
+    middle = body.sum(axis=0) / len(body)
+    extent = float(np.sqrt(((body - middle) ** 2).sum(axis=-1).max()))
+    apart = np.where(known, np.sqrt(((body - targets) ** 2).sum(axis=-1)), 0.0)
+    share = float(apart.max()) / extent
+    if not share <= RIGID_SHARE:
+        raise RefusalError(
+            "NOT_RIGID",
+            f"the goal is no rigid displacement of the marker body: it differs from the nearest by {share:.2f} of the "
+            f"body's extent; up to {RIGID_SHARE} is accepted",
+            value=share, threshold=RIGID_SHARE, unit="of the body's extent",
+        )  # fmt: skip
+
+
+def turned_to(place: BodyState, displacement: FloatArray) -> FloatArray:
+    """(c, m) 1 where a marker's face is turned to the camera after ``displacement``; 1 where no side of it is known."""
+    faces = place.faces
+    found = np.ones((len(place.arrays.camera_centres), len(place.points)))
+    if not bool((faces.sided > 0.0).any()):
+        return found
+    fronts = sights_along(faces, place.points, displacement[None], place.arrays.camera_centres).fronts[0]
+    told = faces.members[faces.sided > 0.0].max(axis=0) > 0.0
+    for c in range(len(found)):
+        turned = (faces.members * fronts[:, c : c + 1]).max(axis=0) > 0.0
+        found[c] = np.where(told & ~turned, 0.0, 1.0)
+    return found
+
+
+def enough_shown(place: BodyState, shown: FloatArray) -> None:
+    """Raises RefusalError where the body turns its back: too few markers are ``shown`` (c, m) from their front."""
+    best = int(shown.sum(axis=-1).argmax())
+    count = int(shown[best].sum())
+    if count >= MIN_MARKERS:
+        return
+    camera = place.settings.cameras[best].name
+    raise RefusalError(
+        "FACE_HIDDEN",
+        f"at the goal camera {camera!r} would see the front of {count} markers, the others of less; {MIN_MARKERS} are "
+        "needed: the body turns its back",
+        subject=camera, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
+    )  # fmt: skip
+
+
+def in_front(place: BodyState, targets: FloatArray, known: BoolArray) -> None:
+    """Raises RefusalError for a goal behind a camera that has the body before it now."""
+    for c, P in enumerate(place.arrays.matrices):
+        now = (place.points * P[2]).sum(axis=-1)
+        side = 1.0 if float(np.sign(now).sum()) >= 0.0 else -1.0
+        if not bool((side * now > 0.0).all()):
+            continue  # the body is about this camera's plane already: it tells nothing
+        then = side * (targets * P[2]).sum(axis=-1)
+        behind = np.flatnonzero(known & ~(then > 0.0))
+        if behind.size:
+            i, camera = int(behind[0]), place.settings.cameras[c].name
+            share = float(then[i] / (side * now[i]))
+            raise RefusalError(
+                "BEHIND_CAMERA",
+                f"at the goal marker {place.arrays.marker_ids[i]} lies behind camera {camera!r} "
+                f"(at {share:.2f} of its present depth; more than 0 is needed)",
+                subject=camera, value=share, threshold=0.0, unit="of the present depth",
+            )  # fmt: skip
+
+
+def mirrored(points: FloatArray, targets: FloatArray, known: BoolArray) -> bool:
+    """Whether four markers that span a wide volume have turned inside out. False for a flat body: not to be told."""
+    four = _widest(points, np.flatnonzero(known))
+    now, then = points[four], targets[four]
+    extent = float(np.sqrt(((now[1:] - now[0]) ** 2).sum(axis=-1).max()))
+    scale = extent**3 * float(np.sqrt((now[0] * now[0]).sum()))
+    volume = determinant4(now) / scale if len(four) == 4 and scale > 0.0 else 0.0
+    return abs(volume) > BODY_DEPTH and determinant4(then) * volume < 0.0
+
+
+def _widest(points: FloatArray, candidates: IntArray) -> list[int]:
+    """Up to four of the ``candidates``, each the farthest from what those before it span."""
+    rest = points[candidates] - points[candidates].sum(axis=0) / max(len(candidates), 1)
+    four: list[int] = []
+    for _ in range(min(4, len(candidates))):
+        squares = (rest * rest).sum(axis=-1)
+        far = int(squares.argmax())
+        four.append(int(candidates[far]))
+        if len(four) == 1:
+            rest = rest - rest[far]
+        elif float(squares[far]) > 0.0:
+            rest = rest - ((rest * rest[far]).sum(axis=-1) / squares[far])[:, None] * rest[far]
+    return four
+
+
+def determinant4(A: FloatArray) -> float:
+    """Determinant of ``A`` (4, 4) by 2×2 minors."""
+    a, b, c, d = A
+    top = [a[i] * b[j] - a[j] * b[i] for i, j in combinations(range(4), 2)]
+    low = [c[i] * d[j] - c[j] * d[i] for i, j in combinations(range(4), 2)]
+    return float(
+        top[0] * low[5]
+        - top[1] * low[4]
+        + top[2] * low[3]
+        + top[3] * low[2]
+        - top[4] * low[1]
+        + top[5] * low[0]
+    )
