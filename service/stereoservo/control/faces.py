@@ -119,7 +119,10 @@ def find_faces(
     chosen = covering_groups(members, facts)
     members, facts = members[chosen], facts[chosen]
     sides = np.array(
-        [_side(group, fact, points, centres, seen) for group, fact in zip(members, facts, strict=True)],
+        [
+            _side(group, fact, plane, centres, seen)
+            for group, fact, plane in zip(members, facts, _planes(points, facts), strict=True)
+        ],
         np.int64,
     )
     outward = facts[:, :3].copy()
@@ -128,10 +131,9 @@ def find_faces(
 
 
 def _side(
-    members: IntArray, facts: IntArray, points: FloatArray, centres: FloatArray, seen: FloatArray
+    members: IntArray, facts: IntArray, plane: FloatArray, centres: FloatArray, seen: FloatArray
 ) -> int:
-    """1 where a group's triple is in outward order, -1 where it is not, 0 where nothing tells."""
-    plane = minors(points[facts[0]], points[facts[1]], points[facts[2]])
+    """1 where the triple of a group in a ``plane`` (4,) is in outward order, -1 where it is not, 0 where it is open."""
     votes = 0
     for eye, row in zip(centres, seen, strict=True):
         if ((row > 0.0) & (members > 0)).sum() >= 3:
@@ -476,6 +478,15 @@ def triangle_altitudes(points: FloatArray, form: FloatArray, triples: IntArray) 
             left = _form(off, form, off) - (mixed * mixed / length if length > 0.0 else 0.0)
             out[t] = min(out[t], math.sqrt(max(0.0, left)))
     return out
+
+
+@kernel
+def _planes(points: FloatArray, triples: IntArray) -> FloatArray:
+    """The planes (k, 4) of three points each, by the first three columns of ``triples``."""
+    planes = np.empty((triples.shape[0], 4))
+    for k in range(triples.shape[0]):
+        planes[k] = minors(points[triples[k, 0]], points[triples[k, 1]], points[triples[k, 2]])
+    return planes
 
 
 @kernel

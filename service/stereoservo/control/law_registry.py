@@ -44,7 +44,7 @@ class LawRegistry(Mapping[str, Law]):
     def __getitem__(self, name: str) -> Law:
         laws = self._loaded()
         if name not in laws:
-            raise UnknownLawError(name, tuple(laws), self._errors.get(name, ""))
+            raise self.unknown(name)
         return laws[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -58,6 +58,10 @@ class LawRegistry(Mapping[str, Law]):
         """Of the laws that are installed and cannot be used, by name."""
         self._loaded()
         return self._errors
+
+    def unknown(self, name: str) -> UnknownLawError:
+        """What is wrong with a name that no usable law has."""
+        return UnknownLawError(name, tuple(self._loaded()), self._errors.get(name, ""))
 
     def usable(self) -> dict[str, Law]:
         """The laws themselves: what a loop looks its law up in. A law that is disabled leaves it."""

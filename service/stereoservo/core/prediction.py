@@ -20,7 +20,8 @@ import numpy as np
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.monitor_state import CameraMonitor, CameraTiming, ModelMonitor
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import HISTORY, CameraEstimate, JointHistory
+from stereoservo.core.state import HISTORY, CameraEstimate, JointHistory, ServoGoal
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import (
     chain_forward,
     distort_pixel,
@@ -104,6 +105,14 @@ def _joint_step(
     """Damped least-squares step (n,) for residuals (k,) with ``weights`` (k,)."""
     step, _ = damped_least_squares(jacobian, residual, weights, damping)
     return step
+
+
+def markers_at(arrays: ModelArrays, q: FloatArray) -> FloatArray:
+    """The markers (m, 4) by kinematics alone at ``q`` (n,)."""
+    points: FloatArray = _body_points(
+        arrays.generators, arrays.kinds, arrays.zero, q, arrays.tip_first, arrays.marker_points
+    )
+    return points
 
 
 def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
@@ -359,13 +368,25 @@ def points_now(
     Predicted points are those of the joints plus correction. A marker that fewer than two cameras see cannot be
     triangulated: its predicted point stands in.
     """
-    points: FloatArray = _body_points(
-        arrays.generators, arrays.kinds, arrays.zero, q + correction, arrays.tip_first, arrays.marker_points
-    )
+    points = markers_at(arrays, q + correction)
     if source == "triangulated":
         found, ok = triangulate(arrays.matrices, pixels, weights, 3)
         points = np.where(ok[:, None], with_unit_height(found, arrays.plane_at_infinity), points)
     return points
+
+
+def composition_of(arrays: ModelArrays) -> int:
+    """How the arm's joints compose, for laws and plans."""
+    return int(Composition.TIP_FIRST if arrays.tip_first else Composition.BASE_FIRST)
+
+
+def centre_of(source: ServoGoal, joints: FloatArray, arrays: ModelArrays, points: FloatArray) -> FloatArray:
+    """The goal's centre (4,) of a body whose markers are at ``points`` (m, 4), with the arm at ``joints`` (n,)."""
+    if bool((source.centre_weights != 0.0).any()):
+        middle: FloatArray = (source.centre_weights[:, None] * points).sum(axis=0)
+        return middle
+    moved: FloatArray = transform_points(chain_at(arrays, joints)[0], source.centre_body[None])[0]
+    return moved
 
 
 def priors(

@@ -18,9 +18,9 @@ from stereoservo.control.faces import FLAT_PX, Faces, find_faces, sights_along
 from stereoservo.control.laws.cartesian3 import cartesian3_step
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import markers_at
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import (
-    chain_forward,
     distort_pixel,
     exp_twist,
     image_jacobian,
@@ -28,7 +28,7 @@ from stereoservo.kinematics.kernels import (
     project_points,
     transform_points,
 )
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
@@ -66,29 +66,12 @@ def place_now(context: StepContext) -> BodyState:
     arrays, prediction = context.arrays, context.prediction
     assert arrays is not None
     assert prediction is not None
-    points = _markers_at(
-        arrays.generators, arrays.kinds, arrays.zero, context.q + context.state.correction, arrays.tip_first,
-        arrays.marker_points,
-    )  # fmt: skip
+    points = markers_at(arrays, context.q + context.state.correction)
     seen = (
         np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
     )
     faces = find_faces(points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators)
     return BodyState(context.settings, arrays, points, prediction.operators, faces)
-
-
-@kernel
-def _markers_at(
-    generators: FloatArray,
-    kinds: KindArray,
-    zero: FloatArray,
-    q: FloatArray,
-    tip_first: bool,
-    marker_points: FloatArray,
-) -> FloatArray:
-    """``marker_points`` (m, 4) of a chain, moved with it to ``q`` (n,)."""
-    H, _ = chain_forward(generators, kinds, zero, q, tip_first)
-    return transform_points(H, marker_points)
 
 
 def view_of(place: BodyState, points: FloatArray) -> tuple[FloatArray, FloatArray]:

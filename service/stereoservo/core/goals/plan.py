@@ -15,8 +15,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import BodyState, view_of
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import chain_at
-from stereoservo.core.sources.law import centre_of, composition_of
+from stereoservo.core.prediction import centre_of, chain_at, composition_of
 from stereoservo.core.state import PlanJob, Purpose, ServoGoal
 from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points
 from stereoservo.messages import goals
@@ -95,7 +94,7 @@ def _plan_request(
             view_margin_px=VIEW_MARGIN_PX,
         ),
         profile=goal.profile or "linear",
-        bend=LAWS[source.law].planned,
+        bend=context.derived.laws[source.law].planned,
         speed_scale=goal.speed_scale,
     )
 
@@ -112,7 +111,7 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
     source, plan = job.source, job.planning.plan
     if plan is not None:
         source.goal_joints = plan.joints[-1].copy()
-        if LAWS[source.law].planned:
+        if context.derived.laws[source.law].planned:
             source.plan, source.plan_s, source.start_points = plan, 0.0, job.points.copy()
         return _planned(job, plan, context)
     failures = job.planning.failure
@@ -123,12 +122,12 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
         shares=(), joints={}, pixels={},
     )  # fmt: skip
     at_goal = failures[0].share >= 1.0
-    path = LAWS[source.law].path
+    path = context.derived.laws[source.law].path
     if path == "free" and not at_goal:
         return report
     hint = ""
-    planned = LAWS.on_path("planned")
     if not at_goal:
+        planned = LAWS.on_path("planned")
         hint = (
             f"; law {planned[0]!r} looks for another way" if path == "straight" and planned
             else "; no other way was found either: go by another goal between"
@@ -161,7 +160,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
     at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
     seconds = float(plan.times[-1])
     way = plan.way
-    path = LAWS[source.law].path
+    path = context.derived.laws[source.law].path
     if path != "planned":
         seconds = max(seconds, _exponential_s(job, context))
         if path == "free":

@@ -12,7 +12,7 @@ import numpy as np
 
 from stereoservo.control.face_choice import NOT_CHOSEN
 from stereoservo.control.law import JacobianChoice
-from stereoservo.control.law_registry import LAWS, UnknownLawError
+from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import (
     MIN_MARKERS,
@@ -429,10 +429,9 @@ def start_servoing(
     settings, model = context.settings, context.state.model
     assert model is not None
     name = goal.law or settings.law
-    try:
-        law = LAWS[name]
-    except UnknownLawError as error:
-        raise RefusalError("NO_SUCH_LAW", str(error), subject=name) from error
+    law = context.derived.laws.get(name)
+    if law is None:
+        raise RefusalError("NO_SUCH_LAW", str(LAWS.unknown(name)), subject=name)
     aim = aim_at(target, place, law.needs_goal_pose, model.epoch)
     weights, body, centre_target = _centre(goal.centre, aim, place, context, model.epoch)
     return ServoGoal(

@@ -35,8 +35,8 @@ from stereoservo.core.goals.resolve import (
     used_cameras,
 )
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
-from stereoservo.core.prediction import points_now
-from stereoservo.core.sources.law import composition_of, options, run_ended
+from stereoservo.core.prediction import composition_of, points_now
+from stereoservo.core.sources.law import options, run_ended
 from stereoservo.core.state import IncidenceGoal
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.kernels import project_points, triangulate

@@ -15,10 +15,9 @@ from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import chain_at, points_now
+from stereoservo.core.prediction import centre_of, composition_of, points_now
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
-from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
@@ -118,11 +117,6 @@ def run_ended(
     return None
 
 
-def composition_of(arrays: ModelArrays) -> int:
-    """How the arm's joints compose, for laws and plans."""
-    return int(Composition.TIP_FIRST if arrays.tip_first else Composition.BASE_FIRST)
-
-
 def scene_and_task(
     source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray
 ) -> tuple[Scene, Task]:
@@ -176,15 +170,6 @@ def choose(source: ServoGoal, context: StepContext, scene: Scene, task: Task) ->
             message=f"works on the face of markers {ids} from here on",
         )
     return law_scene(scene, choice), task._replace(face=choice.triple)
-
-
-def centre_of(source: ServoGoal, joints: FloatArray, arrays: ModelArrays, points: FloatArray) -> FloatArray:
-    """The goal's centre (4,) of a body whose markers are at ``points`` (m, 4), with the arm at ``joints`` (n,)."""
-    if bool((source.centre_weights != 0.0).any()):
-        middle: FloatArray = (source.centre_weights[:, None] * points).sum(axis=0)
-        return middle
-    moved: FloatArray = transform_points(chain_at(arrays, joints)[0], source.centre_body[None])[0]
-    return moved
 
 
 SLOPE_UNIT_PX = 100.0
