@@ -17,7 +17,13 @@ from stereoservo.cli.doctor.camera_findings import (
 from stereoservo.cli.doctor.view_consistency import examine_views, reprojection_rms
 from stereoservo.geometry.cameras import project_many
 from stereoservo.kinematics.model import CameraModel
-from stereoservo.ports.devices import CameraDescription, CameraObservation, CameraStatistics, Finding, Frame
+from stereoservo.ports.devices import (
+    CameraDescription,
+    CameraObservation,
+    CameraStatistics,
+    ExaminationFinding,
+    Frame,
+)
 
 RATE = 30.0
 LEFT = np.array([[900.0, 0, 320, 0], [0, 900, 240, 0], [0, 0, 1, 1.0]])
@@ -54,7 +60,7 @@ def record(
     return CameraRecord(description(name), seen)
 
 
-def named(findings: list[Finding], name: str) -> Finding:
+def named(findings: list[ExaminationFinding], name: str) -> ExaminationFinding:
     return next(finding for finding in findings if finding.name == name)
 
 

@@ -15,7 +15,7 @@ from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.servo import make_driver
 from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
-from stereoservo.ports.devices import Clock, DriverError, Finding
+from stereoservo.ports.devices import Clock, DriverError, ExaminationFinding
 from stereoservo_drivers.fake import FakeJointDriver
 
 Doctor = Callable[..., tuple[int, list[dict[str, Any]]]]
@@ -30,13 +30,13 @@ class Examination:
         self.ended = False
         self.error: DriverError | None = None
 
-    def __call__(self, _driver: object, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+    def __call__(self, _driver: object, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
         try:
-            yield Finding("node 1", True, "answers")
+            yield ExaminationFinding("node 1", True, "answers")
             if self.error is not None:
                 raise self.error
             self.allowed.append(may_move(QUESTION))
-            yield Finding("node 2", False, "is silent", "[[joints.options.joint]] node_id")
+            yield ExaminationFinding("node 2", False, "is silent", "[[joints.options.joint]] node_id")
         finally:
             self.ended = True
 
@@ -48,7 +48,7 @@ def examination(monkeypatch: pytest.MonkeyPatch) -> Examination:
     class ExaminableFake(FakeJointDriver):
         """A class of its own: what a protocol's isinstance has once said of a class, it keeps."""
 
-        def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+        def examine(self, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
             return found(self, may_move)
 
     def make(plan: RunPlan, clock: Clock) -> FakeJointDriver:

@@ -21,7 +21,7 @@ from stereoservo.ports.devices import (
     CommandReport,
     DriverContext,
     DriverError,
-    Finding,
+    ExaminationFinding,
     JointDriverDescription,
     JointState,
 )
@@ -232,7 +232,7 @@ class CanJointDriver:
             self.bus.end()
             self.bus = None
 
-    def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+    def examine(self, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
         """What `stereoservo doctor` wants to know of bus and drives; closes the driver."""
         from stereoservo_drivers.canopen.examination import examine  # for this one command
 

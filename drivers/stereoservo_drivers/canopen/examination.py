@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import DriverError, Finding
+from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import listening
@@ -42,7 +42,7 @@ HEARTBEAT_SHARE = 0.6
 MayMove = Callable[[str], bool]
 
 
-def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterator[Finding]:
+def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterator[ExaminationFinding]:
     """Findings, in the order in which an integrator would ask; ends early where nothing further can be known."""
     options = driver.options
     yield load_finding(options)
@@ -50,21 +50,21 @@ def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterat
         try:
             channel = Channel(options)
         except DriverError as error:
-            yield Finding("bus", False, str(error))
+            yield ExaminationFinding("bus", False, str(error))
             return
-        yield Finding("bus", True, f"{channel.name} is open at {options.bitrate} bit/s")
+        yield ExaminationFinding("bus", True, f"{channel.name} is open at {options.bitrate} bit/s")
         yield from _look(driver, channel, cell_dir)
         yield from _run(driver, may_move)
     except DriverError as error:
-        yield Finding("drives", False, str(error))
+        yield ExaminationFinding("drives", False, str(error))
     finally:
         driver.close()
 
 
-def load_finding(options: CanOptions) -> Finding:
+def load_finding(options: CanOptions) -> ExaminationFinding:
     """The bus load of the cell file's cycle, which the driver has found to be allowed."""
     load = bus_load(options)
-    return Finding(
+    return ExaminationFinding(
         "bus load",
         True,
         f"{load.share:.0%} in the worst case of bit stuffing, limit {options.max_bus_load:.0%} (max_bus_load); "
@@ -72,7 +72,7 @@ def load_finding(options: CanOptions) -> Finding:
     )
 
 
-def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[Finding]:
+def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[ExaminationFinding]:
     """Listen, then ask the drives. Ends the channel."""
     try:
         heard = _listen(channel)
@@ -83,7 +83,7 @@ def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[
     yield traffic_finding(driver.options, heard)
     if errors:
         cure = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
-        yield Finding("bus errors", False, "; ".join(dict.fromkeys(errors)), cure)
+        yield ExaminationFinding("bus errors", False, "; ".join(dict.fromkeys(errors)), cure)
     bus = BusThread(channel, driver.master)
     try:
         if isinstance(driver.master.codec, Cia402Codec):
@@ -100,31 +100,35 @@ def _listen(channel: Channel) -> list[CanFrame]:
     return heard
 
 
-def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> Finding:
+def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> ExaminationFinding:
     """Whether somebody else commands this bus: frames (heard in ``LISTEN_S``) that only a master sends."""
     commands = {RPDO_IDS[0] + joint.node_id for joint in options.joint}
     of_a_master = {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}
     found = {frame.id for frame in heard if not frame.extended} & of_a_master
     if options.protocol == "cia402" and found:
         foreign = ", ".join(f"0x{can_id:X}" for can_id in sorted(found))
-        return Finding(
+        return ExaminationFinding(
             "traffic", False, f"another master is on this bus: it sends {foreign}",
             "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
         )  # fmt: skip
-    return Finding("traffic", True, f"{len(heard)} frames in {LISTEN_S:g} s, none of another master")
+    return ExaminationFinding(
+        "traffic", True, f"{len(heard)} frames in {LISTEN_S:g} s, none of another master"
+    )
 
 
 # -- in the cycle -----------------------------------------------------------------------------------------------
 
 
-def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[Finding]:
+def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[ExaminationFinding]:
     """Configure, watch the cycle, jog. Raises DriverError."""
     driver.configure()
-    yield Finding("configuration", True, "every drive took its settings, and gave them back as written")
+    yield ExaminationFinding(
+        "configuration", True, "every drive took its settings, and gave them back as written"
+    )
     positions = yield from _watch(driver)
     fault = driver.master.fault
     if fault is not None:
-        yield Finding("fault", False, fault.message, fault.hint)
+        yield ExaminationFinding("fault", False, fault.message, fault.hint)
     usable = []
     for k, joint in enumerate(driver.options.joint):
         yield resolution_finding(joint)
@@ -136,7 +140,7 @@ def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[Finding]:
         yield from _jog_all(driver, usable, may_move)
 
 
-def _watch(driver: CanJointDriver) -> Iterator[Finding]:
+def _watch(driver: CanJointDriver) -> Iterator[ExaminationFinding]:
     """A second of cycles with the arm off; returns positions (k, n)."""
     period_s = 1.0 / driver.options.rate_hz
     before, skipped = driver.master.statistics, driver.bus.statistics.skipped if driver.bus else 0
@@ -169,23 +173,23 @@ def _sample(driver: CanJointDriver) -> FloatArray:
         return driver.read_state().positions
 
 
-def cycles_finding(cycles: int, missed: int, skipped: int) -> Finding:
+def cycles_finding(cycles: int, missed: int, skipped: int) -> ExaminationFinding:
     """Cycles that lacked an answer, and slots that this computer missed itself."""
     message = f"{cycles} cycles, {missed} without all answers, {skipped} skipped by this computer"
     if missed == 0 and skipped <= MISSED_SHARE * cycles:
-        return Finding("cycle", True, message)
+        return ExaminationFinding("cycle", True, message)
     if skipped > MISSED_SHARE * cycles:
-        return Finding(
+        return ExaminationFinding(
             "cycle",
             None,
             message,
             "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz",
         )
     cure = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
-    return Finding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, cure)
+    return ExaminationFinding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, cure)
 
 
-def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
+def latency_finding(answered_s: FloatArray, period_s: float) -> ExaminationFinding:
     """From a poll to its last answer [s], (k,)."""
     median, largest = float(np.median(answered_s)), float(np.max(answered_s))
     message = (
@@ -193,13 +197,13 @@ def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
         f"{period_s * 1e3:g} ms"
     )
     if median <= LATE_SHARE * period_s:
-        return Finding("latency", True, message)
-    return Finding(
+        return ExaminationFinding("latency", True, message)
+    return ExaminationFinding(
         "latency", None, message, "a faster adapter (USB ones need 1 ms a transfer), or lower rate_hz"
     )
 
 
-def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[Finding]:
+def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[ExaminationFinding]:
     """Those heard in ``WATCH_S``, against what was asked of the drives."""
     expected = WATCH_S * 1e3 / options.heartbeat_ms
     counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in heard) for joint in options.joint]
@@ -209,7 +213,7 @@ def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[F
         if count < HEARTBEAT_SHARE * expected
     ]
     for joint, count in rare:
-        yield Finding(
+        yield ExaminationFinding(
             f"node {joint.node_id} ({joint.name}) heartbeat",
             False,
             f"{count} in {WATCH_S:g} s, {expected:.0f} were asked for",
@@ -217,29 +221,29 @@ def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[F
         )
     if not rare:
         message = f"from every drive, {min(counts)} to {max(counts)} in {WATCH_S:g} s"
-        yield Finding("heartbeats", True, message)
+        yield ExaminationFinding("heartbeats", True, message)
 
 
 # -- jogs ---------------------------------------------------------------------------------------------------------
 
 
-def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> Iterator[Finding]:
+def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> Iterator[ExaminationFinding]:
     for k, joint in enumerate(driver.options.joint):
         name = f"{joint.name} jog"
         if not usable[k]:
-            yield Finding(name, None, "not jogged: it stands outside its limits")
+            yield ExaminationFinding(name, None, "not jogged: it stands outside its limits")
             continue
         middle = (joint.position_min + joint.position_max) / 2
         sign = 1.0 if float(driver.read_state().positions[k]) <= middle else -1.0
         if not may_move(_question(joint, sign)):
-            yield Finding(name, None, "not jogged: not allowed (--jog asks)")
+            yield ExaminationFinding(name, None, "not jogged: not allowed (--jog asks)")
             continue
         trace, error = _jog(driver, k, sign)
         if error is None:
             yield jog_finding(trace)
             continue
         cure = jog_finding(trace).remedy if trace.asked else ""
-        yield Finding(name, False, str(error), cure)
+        yield ExaminationFinding(name, False, str(error), cure)
         return
 
 

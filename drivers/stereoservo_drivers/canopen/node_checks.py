@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from stereoservo.ports.devices import DriverError, Finding
+from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo_drivers.canopen.bringup import Link
 from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import MODES, eds_path, load_eds
@@ -19,7 +19,9 @@ MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "hom
 _WIRING = "is it powered, is its cable in, are its bit rate and its node id those of the cell file?"
 
 
-def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> Iterator[Finding]:
+def examine_nodes(
+    link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path
+) -> Iterator[ExaminationFinding]:
     """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
     answers = scan(link)
     strangers = [node for node in answers if node not in {axis.node_id for axis in codec.axes}]
@@ -35,10 +37,12 @@ def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir:
                 yield _state(drive)
                 yield _modes(drive, options)
             except DriverError as error:
-                yield Finding(axis.name, False, str(error))
+                yield ExaminationFinding(axis.name, False, str(error))
     if strangers:
         words = ", ".join(str(node) for node in strangers)
-        yield Finding("other nodes", None, f"{words} answer too, and no joint of the cell file has them")
+        yield ExaminationFinding(
+            "other nodes", None, f"{words} answer too, and no joint of the cell file has them"
+        )
 
 
 def scan(link: Link) -> dict[int, int]:
@@ -47,19 +51,19 @@ def scan(link: Link) -> dict[int, int]:
     return {node: len(frames) for node, frames in answers.items() if frames}
 
 
-def _not_one(axis: DriveAxis, count: int, strangers: list[int]) -> Finding:
+def _not_one(axis: DriveAxis, count: int, strangers: list[int]) -> ExaminationFinding:
     if count > 1:
-        return Finding(
+        return ExaminationFinding(
             axis.name, False, f"{count} drives answer as node {axis.node_id}",
             "give each drive a node id of its own (switches on the drive, or its vendor's tool, one drive at a time)",
         )  # fmt: skip
     cure = _WIRING
     if strangers:
         cure += f" Nodes {', '.join(map(str, strangers))} answer, which no joint has: is it one of them?"
-    return Finding(axis.name, False, "no answer", cure)
+    return ExaminationFinding(axis.name, False, "no answer", cure)
 
 
-def _identity(drive: RemoteDrive, joint: CanJoint) -> Finding:
+def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
     name = drive.axis.name
     device = drive.read(0x1000)
     values = {what: drive.read_if_there(0x1018, k + 1) for k, what in enumerate(IDENTITY)}
@@ -68,7 +72,7 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> Finding:
     )
     message = f"answers once; device type {device:#010x}, {told}"
     if device & 0xFFFF != CIA_402:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"{message}: device profile {device & 0xFFFF} is not CiA 402",
             "another device has this node id; or protocol of the cell file",
         )  # fmt: skip
@@ -80,11 +84,13 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> Finding:
     if wrong:
         asked = ", ".join(f"{what} is {getattr(joint, what):#x} in the cell file" for what, _ in wrong)
         mended = ", ".join(f"{what} = {value:#x}" for what, value in wrong if value is not None)
-        return Finding(name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}")
-    return Finding(name, True, message)
+        return ExaminationFinding(
+            name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}"
+        )
+    return ExaminationFinding(name, True, message)
 
 
-def _state(drive: RemoteDrive) -> Finding:
+def _state(drive: RemoteDrive) -> ExaminationFinding:
     name = f"{drive.axis.name} state"
     state = drive_state(drive.read(0x6041))
     register = drive.read(0x1001)
@@ -107,8 +113,10 @@ def _state(drive: RemoteDrive) -> Finding:
         code = drive.read_if_there(0x603F) or (past[0] if past else 0)
         words = f" ({error_words(code)})" if code else ""
         cure = error_hint(code) if code else "look its error up in the drive's manual"
-        return Finding(name, False, f"{message}{words}", f"{cure}; then `stereoservo reset` clears it")
-    return Finding(name, None if switches & 3 else True, message)
+        return ExaminationFinding(
+            name, False, f"{message}{words}", f"{cure}; then `stereoservo reset` clears it"
+        )
+    return ExaminationFinding(name, None if switches & 3 else True, message)
 
 
 def _past_errors(drive: RemoteDrive) -> list[int]:
@@ -118,18 +126,20 @@ def _past_errors(drive: RemoteDrive) -> list[int]:
     return [value & 0xFFFF for value in read if value]
 
 
-def _modes(drive: RemoteDrive, options: CanOptions) -> Finding:
+def _modes(drive: RemoteDrive, options: CanOptions) -> ExaminationFinding:
     name = f"{drive.axis.name} modes"
     supported = drive.read_if_there(0x6502)
     wanted = MODES[options.mode]
     if supported is None:
-        return Finding(
+        return ExaminationFinding(
             name, None, f"0x6502 is not there: whether it has mode {wanted} shows when it is configured"
         )
     modes = [mode for mode in range(1, 33) if supported >> (mode - 1) & 1]
     message = ", ".join(f"{mode} {MODE_NAMES.get(mode, '')}".strip() for mode in modes)
     if wanted in modes:
-        return Finding(name, True, message)
+        return ExaminationFinding(name, True, message)
     other = [mode for mode, number in MODES.items() if number in modes]
     cure = f'mode = "{other[0]}"' if other else "this drive has no velocity mode that this driver knows"
-    return Finding(name, False, f"mode {wanted} ({options.mode}) is not among {message or 'none'}", cure)
+    return ExaminationFinding(
+        name, False, f"mode {wanted} ({options.mode}) is not among {message or 'none'}", cure
+    )

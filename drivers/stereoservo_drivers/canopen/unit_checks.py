@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import Finding
+from stereoservo.ports.devices import ExaminationFinding
 from stereoservo_drivers.canopen.options import CanJoint
 from stereoservo_drivers.canopen.units import JointScale
 
@@ -34,12 +34,12 @@ STOPPED_EARLY = 6.0
 NAMED_UNITS = {1.0: "rev/s", 60.0: "rpm", 600.0: "rpm/10", 6000.0: "rpm/100", 60_000.0: "rpm/1000"}
 
 
-def position_finding(joint: CanJoint, position: float) -> Finding:
+def position_finding(joint: CanJoint, position: float) -> ExaminationFinding:
     """A joint's position [rad or m] against the machine's limits."""
     name, unit = f"{joint.name} position", _unit(joint)
     limits = f"{joint.position_min:g} to {joint.position_max:g} {unit}"
     if joint.position_min <= position <= joint.position_max:
-        return Finding(name, True, f"{position:+.4f} {unit}, within {limits}")
+        return ExaminationFinding(name, True, f"{position:+.4f} {unit}, within {limits}")
     outside = max(joint.position_min - position, position - joint.position_max)
     message = f"{position:+.4f} {unit} is {outside:.3g} {unit} outside {limits}"
     zero = joint.offset_rad + position
@@ -49,10 +49,10 @@ def position_finding(joint: CanJoint, position: float) -> Finding:
             "so far outside, counts_per_rev (of the motor, after quadrature) or gear_ratio is wrong, limits are in "
             "degrees, or the encoder has lost its zero: home the drive"
         )
-    return Finding(name, False, message, cure)
+    return ExaminationFinding(name, False, message, cure)
 
 
-def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
+def noise_finding(joint: CanJoint, positions: FloatArray) -> ExaminationFinding:
     """Positions (k,) of a joint that should stand still."""
     name, unit = f"{joint.name} at rest", _unit(joint)
     counts = abs(JointScale.of(joint).counts_per_unit)
@@ -60,16 +60,18 @@ def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
     drift = float(positions[-1] - positions[0])
     message = f"wavers by {spread:.2g} {unit} ({spread * counts:.0f} counts)"
     if spread <= max(NOISE, NOISE_COUNTS / counts):
-        return Finding(name, True, message)
+        return ExaminationFinding(name, True, message)
     if abs(drift) > 0.8 * spread:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"moves by {drift:+.2g} {unit} while nobody drives it",
             "it sinks: see to its brake; or it was pushed: leave it alone and repeat",
         )  # fmt: skip
-    return Finding(name, False, message, "encoder cable, its screen, and the encoder's type set in the drive")
+    return ExaminationFinding(
+        name, False, message, "encoder cable, its screen, and the encoder's type set in the drive"
+    )
 
 
-def resolution_finding(joint: CanJoint) -> Finding:
+def resolution_finding(joint: CanJoint) -> ExaminationFinding:
     """What one unit of velocity is at the joint."""
     unit = _unit(joint)
     step = 1.0 / abs(JointScale.of(joint).velocity_units_per_unit)
@@ -77,8 +79,8 @@ def resolution_finding(joint: CanJoint) -> Finding:
         f"one unit of velocity is {step:.2g} {unit}/s, one count {JointScale.of(joint).resolution:.2g} {unit}"
     )
     if step <= COARSE:
-        return Finding(f"{joint.name} units", True, message)
-    return Finding(
+        return ExaminationFinding(f"{joint.name} units", True, message)
+    return ExaminationFinding(
         f"{joint.name} units",
         None,
         f"{message}: coarse; goals end in a slow hunt about rest",
@@ -130,7 +132,7 @@ class JogTrace:
         return abs(self.travel) > RUNAWAY * abs(self.asked) + 3.0 * margin
 
 
-def jog_finding(trace: JogTrace) -> Finding:
+def jog_finding(trace: JogTrace) -> ExaminationFinding:
     """A jog that is over: the way it went, how far, by which factor the units are wrong."""
     joint = trace.joint
     name = f"{joint.name} jog"
@@ -138,29 +140,31 @@ def jog_finding(trace: JogTrace) -> Finding:
     ratio = trace.travel / trace.asked if trace.asked else math.inf
     if trace.runs_away():
         cure = _units_cure(joint, ratio, at_least=True)
-        return Finding(name, False, f"asked for {asked}, moved {travel} before it was stopped", cure)
+        return ExaminationFinding(
+            name, False, f"asked for {asked}, moved {travel} before it was stopped", cure
+        )
     if ratio > 1.0 + TOLERANCE:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
         )
     if ratio < -0.05:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"asked for {asked}, its encoder moved {travel}: the wrong way",
             "motor and encoder count in opposite senses: polarity of the encoder in the drive (0x607E turns both)",
         )  # fmt: skip
     if ratio < 0.05:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"asked for {asked}, moved {travel}: it stands",
             f"brake, safe torque off, the drive's mode; or {_units_cure(joint, ratio)}"
             if ratio > 1e-5 else "brake, safe torque off, the drive's mode, its velocity limit",
         )  # fmt: skip
     if ratio < 1.0 - TOLERANCE:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
         )
     share = trace.reported / trace.travel
     if not 1.0 - 2 * TOLERANCE < share < 1.0 + 2 * TOLERANCE:
-        return Finding(
+        return ExaminationFinding(
             name, False,
             f"moved {travel}, but the velocity that the drive reports (0x606C) adds up to "
             f"{_told(joint, trace.reported)}: {share:.3g} times",
@@ -170,8 +174,10 @@ def jog_finding(trace: JogTrace) -> Finding:
     lag_s = trace.longest_lag / fastest
     message = f"asked for {asked}, moved {travel} by its own encoder, at most {lag_s * 1e3:.0f} ms behind"
     if lag_s > LAG_S:
-        return Finding(name, None, message, "velocity loop of the drive: gains, or its acceleration limit")
-    return Finding(
+        return ExaminationFinding(
+            name, None, message, "velocity loop of the drive: gains, or its acceleration limit"
+        )
+    return ExaminationFinding(
         name, True, f"{message}; where your eye saw less or more, gear_ratio is wrong by that factor, where it saw the "
         "other way, direction",
     )  # fmt: skip

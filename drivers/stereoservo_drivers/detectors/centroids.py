@@ -20,9 +20,11 @@ is not noise).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import inlined_kernel, kernel
 from stereoservo_drivers.detectors.components import (
     AREA,
     BACKGROUND,
@@ -56,8 +58,10 @@ from stereoservo_drivers.detectors.components import (
     SHAPE,
     U,
     V,
+    aperture_of,
     crowded,
     extremes,
+    half_sizes,
     nearest_component,
     ring_level,
 )
@@ -158,116 +162,275 @@ def _reach(q11, q12, q22, skirt):
     return skirt + np.sqrt(skirt * skirt + thin * thin) - thin
 
 
+(
+    SX, SY, JXX, JXY, JYX, JYY, WWXX, WWXY, WWYY, RIM, RIM_X, RIM_Y, RIM_3X, RIM_3Y, RIM2, LIGHT, W, WW,
+    LIGHTXX, LIGHTXY, LIGHTYY, WLIGHTXX, WLIGHTXY, WLIGHTYY, WXX, WXY, WYY,
+) = range(27)  # fmt: skip
+"""Sums over a dot's window: S; J = dS/dc; W² ddᵀ; weight of the edge's band, first and third harmonic of its level,
+its squared weight; W I; W; W²; W I ddᵀ; W² I ddᵀ; W ddᵀ."""
+SUMS = 27
+
+
+class RowMoments(NamedTuple):
+    """Sums along a row of what is weighted, and of it times x and x²."""
+
+    all: float
+    x: float
+    xx: float
+
+
+class Rim(NamedTuple):
+    """Sums over the skirt's slope: its part of J, and of the edge's band ``RIM`` to ``RIM2`` of the window's sums."""
+
+    jxx: float
+    jxy: float
+    jyx: float
+    jyy: float
+    weight: float
+    x: float
+    y: float
+    x3: float
+    y3: float
+    square: float
+
+
+@inlined_kernel
+def _row_sums(row, first, y, aperture, edge, rim):
+    """Sums along one ``row`` of the window, at x = ``first``, ``first`` + 1, ... and ``y`` [px] from the centre.
+
+    Returns ``rim`` with this row added, and moments of W I, W² I, W and W². The band and all but W I and W I x only
+    where ``edge``.
+    """
+    q11, q12, q22, skirt, sign, zero = aperture
+    width = 4.0 * skirt * skirt
+    j00, j01, j10, j11, bumps, odd_x, odd_y, odd_3x, odd_3y, bumps2 = rim
+    light = light_x = light_xx = bright = bright_x = bright_xx = 0.0
+    all_w = all_wx = all_wxx = all_w2 = all_w2x = all_w2xx = 0.0
+    for k in range(row.size):
+        x = k + first
+        gx = q11 * x + q12 * y
+        gy = q12 * x + q22 * y
+        e = x * gx + y * gy - 1.0
+        g2 = gx * gx + gy * gy
+        band = width * g2
+        square = e * e
+        if e > 0.0 and square >= band:
+            continue
+        level = sign * row[k] + zero
+        weight = 1.0
+        if square < band:
+            # W = (1 - (delta / skirt)²)², delta = e / 2|Qd|
+            over = 1.0 / band
+            rest = 1.0 - square * over
+            bump = rest * rest
+            if e > 0.0:
+                weight = bump
+                f = 8.0 * e * rest * over
+                g = 2.0 * skirt * skirt * f * e * over
+                dx = (f * gx - g * (q11 * gx + q12 * gy)) * level
+                dy = (f * gy - g * (q12 * gx + q22 * gy)) * level
+                j00 += x * dx
+                j01 += x * dy
+                j10 += y * dx
+                j11 += y * dy
+            if edge:
+                r = 1.0 / np.sqrt(g2)
+                nx = gx * r
+                ny = gy * r
+                part = bump * level
+                bumps += bump
+                bumps2 += bump * bump
+                odd_x += part * nx
+                odd_y += part * ny
+                odd_3x += part * (4.0 * nx * nx - 3.0) * nx
+                odd_3y += part * (3.0 - 4.0 * ny * ny) * ny
+        lit = weight * level
+        light += lit
+        light_x += x * lit
+        if edge:
+            light_xx += x * x * lit
+            here = weight * lit
+            bright += here
+            bright_x += x * here
+            bright_xx += x * x * here
+            all_w += weight
+            all_wx += x * weight
+            all_wxx += x * x * weight
+            here = weight * weight
+            all_w2 += here
+            all_w2x += x * here
+            all_w2xx += x * x * here
+    return (
+        Rim(j00, j01, j10, j11, bumps, odd_x, odd_y, odd_3x, odd_3y, bumps2),
+        RowMoments(light, light_x, light_xx),
+        RowMoments(bright, bright_x, bright_xx),
+        RowMoments(all_w, all_wx, all_wxx),
+        RowMoments(all_w2, all_w2x, all_w2xx),
+    )
+
+
+@inlined_kernel
+def _add_row(sums, xx, row, y):
+    """Second moments of a row's ``row`` at ``y`` into ``sums`` from ``xx`` on."""
+    sums[xx] += row.xx
+    sums[xx + 1] += y * row.x
+    sums[xx + 2] += y * y * row.all
+
+
 @kernel
 def _window_sums(image, dark, background, skirt, out, sums, edge):
-    """S (2), J (4) at the centre in ``out``; where ``edge``, sum T Tᵀ (3), the odd harmonics of the edge's level, and
-    what light, its slopes and its noise take.
+    """Sums over the window about the centre in ``out`` into ``sums`` (SUMS,): S, J, W I; where ``edge``, all of them.
 
     False where the window leaves the image.
     """
     q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    det = q11 * q22 - q12 * q12
     cu, cv = out[U], out[V]
     reach = _reach(q11, q12, q22, skirt)
-    half_u = np.sqrt(q22 / det) + reach
-    half_v = np.sqrt(q11 / det) + reach
+    half_u, half_v = half_sizes(q11, q12, q22)
+    half_u, half_v = half_u + reach, half_v + reach
     lo_u, hi_u = int(np.ceil(cu - half_u)), int(np.floor(cu + half_u))
     lo_v, hi_v = int(np.ceil(cv - half_v)), int(np.floor(cv + half_v))
     rows, columns = image.shape
     if lo_u < 0 or lo_v < 0 or hi_u >= columns or hi_v >= rows:
         return False
     sums[:] = 0.0
-    sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
-    width = 4.0 * skirt * skirt
-    first = lo_u - cu
-    j00 = j01 = j10 = j11 = 0.0
-    bumps = odd_x = odd_y = odd_3x = odd_3y = bumps2 = 0.0
+    rim = Rim(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    aperture = aperture_of(dark, background, skirt, out)
     for v in range(lo_v, hi_v + 1):
         y = v - cv
-        # sums along the row: their powers of y follow
-        light = light_x = light_xx = bright = bright_x = bright_xx = 0.0
-        all_w = all_wx = all_wxx = all_w2 = all_w2x = all_w2xx = 0.0
         row = image[v, lo_u : hi_u + 1]
-        for k in range(row.size):
-            x = k + first
-            gx = q11 * x + q12 * y
-            gy = q12 * x + q22 * y
-            e = x * gx + y * gy - 1.0
-            g2 = gx * gx + gy * gy
-            band = width * g2
-            square = e * e
-            if e > 0.0 and square >= band:
-                continue
-            level = sign * row[k] + zero
-            weight = 1.0
-            if square < band:
-                # W = (1 - (delta / skirt)²)², delta = e / 2|Qd|
-                over = 1.0 / band
-                rest = 1.0 - square * over
-                bump = rest * rest
-                if e > 0.0:
-                    weight = bump
-                    f = 8.0 * e * rest * over
-                    g = 2.0 * skirt * skirt * f * e * over
-                    dx = (f * gx - g * (q11 * gx + q12 * gy)) * level
-                    dy = (f * gy - g * (q12 * gx + q22 * gy)) * level
-                    j00 += x * dx
-                    j01 += x * dy
-                    j10 += y * dx
-                    j11 += y * dy
-                if edge:
-                    r = 1.0 / np.sqrt(g2)
-                    nx = gx * r
-                    ny = gy * r
-                    part = bump * level
-                    bumps += bump
-                    bumps2 += bump * bump
-                    odd_x += part * nx
-                    odd_y += part * ny
-                    odd_3x += part * (4.0 * nx * nx - 3.0) * nx
-                    odd_3y += part * (3.0 - 4.0 * ny * ny) * ny
-            lit = weight * level
-            light += lit
-            light_x += x * lit
-            if edge:
-                light_xx += x * x * lit
-                here = weight * lit
-                bright += here
-                bright_x += x * here
-                bright_xx += x * x * here
-                all_w += weight
-                all_wx += x * weight
-                all_wxx += x * x * weight
-                here = weight * weight
-                all_w2 += here
-                all_w2x += x * here
-                all_w2xx += x * x * here
-        sums[0] += light_x
-        sums[1] += y * light
-        sums[15] += light
+        rim, light, light2, weight, weight2 = _row_sums(row, lo_u - cu, y, aperture, edge, rim)
+        sums[SX] += light.x
+        sums[SY] += y * light.all
+        sums[LIGHT] += light.all
         if edge:
-            sums[6] += all_w2xx
-            sums[7] += y * all_w2x
-            sums[8] += y * y * all_w2
-            sums[16] += all_w
-            sums[17] += all_w2
-            sums[18] += light_xx
-            sums[19] += y * light_x
-            sums[20] += y * y * light
-            sums[21] += bright_xx
-            sums[22] += y * bright_x
-            sums[23] += y * y * bright
-            sums[24] += all_wxx
-            sums[25] += y * all_wx
-            sums[26] += y * y * all_w
-    sums[2], sums[3], sums[4], sums[5] = j00 - sums[15], j01, j10, j11 - sums[15]
-    sums[9], sums[10], sums[11], sums[12], sums[13], sums[14] = bumps, odd_x, odd_y, odd_3x, odd_3y, bumps2
+            sums[W] += weight.all
+            sums[WW] += weight2.all
+            _add_row(sums, LIGHTXX, light, y)
+            _add_row(sums, WLIGHTXX, light2, y)
+            _add_row(sums, WXX, weight, y)
+            _add_row(sums, WWXX, weight2, y)
+    sums[JXX], sums[JXY], sums[JYX], sums[JYY] = (
+        rim.jxx - sums[LIGHT],
+        rim.jxy,
+        rim.jyx,
+        rim.jyy - sums[LIGHT],
+    )
+    sums[RIM], sums[RIM_X], sums[RIM_Y], sums[RIM_3X] = rim.weight, rim.x, rim.y, rim.x3
+    sums[RIM_3Y], sums[RIM2] = rim.y3, rim.square
     return True
 
 
 @kernel
 def _beset(labels, box, label, near, out):
     return crowded(labels, box, label, near, _reach(out[QXX], out[QXY], out[QYY], near), out)
+
+
+@kernel
+def _free_skirt(labels, box, label, out):
+    """The widest skirt [px] that no neighbour reaches into, 0 for none; the standard deviation [px] that one adds."""
+    if not _beset(labels, box, label, SKIRT + 1.0, out):
+        return SKIRT, 0.0
+    if not _beset(labels, box, label, NARROW + 1.0, out):
+        return NARROW, CROWDED
+    if not _beset(labels, box, label, NARROWEST + 0.5, out):
+        return NARROWEST, PRESSED
+    return 0.0, 0.0
+
+
+class Dot(NamedTuple):
+    """A dot's ``background`` level, ``contrast`` to it, and ``skirt`` [px]; what a neighbour adds, ``beside`` [px]."""
+
+    background: float
+    contrast: float
+    skirt: float
+    beside: float
+
+
+@kernel
+def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, labels, stack, out):
+    """Status and the dot nearest to (pu, pv); its ellipse and its centre to first order into ``out``."""
+    rows, columns = image.shape
+    none = Dot(0.0, 0.0, 0.0, 0.0)
+    brightest = np.empty(box[3] - box[1], np.int64)
+    low, high = extremes(image, dark, box, brightest)
+    if high - low < min_contrast:
+        return NO_CONTRAST, none
+    threshold = 255 - (low + high) // 2 if dark else (low + high + 1) // 2
+    found = np.zeros(10)
+    label = nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, labels, stack, found)
+    if label == 0:
+        return NO_COMPONENT, none
+    u_min, u_max, v_min, v_max = int(found[3]), int(found[4]), int(found[5]), int(found[6])
+    if u_min < MARGIN or v_min < MARGIN or u_max >= columns - MARGIN or v_max >= rows - MARGIN:
+        return BORDER, none
+    background = ring_level(image, dark, u_min, u_max, v_min, v_max)
+    contrast = float(255 - low if dark else high) - background
+    if found[8] >= 4:
+        contrast = found[7] / found[8] - background
+    if contrast < min_contrast:
+        return NO_CONTRAST, none
+    if not _ellipse(image, dark, box, labels, label, found, background, contrast, out):
+        return SHAPE, none
+    skirt, beside = SKIRT, 0.0
+    if found[9] > 1.0:
+        skirt, beside = _free_skirt(labels, box, label, out)
+    return (OK if skirt > 0.0 else SHAPE), Dot(background, contrast, skirt, beside)
+
+
+@kernel
+def _refine_centre(image, dark, dot, out, sums):
+    """Newton's method for the zero of S from the centre in ``out``: a status. ``sums`` of the last step."""
+    start_u, start_v = out[U], out[V]
+    # From a start within some hundredths of a pixel the second step is of the order of 1e-4 px.
+    for step in range(4):
+        if not _window_sums(image, dark, dot.background, dot.skirt, out, sums, step > 0):
+            return BORDER
+        det = sums[JXX] * sums[JYY] - sums[JXY] * sums[JYX]
+        if det <= 0.0 or sums[JXX] + sums[JYY] >= 0.0:
+            return DIVERGED
+        du = -(sums[JYY] * sums[SX] - sums[JXY] * sums[SY]) / det
+        dv = -(sums[JXX] * sums[SY] - sums[JYX] * sums[SX]) / det
+        out[U] += du
+        out[V] += dv
+        if (out[U] - start_u) ** 2 + (out[V] - start_v) ** 2 > 1.0:
+            return DIVERGED
+        if step > 0 and du * du + dv * dv < 1e-6:
+            break
+    return OK
+
+
+@kernel
+def _congruence(a, b, c, d, n11, n12, n22):
+    """Upper triangle of A N Aᵀ, A = [a b; c d]."""
+    return (
+        a * a * n11 + 2.0 * a * b * n12 + b * b * n22,
+        a * c * n11 + (a * d + b * c) * n12 + b * d * n22,
+        c * c * n11 + 2.0 * c * d * n12 + d * d * n22,
+    )
+
+
+@kernel
+def _sensitivities(sums, contrast, out):
+    """Into ``out``: the centre's covariance at unit noise, its shifts by slopes of the light and of the background."""
+    det = sums[JXX] * sums[JYY] - sums[JXY] * sums[JYX]
+    a, b, c, d = sums[JYY] / det, -sums[JXY] / det, -sums[JYX] / det, sums[JXX] / det
+    out[CXX], out[CXY], out[CYY] = _congruence(a, b, c, d, sums[WWXX], sums[WWXY], sums[WWYY])
+    out[CONTRAST] = contrast
+    f = 1.0 / contrast
+    out[BXX], out[BXY], out[BYY] = _congruence(
+        a, b, c, d, f * sums[WLIGHTXX], f * sums[WLIGHTXY], f * sums[WLIGHTYY]
+    )
+    for k in range(2):
+        # the shift is -J⁻¹ sum T dI, and T = d W
+        p, r = (a, b) if k == 0 else (c, d)
+        out[LIT + 2 * k] = -(p * sums[LIGHTXX] + r * sums[LIGHTXY])
+        out[LIT + 2 * k + 1] = -(p * sums[LIGHTXY] + r * sums[LIGHTYY])
+        out[DARK + 2 * k] = -(p * sums[WXX] + r * sums[WXY])
+        out[DARK + 2 * k + 1] = -(p * sums[WXY] + r * sums[WYY])
+        # inside the dot T = d is one of the terms that the slope is fitted with
+        out[PULL + 2 * k] = -f * p
+        out[PULL + 2 * k + 1] = -f * r
 
 
 @kernel
@@ -283,90 +446,28 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     if u1 - u0 < 7 or v1 - v0 < 7 or u1 - u0 > MAX_WINDOW or v1 - v0 > MAX_WINDOW:
         return BORDER
     box = (u0, v0, u1, v1)
-    brightest = np.empty(v1 - v0, np.int64)
-    low, high = extremes(image, dark, box, brightest)
-    if high - low < min_contrast:
-        return NO_CONTRAST
-    threshold = (low + high + 1) // 2
-    if dark:
-        threshold = 255 - (low + high) // 2
-    found = np.zeros(10)
-    label = nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, labels, stack, found)
-    if label == 0:
-        return NO_COMPONENT
-    u_min, u_max, v_min, v_max = int(found[3]), int(found[4]), int(found[5]), int(found[6])
-    if u_min < MARGIN or v_min < MARGIN or u_max >= columns - MARGIN or v_max >= rows - MARGIN:
-        return BORDER
-    background = ring_level(image, dark, u_min, u_max, v_min, v_max)
-    top = float(255 - low) if dark else float(high)
-    contrast = top - background
-    if found[8] >= 4:
-        contrast = found[7] / found[8] - background
-    if contrast < min_contrast:
-        return NO_CONTRAST
-    if not _ellipse(image, dark, box, labels, label, found, background, contrast, out):
-        return SHAPE
-    skirt, beside = SKIRT, 0.0
-    if found[9] > 1.0 and _beset(labels, box, label, SKIRT + 1.0, out):
-        skirt, beside = NARROW, CROWDED * CROWDED
-        if _beset(labels, box, label, NARROW + 1.0, out):
-            skirt, beside = NARROWEST, PRESSED * PRESSED
-            if _beset(labels, box, label, NARROWEST + 0.5, out):
-                return SHAPE
-    start_u, start_v = out[U], out[V]
-    sums = np.zeros(27)
-    # Newton's method from a start within some hundredths of a pixel: the second step is of the order of
-    # 1e-4 px
-    for step in range(4):
-        if not _window_sums(image, dark, background, skirt, out, sums, step > 0):
-            return BORDER
-        det = sums[2] * sums[5] - sums[3] * sums[4]
-        if det <= 0.0 or sums[2] + sums[5] >= 0.0:
-            return DIVERGED
-        du = -(sums[5] * sums[0] - sums[3] * sums[1]) / det
-        dv = -(sums[2] * sums[1] - sums[4] * sums[0]) / det
-        out[U] += du
-        out[V] += dv
-        if (out[U] - start_u) ** 2 + (out[V] - start_v) ** 2 > 1.0:
-            return DIVERGED
-        if step > 0 and du * du + dv * dv < 1e-6:
-            break
-    det = sums[2] * sums[5] - sums[3] * sums[4]
-    a, b, c, d = sums[5] / det, -sums[3] / det, -sums[4] / det, sums[2] / det
-    n11, n12, n22 = sums[6], sums[7], sums[8]
-    out[CXX] = a * a * n11 + 2.0 * a * b * n12 + b * b * n22
-    out[CXY] = a * c * n11 + (a * d + b * c) * n12 + b * d * n22
-    out[CYY] = c * c * n11 + 2.0 * c * d * n12 + d * d * n22
-    out[CONTRAST] = contrast
-    f = 1.0 / contrast
-    n11, n12, n22 = f * sums[21], f * sums[22], f * sums[23]
-    out[BXX] = a * a * n11 + 2.0 * a * b * n12 + b * b * n22
-    out[BXY] = a * c * n11 + (a * d + b * c) * n12 + b * d * n22
-    out[BYY] = c * c * n11 + 2.0 * c * d * n12 + d * d * n22
-    for k in range(2):
-        # the shift is -J⁻¹ sum T dI, and T = d W
-        p, r = (a, b) if k == 0 else (c, d)
-        out[LIT + 2 * k] = -(p * sums[18] + r * sums[19])
-        out[LIT + 2 * k + 1] = -(p * sums[19] + r * sums[20])
-        out[DARK + 2 * k] = -(p * sums[24] + r * sums[25])
-        out[DARK + 2 * k + 1] = -(p * sums[25] + r * sums[26])
-        # inside the dot T = d is one of the terms that the slope is fitted with
-        out[PULL + 2 * k] = -f * p
-        out[PULL + 2 * k + 1] = -f * r
+    status, dot = _find_dot(image, dark, box, pu, pv, min_contrast, min_area, labels, stack, out)
+    if status != OK:
+        return status
+    sums = np.zeros(SUMS)
+    status = _refine_centre(image, dark, dot, out, sums)
+    if status != OK:
+        return status
+    _sensitivities(sums, dot.contrast, out)
     plane = np.zeros(2)
-    out[NOISE] = surroundings(
-        image, dark, background, skirt, _reach(out[QXX], out[QXY], out[QYY], skirt), out, plane
-    )
-    inside(image, dark, background, contrast, out)
-    out[BACKGROUND] = background + plane[0]
-    out[FLUX] = sums[15] - plane[0] * sums[16]
-    out[FLUX_NOISE] = np.sqrt(sums[17] + sums[16] ** 2 / max(plane[1], 1.0))
-    out[EXX], out[EXY], out[EYY] = beside, 0.0, beside
-    if sums[9] <= 0.0:
+    reach = _reach(out[QXX], out[QXY], out[QYY], dot.skirt)
+    out[NOISE] = surroundings(image, dark, dot.background, dot.skirt, reach, out, plane)
+    inside(image, dark, dot.background, dot.contrast, out)
+    out[BACKGROUND] = dot.background + plane[0]
+    out[FLUX] = sums[LIGHT] - plane[0] * sums[W]
+    out[FLUX_NOISE] = np.sqrt(sums[WW] + sums[W] ** 2 / max(plane[1], 1.0))
+    even = dot.beside * dot.beside
+    out[EXX], out[EXY], out[EYY] = even, 0.0, even
+    if sums[RIM] <= 0.0:
         return SHAPE
-    odd = sums[10] ** 2 + sums[11] ** 2 + sums[12] ** 2 + sums[13] ** 2
-    out[LOPSIDED] = 2.0 * np.sqrt(odd) / (sums[9] * contrast)
-    out[LOPSIDED_NOISE] = 2.0 * np.sqrt(2.0 * sums[14]) / (sums[9] * contrast)
+    odd = sums[RIM_X] ** 2 + sums[RIM_Y] ** 2 + sums[RIM_3X] ** 2 + sums[RIM_3Y] ** 2
+    out[LOPSIDED] = 2.0 * np.sqrt(odd) / (sums[RIM] * dot.contrast)
+    out[LOPSIDED_NOISE] = 2.0 * np.sqrt(2.0 * sums[RIM2]) / (sums[RIM] * dot.contrast)
     return OK
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -75,11 +77,9 @@ def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, 
             stack[0] = (sv - v0) * MAX_WINDOW + su
             top = 1
             count = 0
-            sum_u = 0
-            sum_v = 0
+            sum_u = sum_v = 0
             u_min, u_max, v_min, v_max = su + u0, su + u0, sv, sv
-            inner_sum = 0
-            inner = 0
+            inner_sum = inner = 0
             while top > 0:
                 top -= 1
                 v = stack[top] // MAX_WINDOW + v0
@@ -151,21 +151,48 @@ def ring_level(image, dark, u_min, u_max, v_min, v_max):
 
 
 @kernel
+def half_sizes(q11, q12, q22):
+    """Half width and half height [px] of the ellipse dᵀQd = 1."""
+    det = q11 * q22 - q12 * q12
+    return np.sqrt(q22 / det), np.sqrt(q11 / det)
+
+
+class Aperture(NamedTuple):
+    """An ellipse dᵀQd = 1 with a ``skirt`` [px], and what makes levels of an image ones above the background:
+    ``sign`` times level plus ``zero``.
+    """
+
+    q11: float
+    q12: float
+    q22: float
+    skirt: float
+    sign: float
+    zero: float
+
+
+@kernel
+def aperture_of(dark, background, skirt, out):
+    """The aperture about a dot's ellipse in ``out``."""
+    sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
+    return Aperture(out[QXX], out[QXY], out[QYY], skirt, sign, zero)
+
+
+@kernel
 def crowded(labels, box, label, near, reach, out):
     """Whether more than specks (noise on the dot's own edge) of other components come within ``near`` [px], to first
     order, of the ellipse of ``out``; ``reach`` [px] how far that is at most."""
     specks = 3
-    u0, v0, u1, v1 = box
     q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    det = q11 * q22 - q12 * q12
-    half_u, half_v = int(np.sqrt(q22 / det) + reach), int(np.sqrt(q11 / det) + reach)
-    u0, u1 = max(u0, int(out[U]) - half_u) - u0, min(u1, int(out[U]) + half_u + 2) - u0
+    wide, high = half_sizes(q11, q12, q22)
+    half_u, half_v = int(wide + reach), int(high + reach)
+    u0, v0, u1, v1 = box
+    lo_u, hi_u = max(u0, int(out[U]) - half_u), min(u1, int(out[U]) + half_u + 2)
     far = 4.0 * near * near
     for v in range(max(v0, int(out[V]) - half_v), min(v1, int(out[V]) + half_v + 2)):
-        row = labels[v - v0, u0:u1]
+        row = labels[v - v0, lo_u - u0 : hi_u - u0]
         for k in range(row.size):
             if row[k] not in (0, label):
-                x, y = k + u0 + box[0] - out[U], v - out[V]
+                x, y = k + lo_u - out[U], v - out[V]
                 gx = q11 * x + q12 * y
                 gy = q12 * x + q22 * y
                 e = x * gx + y * gy - 1.0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import inlined_kernel, kernel
 from stereoservo_drivers.detectors.components import (
     BACKGROUND,
     BRIGHT,
@@ -28,6 +30,8 @@ from stereoservo_drivers.detectors.components import (
     SLOPE_YY,
     U,
     V,
+    aperture_of,
+    half_sizes,
     median_level,
 )
 from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, given, written
@@ -68,6 +72,111 @@ def _add(sums, x, y, level, tail, times):
     sums[14] += times * tail * level
 
 
+@inlined_kernel
+def _ring_row(row, first, y, aperture, histogram, ring, sums):
+    """Add the pixels of a ``row``, at x = ``first``, ... and ``y`` [px] from the centre, that are outside the skirt.
+
+    Their |level| to ``histogram``, (x, y, level, tail) to ``ring`` (n, 4), their moments to ``sums`` (15,), which
+    begins with the number of pixels.
+    """
+    q11, q12, q22, skirt, sign, zero = aperture
+    width = 4.0 * skirt * skirt
+    # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
+    fall = 1.0 / ((skirt + RING) ** 2 - skirt * skirt)
+    before = count = int(sums[0])
+    # sums along the row: their powers of y follow
+    si = sx = sxx = sxi = sii = st = stx = stt = sti = 0.0
+    for k in range(row.size):
+        x = k + first
+        gx = q11 * x + q12 * y
+        gy = q12 * x + q22 * y
+        e = x * gx + y * gy - 1.0
+        g2 = gx * gx + gy * gy
+        if e >= 0.0 and e * e >= width * g2:
+            level = sign * row[k] + zero
+            near = max(1.0 - (0.25 * e * e / g2 - skirt * skirt) * fall, 0.0)
+            tail = near * near * near
+            histogram[int(abs(level))] += 1
+            ring[count, 0] = x
+            ring[count, 1] = y
+            ring[count, 2] = level
+            ring[count, 3] = tail
+            count += 1
+            si += level
+            sx += x
+            sxx += x * x
+            sxi += x * level
+            sii += level * level
+            st += tail
+            stx += tail * x
+            stt += tail * tail
+            sti += tail * level
+    n = float(count - before)
+    sums[0] += n
+    sums[1] += si
+    sums[2] += sx
+    sums[3] += n * y
+    sums[4] += sxx
+    sums[5] += sx * y
+    sums[6] += n * y * y
+    sums[7] += sxi
+    sums[8] += si * y
+    sums[9] += sii
+    sums[10] += st
+    sums[11] += stx
+    sums[12] += st * y
+    sums[13] += stt
+    sums[14] += sti
+
+
+class Surface(NamedTuple):
+    """Levels about a dot: a plane and the tail of its blur, and the ``variance`` about them; -1 where there are none.
+
+    ``plane_level``: that of the plane under the centre where the tail is not fitted.
+    """
+
+    variance: float
+    plane_level: float
+    level: float
+    slope_x: float
+    slope_y: float
+    slope_t: float
+
+
+@kernel
+def _fit_surface(sums):
+    """Least squares by the moments ``sums`` (15,): the plane first, then the tail in what the plane leaves."""
+    n = sums[0]
+    if n < 12.0:
+        return Surface(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    si, sx, sy, st = sums[1], sums[2], sums[3], sums[10]
+    sxx = sums[4] - sx * sx / n
+    sxy = sums[5] - sx * sy / n
+    syy = sums[6] - sy * sy / n
+    sxi = sums[7] - sx * si / n
+    syi = sums[8] - sy * si / n
+    sii = sums[9] - si * si / n
+    d = sxx * syy - sxy * sxy
+    if d <= 0.0:
+        return Surface(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    slope_x = (syy * sxi - sxy * syi) / d
+    slope_y = (sxx * syi - sxy * sxi) / d
+    plane_level = level = (si - slope_x * sx - slope_y * sy) / n
+    left = sii - slope_x * sxi - slope_y * syi
+    stx, sty = sums[11] - st * sx / n, sums[12] - st * sy / n
+    tail_x = (syy * stx - sxy * sty) / d
+    tail_y = (sxx * sty - sxy * stx) / d
+    own = sums[13] - st * st / n - tail_x * stx - tail_y * sty
+    slope_t = 0.0
+    if own > 1e-3:
+        slope_t = (sums[14] - st * si / n - tail_x * sxi - tail_y * syi) / own
+        left -= slope_t * slope_t * own
+        level -= slope_t * (st - tail_x * sx - tail_y * sy) / n
+        slope_x -= slope_t * tail_x
+        slope_y -= slope_t * tail_y
+    return Surface(max(left, 0.0) / (n - 4.0), plane_level, level, slope_x, slope_y, slope_t)
+
+
 @kernel
 def surroundings(image, dark, background, skirt, reach, out, plane):
     """Variance of the dot's surroundings about a plane and the tail of the dot's blur [grey levels squared]; -1 where
@@ -77,119 +186,39 @@ def surroundings(image, dark, background, skirt, reach, out, plane):
     Pixels off by more than four robust standard deviations (a neighbour's skirt, the plate's edge) do not
     count.
     """
-    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    det = q11 * q22 - q12 * q12
+    aperture = aperture_of(dark, background, skirt, out)
     cu, cv = out[U], out[V]
-    reach += RING
-    half_u = np.sqrt(q22 / det) + reach
-    half_v = np.sqrt(q11 / det) + reach
+    half_u, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
+    half_u, half_v = half_u + (reach + RING), half_v + (reach + RING)
     rows, columns = image.shape
     lo_u, hi_u = max(int(cu - half_u), 0), min(int(cu + half_u) + 1, columns - 1)
     lo_v, hi_v = max(int(cv - half_v), 0), min(int(cv + half_v) + 1, rows - 1)
-    histogram = np.zeros(256, np.int32)
+    histogram, sums = np.zeros(256, np.int32), np.zeros(15)
     ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 4))
-    count = 0
     plane[:] = 0.0
-    sums = np.zeros(15)
-    sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
-    width = 4.0 * skirt * skirt
-    # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
-    fall = 1.0 / ((skirt + RING) ** 2 - skirt * skirt)
-    first = lo_u - cu
     for v in range(lo_v, hi_v + 1):
-        y = v - cv
-        # sums along the row: their powers of y follow
-        si = sx = sxx = sxi = sii = st = stx = stt = sti = 0.0
-        before = count
-        row = image[v, lo_u : hi_u + 1]
-        for k in range(row.size):
-            x = k + first
-            gx = q11 * x + q12 * y
-            gy = q12 * x + q22 * y
-            e = x * gx + y * gy - 1.0
-            g2 = gx * gx + gy * gy
-            if e >= 0.0 and e * e >= width * g2:
-                level = sign * row[k] + zero
-                near = max(1.0 - (0.25 * e * e / g2 - skirt * skirt) * fall, 0.0)
-                tail = near * near * near
-                histogram[int(abs(level))] += 1
-                ring[count, 0] = x
-                ring[count, 1] = y
-                ring[count, 2] = level
-                ring[count, 3] = tail
-                count += 1
-                si += level
-                sx += x
-                sxx += x * x
-                sxi += x * level
-                sii += level * level
-                st += tail
-                stx += tail * x
-                stt += tail * tail
-                sti += tail * level
-        n = float(count - before)
-        sums[0] += n
-        sums[1] += si
-        sums[2] += sx
-        sums[3] += n * y
-        sums[4] += sxx
-        sums[5] += sx * y
-        sums[6] += n * y * y
-        sums[7] += sxi
-        sums[8] += si * y
-        sums[9] += sii
-        sums[10] += st
-        sums[11] += stx
-        sums[12] += st * y
-        sums[13] += stt
-        sums[14] += sti
+        _ring_row(image[v, lo_u : hi_u + 1], lo_u - cu, v - cv, aperture, histogram, ring, sums)
+    count = int(sums[0])
     if count < 24:
         return -1.0
     limit = 4.0 * 1.4826 * median_level(histogram, count) + 2.0
     counted = np.ones(count, np.bool_)
-    level0 = slope_x = slope_y = slope_t = variance = 0.0
+    fit = Surface(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(2):
         for k in range(count):
             x, y, level, tail = ring[k, 0], ring[k, 1], ring[k, 2], ring[k, 3]
-            near = abs(level - level0 - slope_x * x - slope_y * y - slope_t * tail) <= limit
+            near = abs(level - fit.level - fit.slope_x * x - fit.slope_y * y - fit.slope_t * tail) <= limit
             if near != counted[k]:
                 # few change sides
                 counted[k] = near
                 _add(sums, x, y, level, tail, 1.0 if near else -1.0)
-        n = sums[0]
-        if n < 12.0:
+        fit = _fit_surface(sums)
+        if fit.variance < 0.0:
             return -1.0
-        si, sx, sy, st = sums[1], sums[2], sums[3], sums[10]
-        sxx = sums[4] - sx * sx / n
-        sxy = sums[5] - sx * sy / n
-        syy = sums[6] - sy * sy / n
-        sxi = sums[7] - sx * si / n
-        syi = sums[8] - sy * si / n
-        sii = sums[9] - si * si / n
-        d = sxx * syy - sxy * sxy
-        if d <= 0.0:
-            return -1.0
-        slope_x = (syy * sxi - sxy * syi) / d
-        slope_y = (sxx * syi - sxy * sxi) / d
-        level0 = (si - slope_x * sx - slope_y * sy) / n
-        plane[0], plane[1] = level0, n
-        left = sii - slope_x * sxi - slope_y * syi
-        # the tail in what the plane leaves
-        stx, sty = sums[11] - st * sx / n, sums[12] - st * sy / n
-        tail_x = (syy * stx - sxy * sty) / d
-        tail_y = (sxx * sty - sxy * stx) / d
-        own = sums[13] - st * st / n - tail_x * stx - tail_y * sty
-        slope_t = 0.0
-        if own > 1e-3:
-            slope_t = (sums[14] - st * si / n - tail_x * sxi - tail_y * syi) / own
-            left -= slope_t * slope_t * own
-            level0 -= slope_t * (st - tail_x * sx - tail_y * sy) / n
-            slope_x -= slope_t * tail_x
-            slope_y -= slope_t * tail_y
-        variance = max(left, 0.0) / (n - 4.0)
-        limit = 3.0 * np.sqrt(variance) + 0.5
+        plane[0], plane[1] = fit.plane_level, sums[0]
+        limit = 3.0 * np.sqrt(fit.variance) + 0.5
     # what lies within three standard deviations of a Gaussian has 0.973 of its variance
-    return variance / 0.973 if variance > 1.0 else variance
+    return fit.variance / 0.973 if fit.variance > 1.0 else fit.variance
 
 
 @kernel

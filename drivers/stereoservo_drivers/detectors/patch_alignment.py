@@ -11,6 +11,7 @@ Level ``l`` of a pyramid has its pixel ``k`` over pixel ``2ˡ k`` of the image, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from numba import types
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import inlined_kernel, kernel
 from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, INT, compile_for, given, written
 
 TEMPLATE_LEVELS = 4
@@ -131,6 +132,115 @@ def _sample_cubic(picture: ImageArray, u: float, v: float) -> tuple[float, float
     return total, squared
 
 
+class Template(NamedTuple):
+    """One patch of :class:`Templates`: ``steps`` (6, w), ``levels`` (w,), ``square``; mean of ``averaged`` pictures."""
+
+    half: int
+    averaged: int
+    steps: npt.NDArray[np.float32]
+    levels: npt.NDArray[np.float32]
+    square: float
+
+
+@kernel
+def _reaches_out(picture: ImageArray, half: int, A: FloatArray, p: FloatArray) -> bool:
+    """Whether a warped patch leaves what :func:`_sample_cubic` needs of the picture."""
+    height, width = picture.shape
+    reach_u, reach_v = half * (abs(A[0, 0]) + abs(A[0, 1])), half * (abs(A[1, 0]) + abs(A[1, 1]))
+    return not (
+        p[0] - reach_u >= 1.0
+        and p[1] - reach_v >= 1.0
+        and p[0] + reach_u < width - 2.0
+        and p[1] + reach_v < height - 2.0
+    )
+
+
+@inlined_kernel
+def _compare(
+    picture: ImageArray, template: Template, A: FloatArray, p: FloatArray, step: FloatArray
+) -> tuple[float, float, float, float]:
+    """Sums over a patch of the picture: of levels, of their squares, of their product with the template, and of the
+    squared weights of interpolation. ``step`` (6,) is what the template makes of the levels.
+    """
+    half, steps, levels = template.half, template.steps, template.levels
+    a00, a01, a10, a11 = A[0, 0], A[0, 1], A[1, 0], A[1, 1]
+    u0, v0 = p[0], p[1]
+    total = total2 = cross = attenuation = 0.0
+    s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+    at = 0
+    for y in range(-half, half + 1):
+        for x in range(-half, half + 1):
+            level, squared = _sample_cubic(picture, u0 + a00 * x + a01 * y, v0 + a10 * x + a11 * y)
+            total += level
+            total2 += level * level
+            attenuation += squared
+            cross += level * levels[at]
+            s0 += steps[0, at] * level
+            s1 += steps[1, at] * level
+            s2 += steps[2, at] * level
+            s3 += steps[3, at] * level
+            s4 += steps[4, at] * level
+            s5 += steps[5, at] * level
+            at += 1
+    step[0], step[1], step[2], step[3], step[4], step[5] = s0, s1, s2, s3, s4, s5
+    return total, total2, cross, attenuation
+
+
+@kernel
+def _compose_inverse(A: FloatArray, p: FloatArray, step: FloatArray, gain: float) -> bool:
+    """Take the template's ``step`` back in the picture: W <- W after its inverse. False if it is too large."""
+    d00, d01, d10, d11 = 1.0 + step[0] / gain, step[1] / gain, step[2] / gain, 1.0 + step[3] / gain
+    t0, t1 = step[4] / gain, step[5] / gain
+    determinant = d00 * d11 - d01 * d10
+    if not (determinant > 0.25 and determinant < 4.0):
+        return False
+    i00, i01, i10, i11 = d11 / determinant, -d01 / determinant, -d10 / determinant, d00 / determinant
+    a00, a01, a10, a11 = A[0, 0], A[0, 1], A[1, 0], A[1, 1]
+    A[0, 0], A[0, 1] = a00 * i00 + a01 * i10, a00 * i01 + a01 * i11
+    A[1, 0], A[1, 1] = a10 * i00 + a11 * i10, a10 * i01 + a11 * i11
+    p[0] -= A[0, 0] * t0 + A[0, 1] * t1
+    p[1] -= A[1, 0] * t0 + A[1, 1] * t1
+    return True
+
+
+@kernel
+def _align_patch(
+    picture: ImageArray,
+    template: Template,
+    iterations: int,
+    A: FloatArray,
+    p: FloatArray,
+    measured: FloatArray,
+) -> int:
+    """Move the warp ``A`` (2, 2), ``p`` (2,) until its patch fits ``picture``: the outcome. ``measured`` (3,)."""
+    half, count = template.half, (2 * template.half + 1) ** 2
+    start_u, start_v = p[0], p[1]
+    step = np.empty(6)
+    for _ in range(iterations):
+        if _reaches_out(picture, half, A, p):
+            return OUTSIDE
+        total, total2, cross, attenuation = _compare(picture, template, A, p, step)
+        spread = total2 - total * total / count
+        gain = cross / template.square
+        if not (spread > 0.0 and gain > 0.1 and gain < 10.0):
+            return LOST
+        measured[0] = cross / np.sqrt(spread * template.square)
+        measured[1] = gain
+        left = max(spread - gain * gain * template.square, 0.0) / (count - PARAMETERS)
+        # The template's noise comes with the gain, the picture's less what interpolation takes from it.
+        measured[2] = left / (gain * gain / template.averaged + attenuation / count)
+        if step[4] * step[4] + step[5] * step[5] < 1e-20:  # nothing to move by
+            return FOUND
+        if not _compose_inverse(A, p, step, gain):
+            return LOST
+        if abs(p[0] - start_u) + abs(p[1] - start_v) > 2.0 * half:
+            return LOST
+        t0, t1 = step[4] / gain, step[5] / gain
+        if t0 * t0 + t1 * t1 < CONVERGED_PX * CONVERGED_PX:
+            return FOUND
+    return RESTLESS
+
+
 @kernel
 def align_patches(
     picture: ImageArray,
@@ -151,72 +261,10 @@ def align_patches(
     In and out: ``A`` (m, 2, 2), ``p`` (m, 2) where the templates' middles are. Out: ``measured`` (m, 3): correlation,
     gain, noise variance [grey levels²] of one pixel of the pair; ``outcome`` (m,).
     """
-    height, width = picture.shape
-    count = (2 * half + 1) ** 2
     for m in range(len(chosen)):
         k = chosen[m]
-        outcome[m] = RESTLESS
-        start_u, start_v = p[m, 0], p[m, 1]
-        for _ in range(iterations):
-            a00, a01, a10, a11 = A[m, 0, 0], A[m, 0, 1], A[m, 1, 0], A[m, 1, 1]
-            u0, v0 = p[m, 0], p[m, 1]
-            reach_u, reach_v = half * (abs(a00) + abs(a01)), half * (abs(a10) + abs(a11))
-            if not (
-                u0 - reach_u >= 1.0
-                and v0 - reach_v >= 1.0
-                and u0 + reach_u < width - 2.0
-                and v0 + reach_v < height - 2.0
-            ):
-                outcome[m] = OUTSIDE
-                break
-            total = total2 = cross = attenuation = 0.0
-            s0 = s1 = s2 = s3 = s4 = s5 = 0.0
-            at = 0
-            for y in range(-half, half + 1):
-                for x in range(-half, half + 1):
-                    level, squared = _sample_cubic(picture, u0 + a00 * x + a01 * y, v0 + a10 * x + a11 * y)
-                    total += level
-                    total2 += level * level
-                    attenuation += squared
-                    cross += level * levels[k, at]
-                    s0 += steps[k, 0, at] * level
-                    s1 += steps[k, 1, at] * level
-                    s2 += steps[k, 2, at] * level
-                    s3 += steps[k, 3, at] * level
-                    s4 += steps[k, 4, at] * level
-                    s5 += steps[k, 5, at] * level
-                    at += 1
-            spread = total2 - total * total / count
-            gain = cross / squares[k]
-            if not (spread > 0.0 and gain > 0.1 and gain < 10.0):
-                outcome[m] = LOST
-                break
-            measured[m, 0] = cross / np.sqrt(spread * squares[k])
-            measured[m, 1] = gain
-            left = max(spread - gain * gain * squares[k], 0.0) / (count - PARAMETERS)
-            # The template's noise comes with the gain, the picture's less what interpolation takes from it.
-            measured[m, 2] = left / (gain * gain / averaged + attenuation / count)
-            if s4 * s4 + s5 * s5 < 1e-20:  # nothing to move by
-                outcome[m] = FOUND
-                break
-            # The step of the template, taken back in the picture: W <- W after the inverse of the step.
-            d00, d01, d10, d11 = 1.0 + s0 / gain, s1 / gain, s2 / gain, 1.0 + s3 / gain
-            t0, t1 = s4 / gain, s5 / gain
-            determinant = d00 * d11 - d01 * d10
-            if not (determinant > 0.25 and determinant < 4.0):
-                outcome[m] = LOST
-                break
-            i00, i01, i10, i11 = d11 / determinant, -d01 / determinant, -d10 / determinant, d00 / determinant
-            A[m, 0, 0], A[m, 0, 1] = a00 * i00 + a01 * i10, a00 * i01 + a01 * i11
-            A[m, 1, 0], A[m, 1, 1] = a10 * i00 + a11 * i10, a10 * i01 + a11 * i11
-            p[m, 0] -= A[m, 0, 0] * t0 + A[m, 0, 1] * t1
-            p[m, 1] -= A[m, 1, 0] * t0 + A[m, 1, 1] * t1
-            if abs(p[m, 0] - start_u) + abs(p[m, 1] - start_v) > 2.0 * half:
-                outcome[m] = LOST
-                break
-            if t0 * t0 + t1 * t1 < CONVERGED_PX * CONVERGED_PX:
-                outcome[m] = FOUND
-                break
+        template = Template(half, averaged, steps[k], levels[k], squares[k])
+        outcome[m] = _align_patch(picture, template, iterations, A[m], p[m], measured[m])
 
 
 def compile_kernels() -> None:

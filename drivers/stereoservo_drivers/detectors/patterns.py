@@ -5,9 +5,11 @@ Pattern coordinates are those of :mod:`~stereoservo_drivers.detectors.homographi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle, misfits
 from stereoservo_drivers.detectors.kernel_types import FLOAT, INT, compile_for, given, written
@@ -106,6 +108,91 @@ def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):
     return count
 
 
+class Dots(NamedTuple):
+    """What a face is searched among: ``pixels`` (m, 2) and ``areas`` (m,) [px²]."""
+
+    pixels: FloatArray
+    areas: FloatArray
+
+
+class Gates(NamedTuple):
+    """The ``least`` dots of a face; distances [px] from the quadruple's homography and from the fitted one."""
+
+    least: int
+    reach: float
+    tolerance: float
+
+
+class Rivals(NamedTuple):
+    """Explanations by equally many dots: ``owners`` (MOST_RIVALS, n), dots' rows or -1, and misfits ``fits`` [px]."""
+
+    owners: IntArray
+    fits: FloatArray
+
+
+class Scratch(NamedTuple):
+    """Memory of one search: a homography, a circle's image, two assignments (n,), and dots to fit to."""
+
+    H: FloatArray
+    circle: FloatArray
+    trial: IntArray
+    again: IntArray
+    used: BoolArray
+    matched: FloatArray
+    distances: FloatArray
+
+
+@kernel
+def _explain(pattern, radius, dots, gates, rivals, best_count, known, scratch):
+    """Number of dots that the homography in ``scratch`` explains, 0 if refused, and their misfit [px] from the better
+    homography that is fitted to all of them. Fewer than ``best_count``, or what is known as a rival, are refused.
+    """
+    H, circle, trial, again, used, matched, distances = scratch
+    count = _assign(pattern, radius, dots.pixels, dots.areas, gates.reach, H, trial, circle)
+    if count < gates.least or count < best_count:
+        return 0, 0.0
+    if count == best_count:
+        for c in range(known):
+            if (rivals.owners[c] == trial).all():
+                return 0, 0.0
+    for d in range(pattern.shape[0]):
+        used[d] = trial[d] >= 0
+        if used[d]:
+            matched[d, 0] = dots.pixels[trial[d], 0]
+            matched[d, 1] = dots.pixels[trial[d], 1]
+    if not fit_homography(pattern, matched, used, H):
+        return 0, 0.0
+    misfit = misfits(pattern, matched, used, H, distances)
+    if misfit > gates.tolerance:
+        return 0, 0.0
+    # sizes once more, under the better homography
+    if _assign(pattern, radius, dots.pixels, dots.areas, gates.reach, H, again, circle) < count:
+        return 0, 0.0
+    return count, misfit
+
+
+@kernel
+def _clearly_best(rivals, known, tolerance):
+    """Row of the best of ``known`` explanations; -1 if another one of some of the same dots is nearly as good."""
+    owners, fits = rivals
+    n = owners.shape[1]
+    best = int(np.argmin(fits[:known]))
+    for c in range(known):
+        if c != best and (fits[c] < CLEAR * fits[best] or fits[c] < 0.5 * tolerance):
+            for d in range(n):
+                for e in range(n):
+                    if owners[best, d] >= 0 and owners[c, e] == owners[best, d]:
+                        return -1
+    return best
+
+
+@kernel
+def _inverse_turns(pattern, basis):
+    """One over twice the signed areas of the triangles 012, 013, 023, 123 of a ``basis`` (4,)."""
+    a, b, c, d = pattern[basis[0]], pattern[basis[1]], pattern[basis[2]], pattern[basis[3]]
+    return 1.0 / _turn(a, b, c), 1.0 / _turn(a, b, d), 1.0 / _turn(a, c, d), 1.0 / _turn(b, c, d)
+
+
 @kernel
 def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tolerance, owner):
     """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas``
@@ -119,29 +206,19 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
     another assignment of some of the same dots explains as many nearly as well. (One of quite other dots is a second
     copy of the pattern, which is found when these are taken away.)
     """
-    n = pattern.shape[0]
-    m = pixels.shape[0]
+    n, m = pattern.shape[0], pixels.shape[0]
     unit = np.pi * radius * radius
-    H = np.zeros((3, 3))
-    circle = np.zeros(7)
-    trial = np.zeros(n, np.int64)
-    again = np.zeros(n, np.int64)
-    used = np.zeros(n, np.bool_)
-    matched = np.zeros((n, 2))
-    distances = np.zeros(n)
-    best_count = 0
-    known = 0
-    owners = np.zeros((MOST_RIVALS, n), np.int64)
-    fits = np.zeros(MOST_RIVALS)
+    dots, gates = Dots(pixels, areas), Gates(least, reach, tolerance)
+    rivals = Rivals(np.zeros((MOST_RIVALS, n), np.int64), np.zeros(MOST_RIVALS))
+    scratch = Scratch(
+        np.zeros((3, 3)), np.zeros(7), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_),
+        np.zeros((n, 2)), np.zeros(n),
+    )  # fmt: skip
+    best_count = known = 0
     owner[:] = -1
     for row in range(bases.shape[0]):
-        basis = bases[row]
-        t012 = _turn(pattern[basis[0]], pattern[basis[1]], pattern[basis[2]])
-        t013 = _turn(pattern[basis[0]], pattern[basis[1]], pattern[basis[3]])
-        t023 = _turn(pattern[basis[0]], pattern[basis[2]], pattern[basis[3]])
-        t123 = _turn(pattern[basis[1]], pattern[basis[2]], pattern[basis[3]])
-        s012, s013, s023, s123 = 1.0 / t012, 1.0 / t013, 1.0 / t023, 1.0 / t123
-        inverse = inverses[row]
+        basis, inverse = bases[row], inverses[row]
+        s012, s013, s023, s123 = _inverse_turns(pattern, basis)
         for i in range(m):
             for j in range(m):
                 if j == i or areas[j] > 3.0 * areas[i] or areas[i] > 3.0 * areas[j]:
@@ -164,50 +241,27 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
                             or (turn - ijl + ikl) * s123 < 0.3 * foretold
                         ):
                             continue
-                        if not _hypothesis(pixels[i], pixels[j], pixels[k], pixels[l], inverse, H):
+                        if not _hypothesis(pixels[i], pixels[j], pixels[k], pixels[l], inverse, scratch.H):
                             continue
-                        if not _promising(pattern, pixels, basis, max(least, best_count), reach + 0.5, H):
+                        wanted = max(least, best_count)
+                        if not _promising(pattern, pixels, basis, wanted, reach + 0.5, scratch.H):
                             continue
-                        count = _assign(pattern, radius, pixels, areas, reach, H, trial, circle)
-                        if count < least or count < best_count:
-                            continue
-                        same = False
-                        if count == best_count:
-                            for c in range(known):
-                                same = same or (owners[c] == trial).all()
-                        if same:
-                            continue
-                        for d in range(n):
-                            used[d] = trial[d] >= 0
-                            if used[d]:
-                                matched[d, 0] = pixels[trial[d], 0]
-                                matched[d, 1] = pixels[trial[d], 1]
-                        if not fit_homography(pattern, matched, used, H):
-                            continue
-                        misfit = misfits(pattern, matched, used, H, distances)
-                        if misfit > tolerance:
-                            continue
-                        # sizes once more, under the better homography
-                        if _assign(pattern, radius, pixels, areas, reach, H, again, circle) < count:
+                        count, misfit = _explain(
+                            pattern, radius, dots, gates, rivals, best_count, known, scratch
+                        )
+                        if count == 0:
                             continue
                         if count > best_count:
-                            best_count = count
-                            known = 0
+                            best_count, known = count, 0
                         if known == MOST_RIVALS:
                             return 0
-                        owners[known] = trial
-                        fits[known] = misfit
+                        rivals.owners[known] = scratch.trial
+                        rivals.fits[known] = misfit
                         known += 1
-    if known == 0:
+    best = _clearly_best(rivals, known, tolerance) if known else -1
+    if best < 0:
         return 0
-    best = int(np.argmin(fits[:known]))
-    for c in range(known):
-        if c != best and (fits[c] < CLEAR * fits[best] or fits[c] < 0.5 * tolerance):
-            for d in range(n):
-                for e in range(n):
-                    if owners[best, d] >= 0 and owners[c, e] == owners[best, d]:
-                        return 0
-    owner[:] = owners[best]
+    owner[:] = rivals.owners[best]
     return best_count
 
 

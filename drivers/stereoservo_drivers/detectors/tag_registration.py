@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import inlined_kernel, kernel
 from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, given, written
 
 PARAMETERS = 13
@@ -62,15 +62,15 @@ class Registered:
 
 
 @kernel
-def _weigh(t, sigma, n, first, weights, by_t, by_s):
-    """Weights of the cells that are felt at coordinate ``t``, and their derivatives in t and in log sigma.
+def _weigh(t, sigma, n, out):
+    """Weights of the cells that are felt at coordinate ``t``, and their derivatives in t and in log sigma, into ``out``
+    (3, n + 1) from its first column on.
 
-    Returns one past the last cell; ``first[0]`` gets the first one. Rows count from the first.
+    Returns the first cell and one past the last.
     """
     reach = REACH * math.sqrt(2.0) * sigma
     low = max(math.floor((t - reach) * n), 0)
     high = min(math.floor((t + reach) * n), n - 1)
-    first[0] = low
     step, step_t, step_s = 0.0, 0.0, 0.0
     for i in range(low, high + 2):
         z = (t - i / n) / (math.sqrt(2.0) * sigma)
@@ -85,10 +85,80 @@ def _weigh(t, sigma, n, first, weights, by_t, by_s):
             step_t = bell / (math.sqrt(2.0) * sigma)
             step_s = -bell * z
         if i > low:
-            weights[i - low - 1] = before - step
-            by_t[i - low - 1] = before_t - step_t
-            by_s[i - low - 1] = before_s - step_s
-    return max(high + 1, low)
+            out[0, i - low - 1] = before - step
+            out[1, i - low - 1] = before_t - step_t
+            out[2, i - low - 1] = before_s - step_s
+    return low, max(high + 1, low)
+
+
+@inlined_kernel
+def _on_tag(p, u, v):
+    """Of a pixel: the denominator ``w`` of the homography, the place (x, y) on the tag, |grad x| and |grad y|."""
+    w = p[6] * u + p[7] * v + 1.0
+    x = (p[0] * u + p[1] * v + p[2]) / w
+    y = (p[3] * u + p[4] * v + p[5]) / w
+    slope_x = math.hypot(p[0] - x * p[6], p[1] - x * p[7]) / w
+    slope_y = math.hypot(p[3] - y * p[6], p[4] - y * p[7]) / w
+    return w, x, y, slope_x, slope_y
+
+
+@inlined_kernel
+def _darkness(cells, columns, across, rows, down, first_order, second_order):
+    """Darkness, 0 white to 1 black, at a pixel that feels these ``columns`` and ``rows`` of cells with weights
+    ``across`` and ``down``; its derivatives in x, y and log sigma.
+
+    A blur that is round in the image is none along two axes that are askew: at a corner, the bivariate normal
+    distribution in powers of their correlation (Pearson's tetrachoric series), two terms of it.
+    """
+    (i0, i_last), (j0, j_last) = columns, rows
+    dark, dark_x, dark_y, dark_s = 0.0, 0.0, 0.0, 0.0
+    for j in range(j0, j_last):
+        row, row_x, row_s = 0.0, 0.0, 0.0
+        for i in range(i0, i_last):
+            if cells[j, i] != 0.0:
+                row += across[0, i - i0]
+                row_x += across[1, i - i0]
+                row_s += across[2, i - i0]
+        weight, by_t, by_s = down[0, j - j0], down[1, j - j0], down[2, j - j0]
+        dark += weight * row
+        dark_x += weight * row_x
+        dark_y += by_t * row
+        dark_s += weight * row_s + by_s * row
+        dark += first_order * by_t * row_x + second_order * by_s * row_s
+    return dark, dark_x, dark_y, dark_s
+
+
+@inlined_kernel
+def _predict(u, v, cells, p, sigma, across, down, J):
+    """Whether the model shows the tag at pixel (u, v), and its grey level there; derivatives into ``J`` (13,)."""
+    w, x, y, slope_x, slope_y = _on_tag(p, u, v)
+    if w <= 1e-3 or slope_x < 1e-9 or slope_y < 1e-9:
+        return False, 0.0
+    columns = _weigh(x, sigma * slope_x, cells.shape[0], across)
+    rows = _weigh(y, sigma * slope_y, cells.shape[0], down)
+    askew = ((p[0] - x * p[6]) * (p[3] - y * p[6]) + (p[1] - x * p[7]) * (p[4] - y * p[7])) / (w * w)
+    first_order = sigma * sigma * askew
+    second_order = 0.5 * (askew / (slope_x * slope_y)) ** 2
+    dark, dark_x, dark_y, dark_s = _darkness(cells, columns, across, rows, down, first_order, second_order)
+    lit = p[9] + p[10] * (x - 0.5) + p[11] * (y - 0.5)
+    fall = -lit * (1.0 - p[12])
+    shade = 1.0 - dark * (1.0 - p[12])
+    along_x = p[10] * shade + fall * dark_x
+    along_y = p[11] * shade + fall * dark_y
+    J[0] = along_x * u / w
+    J[1] = along_x * v / w
+    J[2] = along_x / w
+    J[3] = along_y * u / w
+    J[4] = along_y * v / w
+    J[5] = along_y / w
+    J[6] = -(along_x * x + along_y * y) * u / w
+    J[7] = -(along_x * x + along_y * y) * v / w
+    J[8] = fall * dark_s
+    J[9] = shade
+    J[10] = shade * (x - 0.5)
+    J[11] = shade * (y - 0.5)
+    J[12] = lit * dark
+    return True, lit * shade
 
 
 @kernel
@@ -99,68 +169,18 @@ def accumulate(grey, points, cells, p, huber, A, b, totals):
     gets Huber's cost, the sums of squares of the clipped residuals, of pixels that are not clipped, of |residual|, and
     of model, model squared, model times grey (the last three for the correlation). False where the homography does
     not show the tag.
-
-    A blur that is round in the image is none along two axes that are askew: at a corner, the bivariate normal
-    distribution in powers of their correlation (Pearson's tetrachoric series), two terms of it.
     """
     n = cells.shape[0]
     A[:] = 0.0
     b[:] = 0.0
     totals[:] = 0.0
-    wx, wxt, wxs = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1)
-    wy, wyt, wys = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1)
-    i_first, j_first = np.zeros(1, np.int64), np.zeros(1, np.int64)
+    across, down = np.zeros((3, n + 1)), np.zeros((3, n + 1))
     J = np.zeros(13)
     sigma = math.exp(p[8])
     for k in range(grey.size):
-        u, v = points[k, 0], points[k, 1]
-        w = p[6] * u + p[7] * v + 1.0
-        if w <= 1e-3:
+        shown, value = _predict(points[k, 0], points[k, 1], cells, p, sigma, across, down, J)
+        if not shown:
             return False
-        x = (p[0] * u + p[1] * v + p[2]) / w
-        y = (p[3] * u + p[4] * v + p[5]) / w
-        slope_x = math.hypot(p[0] - x * p[6], p[1] - x * p[7]) / w
-        slope_y = math.hypot(p[3] - y * p[6], p[4] - y * p[7]) / w
-        if slope_x < 1e-9 or slope_y < 1e-9:
-            return False
-        i_last = _weigh(x, sigma * slope_x, n, i_first, wx, wxt, wxs)
-        j_last = _weigh(y, sigma * slope_y, n, j_first, wy, wyt, wys)
-        askew = ((p[0] - x * p[6]) * (p[3] - y * p[6]) + (p[1] - x * p[7]) * (p[4] - y * p[7])) / (w * w)
-        first_order = sigma * sigma * askew
-        second_order = 0.5 * (askew / (slope_x * slope_y)) ** 2
-        i0, j0 = i_first[0], j_first[0]
-        dark, dark_x, dark_y, dark_s = 0.0, 0.0, 0.0, 0.0
-        for j in range(j0, j_last):
-            row, row_x, row_s = 0.0, 0.0, 0.0
-            for i in range(i0, i_last):
-                if cells[j, i] != 0.0:
-                    row += wx[i - i0]
-                    row_x += wxt[i - i0]
-                    row_s += wxs[i - i0]
-            dark += wy[j - j0] * row
-            dark_x += wy[j - j0] * row_x
-            dark_y += wyt[j - j0] * row
-            dark_s += wy[j - j0] * row_s + wys[j - j0] * row
-            dark += first_order * wyt[j - j0] * row_x + second_order * wys[j - j0] * row_s
-        lit = p[9] + p[10] * (x - 0.5) + p[11] * (y - 0.5)
-        fall = -lit * (1.0 - p[12])
-        shade = 1.0 - dark * (1.0 - p[12])
-        value = lit * shade
-        along_x = p[10] * shade + fall * dark_x
-        along_y = p[11] * shade + fall * dark_y
-        J[0] = along_x * u / w
-        J[1] = along_x * v / w
-        J[2] = along_x / w
-        J[3] = along_y * u / w
-        J[4] = along_y * v / w
-        J[5] = along_y / w
-        J[6] = -(along_x * x + along_y * y) * u / w
-        J[7] = -(along_x * x + along_y * y) * v / w
-        J[8] = fall * dark_s
-        J[9] = shade
-        J[10] = shade * (x - 0.5)
-        J[11] = shade * (y - 0.5)
-        J[12] = lit * dark
         residual = grey[k] - value
         size = abs(residual)
         weight = 1.0
@@ -195,29 +215,24 @@ def cell_errors(grey, points, cells, p, out):
     By least squares, so that a neighbour's blur is no error; 0 where a cell has no pixel.
     """
     n = cells.shape[0]
-    wx, wy, spare, spare_2 = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1)
-    i_first, j_first = np.zeros(1, np.int64), np.zeros(1, np.int64)
+    across, down = np.zeros((3, n + 1)), np.zeros((3, n + 1))
+    wx, wy = across[0], down[0]
     squares = np.zeros((n, n))
     out[:] = 0.0
     sigma = math.exp(p[8])
     for k in range(grey.size):
-        u, v = points[k, 0], points[k, 1]
-        w = p[6] * u + p[7] * v + 1.0
-        x = (p[0] * u + p[1] * v + p[2]) / w
-        y = (p[3] * u + p[4] * v + p[5]) / w
-        slope_x = math.hypot(p[0] - x * p[6], p[1] - x * p[7]) / w
-        slope_y = math.hypot(p[3] - y * p[6], p[4] - y * p[7]) / w
-        i_last = _weigh(x, sigma * slope_x, n, i_first, wx, spare, spare_2)
-        j_last = _weigh(y, sigma * slope_y, n, j_first, wy, spare, spare_2)
+        _, x, y, slope_x, slope_y = _on_tag(p, points[k, 0], points[k, 1])
+        i_first, i_last = _weigh(x, sigma * slope_x, n, across)
+        j_first, j_last = _weigh(y, sigma * slope_y, n, down)
         dark = 0.0
-        for j in range(j_first[0], j_last):
-            for i in range(i_first[0], i_last):
-                dark += cells[j, i] * wy[j - j_first[0]] * wx[i - i_first[0]]
+        for j in range(j_first, j_last):
+            for i in range(i_first, i_last):
+                dark += cells[j, i] * wy[j - j_first] * wx[i - i_first]
         lit = p[9] + p[10] * (x - 0.5) + p[11] * (y - 0.5)
         residual = grey[k] - lit * (1.0 - dark * (1.0 - p[12]))
-        for j in range(j_first[0], j_last):
-            for i in range(i_first[0], i_last):
-                share = lit * (1.0 - p[12]) * wy[j - j_first[0]] * wx[i - i_first[0]]
+        for j in range(j_first, j_last):
+            for i in range(i_first, i_last):
+                share = lit * (1.0 - p[12]) * wy[j - j_first] * wx[i - i_first]
                 out[j, i] += share * residual
                 squares[j, i] += share * share
     for j in range(n):

@@ -7,6 +7,7 @@ dots of a plate become sixteen virtual markers off one plane (5.5, fig. 5.16).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -247,6 +248,21 @@ def virtual_markers(
         spread.pixels[:, rows, at] = trials.pixels[:, stops[rows]]
         spread.sigmas[:, rows, at] = trials.sigmas[:, stops[rows]]
     return spread
+
+
+def own_trials(
+    trials: TrialData, points: FloatArray, usable: BoolArray
+) -> Iterator[tuple[int, VirtualObservations, FloatArray]]:
+    """Each joint that has stops enough in a trial of its own, what they show, and its positions (k,) there from its
+    middle one.
+    """
+    for joint in range(len(trials.joint_names)):
+        try:
+            stops, groups, base = trial_stops(trials, points, joint)
+        except CalibrationError:
+            continue
+        sights = virtual_markers(trials, points, usable, stops, groups)
+        yield joint, sights, trials.positions[stops, joint] - base[joint]
 
 
 def best_single_joint(

@@ -193,7 +193,7 @@ def way_home(
 
 
 @dataclass(frozen=True, eq=False)
-class ZeroReset:
+class JointZeros:
     """``offset`` (n,) [rad or m] to add to the encoders so that they read what the cameras see, ``deviations`` (n,) and
     ``covariance`` (n, n) of it; ``cost``, ``freedom``; ``alternatives`` that the images leave possible.
     """
@@ -216,7 +216,7 @@ def joint_zeros(
     limits: FloatArray | None = None,
     point_covariance: FloatArray | None = None,
     largest_deviation: float = LARGEST_DEVIATION,
-) -> ZeroReset:
+) -> JointZeros:
     """Offsets of the joints' zeros from raw ``pixels`` (k, c, m, 2) [px] at readings ``encoders`` (k, n) [rad or m].
 
     One stop will do where it shows enough; more stops add up. ``limits`` (n, 2) are those of the offsets, default a
@@ -237,7 +237,7 @@ def joint_zeros(
         problem, limits=default if limits is None else limits, largest_deviation=largest_deviation
     )
     best = found[0]
-    return ZeroReset(
+    return JointZeros(
         best.q,
         best.deviations,
         best.covariance,

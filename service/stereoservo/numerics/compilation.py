@@ -18,10 +18,21 @@ def kernel(function: _F) -> _F:
     file: after an edit here, touch the callers' files. Where no cache directory is writable the kernel is
     compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
     """
-    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
+    return _compile(function)
+
+
+def inlined_kernel(function: _F) -> _F:
+    """A :func:`kernel` that is compiled into each kernel that calls it: a part of an inner loop, where the call itself
+    would cost.
+    """
+    return _compile(function, inline="always")
+
+
+def _compile(function: _F, **inline: str) -> _F:
+    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", **inline}
     try:
         compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
-        warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=3)
         compiled = numba.njit(**options)(function)
     return cast(_F, compiled)

@@ -224,7 +224,7 @@ class JointDriver(Protocol):
         ...
 
 
-class Finding(msgspec.Struct, frozen=True):
+class ExaminationFinding(msgspec.Struct, frozen=True):
     """One result of an examination of a cell. ``ok``: passed, failed, or None for a remark without a verdict.
 
     ``remedy``: the setting or act that removes the cause; ``cure`` in JSON.
@@ -240,7 +240,7 @@ class Finding(msgspec.Struct, frozen=True):
 class ExaminableJointDriver(Protocol):
     """A joint driver that can examine its machine for `stereoservo doctor`; the driver is not configured then."""
 
-    def examine(self, may_move: Callable[[str], bool]) -> Iterator[Finding]:
+    def examine(self, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
         """Findings on the machine: connect, examine, release. ``may_move`` is asked before any joint is moved.
 
         Never raises on what the machine does: a failure is a finding.

@@ -54,6 +54,82 @@ class ReplayResult:
     fingerprint: Fingerprint
 
 
+class _Replay:
+    """A recording's messages through a fresh core, one after the other, and what came of it so far."""
+
+    def __init__(
+        self,
+        progress: Callable[[int], None] | None,
+        observe: Callable[[StepInputs, StepOutputs], None] | None,
+        header: Callable[[CoreSettings], None] | None,
+    ) -> None:
+        self._progress, self._observe, self._header = progress, observe, header
+        self._core: ServoCore | None = None
+        self._settings: CoreSettings | None = None
+        self.recorded: Fingerprint | None = None
+        self.steps = self.checkpoints = self.gaps = 0
+        self.worst = 0.0
+        self.laws: set[str] = set()
+        self.differs: int | None = None
+
+    def take(self, topic: str, data: bytes) -> None:
+        """The next message. Raises what its decoding and the core raise."""
+        if topic == "header":
+            self._take_header(data)
+        elif topic == "gap":
+            self._core = None
+            self.gaps += 1
+        elif topic == "checkpoint" and self._settings is not None:
+            step, state = msgspec.msgpack.decode(data)
+            self.checkpoints += 1
+            if self._core is None:
+                self._core = ServoCore(self._settings, decode_state(state))
+            elif self.differs is None and encode_state(self._core.state) != state:
+                self.differs = step
+        elif topic == "step" and self._core is not None and self._settings is not None:
+            self._take_step(decode_step(data), self._core, self._settings.law)
+
+    def _take_header(self, data: bytes) -> None:
+        first = msgspec.msgpack.decode(data)
+        self.recorded = msgspec.convert(first["fingerprint"], Fingerprint)
+        self._settings = msgspec.msgpack.decode(first["settings"], type=CoreSettings, dec_hook=decode_array)
+        if self._header is not None:
+            self._header(self._settings)
+
+    def _take_step(self, record: StepRecord, core: ServoCore, default_law: str) -> None:
+        laws = _laws_of_goals(record.inputs, default_law)
+        if self.recorded is not None:
+            _require_installed(laws & set(self.recorded.laws))
+        outputs = core.step(record.inputs)
+        self.laws |= laws | {outputs.status.law}
+        if self._observe is not None:
+            self._observe(record.inputs, outputs)
+        same, error = _compare(record, outputs)
+        self.worst = max(self.worst, error)
+        if not same and self.differs is None:
+            self.differs = record.step
+        self.steps += 1
+        if self._progress is not None and self.steps % 1000 == 0:
+            self._progress(self.steps)
+
+    def result(self, path: Path) -> ReplayResult:
+        """What came of the whole recording. Raises RecordingError where that was nothing."""
+        if self._settings is None or self.recorded is None:
+            raise RecordingError(path, self.steps, "holds no header; is it a flight recording?")
+        if self.steps == 0:
+            raise RecordingError(path, self.steps, "holds no step after a checkpoint")
+        same_machine = comparable(self.recorded, fingerprint(), self.laws)
+        return ReplayResult(
+            identical=(self.differs is None) if same_machine else None,
+            steps=self.steps,
+            max_relative_error=self.worst,
+            first_difference=self.differs,
+            checkpoints=self.checkpoints,
+            gaps=self.gaps,
+            fingerprint=self.recorded,
+        )
+
+
 def replay(
     path: Path,
     progress: Callable[[int], None] | None = None,
@@ -65,78 +141,31 @@ def replay(
     ``header`` is given the core's settings, ``observe`` every step's inputs and outputs: reports and debuggers read a
     recording through them.
     """
-    core: ServoCore | None = None
-    settings: CoreSettings | None = None
-    recorded: Fingerprint | None = None
-    steps = checkpoints = gaps = 0
-    worst = 0.0
-    used: set[str] = set()
-    differs: int | None = None
+    run = _Replay(progress, observe, header)
     for topic, data in recorded_messages(path):
         try:
-            if topic == "header":
-                first = msgspec.msgpack.decode(data)
-                recorded = msgspec.convert(first["fingerprint"], Fingerprint)
-                settings = msgspec.msgpack.decode(first["settings"], type=CoreSettings, dec_hook=decode_array)
-                if header is not None:
-                    header(settings)
-            elif topic == "gap":
-                core = None
-                gaps += 1
-            elif topic == "checkpoint" and settings is not None:
-                step, state = msgspec.msgpack.decode(data)
-                checkpoints += 1
-                if core is None:
-                    core = ServoCore(settings, decode_state(state))
-                elif differs is None and encode_state(core.state) != state:
-                    differs = step
-            elif topic == "step" and core is not None and settings is not None:
-                record = decode_step(data)
-                laws = _laws_of_goals(record.inputs, settings.law)
-                if recorded is not None:
-                    _require_installed(laws & set(recorded.laws))
-                outputs = core.step(record.inputs)
-                used |= laws
-                used.add(outputs.status.law)
-                if observe is not None:
-                    observe(record.inputs, outputs)
-                same, error = _compare(record, outputs)
-                worst = max(worst, error)
-                if not same and differs is None:
-                    differs = record.step
-                steps += 1
-                if progress is not None and steps % 1000 == 0:
-                    progress(steps)
-        except UnknownLawError as error:
-            made = (
-                ""
-                if recorded is None
-                else f" (recorded with {recorded.laws.get(error.name, 'an unknown version')})"
-            )
-            raise RecordingError(
-                path, steps, f"needs a law that is not installed here{made}: {error}"
-            ) from error
-        except StateVersionError as error:
-            raise RecordingError(path, steps, _of_another_version(str(error), recorded)) from error
-        except (msgspec.MsgspecError, ValueError, KeyError, TypeError) as error:
-            if recorded is not None and recorded.stereoservo != stereoservo.__version__:
-                cause = f"the {topic} does not fit this program ({error})"
-                raise RecordingError(path, steps, _of_another_version(cause, recorded)) from error
-            raise RecordingError(path, steps, f"step record is damaged ({error})") from error
-    if settings is None or recorded is None:
-        raise RecordingError(path, steps, "holds no header; is it a flight recording?")
-    if steps == 0:
-        raise RecordingError(path, steps, "holds no step after a checkpoint")
-    same_machine = comparable(recorded, fingerprint(), used)
-    return ReplayResult(
-        identical=(differs is None) if same_machine else None,
-        steps=steps,
-        max_relative_error=worst,
-        first_difference=differs,
-        checkpoints=checkpoints,
-        gaps=gaps,
-        fingerprint=recorded,
-    )
+            run.take(topic, data)
+        except (
+            UnknownLawError, StateVersionError, msgspec.MsgspecError, ValueError, KeyError, TypeError
+        ) as error:  # fmt: skip
+            raise RecordingError(path, run.steps, _cause(error, topic, run.recorded)) from error
+    return run.result(path)
+
+
+def _cause(error: Exception, topic: str, recorded: Fingerprint | None) -> str:
+    """Why a message of this ``topic`` cannot be replayed."""
+    if isinstance(error, UnknownLawError):
+        made = (
+            ""
+            if recorded is None
+            else f" (recorded with {recorded.laws.get(error.name, 'an unknown version')})"
+        )
+        return f"needs a law that is not installed here{made}: {error}"
+    if isinstance(error, StateVersionError):
+        return _of_another_version(str(error), recorded)
+    if recorded is not None and recorded.stereoservo != stereoservo.__version__:
+        return _of_another_version(f"the {topic} does not fit this program ({error})", recorded)
+    return f"step record is damaged ({error})"
 
 
 def _laws_of_goals(inputs: StepInputs, default: str) -> set[str]:

@@ -46,7 +46,7 @@ RX90_LIMITS = np.radians(
 """(6, 2) [rad]"""
 
 
-class Arm(Protocol):
+class TaskArm(Protocol):
     """An arm in the middle of a task. ``pose`` (4, 4) of the plate in the rig, ``joints`` (n,): its readings."""
 
     pose: FloatArray

@@ -21,7 +21,7 @@ from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.tasks.arms import Arm, ArmName, FreeArm, SerialArm, rx90_reach
+from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, Knowledge, TaskCalibration, known_at_start
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
 from stereoservo_sim.tasks.ground_truth import (
@@ -128,7 +128,7 @@ def run_task(
         reach = rx90_reach(calibration.cell, task.start, task.goal)
         if reach is None:
             return _unreachable(task, settings)
-    arm: Arm = FreeArm(task.start) if reach is None else SerialArm(calibration.cell, reach.start)
+    arm: TaskArm = FreeArm(task.start) if reach is None else SerialArm(calibration.cell, reach.start)
     controller = Controller(known_at_start(calibration, task, reach), task, settings, arm.limits)
     rng = np.random.default_rng([settings.seed, task.id])
     return _run(task, arm, controller, settings, rng)
@@ -261,7 +261,11 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
 
 
 def _run(
-    task: AlignmentTask, arm: Arm, controller: Controller, settings: LoopSettings, rng: np.random.Generator
+    task: AlignmentTask,
+    arm: TaskArm,
+    controller: Controller,
+    settings: LoopSettings,
+    rng: np.random.Generator,
 ) -> tuple[TaskResult, Trace]:
     dt_s = 1.0 / settings.rate_hz
     window = max(2, round(REST_STEPS * settings.rate_hz / DEFAULT_RATE_HZ))

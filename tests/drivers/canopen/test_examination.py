@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import DriverContext, Finding
+from stereoservo.ports.devices import DriverContext, ExaminationFinding
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.examination import (
@@ -43,7 +43,7 @@ OPTIONS: dict[str, Any] = {
         for k in (1, 2)
     ],
 }  # fmt: skip
-Examine = Callable[..., dict[str, Finding]]
+Examine = Callable[..., dict[str, ExaminationFinding]]
 
 
 def changed(**of_joint_1: Any) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def examine(tmp_path: Path) -> Iterator[Examine]:
         *orders: str,
         drives: dict[str, Any] | None = None,
         allow: bool = False,
-    ) -> dict[str, Finding]:
+    ) -> dict[str, ExaminationFinding]:
         built = {**(drives or options), "channel": "socket://127.0.0.1:1"}
         rack = make_rack(
             decode_options(CanOptions, built, "canopen"), DrivesSettings(plant="ideal", brake_ms=10.0),

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.ports.devices import Finding
+from stereoservo.ports.devices import ExaminationFinding
 from stereoservo_drivers.canopen.options import CanJoint
 from stereoservo_drivers.canopen.unit_checks import (
     JOG,
@@ -29,7 +29,7 @@ H = 0.004
 
 def jogged(
     joint: CanJoint, speed: float, *, encoder: float = 1.0, reported: float = 1.0, lag_s: float = 0.01
-) -> tuple[Finding, float]:
+) -> tuple[ExaminationFinding, float]:
     """Jog a drive that runs at ``speed`` times the velocity meant, behind a lag of first order; the finding, and the
     farthest that the joint got [rad].
     """

@@ -183,6 +183,30 @@ def _kind(h: int, cameras: int, markers: int, joints: int) -> int:
 
 
 @kernel
+def _predict(
+    Ps: FloatArray, X: FloatArray, innovations: FloatArray, weights: FloatArray,
+    pixels: FloatArray, observed: FloatArray,
+) -> tuple[float, float]:  # fmt: skip
+    """``pixels`` (c, p, 2) as predicted and ``observed``, where seen; chi-square and rms [px] of the innovations."""
+    chi2, square_px, seen = 0.0, 0.0, 0.0
+    for c in range(Ps.shape[0]):
+        P = Ps[c]
+        for p in range(X.shape[0]):
+            if not weights[c, p] > 0.0:
+                continue
+            z = P[2, 0] * X[p, 0] + P[2, 1] * X[p, 1] + P[2, 2] * X[p, 2] + P[2, 3] * X[p, 3]
+            for r in range(2):
+                value = (P[r, 0] * X[p, 0] + P[r, 1] * X[p, 1] + P[r, 2] * X[p, 2] + P[r, 3] * X[p, 3]) / z
+                pixels[c, p, r] = value
+                observed[c, p, r] = value + innovations[c, p, r]
+                square = innovations[c, p, r] * innovations[c, p, r]
+                square_px += square
+                chi2 += weights[c, p] * weights[c, p] * square
+            seen += 1.0
+    return chi2, math.sqrt(square_px / max(seen, 1.0))
+
+
+@kernel
 def explain_innovations(
     Ps: FloatArray, X: FloatArray, markers: int, innovations: FloatArray, weights: FloatArray,
     operators: FloatArray, twists: FloatArray, thresholds: FloatArray, log_alpha: float, least_px: float,
@@ -196,24 +220,10 @@ def explain_innovations(
     cameras, points, joints = Ps.shape[0], X.shape[0], operators.shape[0]
     count = cameras + 3 + markers + joints
     pixels, observed = np.empty((cameras, points, 2)), np.empty((cameras, points, 2))
-    whole, square_px, seen = 0.0, 0.0, 0.0
-    for c in range(cameras):
-        P = Ps[c]
-        for p in range(points):
-            if not weights[c, p] > 0.0:
-                continue
-            z = P[2, 0] * X[p, 0] + P[2, 1] * X[p, 1] + P[2, 2] * X[p, 2] + P[2, 3] * X[p, 3]
-            for r in range(2):
-                value = (P[r, 0] * X[p, 0] + P[r, 1] * X[p, 1] + P[r, 2] * X[p, 2] + P[r, 3] * X[p, 3]) / z
-                pixels[c, p, r] = value
-                observed[c, p, r] = value + innovations[c, p, r]
-                square = innovations[c, p, r] * innovations[c, p, r]
-                square_px += square
-                whole += weights[c, p] * weights[c, p] * square
-            seen += 1.0
+    whole, rms_px = _predict(Ps, X, innovations, weights, pixels, observed)
     total = hypothesis_sizes(weights, cameras, markers, joints, twists.shape[0] == 6, sizes)
     penalty = math.log(max(total, 2))
-    large = math.sqrt(square_px / max(seen, 1.0)) >= least_px
+    large = rms_px >= least_px
     answer[0], answer[1], answer[2] = NOTHING, 0, -1
     chi2[0] = whole
     amounts[0], effects[0] = 0.0, 0.0

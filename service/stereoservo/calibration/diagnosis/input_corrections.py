@@ -23,7 +23,7 @@ from stereoservo.calibration.diagnosis.outlier_causes import expected_pixels
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.lens_estimation import FREE_LENS, prior_of_lenses, straight_lenses, undistorted
 from stereoservo.calibration.rig_model import Measurements, projective_rig, stratum_rig
-from stereoservo.calibration.single_joint_fit import best_single_joint, trial_stops, virtual_markers
+from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.homogeneous import GeometryError
@@ -82,13 +82,8 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
     """The other kind for a joint whose own trial fits it much better."""
     cameras, points, usable = views
     residuals_by_kind: dict[int, tuple[float, float, Kind]] = {}
-    for joint, said in enumerate(trials.joint_kinds):
-        try:
-            stops, groups, base = trial_stops(trials, points, joint)
-        except CalibrationError:
-            continue  # too few stops to determine a kind
-        sights = virtual_markers(trials, points, usable, stops, groups)
-        way = trials.positions[stops, joint] - base[joint]
+    for joint, sights, way in own_trials(trials, points, usable):
+        said = trials.joint_kinds[joint]
         other: Kind = "prismatic" if said == "revolute" else "revolute"
         as_said, as_other = (
             best_single_joint(kind, cameras, sights, way, thorough=True)[1] for kind in (said, other)

@@ -22,10 +22,9 @@ from stereoservo.calibration.rig_model import Measurements, RigModel, residuals
 from stereoservo.calibration.single_joint_fit import (
     VirtualObservations,
     best_single_joint,
-    trial_stops,
-    virtual_markers,
+    own_trials,
 )
-from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
+from stereoservo.calibration.trial_data import TrialData, finite_rows
 from stereoservo.geometry.cameras import NOMINAL_FOCAL
 from stereoservo.numerics.arrays import FloatArray
 
@@ -64,13 +63,8 @@ def trial_scales(
     what the other joints' trials do: something else is wrong then.
     """
     factors, residual = np.ones(len(trials.joint_names)), np.full(len(trials.joint_names), np.nan)
-    for joint, kind in enumerate(trials.joint_kinds):
-        try:
-            stops, groups, base = trial_stops(trials, points, joint)
-        except CalibrationError:
-            continue  # too few stops to estimate a scale
-        sights = virtual_markers(trials, points, usable, stops, groups)
-        way = trials.positions[stops, joint] - base[joint]
+    for joint, sights, way in own_trials(trials, points, usable):
+        kind = trials.joint_kinds[joint]
         if kind == "revolute":
             factors[joint], residual[joint] = _best_factor(cameras, sights, way)
         else:

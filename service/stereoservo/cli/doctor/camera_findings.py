@@ -13,7 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo.ports.devices import CameraDescription, CameraObservation, CameraStatistics, Finding, Frame
+from stereoservo.ports.devices import (
+    CameraDescription,
+    CameraObservation,
+    CameraStatistics,
+    ExaminationFinding,
+    Frame,
+)
 
 HELD_RATE = 0.95
 """Share of the stated rate below which a camera is said not to hold it."""
@@ -56,14 +62,14 @@ class CameraRecord:
         return np.array([o.t_shutter_ns for o in self.seen], dtype=np.int64)
 
 
-def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Finding]:
+def examine_record(record: CameraRecord, min_markers: int) -> Iterator[ExaminationFinding]:
     """Findings on one camera by itself. ``min_markers``: what calibration asks of every stop."""
     what = f"camera {record.name}"
     if record.error:
-        yield Finding(what, False, record.error)
+        yield ExaminationFinding(what, False, record.error)
         return
     if len(record.seen) < 2:
-        yield Finding(
+        yield ExaminationFinding(
             what, False, f"{len(record.seen)} frames while it was watched; at least 2 are needed",
             f"[camera.options] of {record.name!r}: source; is another program using the camera?",
         )  # fmt: skip
@@ -75,7 +81,7 @@ def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Finding]:
         yield from _picture_quality(record.name, record.frame.image, record.seen[-1])
 
 
-def _rate(record: CameraRecord) -> Finding:
+def _rate(record: CameraRecord) -> ExaminationFinding:
     stamps, asked = record.shutters_ns, record.description.rate_hz
     gaps_ms = np.diff(stamps) * 1e-6
     rate = 1e9 * (len(stamps) - 1) / float(stamps[-1] - stamps[0]) if stamps[-1] > stamps[0] else 0.0
@@ -96,25 +102,25 @@ def _rate(record: CameraRecord) -> Finding:
         f"{max(missing, 0)} not looked at{extra}"
     )
     if rate >= HELD_RATE * asked:
-        return Finding(f"{record.name} rate", True, told)
-    return Finding(
+        return ExaminationFinding(f"{record.name} rate", True, told)
+    return ExaminationFinding(
         f"{record.name} rate", None, told,
         f"more light for a shorter exposure, or rate_hz = {rate:.0f}, which is what it holds",
     )  # fmt: skip
 
 
-def _latency(record: CameraRecord) -> Finding:
+def _latency(record: CameraRecord) -> ExaminationFinding:
     ms = np.array([(o.t_received_ns - o.t_shutter_ns) * 1e-6 for o in record.seen])
     told = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
     if ms.max() <= 0.0:
-        return Finding(
+        return ExaminationFinding(
             f"{record.name} latency", None, f"{told}: none is stated",
             "latency_s of its options; `stereoservo status` tells it once the arm has moved",
         )  # fmt: skip
-    return Finding(f"{record.name} latency", True, told)
+    return ExaminationFinding(f"{record.name} latency", True, told)
 
 
-def _markers(record: CameraRecord, min_markers: int) -> Finding:
+def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
     name = f"{record.name} markers"
     counts = np.array([o.ids.size for o in record.seen])
     known = len(record.description.marker_ids)
@@ -123,22 +129,22 @@ def _markers(record: CameraRecord, min_markers: int) -> Finding:
         f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
     )
     if counts.max() == 0 and record.flipped:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"none is seen, but {record.flipped} in the mirror image",
             "print the plate again, not mirrored; or undo the camera's flip (option flip)",
         )  # fmt: skip
     if counts.max() == 0:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"none of {known} is seen; look at the picture",
             "the plate in view, light on it, lens cap off; polarity, dictionary, landmarks of detector_options",
         )  # fmt: skip
     if steady < STEADY_MARKERS:
-        return Finding(
+        return ExaminationFinding(
             name, False, f"{told}; enough in {100 * steady:.0f} % of the frames",
             "more light, a nearer or larger plate, less tilt; or calibration.min_markers",
         )  # fmt: skip
     sigma = float(np.median([np.sqrt(0.5 * np.trace(C)) for C in record.seen[-1].covariances]))
-    return Finding(name, True, f"{told}; standard deviation {sigma:.3f} px{_scatter(record)}")
+    return ExaminationFinding(name, True, f"{told}; standard deviation {sigma:.3f} px{_scatter(record)}")
 
 
 def _scatter(record: CameraRecord) -> str:
@@ -171,7 +177,9 @@ def contrast_and_blur(image: ImageArray, pixel: FloatArray) -> tuple[float, floa
     return float(bright - dark), float(np.sqrt(max(blur**2 - 1 / 3, 0.0))), float((grey >= SATURATED).mean())
 
 
-def _picture_quality(name: str, image: ImageArray, observation: CameraObservation) -> Iterator[Finding]:
+def _picture_quality(
+    name: str, image: ImageArray, observation: CameraObservation
+) -> Iterator[ExaminationFinding]:
     found = [contrast_and_blur(image, pixel) for pixel in observation.pixels]
     measured = np.array([values for values in found if values is not None])
     if not len(measured):
@@ -179,16 +187,16 @@ def _picture_quality(name: str, image: ImageArray, observation: CameraObservatio
     contrast, blur, saturated = np.median(measured, axis=0)
     told = f"contrast {contrast:.0f} grey levels (least {measured[:, 0].min():.0f})"
     if contrast < LOW_CONTRAST:
-        yield Finding(
+        yield ExaminationFinding(
             f"{name} contrast",
             None,
             f"{told}; {LOW_CONTRAST:g} are wanted",
             "more light, longer exposure, matt print",
         )
     else:
-        yield Finding(f"{name} contrast", True, told)
+        yield ExaminationFinding(f"{name} contrast", True, told)
     if saturated > MUCH_SATURATED:
-        yield Finding(
+        yield ExaminationFinding(
             f"{name} exposure", None,
             f"{100 * saturated:.0f} % of the pixels around the markers are white to the limit: edges are cut",
             "shorter exposure, less gain",
@@ -196,16 +204,16 @@ def _picture_quality(name: str, image: ImageArray, observation: CameraObservatio
     told = f"edges at the markers are blurred by {blur:.1f} px"
     sharp = bool(blur <= WIDE_EDGE_PX)
     cure = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
-    yield Finding(f"{name} focus", True if sharp else None, told, cure)
+    yield ExaminationFinding(f"{name} focus", True if sharp else None, told, cure)
 
 
-def examine_skew(records: Sequence[CameraRecord]) -> Iterator[Finding]:
-    """Finding on the time between the cameras' shutters. Not a fault: each image counts at its own time."""
+def examine_skew(records: Sequence[CameraRecord]) -> Iterator[ExaminationFinding]:
+    """ExaminationFinding on the time between the cameras' shutters. Not a fault: each image counts at its own time."""
     shown = [record for record in records if len(record.seen) >= 2]
     for first, second in pairwise(shown):
         apart = first.shutters_ns[:, None] - second.shutters_ns[None, :]
         nearest = apart[np.arange(len(apart)), np.abs(apart).argmin(axis=1)] * 1e-6
-        yield Finding(
+        yield ExaminationFinding(
             f"skew {first.name}-{second.name}", True,
             f"{np.median(nearest):+.1f} ms (median; {np.abs(nearest).max():.1f} at most): used, each at its own time",
         )  # fmt: skip
@@ -229,14 +237,14 @@ def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray
     )
 
 
-def near_border(record: CameraRecord) -> Finding | None:
+def near_border(record: CameraRecord) -> ExaminationFinding | None:
     """Markers that are about to leave the picture."""
     ids, pixels, _ = mean_sights(record)
     size = np.array([record.description.width, record.description.height])
     close = ids[((pixels < EDGE_PX) | (pixels > size - 1 - EDGE_PX)).any(axis=1)]
     if not close.size:
         return None
-    return Finding(
+    return ExaminationFinding(
         f"{record.name} view", None,
         f"markers {close.tolist()} are within {EDGE_PX} px of the picture's border: they leave it with the next motion",
         "aim the camera so that the plate stands near the middle at calibration.base",

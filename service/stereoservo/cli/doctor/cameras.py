@@ -27,7 +27,7 @@ from stereoservo.ports.devices import (
     CountingCameraDriver,
     Detector,
     DriverError,
-    Finding,
+    ExaminationFinding,
     Frame,
 )
 
@@ -99,12 +99,14 @@ class WatchedCamera:
 
 def examine_cameras(
     plan: RunPlan, settings: CoreSettings, model: CellModel | None, seconds: float, pictures: Path
-) -> Iterator[Finding]:
+) -> Iterator[ExaminationFinding]:
     """Findings on the cell's cameras; a picture of each goes to ``pictures``. Not while somebody else has them."""
     directories = plan.directories
     pid = holder(directories.daemon_lock)
     if pid is not None:
-        yield Finding("cameras", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`")
+        yield ExaminationFinding(
+            "cameras", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`"
+        )
         return
     with ExitStack() as locks:
         owners: dict[Path, str] = {}
@@ -114,7 +116,7 @@ def examine_cameras(
                 if path is None:
                     continue
                 if path in owners:
-                    yield Finding(
+                    yield ExaminationFinding(
                         "cameras", False, f"{owners[path]!r} and {section.name!r} are one and the same camera",
                         "camera.options of one of them: each camera has its own",
                     )  # fmt: skip
@@ -122,7 +124,7 @@ def examine_cameras(
                 locks.enter_context(FileLock(path, f"camera {section.name!r}"))
                 owners[path] = section.name
         except AlreadyRunningError as error:
-            yield Finding("cameras", None, f"not examined: {error}")
+            yield ExaminationFinding("cameras", None, f"not examined: {error}")
             return
         records = watch_cameras(plan, seconds)
     min_markers = DEFAULT_MARKERS if settings.trials is None else settings.trials.min_markers
@@ -188,7 +190,7 @@ def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
     return np.asarray(picture, dtype=np.uint8)
 
 
-def _save_pictures(records: list[CameraRecord], directory: Path) -> Iterator[Finding]:
+def _save_pictures(records: list[CameraRecord], directory: Path) -> Iterator[ExaminationFinding]:
     saved = []
     for record in records:
         if record.frame is None or not record.seen:
@@ -201,10 +203,12 @@ def _save_pictures(records: list[CameraRecord], directory: Path) -> Iterator[Fin
                 raise OSError(f"{path}: the picture could not be encoded as PNG")
             path.write_bytes(data.tobytes())
         except OSError as error:
-            yield Finding("pictures", None, f"not saved: {error}", "--pictures DIR that can be written")
+            yield ExaminationFinding(
+                "pictures", None, f"not saved: {error}", "--pictures DIR that can be written"
+            )
             return
         saved.append(str(path))
     if saved:
-        yield Finding(
+        yield ExaminationFinding(
             "pictures", True, "what each camera sees, and what was found in it: " + ", ".join(saved)
         )

@@ -24,7 +24,7 @@ from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import holder
-from stereoservo.ports.devices import Finding
+from stereoservo.ports.devices import ExaminationFinding
 
 LOW_DISK_BYTES = 500_000_000
 
@@ -55,11 +55,11 @@ def doctor(
     """
     may_move = permission(jog, yes)
     loaded = load_cell_file(cell)
-    findings = [Finding("cell file", True, f"{cell} is valid")]
+    findings = [ExaminationFinding("cell file", True, f"{cell} is valid")]
     directories = cell_directories(loaded.cell.name)
     create_directories(directories)
     plan = make_plan(cell.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
-    findings.append(Finding("drivers", True, _drivers(plan)))
+    findings.append(ExaminationFinding("drivers", True, _drivers(plan)))
     findings += [check(plan, directories) for check in CHECKS]
     signal.signal(
         signal.SIGPIPE, signal.SIG_IGN
@@ -83,7 +83,7 @@ def doctor(
     emit({"checks": findings}, text, json)
 
 
-def _line(finding: Finding) -> str:
+def _line(finding: ExaminationFinding) -> str:
     mark = {True: "ok", False: "FAILED", None: "note"}[finding.ok]
     remedy = f"\n{'':20}cure: {finding.remedy}" if finding.remedy else ""
     return f"{mark:6} {finding.name:12} {finding.message}{remedy}"
@@ -97,19 +97,21 @@ def _drivers(plan: RunPlan) -> str:
     return f"{plan.joints.driver}: {len(plan.joints.joints)} joints; {cameras}"
 
 
-def _daemon(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _daemon(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     pid = holder(directories.daemon_lock)
     if pid is None:
-        return Finding("daemon", True, "none runs for this cell")
-    return Finding("daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`")
+        return ExaminationFinding("daemon", True, "none runs for this cell")
+    return ExaminationFinding(
+        "daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`"
+    )
 
 
-def _rates(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _rates(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     servo, joints = plan.cell.servo.rate_hz, plan.joints.rate_hz
     told = f"loop {servo:g} Hz, joints {joints:g} Hz"
     if servo <= joints:
-        return Finding("rates", True, told)
-    return Finding(
+        return ExaminationFinding("rates", True, told)
+    return ExaminationFinding(
         "rates",
         None,
         f"{told}: some cycles see no new sample, and their command waits for the next",
@@ -117,47 +119,47 @@ def _rates(plan: RunPlan, directories: CellDirectories) -> Finding:
     )
 
 
-def _wire(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _wire(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     try:
         config = gateway_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
     except SessionError as error:
-        return Finding("zenoh", False, str(error))
-    return Finding(
+        return ExaminationFinding("zenoh", False, str(error))
+    return ExaminationFinding(
         "zenoh",
         True,
         f"{config['mode']}: {', '.join(config['listen']['endpoints'] or config['connect']['endpoints'])}",
     )
 
 
-def _model(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _model(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     model, passed = ModelStore(directories.models).newest_fitting(plan.settings())
     if model is not None and passed:
         why = "; ".join(passed)
-        return Finding(
+        return ExaminationFinding(
             "model",
             None,
             f"epoch {model.epoch} of {model.created} is used, newer ones are passed over: {why}",
         )
     if model is not None:
-        return Finding("model", True, f"epoch {model.epoch}, {model.stratum}, of {model.created}")
-    return Finding("model", None, "; ".join(passed) or "none yet: calibrate")
+        return ExaminationFinding("model", True, f"epoch {model.epoch}, {model.stratum}, of {model.created}")
+    return ExaminationFinding("model", None, "; ".join(passed) or "none yet: calibrate")
 
 
-def _taught(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _taught(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     goals = load_taught(directories.taught)
-    return Finding("taught", True, ", ".join(sorted(goals)) or "none yet")
+    return ExaminationFinding("taught", True, ", ".join(sorted(goals)) or "none yet")
 
 
-def _scheduling(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _scheduling(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     wanted = plan.cell.servo.priority
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     if wanted == 0 or soft >= wanted or soft == resource.RLIM_INFINITY or _is_root():
-        return Finding(
+        return ExaminationFinding(
             "scheduling",
             True,
             f"SCHED_FIFO priority {wanted}" if wanted else "ordinary scheduling was asked for",
         )
-    return Finding(
+    return ExaminationFinding(
         "scheduling",
         None,
         f"SCHED_FIFO priority {wanted} is not allowed here (limit {soft}): `ulimit -r {wanted}`",
@@ -170,13 +172,13 @@ def _is_root() -> bool:
     return bool(capabilities >> 23 & 1)  # CAP_SYS_NICE
 
 
-def _disk(plan: RunPlan, directories: CellDirectories) -> Finding:
+def _disk(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     free = shutil.disk_usage(directories.state).free
     ok = True if free > LOW_DISK_BYTES else None
-    return Finding("disk", ok, f"{free / 1e9:.1f} GB free for recordings in {directories.state}")
+    return ExaminationFinding("disk", ok, f"{free / 1e9:.1f} GB free for recordings in {directories.state}")
 
 
-CHECKS: tuple[Callable[[RunPlan, CellDirectories], Finding], ...] = (
+CHECKS: tuple[Callable[[RunPlan, CellDirectories], ExaminationFinding], ...] = (
     _daemon,
     _rates,
     _wire,

@@ -14,7 +14,7 @@ from stereoservo.daemon.pacing import realtime_for_a_while
 from stereoservo.daemon.servo import make_driver
 from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path, holder
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import DriverError, ExaminableJointDriver, Finding
+from stereoservo.ports.devices import DriverError, ExaminableJointDriver, ExaminationFinding
 
 MayMove = Callable[[str], bool]
 
@@ -38,7 +38,7 @@ def permission(jog: bool, yes: bool) -> MayMove:
     return lambda question: typer.confirm(question, default=False, err=True)
 
 
-def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
+def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFinding]:
     """Findings on the cell's arm; none where its driver cannot examine it. Nothing is touched while somebody else has
     the machine.
     """
@@ -48,7 +48,9 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
     directories = plan.directories
     pid = holder(directories.daemon_lock)
     if pid is not None:
-        yield Finding("drives", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`")
+        yield ExaminationFinding(
+            "drives", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`"
+        )
         return
     hardware = hardware_lock_path(
         directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options
@@ -59,7 +61,7 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
             if hardware is not None:
                 locks.enter_context(FileLock(hardware, f"joint driver {plan.cell.joints.driver!r}"))
         except AlreadyRunningError as error:
-            yield Finding("drives", None, f"not examined: {error}")
+            yield ExaminationFinding("drives", None, f"not examined: {error}")
             return
         # As the servo process is scheduled, so that what is measured is what it would see; where that is not allowed,
         # the check "scheduling" says so.
@@ -67,4 +69,4 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[Finding]:
         try:
             yield from driver.examine(may_move)
         except DriverError as error:
-            yield Finding("drives", False, str(error))
+            yield ExaminationFinding("drives", False, str(error))

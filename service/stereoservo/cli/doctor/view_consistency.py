@@ -16,7 +16,7 @@ from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CameraModel, CellModel
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import Finding
+from stereoservo.ports.devices import ExaminationFinding
 
 FITS_PX = 0.5
 """Root mean square that views of one point may leave before the cameras are said not to stand where they stood."""
@@ -25,7 +25,7 @@ MATCHES = 10
 WORKSPACE_SHARE = 0.9
 
 
-def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[Finding]:
+def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[ExaminationFinding]:
     """Findings on what pairs of cameras see at once."""
     seen = [record for record in records if len(record.seen) >= 2]
     if len(seen) < 2:
@@ -61,15 +61,15 @@ def reprojection_rms(cameras: Sequence[CameraModel], pixels: FloatArray) -> floa
     return float(np.sqrt(np.nansum(squares) / free)) if free > 0 else float("nan")
 
 
-def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -> Finding:
+def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -> ExaminationFinding:
     ids, pixels = _common(records)
     name = "views " + "-".join(record.name for record in records)
     if not ids:
-        return Finding(name, None, "no marker is seen by all of them at once: nothing to compare")
+        return ExaminationFinding(name, None, "no marker is seen by all of them at once: nothing to compare")
     rms = reprojection_rms(cameras, pixels)
     told = f"{len(ids)} markers seen by all leave {rms:.3f} px by the model's cameras"
     if rms <= FITS_PX:
-        return Finding(name, True, told)
+        return ExaminationFinding(name, True, told)
     for order in permutations(range(len(cameras))):
         if order == tuple(range(len(cameras))):
             continue
@@ -79,21 +79,21 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
                 for r, k in zip(records, order, strict=True)
                 if r.name != cameras[k].name
             )
-            return Finding(
+            return ExaminationFinding(
                 name, False, f"{told}: {swapped}", "exchange their sources, or their cables; none has moved"
             )
-    return Finding(
+    return ExaminationFinding(
         name, False,
         f"{told}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
         "re-anchor it (the running daemon does, once it sees enough), or `stereoservo calibrate`",
     )  # fmt: skip
 
 
-def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
+def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFinding:
     ids, pixels = _common([first, second])
     name = f"views {first.name}-{second.name}"
     if len(ids) < MATCHES:
-        return Finding(
+        return ExaminationFinding(
             name,
             None,
             f"{len(ids)} markers are seen by both; the epipolar constraint needs {MATCHES} to say anything",
@@ -102,14 +102,14 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
     try:
         F, inliers = fundamental_robust(pixels[0], pixels[1], max(sigma, 0.05))
     except GeometryError as error:
-        return Finding(name, None, f"no epipolar constraint yet: {error}")
+        return ExaminationFinding(name, None, f"no epipolar constraint yet: {error}")
     distances = epipolar_distances(F, pixels[0], pixels[1])
     rms = float(np.sqrt(np.mean(distances[inliers] ** 2)))
     told = f"{int(inliers.sum())} of {len(ids)} markers agree on one epipolar geometry, {rms:.3f} px"
     if inliers.all():
-        return Finding(name, True, told)
+        return ExaminationFinding(name, True, told)
     off = [marker for marker, inside in zip(ids, inliers, strict=True) if not inside]
-    return Finding(
+    return ExaminationFinding(
         name, False, f"{told}; markers {off} do not",
         "are they mistaken for others, or is there a second plate in view?",
     )  # fmt: skip
@@ -117,7 +117,7 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
 
 def examine_coverage(
     model: CellModel, trials: TrialSettings, records: Sequence[CameraRecord]
-) -> Iterator[Finding]:
+) -> Iterator[ExaminationFinding]:
     """Findings on the share of the trial motions in each camera's image, by the model, at all corners of two joints."""
     configurations = _corners(trials)
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
@@ -132,7 +132,7 @@ def examine_coverage(
         share = float(inside.mean())
         told = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
         wide = share >= WORKSPACE_SHARE
-        yield Finding(
+        yield ExaminationFinding(
             f"{record.name} coverage", True if wide else None, told,
             "" if wide else "a shorter lens, more distance, or goals that keep to the middle",
         )  # fmt: skip

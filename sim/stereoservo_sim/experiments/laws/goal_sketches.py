@@ -158,7 +158,7 @@ def _frame(world: World, pose: FloatArray) -> FloatArray:
     return world.seen_points(corners @ pose.T)[1]
 
 
-class TransferredGoal(NamedTuple):
+class GoalSketch(NamedTuple):
     """A goal carried over to a workpiece that has moved; pixels (2, n, 2)."""
 
     taught: FloatArray
@@ -168,7 +168,7 @@ class TransferredGoal(NamedTuple):
     drive: Drive
 
 
-def carried_over(calibration: TaskCalibration) -> TransferredGoal:
+def carried_over(calibration: TaskCalibration) -> GoalSketch:
     """``taught``: relative to five markers of the workpiece, by a homography of space alone."""
     world = World(calibration, start_pose())
     then = translation(0.06, 0.06, 1.12) @ rotation("x", 10)
@@ -180,9 +180,7 @@ def carried_over(calibration: TaskCalibration) -> TransferredGoal:
     change = align("projective", frame, frame, old_points, new_pixels, SIGMA_PX)
     targets = with_unit_height(world.points_at(goal) @ change.H.T, world.knowledge.plane_at_infinity)
     drive = world.servo("cartesian3", targets)
-    return TransferredGoal(
-        sight(goal).pixels, old_pixels, new_pixels, world.towards(targets).set_points, drive
-    )
+    return GoalSketch(sight(goal).pixels, old_pixels, new_pixels, world.towards(targets).set_points, drive)
 
 
 class OnLine(NamedTuple):

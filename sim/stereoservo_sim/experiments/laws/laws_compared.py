@@ -35,7 +35,7 @@ THESIS = {
 
 
 @dataclass(frozen=True, eq=False)
-class LawRun:
+class ComparedRun:
     """A law on a task: what the judge says, and the way it went."""
 
     name: str
@@ -49,7 +49,7 @@ class LawComparison:
     """All runs, by task name and law."""
 
     seed: int
-    runs: dict[str, dict[str, LawRun]]
+    runs: dict[str, dict[str, ComparedRun]]
 
 
 def compared_tasks() -> dict[str, AlignmentTask]:
@@ -76,7 +76,7 @@ def run_laws(
     total = len(tasks) * len(laws)
     progress("laws", 0, total)
     known = calibration or calibrate("free", "self", NOISE_PX, seed)
-    runs: dict[str, dict[str, LawRun]] = {name: {} for name in tasks}
+    runs: dict[str, dict[str, ComparedRun]] = {name: {} for name in tasks}
     for name, task in tasks.items():
         for law in laws:
             settings = LoopSettings(
@@ -86,7 +86,7 @@ def run_laws(
                 seed=seed,
             )
             result, trace = run_task(task, known, settings)
-            runs[name][law] = LawRun(name, task, result, trace)
+            runs[name][law] = ComparedRun(name, task, result, trace)
             progress("laws", sum(len(of_task) for of_task in runs.values()), total)
     return LawComparison(seed, runs)
 
@@ -100,7 +100,7 @@ def report_laws(comparison: LawComparison) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _row(law: str, run: LawRun) -> dict[str, Any]:
+def _row(law: str, run: ComparedRun) -> dict[str, Any]:
     result, task = run.result, run.task
     facing = float(np.degrees(np.arccos(np.clip(run.trace.facing.min(), -1.0, 1.0))))
     return {

@@ -18,7 +18,7 @@ from stereoservo.planning.motion_frame import progress
 from stereoservo.planning.path_search import SHAPES
 from stereoservo_sim.experiments.laws import goal_sketches
 from stereoservo_sim.experiments.laws.goal_sketches import Drive
-from stereoservo_sim.experiments.laws.laws_compared import LawComparison, LawRun
+from stereoservo_sim.experiments.laws.laws_compared import ComparedRun, LawComparison
 from stereoservo_sim.tasks.calibrations import TaskCalibration, calibrate
 from stereoservo_sim.tasks.ground_truth import sight
 from stereoservo_sim.tasks.setting import DEFAULT_RATE_HZ, HEIGHT, WIDTH
@@ -98,12 +98,12 @@ def _marker_tracks(axis: Axes, pixels: FloatArray, colour: str, style: str = "-"
         axis.plot(pixels[:, marker, 0], pixels[:, marker, 1], style, color=colour, linewidth=0.9)
 
 
-def _left(run: LawRun) -> FloatArray:
+def _left(run: ComparedRun) -> FloatArray:
     """(k, 4, 2): the left image of a run."""
     return np.array([sight(pose).pixels[0] for pose in run.trace.poses])
 
 
-def _around(runs: list[LawRun]) -> FloatArray:
+def _around(runs: list[ComparedRun]) -> FloatArray:
     """(2, 2): where the markers' ways lie, but for the wildest."""
     pixels = np.concatenate([_left(run).reshape(-1, 2) for run in runs])
     ends = np.concatenate([sight(pose).pixels[0] for run in runs for pose in (run.task.start, run.task.goal)])
@@ -112,7 +112,7 @@ def _around(runs: list[LawRun]) -> FloatArray:
     return np.array([least - AROUND_PX, largest + AROUND_PX])
 
 
-def _ending(run: LawRun) -> str:
+def _ending(run: ComparedRun) -> str:
     result = run.result
     if result.refused:
         return "refused"
@@ -140,7 +140,7 @@ def _tracks(comparison: LawComparison, task: str) -> Figure:
     return figure
 
 
-def _off_line_mm(run: LawRun) -> FloatArray:
+def _off_line_mm(run: ComparedRun) -> FloatArray:
     """(k,): distances of the plate's middle from the straight line through start and goal."""
     begin, end = run.task.start[:3, 3], run.task.goal[:3, 3]
     offset = run.trace.poses[:, :3, 3] - begin
@@ -151,7 +151,7 @@ def _off_line_mm(run: LawRun) -> FloatArray:
     return np.asarray(1e3 * np.linalg.norm(offset, axis=1))
 
 
-def _left_deg(run: LawRun) -> FloatArray:
+def _left_deg(run: ComparedRun) -> FloatArray:
     """(k,): angle [°] between the plate and its goal."""
     trace = np.einsum("kij,ij->k", run.trace.poses[:, :3, :3], run.task.goal[:3, :3])
     return np.asarray(np.degrees(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))))
@@ -268,7 +268,7 @@ def _displacement(axis: Axes, first: Drive, second: Drive) -> None:
     _outline(axis, first.pixels[0, 0], "#888888")
 
 
-def _taught(axis: Axes, carried: goal_sketches.TransferredGoal) -> None:
+def _taught(axis: Axes, carried: goal_sketches.GoalSketch) -> None:
     _image(axis, "taught, relative to the workpiece")
     for pixels, goal, colour in (
         (carried.workpiece_then[0], carried.taught[0], "#bbbbbb"),
