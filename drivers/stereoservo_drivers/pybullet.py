@@ -1,4 +1,4 @@
-"""The simulated cell: an arm whose joints pybullet moves, and cameras that render what they would see.
+"""Drivers of the simulated cell: an arm in the physics engine pybullet, and cameras that render images.
 
 pybullet itself is imported by the arm only, when it is configured: the servo process loads no image code,
 the camera process no physics.
@@ -27,7 +27,7 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class PybulletJointOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the pybullet arm: those of every simulated arm."""
+    """Options of the pybullet arm: the same as of every simulated arm."""
 
 
 class PybulletJointDriver(SimulatedArm):
@@ -76,9 +76,7 @@ class PybulletCameraDriver(SimulatedCamera):
         return self.describe_as("frames")
 
     def configure(self) -> None:
-        """Load the renderer and draw once, so that no later frame waits for a compiler. Raises
-        DriverError.
-        """
+        """Load the renderer and draw once, so that no later frame waits for compilation. Raises DriverError."""
         super().configure()
         if self._renderer is None:
             self._renderer = self._draw_anew()

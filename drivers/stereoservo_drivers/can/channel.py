@@ -1,4 +1,4 @@
-"""Any python-can interface as frames, its failures as typed errors that say what to check."""
+"""CAN channel over any python-can interface; its failures become typed errors with what to check."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FULL = (errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT)
 
 
 class ChannelOptions(Protocol):
-    """What a channel is opened by; ``CanOptions`` has these too."""
+    """Options to open a channel; ``CanOptions`` contains them, too."""
 
     @property
     def interface(self) -> str: ...
@@ -46,7 +46,7 @@ class ChannelOptions(Protocol):
 
 
 class ChannelSettings(msgspec.Struct, frozen=True):
-    """The options alone."""
+    """The channel options as a struct of their own."""
 
     interface: str
     channel: str | int
@@ -87,7 +87,7 @@ class Channel:
         self.frames_sent += len(frames)
 
     def receive(self, timeout_s: float) -> list[tuple[int, CanFrame]]:
-        """All frames that are there (at most ``BATCH``), stamped [ns, monotonic] as read; waits for the first one.
+        """All waiting frames (at most ``BATCH``), stamped [ns, monotonic] as read; blocks until the first one.
 
         What controller and line report beside frames is kept for ``take_errors``; bus-off raises.
         """
@@ -99,13 +99,13 @@ class Channel:
         return received
 
     def take_errors(self) -> list[tuple[int, BusError]]:
-        """What the bus reported since the last call, stamped [ns]; the newest 256."""
+        """Bus errors since the last call, stamped [ns]; the newest 256."""
         errors = list(self._errors)
         self._errors.clear()
         return errors
 
     def close(self) -> None:
-        """Release the interface. Idempotent; what fails now has no consequence any more."""
+        """Release the interface. Idempotent; errors are ignored."""
         try:
             self._bus.shutdown()
         except (can.CanError, OSError) as error:
@@ -236,7 +236,7 @@ class Channel:
         return self._error("connection_lost", f"{doing}: {error}. {self._where_it_went()}", retry=True)
 
     def _told(self) -> str:
-        """What the adapter answers when asked why it refused."""
+        """The adapter's status as text, to explain a refusal."""
         assert self._fast is not None
         try:
             flags = self._fast.status_flags()
@@ -268,7 +268,7 @@ class Channel:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """The system's number of an error, looked for in its causes too."""
+    """The system's error number, searched in an error's causes, too."""
     while error is not None:
         number = getattr(error, "errno", None)
         if number is None:
@@ -280,5 +280,5 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def _wrong(error: BaseException) -> bool:
-    """Whether the configuration and not the world is at fault."""
+    """Whether the configuration is at fault, and not the hardware."""
     return isinstance(error, (TypeError, ValueError, ImportError, can.CanInterfaceNotImplementedError))

@@ -1,4 +1,4 @@
-"""Bring-up of CiA 402 drives: who is there, is it the right drive, its configuration, faults cleared on demand.
+"""Bring-up of CiA 402 drives: presence, identity, configuration, and reset of faults on request.
 
 All of it in NMT state pre-operational, where no process data moves anything and none is awaited. What is written is
 read back. Nothing here enables a drive.
@@ -96,7 +96,8 @@ class Cia402Bringup:
                 self._start(link, drives)
 
     def reset(self, link: Link) -> None:
-        """Configure anew and clear the faults of all drives, by NMT reset communication where they were of the bus.
+        """Configure again and clear the faults of all drives, by NMT reset communication where they were bus
+        faults.
 
         Ends in switch on disabled. Raises DriverError: as ``connect``; ``fault_stays`` where one cannot be cleared.
         """
@@ -119,7 +120,7 @@ class Cia402Bringup:
                     raise stays
 
     def release(self, link: Link) -> None:
-        """Process data off; the drives no longer wait for this master. Raises one DriverError for all.
+        """Stop process data and the drives' monitoring of this master. Raises one DriverError for all.
 
         A drive that is still enabled is stopped and switched off first; one that cannot be keeps its watch.
         """
@@ -173,7 +174,7 @@ class Cia402Bringup:
             self._configure(link, drive)
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
-        """A drive that was left enabled is brought to rest and switched off. A fault stays as it is."""
+        """Bring a drive that was left enabled to rest and switch it off. A fault stays as it is."""
         state = _state(drive)
         if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
             drive.write(0x6040, 0, ControlWord.QUICK_STOP)
@@ -189,7 +190,7 @@ class Cia402Bringup:
             )
 
     def _configure(self, link: Link, drive: RemoteDrive) -> None:
-        """Write everything, then read everything back. Raises DriverError (``read_back``)."""
+        """Write the whole configuration, then read it back. Raises DriverError (``read_back``)."""
         options, joint = self._options, drive.axis.joint
         parameters = parameter_writes(options, joint, drive.dictionary)
         pdos = pdo_writes(options, drive.node_id)
@@ -205,7 +206,7 @@ class Cia402Bringup:
 
     @staticmethod
     def _differs(drive: RemoteDrive, write: Write) -> bool:
-        """Not where the drive lacks the object: what it would be is then fixed."""
+        """Whether a value read back differs; not where the drive lacks the object, whose value is then fixed."""
         found = drive.read_if_there(write.index, write.subindex)
         return found is not None and not write.agrees(found)
 
@@ -231,7 +232,7 @@ class Cia402Bringup:
             )
 
     def _start(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Arm the watch on this master's heartbeat, go operational, see that all say so."""
+        """Activate the drives' monitoring of this master's heartbeat, go operational, check that all report so."""
         value = self._options.master_id << 16 | self._options.heartbeat_timeout_ms
         for drive in drives:
             drive.write(*HEARTBEAT_CONSUMER, value)
@@ -256,7 +257,7 @@ class Cia402Bringup:
     # -- faults ---------------------------------------------------------------------------------------------
 
     def _reset_communication(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Some drives refuse to forget a lost heartbeat or bus without it (EPOS4)."""
+        """Reset communication by NMT, without which some drives (EPOS4) keep a lost heartbeat or bus as a fault."""
         with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
             for drive in drives:
                 drive.nmt("RESET COMMUNICATION")
@@ -272,7 +273,7 @@ class Cia402Bringup:
                     )
 
     def _clear_fault(self, link: Link, drive: RemoteDrive) -> None:
-        """The fault reset's edge, and what came of it. Raises DriverError (``fault_stays``)."""
+        """Send the fault reset's edge and check its effect. Raises DriverError (``fault_stays``)."""
         until(link, lambda: _state(drive) is not DriveState.FAULT_REACTION_ACTIVE, REST_S)
         drive.axis.codes = []
         if _state(drive) in FAULTY:
@@ -284,7 +285,7 @@ class Cia402Bringup:
             raise self._stays(drive)
 
     def _settle(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """A cause that is still there shows itself. Raises DriverError (``fault_stays``)."""
+        """Wait for causes that are still present to appear again. Raises DriverError (``fault_stays``)."""
         with listening(link, [EMCY_ID + drive.node_id for drive in drives]) as heard:
             link.wait(SETTLE_S)
         for drive in drives:
@@ -310,7 +311,7 @@ class Cia402Bringup:
 
 
 def _state(drive: RemoteDrive) -> DriveState:
-    """By SDO; the codec takes it as the newest."""
+    """Drive state read by SDO; the codec takes it as the newest."""
     drive.axis.take_status(drive.read(0x6041))
     return drive.axis.state
 
@@ -323,7 +324,7 @@ def _at_rest(drive: RemoteDrive) -> bool:
 
 
 def _look(drive: RemoteDrive) -> None:
-    """State, error code and limit switches before the first cycle."""
+    """Read state, error code and limit switches before the first cycle."""
     axis = drive.axis
     if _state(drive) in FAULTY:
         axis.take_code(drive.read_if_there(0x603F) or 0)

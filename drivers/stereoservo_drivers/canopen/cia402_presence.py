@@ -1,4 +1,4 @@
-"""Who is on the bus, and is it the right drive: one answer a node id, device type, identity, EDS, mode."""
+"""Presence and identity of drives on the bus: one reply per node id, device type, identity, EDS, mode."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity object 0x1018."""
+    """Identity object 0x1018 of a drive."""
 
     vendor_id: int
     product_code: int
@@ -42,7 +42,9 @@ class Identity:
 
 
 def alone(link: Link, drives: list[RemoteDrive]) -> None:
-    """Listens before anything is sent. Raises DriverError (``second_master``) where somebody commands these drives."""
+    """Check, before anything is sent, that no other master commands these drives. Raises DriverError
+    (``second_master``).
+    """
     with listening(link, [RPDO_IDS[0] + drive.node_id for drive in drives]) as heard:
         link.wait(ALONE_S)
     for drive in drives:
@@ -61,7 +63,9 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
 
 @contextmanager
 def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
-    """Raises DriverError (``rebooted``) at its end where a drive has booted meanwhile: its configuration is gone."""
+    """Context manager that raises DriverError (``rebooted``) at its end where a drive has booted meanwhile and lost
+    its configuration.
+    """
     with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
         try:
             yield
@@ -88,7 +92,7 @@ def _check_boots(
 def ask(
     link: Link, nodes: list[int], index: int, subindex: int, patience_s: float = PROBE_S
 ) -> dict[int, list[CanFrame]]:
-    """All answers of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
+    """All replies of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
     request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
     with listening(link, [0x580 + node for node in nodes]) as heard:
         for node in nodes:
@@ -101,7 +105,7 @@ def ask(
 
 
 def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
-    """One answer of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
+    """One reply of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
     answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
     missing = [drive for drive in drives if not answers[drive.node_id]]
     if missing:
@@ -146,7 +150,9 @@ def _missing(
 
 
 def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
-    """Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``, ``mode``)."""
+    """Check the drive's type and identity. Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``,
+    ``mode``).
+    """
     device_type = drive.read(0x1000)
     if device_type & 0xFFFF != CIA_402:
         raise DriverError(
@@ -185,7 +191,7 @@ def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
 
 
 def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
-    """An EDS of the drive's own maker must be of this drive; the shipped one is of none."""
+    """Check that an EDS of the drive's own maker is of this drive; the shipped one is of no particular drive."""
     if eds == SHIPPED_EDS:
         return
     of = drive.dictionary.device_information

@@ -1,4 +1,4 @@
-"""What ``stereoservo doctor`` learns from a CAN arm: the bus, the drives, their cycle, their units."""
+"""Examination of a CAN arm for ``stereoservo doctor``: the bus, the drives, their cycle, their units."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MayMove = Callable[[str], bool]
 
 
 def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterator[Finding]:
-    """Findings, in the order in which an integrator would ask; ends early where nothing further can be known."""
+    """Findings, in the order in which an integrator would check; ends early where no more can be determined."""
     options = driver.options
     yield load_finding(options)
     try:
@@ -62,7 +62,7 @@ def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterat
 
 
 def load_finding(options: CanOptions) -> Finding:
-    """The bus load of the cell file's cycle, which the driver has found to be allowed."""
+    """Finding on the bus load of the cell file's cycle, which the driver has accepted."""
     load = bus_load(options)
     return Finding(
         "bus load",
@@ -73,7 +73,7 @@ def load_finding(options: CanOptions) -> Finding:
 
 
 def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[Finding]:
-    """Listen, then ask the drives. Ends the channel."""
+    """Listen, then query the drives. Closes the channel."""
     try:
         heard = _listen(channel)
         errors = [error.message for _, error in channel.take_errors()]
@@ -101,7 +101,7 @@ def _listen(channel: Channel) -> list[CanFrame]:
 
 
 def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> Finding:
-    """Whether somebody else commands this bus: frames (heard in ``LISTEN_S``) that only a master sends."""
+    """Finding on other masters on this bus, by frames (received in ``LISTEN_S``) that only a master sends."""
     commands = {RPDO_IDS[0] + joint.node_id for joint in options.joint}
     of_a_master = {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}
     found = {frame.id for frame in heard if not frame.extended} & of_a_master
@@ -118,7 +118,7 @@ def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> Finding:
 
 
 def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[Finding]:
-    """Configure, watch the cycle, jog. Raises DriverError."""
+    """Configure, observe the cycle, jog. Raises DriverError."""
     driver.configure()
     yield Finding("configuration", True, "every drive took its settings, and gave them back as written")
     positions = yield from _watch(driver)
@@ -137,7 +137,7 @@ def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[Finding]:
 
 
 def _watch(driver: CanJointDriver) -> Iterator[Finding]:
-    """A second of cycles with the arm off; returns positions (k, n)."""
+    """Run a second of cycles with the arm off; returns positions (k, n)."""
     period_s = 1.0 / driver.options.rate_hz
     before, skipped = driver.master.statistics, driver.bus.statistics.skipped if driver.bus else 0
     first = (before.cycles, before.incomplete)
@@ -162,7 +162,7 @@ def _watch(driver: CanJointDriver) -> Iterator[Finding]:
 
 
 def _sample(driver: CanJointDriver) -> FloatArray:
-    """Positions now; of a latched fault, which is told once, the sample behind it."""
+    """Current positions; with a latched fault, which is raised once, the sample after it."""
     try:
         return driver.read_state().positions
     except DriverError:
@@ -170,7 +170,7 @@ def _sample(driver: CanJointDriver) -> FloatArray:
 
 
 def cycles_finding(cycles: int, missed: int, skipped: int) -> Finding:
-    """Cycles that lacked an answer, and slots that this computer missed itself."""
+    """Finding on cycles that lacked a reply, and slots that this computer missed itself."""
     message = f"{cycles} cycles, {missed} without all answers, {skipped} skipped by this computer"
     if missed == 0 and skipped <= MISSED_SHARE * cycles:
         return Finding("cycle", True, message)
@@ -186,7 +186,7 @@ def cycles_finding(cycles: int, missed: int, skipped: int) -> Finding:
 
 
 def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
-    """From a poll to its last answer [s], (k,)."""
+    """Finding on the time from a poll to its last reply [s], (k,)."""
     median, largest = float(np.median(answered_s)), float(np.max(answered_s))
     message = (
         f"SYNC to last answer {median * 1e3:.2f} ms median, {largest * 1e3:.2f} ms largest, of a cycle of "
@@ -200,7 +200,7 @@ def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
 
 
 def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[Finding]:
-    """Those heard in ``WATCH_S``, against what was asked of the drives."""
+    """Findings on the heartbeats received in ``WATCH_S``, against the configured ones."""
     expected = WATCH_S * 1e3 / options.heartbeat_ms
     counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in heard) for joint in options.joint]
     rare = [
@@ -256,7 +256,7 @@ def _question(joint: CanJoint, sign: float) -> str:
 
 
 def _jog(driver: CanJointDriver, k: int, sign: float) -> tuple[JogTrace, DriverError | None]:
-    """Enable, move joint ``k``, wait until it stands, switch off; what ended it early, if anything did."""
+    """Enable, move joint ``k``, wait for rest, switch off; returns what ended it early, if anything."""
     joint = driver.options.joint[k]
     trace = JogTrace(joint, float(driver.read_state().positions[k]))
     try:
@@ -289,7 +289,7 @@ def _hold(driver: CanJointDriver, trace: JogTrace, k: int, seconds: float) -> No
 
 
 def _step(driver: CanJointDriver, trace: JogTrace, k: int, velocity: float) -> None:
-    """Command for one period, then look."""
+    """Command for one period, then read."""
     begun = time.monotonic()
     command = np.zeros(len(driver.options.joint))
     command[k] = velocity

@@ -1,4 +1,4 @@
-"""What ``doctor`` asks of CiA 402 drives before anything is configured: who answers, what they are, how they are."""
+"""Checks of CiA 402 drives for ``doctor``, before anything is configured: presence, identity, state."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir:
 
 
 def scan(link: Link) -> dict[int, int]:
-    """Ask every node id for its device type; how many answers came from each that answered."""
+    """Query every node id for its device type; returns the number of replies from each that replied."""
     answers = ask(link, list(ALL_NODES), 0x1000, 0)
     return {node: len(frames) for node, frames in answers.items() if frames}
 
@@ -112,7 +112,7 @@ def _state(drive: RemoteDrive) -> Finding:
 
 
 def _past_errors(drive: RemoteDrive) -> list[int]:
-    """0x1003, newest first."""
+    """Error history 0x1003, newest first."""
     count = drive.read_if_there(0x1003, 0) or 0
     read = (drive.read_if_there(0x1003, k) for k in range(1, min(count, 4) + 1))
     return [value & 0xFFFF for value in read if value]

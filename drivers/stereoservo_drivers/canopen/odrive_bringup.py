@@ -1,4 +1,4 @@
-"""Bring-up of ODrives over CANSimple: who is there, one drive a node id, velocity control, errors cleared on demand.
+"""Bring-up of ODrives over CANSimple: presence, unique node ids, velocity control, and reset of errors on request.
 
 What CANSimple cannot do: the axis watchdog (``axis0.config.enable_watchdog``, ``watchdog_timeout``), which disarms an
 axis when velocities cease, and the rates of cyclic messages are configured over USB. The watchdog is all that stops
@@ -66,7 +66,7 @@ class OdriveBringup:
         self._await_idle(link)
 
     def reset(self, link: Link) -> None:
-        """Set up anew (a drive may have rebooted), clear errors, read them. Enables nothing.
+        """Configure again (a drive may have rebooted), clear errors, read them. Enables nothing.
 
         Raises DriverError (``node_missing``, ``reset_refused``, ``no_answer``, ``not_idle``).
         """
@@ -92,12 +92,12 @@ class OdriveBringup:
                 raise DriverError("reset_refused", fault.message, retry=True, errors=fault.value)
 
     def release(self, link: Link) -> None:
-        """Velocity zero, power off."""
+        """Command velocity zero and power off."""
         link.send([axis.velocity(0.0) for axis in self.codec.axes])
         link.send([axis.request(odrive.IDLE) for axis in self.codec.axes])
 
     def _ask(self, link: Link, command: int) -> Heard:
-        """All answers of all nodes to a remote frame within ``ANSWER_WAIT_S``; raises where one has none."""
+        """All replies of all nodes to a remote frame within ``ANSWER_WAIT_S``; raises where one has none."""
         with _listening(link, self._nodes, command) as heard:
             link.send([axis.remote(command) for axis in self.codec.axes])
             link.wait(ANSWER_WAIT_S)
@@ -113,7 +113,7 @@ class OdriveBringup:
         return answers
 
     def _check_alone(self, link: Link) -> None:
-        """Nobody else sends velocities to these axes."""
+        """Check that no other master sends velocities to these axes."""
         with _listening(link, self._nodes, odrive.SET_INPUT_VEL) as heard:
             link.wait(QUIET_S)
         for node, frames in heard.items():
@@ -173,7 +173,7 @@ class OdriveBringup:
             self.firmware[node] = ".".join(str(number) for number in data[4:7])
 
     def _check_estimates(self, link: Link) -> None:
-        """None comes unasked (in the cycle it would be taken for a second drive's); one when asked for."""
+        """Check that an estimate comes only on request (in the cycle others would look like a second drive's)."""
         with _listening(link, self._nodes, odrive.GET_ENCODER_ESTIMATES) as unasked:
             link.wait(QUIET_S)
         for node, frames in unasked.items():
@@ -205,7 +205,7 @@ class OdriveBringup:
                 link.send([CanFrame(frame_id(node, odrive.SET_LIMITS), limits)])
 
     def _await_idle(self, link: Link) -> None:
-        """A heartbeat of every axis, from now on, says idle."""
+        """Wait for a new heartbeat of every axis that reports idle."""
 
         def all_idle() -> bool:
             return all(frames and frames[-1].data[4:5] == bytes([odrive.IDLE]) for frames in heard.values())

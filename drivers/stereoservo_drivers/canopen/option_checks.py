@@ -1,4 +1,4 @@
-"""What the types of the options cannot say: whether they fit each other, the wire and the bus."""
+"""Checks of the CAN options beyond their types: consistency with each other, the wire format and the bus."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ODRIVE_HEARTBEATS_S = 10.0
 
 
 def parse_sdo_key(key: str) -> tuple[int, int]:
-    """``"0x60C2:1"`` as (index, sub-index). Raises ValueError, which says what is valid."""
+    """Parse ``"0x60C2:1"`` as (index, sub-index). Raises ValueError, which states what is valid."""
     if SDO_KEY.fullmatch(key):
         index, subindex = (int(part, 0) for part in key.split(":"))
         if index and subindex <= 0xFF:
@@ -33,7 +33,7 @@ def parse_sdo_key(key: str) -> tuple[int, int]:
 
 
 def check_options(options: CanOptions) -> None:
-    """Raises DriverError (``option``): names the joint, the value, and what would be valid."""
+    """Check the options. Raises DriverError (``option``): names the joint, the value, and what would be valid."""
     if not options.joint:
         raise _refusal("joint", "[]", "at least one [[joints.options.joint]] with its name and node_id")
     _check_bus(options)
@@ -79,7 +79,7 @@ def _check_bus(options: CanOptions) -> None:
 
 
 def bus_load(options: CanOptions) -> BusLoad:
-    """Worst case of the cycle and of the heartbeats beside it."""
+    """Worst-case load of the cycle and of the heartbeats beside it."""
     n = len(options.joint)
     if options.protocol == "odrive":
         asked_in_turn = (2 if "effort" in options.feedback else 1) * min(SHARE, n)
@@ -115,7 +115,7 @@ def _check_identity(options: CanOptions, joint: CanJoint) -> None:
 
 
 def _largest_identity(options: CanOptions) -> int:
-    """0x1018 has 32 bits (CiA 301, 7.5.2.19); serial numbers of ODrives have 48."""
+    """Largest identity number: 32 bits in 0x1018 (CiA 301, 7.5.2.19), 48 in ODrive's serial numbers."""
     return UINT32_MAX if options.protocol == "cia402" else 2**48 - 1
 
 
@@ -151,7 +151,7 @@ def _in_radians(degrees: float) -> str:
 
 
 def _check_range(joint: CanJoint) -> None:
-    """Whether what goes to the drive fits its objects: 0x60FF is INTEGER32, 0x6083 to 0x6085 are UNSIGNED32."""
+    """Check the range of the drive's objects: 0x60FF is INTEGER32, 0x6083 to 0x6085 are UNSIGNED32."""
     scale = JointScale.of(joint)
     units = abs(scale.velocity_units_per_unit)
     cure = "check counts_per_rev, gear_ratio and velocity_units_per_rev_s"

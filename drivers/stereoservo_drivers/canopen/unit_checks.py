@@ -1,4 +1,4 @@
-"""Whether units, limits and signs of a joint in the cell file fit what its drive does. Numbers in, findings out."""
+"""Checks whether a joint's units, limits and signs in the cell file agree with the drive's behaviour."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NAMED_UNITS = {1.0: "rev/s", 60.0: "rpm", 600.0: "rpm/10", 6000.0: "rpm/100", 60
 
 
 def position_finding(joint: CanJoint, position: float) -> Finding:
-    """A joint's position [rad or m] against the machine's limits."""
+    """Finding on a joint's position [rad or m] against the machine's limits."""
     name, unit = f"{joint.name} position", _unit(joint)
     limits = f"{joint.position_min:g} to {joint.position_max:g} {unit}"
     if joint.position_min <= position <= joint.position_max:
@@ -53,7 +53,7 @@ def position_finding(joint: CanJoint, position: float) -> Finding:
 
 
 def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
-    """Positions (k,) of a joint that should stand still."""
+    """Finding on positions (k,) of a joint that should be at rest."""
     name, unit = f"{joint.name} at rest", _unit(joint)
     counts = abs(JointScale.of(joint).counts_per_unit)
     spread = float(np.ptp(positions))
@@ -70,7 +70,7 @@ def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
 
 
 def resolution_finding(joint: CanJoint) -> Finding:
-    """What one unit of velocity is at the joint."""
+    """Finding on the joint velocity of one velocity unit."""
     unit = _unit(joint)
     step = 1.0 / abs(JointScale.of(joint).velocity_units_per_unit)
     message = (
@@ -87,7 +87,7 @@ def resolution_finding(joint: CanJoint) -> Finding:
 
 
 def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
-    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: creeping, doubling, constant; None: it is over."""
+    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: slow, doubling, constant; None: finished."""
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
     slowest = max(SLOWEST_SHARE * fastest, 1.0 / abs(JointScale.of(joint).velocity_units_per_unit))
     slowest = min(slowest, fastest)
@@ -103,7 +103,7 @@ def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
 
 @dataclass
 class JogTrace:
-    """A jog as it went. ``add`` every cycle; ``asked``: travel that the commands sent so far mean [rad or m]."""
+    """Record of a jog. ``add`` every cycle; ``asked``: commanded travel so far [rad or m]."""
 
     joint: CanJoint
     start: float
@@ -114,24 +114,24 @@ class JogTrace:
 
     @property
     def travel(self) -> float:
-        """By the joint's encoder."""
+        """Travel by the joint's encoder."""
         return self.positions[-1] - self.start if self.positions else 0.0
 
     def add(self, asked: float, position: float, velocity: float, dt_s: float) -> None:
-        """One cycle: the travel asked for in it, position and velocity as reported."""
+        """Add one cycle: its commanded travel, position and velocity as reported."""
         self.asked += asked
         self.positions.append(position)
         self.reported += velocity * dt_s
         self.longest_lag = max(self.longest_lag, abs(self.asked - self.travel))
 
     def runs_away(self) -> bool:
-        """Whether the joint moves far more than it was asked to: stop it."""
+        """Whether the joint moves far more than commanded, and must be stopped."""
         margin = max(NOISE, NOISE_COUNTS / abs(JointScale.of(self.joint).counts_per_unit))
         return abs(self.travel) > RUNAWAY * abs(self.asked) + 3.0 * margin
 
 
 def jog_finding(trace: JogTrace) -> Finding:
-    """A jog that is over: the way it went, how far, by which factor the units are wrong."""
+    """Finding on a finished jog: direction, travel, and the factor by which the units are wrong."""
     joint = trace.joint
     name = f"{joint.name} jog"
     asked, travel = _told(joint, trace.asked), _told(joint, trace.travel)
@@ -178,7 +178,7 @@ def jog_finding(trace: JogTrace) -> Finding:
 
 
 def _units_cure(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:
-    """``at_least``: the joint was stopped while it was still gaining speed; the true ratio is larger."""
+    """Remedy for wrong units. ``at_least``: the joint was stopped while accelerating; the true ratio is larger."""
     configured = joint.velocity_units_per_rev_s or joint.counts_per_rev
     if not 0.0 < abs(ratio) < math.inf:
         return f"velocity_units_per_rev_s is {configured:g}, counts_per_rev {joint.counts_per_rev:g}: both right?"

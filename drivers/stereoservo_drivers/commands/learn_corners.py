@@ -33,7 +33,7 @@ Sights = dict[str, list[ImageArray]]
 
 
 class LearnError(Exception):
-    """The command cannot do what was asked; ``code`` is stable."""
+    """The command cannot be carried out; ``code`` is stable."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -74,7 +74,7 @@ def learn_corners(
     force: Annotated[bool, typer.Option("--force", help="Write over a file that exists.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Learn landmarks from images of one moment, or of a scene at rest; a second set sorts tool from scene."""
+    """Learn landmarks from images of one moment, or of a scene at rest; a second set separates tool from scene."""
     if images is not None and pair is not None:
         raise LearnError("argument", "--images and --pair are two ways to give the images; give one of them")
     if moved is not None and moved_images is not None:
@@ -142,7 +142,7 @@ def _text(answer: Mapping[str, Any]) -> list[str]:
 def _sights(
     cell: CellFile, path: Path, images: Path | None, pair: tuple[Path, Path] | None, frames: int, ask: bool
 ) -> tuple[Sights, Sights | None]:
-    """Images before, and, of live cameras where it was ``ask``ed for, after a motion."""
+    """Images before a motion and, of live cameras where ``ask`` is set, after it."""
     if images is not None:
         return _folder(cell, images, frames), None
     if pair is not None:
@@ -256,7 +256,7 @@ def _write_picture(path: Path, drawn: ImageArray) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Whole or not at all. Raises OSError."""
+    """Write a file atomically. Raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         beside.write_bytes(data)

@@ -1,4 +1,4 @@
-"""Contract suites: what every joint driver, camera driver and detector has to keep, as pytest classes.
+"""Contract tests, as pytest classes: what every joint driver, camera driver and detector must fulfil.
 
 Subclass one in your own tests, say how to make your driver, and run pytest::
 

@@ -1,4 +1,4 @@
-"""The contract of joint drivers."""
+"""Contract tests of joint drivers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_bud
 
 
 class JointDriverContract(PacedSuite):
-    """Subclass under pytest and override :meth:`make_driver`.
+    """Base class of the tests: subclass under pytest and override :meth:`make_driver`.
 
     The suite moves the arm: slowly (``speed`` of each joint's largest velocity) and for fractions of a
     second. Clear the machine's surroundings before you run it on hardware.

@@ -1,4 +1,4 @@
-"""The dot detector: faces of seven dots, found anywhere, then tracked in windows placed by the core's
+"""Detector of dot faces (seven dots each): acquisition in the whole image, then tracking in windows at the core's
 priors.
 """
 
@@ -76,7 +76,7 @@ _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
 
 
 class DotDetector:
-    """Dots of self-identifying faces with ids, centres and calibrated covariances. One thread at a time.
+    """Detects dots of self-identifying faces: ids, centres and calibrated covariances. One thread at a time.
 
     With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are
     found, the whole image is searched and every face identified on its own. Faces ``beside`` the body, which the prior
@@ -129,7 +129,7 @@ class DotDetector:
         return self._observation(frame, self._search(frame, image, prior))
 
     def _search(self, frame: Frame, image: ImageArray, prior: Prior | None) -> _Found:
-        """All faces: where the prior, of whatever age, expects them; in the whole image if that is not enough."""
+        """Search for all faces: near the prior, of any age; in the whole image if that is not enough."""
         every = range(len(self._patterns))
         if prior is None or not len(prior.ids):
             return self._acquire(image, every, [None] * len(every))
@@ -177,7 +177,7 @@ class DotDetector:
         return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
 
     def _with_others(self, image: ImageArray, tracked: _Found, prior: Prior) -> _Found:
-        """What was tracked, and the faces beside the body that the prior does not know, wherever they are."""
+        """Tracked dots together with faces outside of the body, which the prior does not contain, found by search."""
         if not self.options.beside:
             return tracked
         unknown = ~np.isin(self._every_id, prior.ids).any(axis=1)
@@ -197,7 +197,7 @@ class DotDetector:
         origin: npt.NDArray[np.int64] | None = None,
         taken: FloatArray | None = None,
     ) -> _Found:
-        """The ``faces`` by index, among all spots of an image but those ``taken`` (k, 2) [px].
+        """Find the ``faces`` (indices) among all spots of an image except those ``taken`` (k, 2) [px].
 
         ``expected`` of all faces chooses among copies. ``origin`` (2,): where the image stands in a larger one.
         """

@@ -1,4 +1,4 @@
-"""What uneven light does to the dots of a face, and what is taken back of it. Numba kernels; no state.
+"""Correction of the dots' centres for uneven light (shading). Numba kernels; no state.
 
 Light falls on a dot as background b(x) and contrast g(x); to first order a slope of either moves the centroid, by the
 columns DARK and LIT of its measurement. Both slopes are those of planes through the face's dots, whose predicted areas
@@ -129,7 +129,8 @@ def _odd_one(dots, values, used, variance, plane):
 
 @kernel
 def _known(dots, values, used, variance, typical, plane, slope):
-    """Slope (2) of ``values`` and its covariance (3) at any of the dots into ``slope``; the odd dot, -1 for none.
+    """Slope (2) of ``values`` and its covariance (3) at any of the dots into ``slope``; the outlier dot, -1 for
+    none.
 
     ``variance`` of a value by noise; ``typical`` standard deviation beside it. -2 where there is no plane.
     """
@@ -152,7 +153,9 @@ def _known(dots, values, used, variance, typical, plane, slope):
 
 @kernel
 def _as_bright_as_its_light(dots, areas, used, i, away):
-    """Whether dot ``i``, whose flux is ``away`` from the others' (relative), is so for its light, not for its shape."""
+    """Whether the flux of dot ``i``, which differs by ``away`` (relative) from the others', is explained by its
+    light and not its shape.
+    """
     others = 0.0
     count = 0
     for k in range(used.size):
@@ -190,8 +193,8 @@ def _add_spread(dot, a, b, c, d, p, q, r):
 
 @kernel
 def _follow(dot, slope, noise, ground, moved):
-    """Undo the slope of the light at one dot; ``slope`` (5,) is that of its face, ``noise`` inside the dot, ``ground``
-    the part of the background that slopes with it.
+    """Remove the slope of the light at one dot; ``slope`` (5,) is that of its face, ``noise`` inside the dot,
+    ``ground`` the part of the background that slopes with it.
     """
     p, q, r = slope[2], slope[3], slope[4]
     sampled = SAMPLED_SLOPE * SAMPLED_SLOPE / dot[AREA]
@@ -231,7 +234,7 @@ def _follow(dot, slope, noise, ground, moved):
 
 @kernel
 def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
-    """Move the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) to where they were under even light.
+    """Correct the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) for uneven light.
 
     ``areas`` (n,) [px²] as the face's homography predicts them. Adds to EXX .. EYY what remains uncertain: the slopes,
     and for a dot whose light does not fit the others' as much as the missing part of its rim would move it.

@@ -125,7 +125,7 @@ class MjpegSource:
         return boundary
 
     def read(self) -> SourcePicture | None:
-        """The newest whole picture, waiting for one; None: it was spoiled. Raises DriverError."""
+        """The newest whole image, waiting for one; None: it was damaged. Raises DriverError."""
         parts: list[MultipartPart] = []
         assert self._response is not None
         assert self._parser is not None
@@ -207,7 +207,9 @@ def _target(url: SplitResult) -> str:
 
 
 def authorization(url: SplitResult, challenge: str = "") -> str:
-    """Header of the user in ``url``: Basic, or Digest where the server's ``challenge`` asks for it (RFC 7617, 7616)."""
+    """Authorization header for the user in ``url``: Basic, or Digest where the server's ``challenge`` requires it
+    (RFC 7617, 7616).
+    """
     user, password = unquote(url.username or ""), unquote(url.password or "")
     if not challenge:
         return "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()

@@ -1,4 +1,4 @@
-"""Alternative joint axes for a metric bundle that a flat target may have led into a local minimum.
+"""Alternative joint axes as new start values, for a metric bundle in a local minimum (which planar targets cause).
 
 A plate that rotates nearly in its own plane determines its axis by small perspective effects only, and two axes may
 explain it almost alike. With cameras and markers known, each joint's trial is searched over all directions.
@@ -22,7 +22,8 @@ GAIN = 8.0
 
 
 def with_other_axes(solution: Solution) -> list[RigModel]:
-    """Metric rigs in which revolute joints turn about axes that explain their own trials better, most joints first.
+    """Metric rigs to start from again: revolute joints get the axes that fit their own trials better, most joints
+    first.
 
     Empty where no joint has a better one.
     """
@@ -43,7 +44,9 @@ def with_other_axes(solution: Solution) -> list[RigModel]:
 
 
 def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
-    """A generator (4, 4) that explains a joint's trial better, cameras and markers as they are; or None."""
+    """Generator (4, 4) that fits a joint's own trial better, with cameras and markers fixed; None where there is
+    none.
+    """
     rig, data = solution.rig, solution.data
     used = np.unique(data.stop)
     base = np.median(data.offsets[used], axis=0)
@@ -82,7 +85,7 @@ def _solved(rig: RigModel, data: Measurements) -> Solution:
 
 
 def _middle(rig: RigModel, angle: float) -> FloatArray:
-    """Middle (3,) of a single joint's markers at ``angle``."""
+    """Centroid (3,) of a single joint's markers at ``angle``."""
     _, after = partial_products(rig, np.array([[angle]]))
     points = rig.points @ after[0, 0].T
     return np.asarray((points[:, :3] / points[:, 3:]).mean(axis=0))

@@ -26,7 +26,7 @@ def degrees_of_freedom(solution: Solution) -> int:
 
 
 def variance_factor(solution: Solution) -> float:
-    """Estimated over stated variance of the pixels."""
+    """Variance factor of the fit: estimated over stated variance of the pixels."""
     return solution.cost / max(1, degrees_of_freedom(solution))
 
 
@@ -86,8 +86,8 @@ class GroupRms(NamedTuple):
 
 
 def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) -> GroupRms:
-    """Of pixels (k,): mean squared residuals of the two coordinates [px²], sigmas [px], and the variance of their
-    prediction [px², both coordinates].
+    """Residual statistics of a group of pixels (k,), from squared residuals of the two coordinates [px²], sigmas
+    [px], and the variance of their prediction [px², both coordinates].
     """
     n = 2 * len(squares)
     if not n:

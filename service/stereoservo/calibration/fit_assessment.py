@@ -1,4 +1,4 @@
-"""Assessment of a calibration in words: grade, reasons, and what to do."""
+"""Assessment of a calibration for people: grade, reasons, and advice."""
 
 from __future__ import annotations
 

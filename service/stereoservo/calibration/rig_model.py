@@ -270,7 +270,7 @@ def reversed_trials(trials: TrialData) -> TrialData:
 
 
 def with_joints_reversed(model: CellModel) -> CellModel:
-    """The model of reversed trials with its joints in base-first order again, mounted eye-in-hand."""
+    """Model of reversed trials with its joints base first again, mounted eye-in-hand."""
     statistics = model.statistics
     if statistics is not None:
         statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])

@@ -177,7 +177,7 @@ def _projective(
     options: FitOptions,
     decided: bool,
 ) -> tuple[Solution, BoolArray]:
-    """The projective bundle on its inliers; unless ``decided``, with the lenses that the data ask for."""
+    """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
     robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     if not decided and lenses == "none":
         # Before anything is called an outlier: distortion makes many of them.
@@ -231,7 +231,7 @@ def _without_rare_markers(
 def link_joints(
     trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
 ) -> RigModel:
-    """Rig of all joints, base to tip: operators transformed from their trials' bases to one zero (5.21), with one
+    """Rig of all joints, base to tip: generators transformed from their trials' bases to one zero (5.21), one
     marker structure (5.53).
 
     Raises CalibrationError (``too_few_markers``) for a marker that no trial shows.
@@ -272,7 +272,7 @@ def refine_to_convergence(
     lenses: LensModel,
     tolerance: float = 1e-10,
 ) -> tuple[Solution, BoolArray]:
-    """Least-squares bundle and its inliers (k,): gate and solve are repeated until the set of inliers is constant.
+    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same.
 
     Whether the last solution has converged is for the caller to judge. Raises CalibrationError
     (``no_convergence``).
@@ -366,7 +366,7 @@ def _refuse_misfit(
 
 
 def _refuse_open(solution: Solution, notes: tuple[str, ...]) -> None:
-    """Refuse a final bundle with directions that the data leave open, or that has not converged."""
+    """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
     rank = rank_of(solution)
     because = f" ({'; '.join(notes)})" if notes else ""
     if rank < solution.charts.size:

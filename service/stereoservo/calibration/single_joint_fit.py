@@ -207,7 +207,7 @@ def fit_single_joint(
 
 
 def _common_markers(sights: VirtualObservations, angles: FloatArray) -> int:
-    """Most virtual markers that two stops half of the trial's range apart have in common."""
+    """Largest number of virtual markers that two stops half of the trial's range apart have in common."""
     shown = finite_rows(sights.points).astype(np.int64)
     apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
     return int((shown @ shown.T)[apart].max(initial=0))
@@ -230,7 +230,7 @@ class VirtualObservations:
 def virtual_markers(
     trials: TrialData, points: FloatArray, usable: BoolArray, stops: IntArray, groups: IntArray
 ) -> VirtualObservations:
-    """The markers (m) of G distal ``groups`` (k,) at ``stops`` (k,) as G m rigid virtual ones."""
+    """The markers (m) of G distal ``groups`` (k,) at ``stops`` (k,) as G m virtual markers of one rigid body."""
     c, m, k = len(trials.cameras), len(trials.marker_ids), len(stops)
     count = int(groups.max()) + 1
     spread = VirtualObservations(
@@ -257,9 +257,9 @@ def best_single_joint(
     *,
     thorough: bool = False,
 ) -> tuple[RigModel | None, float]:
-    """The single joint of ``kind`` that explains the ``sights`` at ``angles`` (k,) best, with its median residual
-    [sigmas]; starts are tried until one fits. ``thorough``: unless one does, or two end alike, rotations about axes
-    all around are tried, too.
+    """Single joint of ``kind`` that fits the ``sights`` at ``angles`` (k,) best, with its median residual [sigmas];
+    start values are tried until one fits. ``thorough``: unless one does, or two converge to the same result,
+    rotations about axes in all directions are tried, too.
     """
     camera, stop, marker = np.nonzero(sights.usable)
     data = Measurements(
@@ -303,7 +303,7 @@ class _StartResult:
 
 
 def _is_certain(found: list[_StartResult]) -> bool:
-    """Whether the best result is a minimum that fits, or one that two starts have reached."""
+    """Whether the best result fits, or was reached from two start values."""
     if not found:
         return False
     best = min(found, key=lambda one: one.score)
@@ -319,7 +319,7 @@ def _solve_from(
     data: Measurements,
     evaluations: int,
 ) -> list[_StartResult]:
-    """Result of a start with ``generator`` (4, 4) after at most ``evaluations``; empty where it breaks down."""
+    """Result from start value ``generator`` (4, 4) after at most ``evaluations``; empty where the fit fails."""
     structure = common_points(generator, kind, sights.points, data.offsets[:, 0])
     structure[~sights.usable.any(axis=(0, 1))] = [0.0, 0.0, 1.0, 1.0]
     try:

@@ -59,8 +59,8 @@ def with_static_points(
 def _scene_point(
     model: CellModel, pixels: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray] | str:
-    """A point (4,) of height 1 and its covariance (4, 4), given the cameras, from raw pixels (c, 2), NaN where missing;
-    or why not.
+    """Point (4,) of scale 1 and its covariance (4, 4), given the cameras, from raw pixels (c, 2), NaN where
+    missing; or the reason why there is none.
     """
     seen = np.flatnonzero(np.isfinite(pixels).all(axis=1))
     if len(seen) < 2:
@@ -137,7 +137,7 @@ def _covariance(
     pixels: FloatArray,
     sigmas: FloatArray,
 ) -> FloatArray:
-    """Covariance (2 c, 2 c) of the pixels of a point, with that of the cameras which see it."""
+    """Covariance (2 c, 2 c) of the pixels of a point, with that of the cameras that see it."""
     covariance = np.diag(np.repeat(sigmas[seen] ** 2, 2))
     if model.covariance is None:
         return covariance

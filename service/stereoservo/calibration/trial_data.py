@@ -27,7 +27,7 @@ MAX_OUTSIDE = 0.5
 
 
 class CalibrationError(Exception):
-    """Raised where a calibration gives no model; the text holds the reason, the value and the valid range.
+    """A calibration gives no model; the text holds the reason, the value and the valid range.
 
     Attributes:
         code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
@@ -230,7 +230,7 @@ def _check_sizes(trials: TrialData) -> None:
 
 
 def _check_pixels(trials: TrialData) -> None:
-    """Refuse sigmas that are none, and measured pixels that no detector finds in an image of that size."""
+    """Check that sigmas are positive and that pixels lie within their images. Raises CalibrationError."""
     for c, camera in enumerate(trials.cameras):
         size = max(camera.width, camera.height)
         seen = trials.visible[c]
@@ -296,7 +296,7 @@ def encode_trials(trials: TrialData) -> bytes:
 
 
 def _load_arrays(loads: JointLoads | None) -> dict[str, FloatArray]:
-    """Loads as arrays of their own: a program that does not know them reads the rest."""
+    """Joint loads as arrays of their own, which programs that do not know them ignore."""
     if loads is None:
         return {}
     given = {field: getattr(loads, field) for field in JointLoads.__struct_fields__}
@@ -371,7 +371,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
 
 
 def save_trials(trials: TrialData, path: Path) -> None:
-    """Write trial data, whole or not at all. Raises CalibrationError, OSError."""
+    """Write trial data atomically. Raises CalibrationError, OSError."""
     write_atomically(path, encode_trials(trials))
 
 

@@ -1,4 +1,4 @@
-"""``stereoservo status``: the state of a cell in words."""
+"""``stereoservo status``: prints the state of a cell."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
 
 
 def describe(state: StateMessage) -> str:
-    """A state in some lines of text."""
+    """A state as some lines of text."""
     joints = "  ".join(
         f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items()
     )
@@ -46,7 +46,7 @@ def describe(state: StateMessage) -> str:
 
 
 def progress_words(state: StateMessage) -> str:
-    """Progress of the active goal; empty where it is unknown."""
+    """Progress of the active goal as text; empty where it is unknown."""
     words = []
     if state.progress is not None:
         words.append(f"{100.0 * state.progress:.0f} % of its way")
@@ -58,7 +58,7 @@ def progress_words(state: StateMessage) -> str:
 
 
 def _health(state: StateMessage) -> list[str]:
-    """Agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
+    """Text: agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
     health = state.health
     if health.verdict == "unknown":
         return []
@@ -73,7 +73,7 @@ def _health(state: StateMessage) -> list[str]:
 
 
 def _loads(state: StateMessage) -> str:
-    """Efforts, the following error that is nearest to its limit, and whether a contact would stop the arm."""
+    """Text: efforts, the following error nearest to its limit, and whether a contact would stop the arm."""
     words = [f"{name} {value:+.3g}" for name, value in state.efforts.items()]
     used = {
         name: abs(error) / state.following_limits[name]

@@ -1,4 +1,4 @@
-"""``stereoservo teach``: stores the current view, or a drawing, as a goal."""
+"""``stereoservo teach``: stores the current view, or a goal made from CAD drawings, as a goal."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def teach(
 
 
 def read_drawing(path: Path, name: str) -> Synthesise:
-    """A drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
+    """Parse a drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
     try:
         tree: Any = msgspec.json.decode(read_file(path))
     except msgspec.DecodeError as error:

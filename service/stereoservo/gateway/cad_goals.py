@@ -29,7 +29,7 @@ from stereoservo.messages.wire import Synthesise
 def synthesise(
     wanted: Synthesise, model: CellModel | None, observations: MarkerObservations, created: str
 ) -> tuple[TaughtGoal, str]:
-    """A goal from drawn points and the pose of the tool on the workpiece, and in words how well it is known.
+    """Goal from drawn points and the pose of the tool on the workpiece, and a description of its accuracy.
 
     The markers that the arm does not move are seen now; they place the drawing. Raises TransferError.
     """
@@ -80,7 +80,7 @@ def _drawn_goal(
     standing: list[int],
     created: str,
 ) -> TaughtGoal:
-    """Set-points of drawn markers as if they had been shown, with the markers that placed them."""
+    """Goal with the set-points of drawn markers as if they had been taught, and the markers that located them."""
     of_body = {c: {m: p for m, p in seen.items() if m in model.marker_ids} for c, seen in set_points.items()}
     others = {
         c: {m: p for m, p in seen.items() if m not in model.marker_ids} for c, seen in set_points.items()

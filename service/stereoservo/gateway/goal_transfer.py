@@ -45,7 +45,7 @@ MOUNTED_PX = 5.0
 
 @dataclass(frozen=True)
 class TransferredGoal:
-    """Set-points for the model in use, and in words how they came about and how well they are known."""
+    """Set-points for the model in use, with a description of their origin and accuracy."""
 
     target: FeatureTarget
     note: str
@@ -54,7 +54,7 @@ class TransferredGoal:
 def resolve(
     wanted: TaughtTarget, goal: TaughtGoal, model: CellModel | None, observations: MarkerObservations
 ) -> TransferredGoal:
-    """A taught goal as set-points of the body for the current model and cameras. Raises TransferError."""
+    """Set-points of a taught goal for the current model and cameras. Raises TransferError."""
     if wanted.relative_to is None and not goal.tool:
         return _as_taught(goal, model)
     if model is None:
@@ -93,7 +93,7 @@ def resolve(
 
 
 def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
-    """The recorded pixels; those of cameras relocalized since are reprojected into the current images.
+    """The recorded pixels; those of cameras that were relocalized since are reprojected into the current images.
 
     Re-anchoring keeps the frame, to the bit: the goal's points are still what the cameras of teaching make of it.
     Mobile cameras are found anew within one epoch.
@@ -134,7 +134,7 @@ def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
 
 
 def _same_frame(taught: TaughtModel, model: CellModel) -> bool:
-    """Whether one model comes from the other by re-anchoring: what fixes the frame is the same to the bit."""
+    """Whether one model is a relocalization of the other: the parts that fix the frame are bitwise equal."""
     upgrade = model.projective_to_euclidean
     return (
         taught.stratum == model.stratum
@@ -157,7 +157,7 @@ def _common_change(
     observations: MarkerObservations,
     same: bool,
 ) -> tuple[FrameChange, str]:
-    """The map of the common markers since the goal was taught, and a sentence on its evidence."""
+    """Map of the common markers since the goal was taught, and a sentence on its evidence."""
     common = _common(wanted, goal, model, observations)
     before, now = taught.subset(common), observed_views(observations, model, common)
     require_still(observations, common, "the common markers")
@@ -180,7 +180,7 @@ def _common_change(
 def _common(
     wanted: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations
 ) -> list[int]:
-    """The common markers by id: those asked for, or all that were seen then and are seen now."""
+    """Common markers by id: those requested, or all that were observed then and are observed now."""
     then = {marker for points in goal.others.values() for marker in points} - set(goal.tool)
     now = {marker for points in observations.values() for marker in points} - set(model.marker_ids)
     for marker in wanted.common:
@@ -210,7 +210,7 @@ def _points_when_taught(
     observations: MarkerObservations,
     same: bool,
 ) -> tuple[FloatArray, FloatArray, list[int]]:
-    """Points (n, 4) of the body's markers at the goal in the frame of teaching, covariances, ids.
+    """Points (n, 4) of the body's markers at the goal in the frame of teaching, with covariances and ids.
 
     By themselves, or, where the goal is meant by a tool's features, by where the body sits on that tool now: mounting
     the body anew does not change the goal.
@@ -240,7 +240,7 @@ def _points_when_taught(
 
 
 def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int], moved: FloatArray) -> None:
-    """Check by the arm's kinematics that the body is mounted as it was. Raises TransferError."""
+    """Check by the arm's kinematics that the body is mounted as at teaching. Raises TransferError."""
     if len(goal.joints) != len(model.joint_names):
         return
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
@@ -263,7 +263,8 @@ def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int],
 def _relative_to_cameras(
     wanted: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations, same: bool
 ) -> TransferredGoal:
-    """With cameras on the arm: they shall see the common markers as they were taught, so the standing body goes along.
+    """Set-points with cameras on the arm: the goal is relative to the common markers, which the static body belongs
+    to.
 
     The common markers stand on a workpiece that has moved within the scene (relative to the model's body).
     """

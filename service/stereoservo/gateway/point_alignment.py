@@ -27,11 +27,11 @@ MIN_MARKERS = 3
 
 
 class TransferError(Exception):
-    """A taught goal cannot be transferred, or a drawn one not be placed; the text has cause and values."""
+    """A taught goal cannot be transferred, or a CAD goal not be located; the text has cause and values."""
 
 
 def require_still(observations: MarkerObservations, markers: list[int], what: str) -> None:
-    """Raises TransferError naming those of ``markers`` that move."""
+    """Raise TransferError naming those of ``markers`` that move."""
     moving = sorted(
         {m for points in observations.values() for m in markers if m in points and points[m].moves}
     )
@@ -49,7 +49,7 @@ def align_points(
     common: list[int],
     what: str,
 ) -> tuple[FrameChange, str]:
-    """The map of points (n, 4) onto where markers are seen; refused where they have not moved as one."""
+    """Map of points (n, 4) onto their observed markers; refused where they have not moved rigidly."""
 
     def fit(rows: BoolArray) -> tuple[FrameChange, FloatArray]:
         kept = np.flatnonzero(rows)
@@ -82,7 +82,7 @@ def align_points(
 
 
 def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float) -> str:
-    """Which single marker, left out, makes the others agree; empty where none does, or too few are left."""
+    """The single marker without which the others agree; empty where there is none, or too few are left."""
     best = (limit, -1)
     for k in np.flatnonzero(usable):
         without = usable.copy()
@@ -103,7 +103,8 @@ def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float
 def reproject_set_points(
     model: CellModel, names: list[int], points: FloatArray, spread: FloatArray, what: str
 ) -> tuple[Pixels, Deviations, str]:
-    """Raw set-points of points (n, 4) by camera and marker, their deviations [px], and in words how well known.
+    """Raw set-points of points (n, 4) by camera and marker, their deviations [px], and a description of their
+    accuracy.
 
     A point outside of an image is none there. Raises TransferError behind a camera, and where too few remain.
     """

@@ -1,4 +1,4 @@
-"""Taught goals: stored with their model, made from drawings, and resolved to set-points for the current model."""
+"""Taught goals: stored with their model, made from CAD drawings, and resolved to set-points for the current model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KNOWN_TOOLS = 100
 
 
 class TaughtGoalRegistry:
-    """The cell's taught goals, the model that reads them, and what the cameras see now."""
+    """The cell's taught goals, with access to the current model and observations that resolve them."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class TaughtGoalRegistry:
                 self._tools.popitem(last=False)
 
     def taught(self, event: Event) -> None:
-        """Store what a ``taught`` event carries."""
+        """Store the goal of a ``taught`` event."""
         model = self._model()
         tool = self._tools.pop(event.request, ())
         if model is None:
@@ -72,7 +72,7 @@ class TaughtGoalRegistry:
         self._keep(event.name, taught_goal(event, model, _now(), tool))
 
     def synthesise(self, wanted: Synthesise) -> str:
-        """Store a goal made from drawings; gives in words how well it is known. Raises TransferError."""
+        """Store a goal made from CAD drawings; returns a description of its accuracy. Raises TransferError."""
         goal, note = synthesise(wanted, self._model(), self._seen(), _now())
         if not self._keep(wanted.name, goal):
             raise TransferError(f"goal {wanted.name!r} could not be saved; see the events")
@@ -81,7 +81,7 @@ class TaughtGoalRegistry:
         return message
 
     def resolve(self, target: TaughtTarget) -> TransferredGoal:
-        """A taught goal as set-points. Raises KeyError, TransferError."""
+        """Set-points of a taught goal. Raises KeyError, TransferError."""
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
 
     def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
@@ -113,7 +113,7 @@ class TaughtGoalRegistry:
 
 
 def _standing(feature: Feature, observations: MarkerObservations) -> Feature:
-    """A feature spanned by markers beside the body, by where two or more cameras see them now."""
+    """Feature spanned by markers that are not on the body, by their current observations in two or more cameras."""
     pixels = {
         camera: tuple(seen[marker].pixel for marker in feature.markers)
         for camera, seen in observations.items()

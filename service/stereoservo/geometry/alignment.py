@@ -1,4 +1,4 @@
-"""What brings known points onto the same points where cameras see them now, within the group that the frames allow.
+"""Alignment of known points with their current images, over the group of maps that the two frames allow.
 
 `moved_cameras.frame_change` for every stratum: a workpiece that has moved, cameras that were exchanged, points of a
 drawing (thesis 8.6: targets "can be reprojected onto images actually taken, even if the cameras have changed"). With
@@ -45,7 +45,7 @@ STRAIGHT = 1e-6
 
 @dataclass(frozen=True)
 class AlignmentFrame:
-    """A projective frame: its cameras (c, 3, 4), and what brings it to an affine and a Euclidean one, where known."""
+    """A projective frame: its cameras (c, 3, 4), and its maps to an affine and a Euclidean frame, where known."""
 
     Ps: FloatArray
     to_affine: FloatArray | None = None
@@ -64,7 +64,7 @@ def family_between(old: AlignmentFrame, new: AlignmentFrame, same_scale: bool) -
 
 
 def _algebra(family: Family) -> FloatArray:
-    """A basis (k, 4, 4) of the group's generators, with trace 0, so that determinants stay."""
+    """Basis (k, 4, 4) of the group's Lie algebra, with trace 0, so that determinants are preserved."""
     units = np.eye(16).reshape(16, 4, 4)
     moves = [units[3], units[7], units[11]]
     turns = [units[4 * i + j] - units[4 * j + i] for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -80,7 +80,7 @@ def _algebra(family: Family) -> FloatArray:
 
 
 def _upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[FloatArray, FloatArray]:
-    """What brings either frame to where the group's generators are those of `_algebra`."""
+    """Maps from either frame to the one in which `_algebra` holds."""
     pairs = {"rigid": "to_euclidean", "similar": "to_euclidean", "affine": "to_affine"}
     if family == "projective":
         return np.eye(4), np.eye(4)
@@ -138,7 +138,7 @@ def align(
     M_covariance: FloatArray | None = None,
     names: Sequence[int] | None = None,
 ) -> FrameChange:
-    """The map of a family from points ``(n, 4)`` of the old frame onto where the new cameras see them.
+    """Map of the family that moves points ``(n, 4)`` of the old frame onto their images in the new cameras.
 
     Of least reprojection error over ``pixels_new`` (c, n, 2) [px], NaN where missing, ``sigmas`` (c, n) or a number
     [px]; ``M_covariance`` (n, 4, 4) as for `homography_refine`. ``names`` (n,): what to call the points. With the sign
@@ -192,7 +192,7 @@ class _Views:
     covariance: FloatArray | None
 
     def whitening(self, T: FloatArray) -> FloatArray:
-        """``(n, 2c, 2c)`` at the map ``T`` (4, 4): the points' own covariance goes along with it."""
+        """Whitening ``(n, 2c, 2c)`` at the map ``T`` (4, 4), which also moves the points' own covariance."""
         return pixel_whitening(self.Ps, T, self.M, self.weights, self.covariance)
 
     def residuals(self, T: FloatArray, whitening: FloatArray) -> FloatArray:
@@ -203,7 +203,7 @@ class _Views:
         return whitened
 
     def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
-        """Derivatives (r, k) of the residuals by ``exp(Σ x Ĝ) T`` at x = 0."""
+        """Derivatives (r, k) of the residuals by x in ``exp(Σ x Ĝ) T`` at x = 0."""
         moved = self.M @ T.T
         by_point = projection_jacobian_many(self.Ps, moved)
         by_map = np.einsum("cnij,knj->ncik", by_point, moved @ generators.transpose(0, 2, 1))
@@ -254,7 +254,7 @@ def _similarity(x: FloatArray, y: FloatArray, family: Family) -> FloatArray:
 
 
 def _local(family: Family, X: FloatArray) -> FloatArray:
-    """Coordinates about the points ``(n, 4)`` of an upgraded frame."""
+    """Coordinates of the points ``(n, 4)`` of an upgraded frame relative to their centroid."""
     if family == "projective":
         return whitener(X)
     x = X[:, :3] / X[:, 3:]
@@ -301,7 +301,7 @@ def reprojected(Ps: FloatArray, M: FloatArray, covariance: FloatArray) -> tuple[
 
 
 def drawn_points(coordinates: FloatArray, placed: FloatArray | None = None) -> FloatArray:
-    """Homogeneous points ``(n, 4)`` of drawn ones ``(n, 3)``, after the rigid motion ``placed`` (4, 4), if given.
+    """Homogeneous points ``(n, 4)`` of CAD points ``(n, 3)``, after the rigid motion ``placed`` (4, 4), if given.
 
     Raises GeometryError where that is none: a mirror image, a change of size.
     """

@@ -1,4 +1,4 @@
-"""Radial lens distortion with one parameter and its own centre: between ideal pinhole pixels and raw pixels.
+"""Radial lens distortion with one parameter and its own centre: ideal (pinhole) pixels to raw pixels and back.
 
 A ``lens`` is ``(k, cu, cv, r0)``: the raw pixel of an ideal one ``p`` is ``c + (p - c)(1 + k |p - c|² / r0²)``
 with the centre ``c = (cu, cv)`` [px] and the reference radius ``r0`` [px], half the image width. With square
@@ -180,7 +180,7 @@ def _projected(
     lens: FloatArray, pixels: FloatArray, starts: npt.NDArray[np.int64], sigma: float
 ) -> tuple[FloatArray, FloatArray]:
     """Distances (n,) of raw pixels from the images of their best lines [sigmas], and their derivatives (n, 3) by
-    (k, cu, cv) with the lines free to follow.
+    (k, cu, cv) with the lines eliminated.
     """
     ideal = undistort(lens, pixels)
     if not np.isfinite(ideal).all():

@@ -58,7 +58,7 @@ def unit_determinant(H: FloatArray, what: str) -> FloatArray:
 def pixel_whitening(
     Ps: FloatArray, H: FloatArray, M: FloatArray, weights: FloatArray, M_covariance: FloatArray | None
 ) -> FloatArray:
-    """``(n, 2c, 2c)``: pixel differences of each point into uncorrelated ones of unit size, 0 where not seen.
+    """Whitening ``(n, 2c, 2c)`` of the pixel differences of each point, 0 where not seen.
 
     ``weights`` (c, n) [1/px]. The points' own covariance, if given, is carried into the images to first order.
     """

@@ -29,7 +29,7 @@ REGULAR = 5.0
 
 @dataclass(frozen=True)
 class Incidence:
-    """A constraint on a homography: what ``first`` spans shall, once moved, lie in what ``second`` spans (2.77).
+    """A constraint on a homography: the span of ``first``, once moved, lies in the span of ``second`` (2.77).
 
     ``first`` (K, 4) points in the first frame, ``second`` (K', 4) points in the second one: 1 a point, 2 a line,
     3 a plane; K = K' makes them coincide. The reverse, K > K', is not linear in H: give it to the inverse map.
@@ -210,7 +210,7 @@ def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray,
 
 @dataclass(frozen=True)
 class _PixelTargets:
-    """Flat lists of what moved points are compared to: index of the point, of the camera, and the target."""
+    """Targets of moved points, as flat lists: index of the point, index of the camera, pixel."""
 
     pixel_at: tuple[list[int], list[int]]
     pixels: FloatArray

@@ -99,7 +99,8 @@ class FrameChange:
 def carried_point_covariance(
     change: FrameChange, M: FloatArray, M_covariance: FloatArray | None = None
 ) -> FloatArray:
-    """First-order covariance ``(m, 4, 4)`` of carried points ``H M`` from that of H and, if given, of the points.
+    """First-order covariance ``(m, 4, 4)`` of transformed points ``H M`` from that of H and, if given, of the
+    points.
 
     Both taken as independent: for points that are not among those that gave H.
     """
@@ -124,7 +125,7 @@ class ResectedCamera:
 
 
 def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -> ResectedCamera:
-    """One moved camera in the frame of scene points ``(n, 4)`` that stood still, n >= 6, from ``pixels`` (n, 2) [px].
+    """One moved camera in the frame of static scene points ``(n, 4)``, n >= 6, from ``pixels`` (n, 2) [px].
 
     Of least reprojection error (`resection`); NaN pixels are left out, ``sigma`` [px] is their noise. Raises
     GeometryError for fewer than six points and where they, or noise, leave the camera undetermined (coplanar points).

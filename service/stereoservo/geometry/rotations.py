@@ -90,7 +90,7 @@ def rotation_frame(G: FloatArray) -> RotationFrame:
 
 @dataclass(frozen=True, eq=False)
 class RotationChart:
-    """Where the ten parameters of (4.43) stand: ``order`` (4,) is the permutation Y of the coordinates.
+    """Layout of the ten parameters of (4.43): ``order`` (4,) is the permutation Y of the coordinates.
 
     Coordinates so ordered, ``h'₁₁ = 1`` and ``h'₂₁ = 0`` are fixed and ``h'₂₂`` is the second pivot. The
     charts of a calibration's bundle span the same ten freedoms as directions of conjugation, which reach

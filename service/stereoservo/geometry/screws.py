@@ -59,7 +59,7 @@ def exp_twist(X: FloatArray) -> FloatArray:
 
 
 def _sine_excess(theta: FloatArray) -> FloatArray:
-    """``(θ - sinθ)/θ³``, to rounding at 0."""
+    """Coefficient ``(θ - sinθ)/θ³``, accurate at 0."""
     s = theta**2
     series = (1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156))))) / 6
     large = np.where(s > 0.25, theta, 1.0)

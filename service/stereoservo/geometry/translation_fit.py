@@ -47,7 +47,7 @@ class TranslationFit:
     evaluations: int
 
     def agrees(self, tail: float = 1e-3) -> bool:
-        """Whether the cost is one that the stated noise exceeds with a probability above ``tail``."""
+        """Whether the stated noise exceeds the cost with a probability above ``tail``."""
         return bool(self.cost <= chi2_distribution.isf(tail, max(1, self.freedom)))
 
 
@@ -226,7 +226,7 @@ def _only(images: Images, known: BoolArray) -> Images:
 def _answer(
     best: Minimum, chart: SharedPlane, covariance: FloatArray, W: FloatArray, points: FloatArray, freedom: int
 ) -> TranslationFit:
-    """The fit in the caller's frame: ``h = Wᵀ h_w`` of unit norm, the points on its positive side."""
+    """The fit transformed to the caller's frame: ``h = Wᵀ h_w`` of unit norm, the points on its positive side."""
     h_white, k_white = chart.vectors(best.x)
     h = W.T @ h_white
     size = float(np.linalg.norm(h)) * (1.0 if np.nansum(np.sign(points @ h)) >= 0 else -1.0)
@@ -255,7 +255,7 @@ def plane_basis(M: FloatArray) -> FloatArray:
 
 
 def planar_map(Ps: FloatArray, m: FloatArray, depth: FloatArray, pixels: FloatArray) -> FloatArray:
-    """``D`` (4, 3) with ``P_c D m`` at the pixels, up to scale, of plane coordinates m (n, 3), linear.
+    """Map ``D`` (4, 3), linear, such that ``P_c D m`` are, up to scale, the pixels of plane coordinates m (n, 3).
 
     ``depth`` (c, n) before the motion divides the equations; pixels (c, n, 2) [px], NaN where missing. Raises
     GeometryError for fewer than 11 equations or points that leave D undetermined (collinear).
@@ -308,7 +308,7 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
 def _last_freedom(
     within: FloatArray, normal: FloatArray, k: FloatArray, left: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """``h = within + η normal`` with ``hᵀk`` least over the motions; the k then put onto the plane."""
+    """Plane ``h = within + η normal`` with least ``hᵀk`` over the motions; the k then projected onto the plane."""
     across = k @ normal
     if not np.linalg.norm(across) > ACROSS * np.linalg.norm(k):
         raise GeometryError(

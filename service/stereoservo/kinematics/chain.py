@@ -1,5 +1,5 @@
-"""The arm as the cameras see it: a product of exponentials of projective generators (thesis 5). Readable
-reference.
+"""Forward kinematics and Jacobians in the cameras' projective frame: a product of exponentials (thesis 5).
+Reference in numpy.
 
 The loop itself runs on :mod:`stereoservo.kinematics.kernels`, which are tested against this module.
 """
@@ -72,7 +72,7 @@ class ProjectiveChain:
 
     @property
     def kind_codes(self) -> npt.NDArray[np.uint8]:
-        """``(n,)`` as the kernels take them: 0 revolute, 1 prismatic."""
+        """Joint kinds (n,) as codes for the kernels: 0 revolute, 1 prismatic."""
         return np.array([KIND_CODES[kind] for kind in self.kinds], dtype=np.uint8)
 
     @property
@@ -97,9 +97,7 @@ class ProjectiveChain:
         return np.array(self.partial_displacements(q)[-1])
 
     def operators_at(self, q: FloatArray) -> FloatArray:
-        """``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4): the joints' generators where the arm is now
-        (5.21).
-        """
+        """Generators at the present configuration, ``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4) (5.21)."""
         order = list(self.order)
         partial = self.partial_displacements(q)[:-1]
         operators = np.empty_like(self.generators)

@@ -1,4 +1,4 @@
-"""How joints compose: what a small motion of all joints does to points and to the operators themselves.
+"""Composition of joint displacements: the effect of a small motion of all joints on points and on the operators.
 
 An arm re-zeroed where it stands (Theorem 10) needs no more than its operators there: ``H(q+Δq) H(q)⁻¹`` is their
 product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the loop runs the
@@ -29,7 +29,7 @@ class Composition(IntEnum):
 
 
 def displacement(operators: FloatArray, composition: Composition, step: FloatArray) -> FloatArray:
-    """What a motion of the joints by ``step`` (n,) does to points: (4, 4). ``operators`` (n, 4, 4) before it."""
+    """Displacement (4, 4) of points by a motion ``step`` (n,) of the joints; ``operators`` (n, 4, 4) before it."""
     if composition == Composition.SIMULTANEOUS:
         return exp_twist_reference(np.tensordot(step, operators, axes=1))
     H = np.eye(4)
@@ -56,7 +56,7 @@ def _order(composition: Composition, n: int) -> range:
 
 @kernel
 def _follow_joint(H: FloatArray, operator: FloatArray, step: float, product: FloatArray) -> None:
-    """``H exp(step Ĥ)`` in place of ``H`` (4, 4); ``product`` (4, 4): scratch."""
+    """Multiply ``H`` (4, 4) in place: ``H exp(step Ĥ)``; ``product`` (4, 4) is scratch."""
     multiply4_into(H, exp_twist(step * operator), product)
     for i in range(4):
         for k in range(4):
@@ -98,8 +98,9 @@ def move_operators(operators: FloatArray, composition: int, step: FloatArray) ->
 
 
 def displacement_basis(projective_to_euclidean: FloatArray, points: FloatArray) -> FloatArray:
-    """Twists (6, 4, 4): translations along three axes, then rotations about them through the middle of ``points``
-    (m, 4). A unit of translation is the largest distance of a point from the middle, so that all six are of one size.
+    """Twists (6, 4, 4): translations along three axes, then rotations about them through the centroid of ``points``
+    (m, 4). A unit of translation is the largest distance of a point from the centroid, so that all six are of
+    similar size.
     """
     H = np.asarray(projective_to_euclidean, dtype=np.float64)
     euclidean = points @ H.T

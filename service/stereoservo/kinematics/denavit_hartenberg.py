@@ -1,4 +1,4 @@
-"""Denavit-Hartenberg rows of a metric model, with one known length for the scale (5.1, 5.2; thesis 5.5.2).
+"""Denavit-Hartenberg parameters of a metric model, scaled by one known length (5.1, 5.2; thesis 5.5.2).
 
 Row j, base first, is what joint j does and the link behind it: ``Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β)``, with ``θ = q +
 theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j stands before joint j: its r_j,
@@ -54,7 +54,7 @@ COLUMNS = ("a", "alpha", "beta", "d", "theta")
 
 
 class ReadOutError(ValueError):
-    """A model does not hold what was asked of it.
+    """The model does not contain the requested quantity.
 
     Attributes:
         code: ``stratum``, ``unknown_name``, ``length``.
@@ -68,7 +68,8 @@ class ReadOutError(ValueError):
 
 
 class KnownLength(msgspec.Struct, frozen=True):
-    """The one length that a metric model lacks: ``metres`` of a thing named by ``what`` and ``of``.
+    """The known length that fixes the scale of a metric model: ``metres`` of a quantity named by ``what`` and
+    ``of``.
 
     ``a`` or ``d`` of a joint's row, ``prismatic`` (one unit of that joint), ``markers`` (two ids), ``baseline``
     (two cameras' names).
@@ -80,7 +81,8 @@ class KnownLength(msgspec.Struct, frozen=True):
 
 
 class DhRow(msgspec.Struct, frozen=True):
-    """One row: ``a``, ``d`` [m], ``alpha``, ``beta``, ``theta`` [rad], each with its standard deviation.
+    """Denavit-Hartenberg parameters of one link: ``a``, ``d`` [m], ``alpha``, ``beta``, ``theta`` [rad], each with
+    its standard deviation.
 
     ``theta`` (revolute) and ``d`` (prismatic) are the offsets at joint position 0; ``scale``: metres for one unit
     of a prismatic joint. A standard deviation is None where the model carries no covariance, 0 for entries in
@@ -106,7 +108,7 @@ class DhRow(msgspec.Struct, frozen=True):
 
 
 def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...]:
-    """Rows of a metric ``model``, base first, in metres by the ``known`` length.
+    """Denavit-Hartenberg rows of a metric ``model``, base first, scaled by the ``known`` length.
 
     Raises ReadOutError: ``stratum`` (not metric), ``unknown_name``, ``length`` (not positive, or the model's is zero).
     """
@@ -138,7 +140,7 @@ def _row(
     spread: FloatArray | None,
     chosen: tuple[str, ...],
 ) -> DhRow:
-    """A row of its six values and their standard deviations, where there are any."""
+    """A row from its six values and their standard deviations, if any."""
     slides = kind == "prismatic"
     told = {column: float(value) for column, value in zip(COLUMNS, values, strict=False)}
 
@@ -164,7 +166,7 @@ def _row(
 
 
 def chosen_columns(axes: Axes, links: tuple[Convention, ...]) -> tuple[tuple[str, ...], ...]:
-    """For each row the columns that a convention sets."""
+    """Columns of each row that are set by a convention and not measured."""
     first, leaves = base_leaves(axes)
     by_link: dict[LinkKind, set[str]] = {
         "skew": {"beta"},
@@ -203,7 +205,7 @@ def dh_values(
 
 
 def _length(parts: FramedModel, axes: Axes, table: FloatArray, known: KnownLength, names: CellModel) -> float:
-    """The known length in the lengths of the frame."""
+    """The known length in the units of the frame."""
     if known.what == "markers":
         i, k = (names.marker_ids.index(int(marker)) for marker in known.of)
         return float(np.linalg.norm(parts.points[i, :3] - parts.points[k, :3]))
@@ -257,14 +259,14 @@ def _check_known(model: CellModel, known: KnownLength) -> None:
 
 @dataclass(frozen=True)
 class Convention:
-    """How one link is told: its kind, and the sense of x beside ``z_j x z_j+1`` where axes cross."""
+    """Convention of one link: its kind, and the sense of x relative to ``z_j x z_j+1`` where axes intersect."""
 
     link: LinkKind
     sense: float = 1.0
 
 
 def conventions(parts: FramedModel) -> tuple[Convention, ...]:
-    """How each link of a mechanism is told, by the module's conventions."""
+    """Convention of each link of a mechanism, by the rules of this module."""
     axes = axes_at_origin(parts)
     plain = tuple(Convention(_link_kind(axes, j)) for j in range(len(axes.kinds)))
     table = dh_table(axes, plain)
@@ -326,7 +328,7 @@ def dh_table(axes: Axes, links: tuple[Convention, ...]) -> FloatArray:
 def _link(
     axes: Axes, j: int, convention: Convention, start: FloatArray, before: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where link j leaves its axis (3,), its x (3,), and ``a, α, β`` (3,).
+    """Foot point (3,) of link j on its axis, its x (3,), and ``a, α, β`` (3,).
 
     ``start``, ``before`` (3,): the end of the row before and its x.
     """
@@ -361,14 +363,14 @@ def _two_angles(z: FloatArray, x: FloatArray, z_next: FloatArray) -> tuple[float
 
 
 def _square_to(z: FloatArray, x: FloatArray | None) -> FloatArray:
-    """``x`` made square to ``z``, or anything square to it where there is none."""
+    """Projection of ``x`` normal to ``z``, or any normal where there is none."""
     if x is None or np.linalg.norm(np.cross(z, x)) < 1e-3:
         x = np.eye(3)[int(np.argmin(np.abs(z)))]
     return unit(x - z * (x @ z))
 
 
 def base_leaves(axes: Axes) -> tuple[int, int]:
-    """The first revolute joint, and the last one of those parallel to it before an axis of another direction.
+    """Indices of the first revolute joint, and of the last one parallel to it before an axis of another direction.
 
     Both are the number of joints where there is no such joint.
     """
@@ -383,7 +385,7 @@ def base_leaves(axes: Axes) -> tuple[int, int]:
 
 
 def _base_origin(axes: Axes) -> FloatArray:
-    """The base's origin (3,), free by nature: chosen so that no row tells a length that is only its choice.
+    """Origin (3,) of the base, a free choice: such that no row contains an arbitrary length.
 
     On the first revolute axis, at the height at which the first axis of another direction leaves those parallel to it.
     """

@@ -93,7 +93,7 @@ def exponentials(generators: FloatArray, kinds: tuple[Kind, ...], q: FloatArray)
 def camera_basis(
     matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum
 ) -> FloatArray:
-    """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) that are no gauge.
+    """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) without gauge freedoms.
 
     ``other``: all but the matrix's own scale (11). ``right``: in addition without what a change of frame that
     keeps the left camera does: 4 freedoms in the projective (7 left), 1 in the affine and metric strata (10

@@ -1,4 +1,4 @@
-"""The struct `Reason`: why the arm is slow, held or faulted, as code, value, threshold, unit and a hint in words."""
+"""The struct `Reason`: why the arm is slow, held or in fault, as code, value, threshold, unit and a hint as text."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ INNER = (5, 6)
 
 @dataclass(frozen=True, eq=False)
 class DotFace:
-    """One planar face.
+    """One planar face with seven dots.
 
     ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen
     from in front. Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids`` name the

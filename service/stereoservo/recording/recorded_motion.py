@@ -32,7 +32,8 @@ class RestInterval:
 @dataclass(frozen=True)
 class RecordedMotion:
     """Steps (s,) of a recording: ``now_ns``, ``step`` number, ``asked``, whether the core commanded zero velocity;
-    joint samples (k,), (k, n) of their own times; ``calibration_ns``: when the last calibration was asked for, or -1.
+    joint samples (k,), (k, n) at their own times; ``calibration_ns``: time of the last request to calibrate, or
+    -1.
     """
 
     settings: CoreSettings
@@ -44,7 +45,7 @@ class RecordedMotion:
     calibration_ns: int
 
     def joints_at(self, t_ns: int) -> FloatArray | None:
-        """Joints (n,) at ``t_ns``, between two samples; None outside of the recording."""
+        """Joints (n,) at ``t_ns``, interpolated between two samples; None outside of the recording."""
         after = int(np.searchsorted(self.joint_ns, t_ns))
         if after == 0 or after == len(self.joint_ns):
             return None
@@ -103,7 +104,7 @@ def _calibrates(record: StepRecord) -> bool:
 
 
 def rest_intervals(flight: RecordedMotion, settle_s: float) -> list[RestInterval]:
-    """The intervals at rest in order; from the last calibration's start on, where there was one.
+    """Intervals at rest in order; only those after the last calibration's start, where there was one.
 
     An interval begins where zero velocity is commanded and needs ``settle_s`` to settle, as in the calibration motion.
     It ends where a joint moves all the same (by hand, for example); the remainder needs ``settle_s`` again.

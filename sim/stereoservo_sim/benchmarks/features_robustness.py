@@ -1,4 +1,4 @@
-"""How often the dot detector finds its faces, and how well, under what light, lens, sensor and clutter do."""
+"""Robustness of the dot detector: detection rate and accuracy under light, lens, sensor and clutter effects."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ TRACKED_DOTS = 4
 
 @dataclass
 class _Tally:
-    """What was found in the pictures of one row, by one way of looking."""
+    """Counts of one row's images, for one mode of detection."""
 
     faces: int = 0
     dots: int = 0

@@ -1,4 +1,4 @@
-"""``stereoservo emulate WHAT CELL``: stand-ins for a cell's hardware."""
+"""``stereoservo emulate WHAT CELL``: runs emulated drives or cameras in place of a cell's hardware."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _drives(settings: _Settings, termination: Termination) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path, key: str) -> Iterator[None]:
-    """What is wrong with a cell's options, with the file and the section that they stand in."""
+    """Error of a cell's options, with its file and section."""
     from stereoservo.ports.devices import DriverError
     from stereoservo_sim.emulators.fault_engine import EmulationError
 

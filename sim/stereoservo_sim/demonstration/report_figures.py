@@ -1,4 +1,4 @@
-"""Figures of a session report, drawn by matplotlib's Agg, without a display."""
+"""Figures of a session report, by matplotlib without a display."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ def _image_axis(axis: Any, name: str, size: IntArray) -> None:
 
 
 def _along_and_across(path: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Way along the line and distance from it, (p,) each [m]; along is 0 for a line of no length."""
+    """Distance along the line and from it, (p,) each [m]; along is 0 for a line of no length."""
     direction = line[1] - line[0]
     length = float(np.linalg.norm(direction))
     offset = path - line[0]

@@ -1,4 +1,4 @@
-"""The judge: Euclidean truth on noise-free projections, out of the controller's sight."""
+"""Evaluation of tasks: Euclidean ground truth on noise-free projections."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EYES = camera_poses()[:, :3, 3].copy()
 
 
 class PlateView(NamedTuple):
-    """What the cameras truly see of the plate: ``pixels`` (c, m, 2), and the worst over markers and cameras used.
+    """True images of the plate: ``pixels`` (c, m, 2), and the worst measures over markers and cameras used.
 
     ``margin_px``: to the nearest border, negative out of view; ``depth_m``; ``facing``: cosine of the angle at which a
     camera sees the plate's normal, negative where it sees the back.
@@ -43,12 +43,12 @@ class PlateView(NamedTuple):
 
 
 def sight(pose: FloatArray, cameras: int = len(MATRICES)) -> PlateView:
-    """The plate at ``pose`` (4, 4), in all images; judged in those of the first ``cameras``."""
+    """View of the plate at ``pose`` (4, 4) in all images; measures of those of the first ``cameras``."""
     return PlateView(*_sight(MATRICES, EYES, HOMOGENEOUS_MARKERS, pose, cameras))
 
 
 def in_images(pixels: FloatArray) -> npt.NDArray[np.bool_]:
-    """(c, m): which of the pixels (c, m, 2) are in their image."""
+    """Mask (c, m) of the pixels (c, m, 2) inside their image."""
     inside = (pixels >= 0.0) & (pixels < np.array([WIDTH, HEIGHT]))
     return np.asarray(inside.all(axis=-1))
 
@@ -94,7 +94,7 @@ def error_px(pixels: FloatArray, set_points: FloatArray, cameras: int) -> float:
 
 
 def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> FloatArray:
-    """Distances (k,) [m] of the plate's middle in ``poses`` (k, 4, 4) from the line between ``start``'s and ``goal``'s.
+    """Distances (k,) [m] of the plate's centre in ``poses`` (k, 4, 4) from the line from ``start`` to ``goal``.
 
     From the segment: what is overshot counts.
     """
@@ -107,7 +107,7 @@ def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> F
 
 
 def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, cameras: int) -> float:
-    """Mean of the largest error over markers that image noise leaves to a loop at rest [px].
+    """Expected largest error over markers [px] of a loop at rest by image noise.
 
     The pose of least squares of each frame alone has the covariance ``σ²(JᵀJ)⁻¹``; a loop in which an error decays by
     ``exp(-gain·dt)`` a step lets ``λ/(2 - λ)``, ``λ = 1 - exp(-gain·dt)``, of it through. The mean over its directions

@@ -1,4 +1,4 @@
-"""Hard alignment tasks: to 180° and 0.6 m, near the borders of the images, so that the straight way leaves the view.
+"""Hard alignment tasks: up to 180° and 0.6 m, near the image borders, such that the straight path leaves the view.
 
 ``python -m stereoservo_sim.tasks.hard_tasks`` writes `tasks_hard.csv` beside this module; the same seed, the same file.
 Both end poses are visible in both cameras. Tasks are drawn until their straight way is of the kind whose turn it is
@@ -99,7 +99,7 @@ def _angle(rng: np.random.Generator, number: int, kind: str) -> float:
 
 
 def straight_way(start: FloatArray, goal: FloatArray) -> tuple[float, float]:
-    """Least distance from the borders [px] and least cosine to the plate's normal on the straight way.
+    """Least distance from the image borders [px] and least cosine to the plate's normal on the straight path.
 
     The middle goes on its line while the plate turns about one axis, the shorter way round.
     """
@@ -125,7 +125,7 @@ def _pose(rng: np.random.Generator) -> FloatArray:
 
 
 def _visible(pose: FloatArray) -> bool:
-    """Whether both cameras see the plate's front, no nearer to a border than allowed."""
+    """Whether both cameras see the plate's front, at the required distance from the borders."""
     seen: PlateView = sight(pose)
     return (
         seen.in_view

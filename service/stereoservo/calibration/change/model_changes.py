@@ -67,7 +67,9 @@ class LinearisedProblem:
         return residuals(rig, replace(self.data, offsets=self.data.offsets + drift))
 
     def whitened(self, rows: FloatArray) -> FloatArray:
-        """``W rows`` with ``W = (I + A Aᵀ)⁻¹``, ``A`` the model's own uncertainty; ``rows`` (2 k,) or (2 k, q)."""
+        """Rows whitened by the model's own uncertainty A: ``W rows`` with ``W = (I + A Aᵀ)⁻¹``; ``rows`` (2 k,) or
+        (2 k, q).
+        """
         found: FloatArray = rows - self.uncertainty @ (self.uncertainty.T @ rows)
         return found
 
@@ -78,7 +80,7 @@ class LinearisedProblem:
 
 
 def _bound(A: FloatArray) -> FloatArray:
-    """``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``."""
+    """Matrix ``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``: an uncertainty ``A`` of any size as one of norm below 1."""
     if not A.shape[1]:
         return A
     triangle = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
@@ -157,7 +159,7 @@ def with_corrected_zeros(
 def _stated_uncertainty(
     model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
 ) -> FloatArray:
-    """Root (2 k, p) of what the model's covariance does to the pixels of ``data`` [sigmas²]."""
+    """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` by the model's stated covariance."""
     slopes, columns = covariance_jacobian(model, stated, data, order)
     values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
     root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -188,7 +190,7 @@ def covariance_jacobian(
 def _curvature_uncertainty(
     model: CellModel, rig: RigModel, past: Measurements, data: Measurements
 ) -> FloatArray:
-    """The same from the curvature of the calibration's own least squares at the model."""
+    """Like `_stated_uncertainty`, from the curvature of the calibration's own least squares at the model."""
     bent = bool((rig.lenses[:, 0] != 0.0).any())
     charts = full_charts(rig, model.stratum, lenses="radial_centre" if bent else "none")
     triangle = triangle_of(rig, charts, past)[:-1, :-1]
@@ -205,7 +207,7 @@ def _curvature_uncertainty(
 
 
 def possible_changes(model: CellModel, problem: LinearisedProblem) -> list[ModelChange]:
-    """All changes that are tested: rigid motions in a Euclidean frame, free camera matrices without one."""
+    """All changes to test: rigid motions in a Euclidean frame, free camera matrices without one."""
     rig = problem.rig
     metric = model.stratum == "metric"
     found: list[ModelChange] = []
@@ -306,12 +308,12 @@ class ChangeEstimate:
 
 
 def start_state(problem: LinearisedProblem) -> State:
-    """The unchanged model."""
+    """The state of the unchanged model."""
     return problem.rig, np.zeros(len(problem.order))
 
 
 def changed_state(problem: LinearisedProblem, found: tuple[ModelChange, ...], x: FloatArray) -> State:
-    """The model with changes ``found`` at parameters ``x`` (q,)."""
+    """The state of a model with changes ``found`` at parameters ``x`` (q,)."""
     state, at = start_state(problem), 0
     for cause in found:
         state = cause.apply(state, x[at : at + cause.size])

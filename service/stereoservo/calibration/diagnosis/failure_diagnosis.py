@@ -1,5 +1,4 @@
-"""Diagnosis of a failed calibration: the cause where it can be identified, instead of the stage at which the fit
-failed.
+"""Diagnosis of a failed calibration: names the cause where it can be identified, not the stage that failed.
 
 Each cause is a correction of the trials: with the views of some stops exchanged back, two ids exchanged, an angle
 divided by a factor, the fit must succeed, or the cause is not reported.
@@ -70,7 +69,7 @@ LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 def diagnose_failure(
     trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
 ) -> CalibrationError:
-    """The error that names the cause of ``error``, or ``error`` with what is possible.
+    """Error that names the cause of ``error``; else ``error`` itself with a list of possible causes.
 
     ``refit`` fits trial data again. Tries hypotheses until one makes the data fit; costs some fits.
     """
@@ -95,7 +94,7 @@ def diagnose_failure(
 def _named(
     trials: TrialData, refit: Refit, options: FitOptions, left: TrialData | None = None
 ) -> CalibrationError | None:
-    """The error of the first cause that holds, cheap ones first. ``left``: what a model leaves of the trials."""
+    """Error of the first cause that holds, cheap tests first. ``left``: the model's residuals of the trials."""
     for hypothesis in exchange_hypotheses(trials):
         if fit_of_correction(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
@@ -128,7 +127,7 @@ def _named(
 
 
 def _stepped(trials: TrialData) -> CalibrationError | None:
-    """The error of a step in the markers' paths, if there is one."""
+    """Error of a step in the markers' tracks; None where there is none."""
     step = find_step(trials)
     if step is None:
         return None
@@ -142,7 +141,7 @@ def _stepped(trials: TrialData) -> CalibrationError | None:
 def _explained(
     trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
 ) -> CalibrationError:
-    """The error with what the outliers of a lenient fit have in common, or with what is possible."""
+    """Error with what the outliers of a lenient fit have in common, or with a list of possible causes."""
     lenient = replace(options, max_outliers=LENIENT_OUTLIERS, max_trial_outliers=LENIENT_TRIAL_OUTLIERS)
     try:
         result = refit(trials, lenient)
@@ -176,7 +175,9 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
 
 
 def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationError:
-    """The error of a joint whose stops are lost because cameras contradict each other, not because they see nothing."""
+    """Error of a joint whose stops are lost because the cameras contradict each other, not because they see
+    nothing.
+    """
     own = trials.trials == trials.joint_names.index(error.data["joint"])
     seen = int(((trials.visible[:, own].sum(axis=0) >= 2).sum(axis=1) >= MIN_SHOWN).sum())
     if seen < error.data["minimum"]:
@@ -193,7 +194,7 @@ def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationErr
 def review_notes(
     trials: TrialData, result: CalibrationFit, refit: Refit, options: FitOptions
 ) -> tuple[str, ...]:
-    """What is to be said of a fit that succeeded: its outliers' causes, scales of prismatic joints that disagree.
+    """Notes on a fit that succeeded: causes of its outliers, prismatic joints whose scales disagree.
 
     Raises CalibrationError where the model is of a cell that is no more (a camera or marker moved), where two ids are
     exchanged throughout, or where revolute joints report wrong scales.
@@ -233,7 +234,9 @@ def review_notes(
 
 
 def untested(trials: TrialData) -> tuple[str, ...]:
-    """What the trials do not determine: the order of joints that only ever move alone, from one configuration."""
+    """Notes on what the trials do not determine: the order of joints that only ever move alone, from one
+    configuration.
+    """
     n = len(trials.joint_names)
     free = bool((trials.trials < 0).any())
     bases = [

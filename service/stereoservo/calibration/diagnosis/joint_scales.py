@@ -43,7 +43,7 @@ LEAST_FACTOR = 2e-3
 
 @dataclass(frozen=True)
 class JointScaleEstimate:
-    """Reported over true motion of a joint, and its standard deviation."""
+    """Estimated scale factor of a joint's reading, reported over true motion, and its standard deviation."""
 
     joint: int
     factor: float
@@ -51,7 +51,7 @@ class JointScaleEstimate:
 
     @property
     def wrong(self) -> bool:
-        """Whether the factor is not 1, by its own deviation."""
+        """Whether the factor differs significantly from 1."""
         off = abs(self.factor - 1.0)
         return off > SIGNIFICANT * self.deviation and off > LEAST_FACTOR
 
@@ -59,9 +59,9 @@ class JointScaleEstimate:
 def trial_scales(
     trials: TrialData, cameras: FloatArray, points: FloatArray, usable: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where the trial
-    shows no other, for prismatic joints, where the trial is of no use, and where it does not reach with its factor
-    what the other joints' trials do: something else is wrong then.
+    """Scale factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where no
+    other is significant, for prismatic joints, for trials of no use, and where the factor does not bring the
+    trial to the residuals of the other joints' trials (another fault is present then).
     """
     factors, residual = np.ones(len(trials.joint_names)), np.full(len(trials.joint_names), np.nan)
     for joint, kind in enumerate(trials.joint_kinds):
@@ -90,8 +90,8 @@ def with_scales_removed(trials: TrialData, factors: FloatArray) -> TrialData:
 def _best_factor(
     cameras: FloatArray, sights: VirtualObservations, reported: FloatArray
 ) -> tuple[float, float]:
-    """The factor of one joint's ``reported`` angles (k,), 1 where none is worth more, and the median residual
-    [sigmas] with it; NaN where no joint fits at all.
+    """Scale factor of one joint's ``reported`` angles (k,), 1 where no other gains enough, and the median residual
+    [sigmas] with it; NaN where the joint fits with none.
     """
     rough = _rigid_factor(sights, reported)
     rigs: dict[float, tuple[RigModel, float]] = {}
@@ -141,7 +141,7 @@ def _best_factor(
 
 
 def _rigid_factor(sights: VirtualObservations, reported: FloatArray) -> float:
-    """Reported over turned angle between stops far apart, as if the cameras were nominal ones: coarse."""
+    """Coarse scale factor: reported over rotated angle between distant stops, as if the cameras were nominal ones."""
     scale = np.array([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0])
     with np.errstate(divide="ignore", invalid="ignore"):
         euclidean = sights.points[..., :3] * scale / sights.points[..., 3:]
@@ -161,7 +161,7 @@ def _rigid_factor(sights: VirtualObservations, reported: FloatArray) -> float:
 
 
 def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
-    """Factors of all revolute joints' positions and their deviations, estimated together with everything else.
+    """Scale factors of all revolute joints' positions and their deviations, estimated jointly with the model.
 
     One Gauss-Newton step from a converged bundle: exact for factors near 1.
     """
@@ -195,8 +195,8 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
 
 
 def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointScaleEstimate, ...]:
-    """Reported motion per length of each prismatic joint over that of the first one, with deviations; () below the
-    metric stratum and with fewer than two.
+    """Scale of each prismatic joint (reported motion per length) over that of the first one, with deviations; ()
+    below the metric stratum and with fewer than two.
 
     One scale for all of them is gauge; their ratios are not, and are 1 where every drive states the truth.
     """

@@ -1,4 +1,4 @@
-"""Relocalization: a cell's model with new matrices of cameras that have moved, without calibration of the arm.
+"""Relocalization: new matrices of moved cameras in a cell's model, without recalibration of the arm.
 
 Arm and static points of the model are a known rigid structure in its projective frame: at rest poses the joints
 determine where the arm's markers are. A moved camera is resected in that frame (2.19-2.21), in the metric stratum as a
@@ -41,7 +41,7 @@ WORKSPACE = 40
 
 
 class CameraSample(Protocol):
-    """What one camera saw at rest: `stereoservo.core.cycle.Sample` is one.
+    """Protocol of one camera's observations at rest; implemented by `stereoservo.core.cycle.Sample`.
 
     ``ids`` (k,), raw ``pixels`` (k, 2) and ``covariances`` (k, 2, 2) of the mean [px²].
     """
@@ -65,7 +65,7 @@ class CameraSample(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """The arm at rest: its ``joints`` (n,) [rad or m], and what the cameras saw meanwhile."""
+    """The arm at rest: its ``joints`` (n,) [rad or m], and the cameras' observations meanwhile."""
 
     joints: FloatArray
     sights: tuple[CameraSample, ...]
@@ -73,14 +73,14 @@ class RestPose:
 
 @dataclass(frozen=True, eq=False)
 class RestObservations:
-    """Everything that was seen at rest since the cameras moved; more poses of the arm are a larger structure."""
+    """All observations at rest since the cameras moved; several poses of the arm give more points."""
 
     poses: tuple[RestPose, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class RelocalizedModel:
-    """A relocalized ``model``, what moved, how well it fits and how well it is known.
+    """A relocalized ``model`` with its report: what moved, residuals, accuracy.
 
     ``predicted_px``: largest standard deviation, an axis, of a marker's predicted pixel in the moved cameras, over the
     range of the joints, where the camera sees it; the model's own uncertainty included where it states one.
@@ -241,7 +241,9 @@ def _arm_points(model: CellModel, joints: FloatArray) -> FloatArray:
 
 
 def _workspace(model: CellModel, sights: RestObservations, given: FloatArray | None) -> FloatArray:
-    """Joint positions (w, n): those of the sights, and the trials' range, one joint at a time and all at random."""
+    """Joint positions (w, n): those of the observations, and the trials' range, one joint at a time and all at
+    random.
+    """
     here = np.array([pose.joints for pose in sights.poses])
     if given is not None:
         return np.asarray(np.concatenate([here, given]))

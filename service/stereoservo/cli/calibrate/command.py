@@ -1,4 +1,6 @@
-"""``stereoservo calibrate``: by the daemon, or one started for it; a model check; a fit of stored trials."""
+"""``stereoservo calibrate``: calibration by the daemon (one is started if needed), model check, or fit of stored
+trials.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +158,7 @@ def calibrate(
 
 
 def _failure(error: FailedError, **said: Any) -> CommandError:
-    """The failure with its cause's own code and, where the motion ended early, the reasons with their values."""
+    """Error with its cause's own code and, where the motion ended early, the reasons with their values."""
     if error.event.reasons:
         said["reasons"] = msgspec.to_builtins(error.event.reasons)
     return CommandError(error.code, str(error), **said)
@@ -205,7 +207,7 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
 
 
 def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
-    """Print the report, with earlier checks where they are stored on this host."""
+    """Print the report of a check, with earlier checks where they are stored on this host."""
     past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
     history = [
         {"created": one.created, "epoch": one.model_epoch, "status": one.status, "sigmas": one.sigmas,
@@ -231,7 +233,9 @@ def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool
 
 
 def _reset_zeros(client: Client, json: bool) -> None:
-    """Check, and reset joint zeros; prints the check in any case. Raises CommandError with the code of the refusal."""
+    """Check the model, and reset joint zeros; prints the check in any case. Raises CommandError with the code of
+    the refusal.
+    """
     checks: list[CheckReport] = []
 
     def reset(progress: Callable[[EventMessage], None]) -> ZeroReset:

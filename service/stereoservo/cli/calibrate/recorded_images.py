@@ -14,7 +14,7 @@ TELL_EVERY = 500
 
 
 class ImagesUsed(msgspec.Struct, frozen=True):
-    """The images of a calibration. ``left_out``: rests that were not used, by the reason."""
+    """Images used by a calibration. ``left_out``: rests that were not used, by the reason."""
 
     directory: str
     stops: int
@@ -63,7 +63,7 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
 
 
 def table_of_images(result: ImageFit) -> str:
-    """The result in lines of text."""
+    """The result as lines of text."""
     used = result.from_images
     what = "" if used is None else f"\n  images {used.directory}: {used.stops} stops, {used.frames} frames"
     return table_of_stored(result) + what

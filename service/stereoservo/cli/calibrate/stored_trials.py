@@ -22,7 +22,7 @@ from stereoservo.messages.wire import CalibrationResult
 
 
 class LinesUsed(msgspec.Struct, frozen=True):
-    """Straight lines that held the lenses: names of the lines by camera, noise of their pixels [px]."""
+    """Straight lines that determined the lenses: names of the lines by camera, noise of their pixels [px]."""
 
     file: str
     sigma_px: float
@@ -30,14 +30,14 @@ class LinesUsed(msgspec.Struct, frozen=True):
 
 
 class StoredFit(CalibrationResult, frozen=True):
-    """A fit of stored trials. ``use``: from when on the cell works with it. ``lines``: None without ``--lines``."""
+    """A fit of stored trials. ``use``: when the cell starts to use it. ``lines``: None without ``--lines``."""
 
     use: str = ""
     lines: LinesUsed | None = None
 
 
 def table(result: CalibrationResult) -> str:
-    """A calibration's result in lines of text."""
+    """A calibration's result as lines of text."""
     lines = [
         f"model epoch {result.epoch} ({result.stratum}): {result.rms_px:.4f} px rms over "
         f"{result.measurements} "
@@ -53,7 +53,7 @@ def table(result: CalibrationResult) -> str:
 
 
 def table_of_stored(result: StoredFit) -> str:
-    """The same of a fit of stored trials."""
+    """The result of a fit of stored trials as lines of text."""
     lines = [table(result), f"  fitted in {result.seconds:.1f} s"]
     if result.lines is not None:
         used = "; ".join(f"{name}: {', '.join(names)}" for name, names in result.lines.cameras.items())
@@ -65,7 +65,8 @@ def table_of_stored(result: StoredFit) -> str:
 def fit_again(
     cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None
 ) -> StoredFit:
-    """Fit stored trial data in this process; the model goes beside the cell's others unless ``output`` says where.
+    """Fit stored trial data in this process; the model is stored beside the cell's others unless ``output`` is
+    given.
 
     Beside the others only while no daemon runs: that would keep its model and take this one unasked at its next start.
 
@@ -113,7 +114,7 @@ def fit_again(
 
 
 def may_fit(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
-    """The cell file, where it was given, the cell's name, and where it keeps its models.
+    """The cell file, where it was given, the cell's name, and its directory of models.
 
     Raises CommandError where a fit could not be kept, CellFileError.
     """
@@ -164,7 +165,7 @@ def _must_fit(file: CellFile, data: Any, path: Path) -> None:
 
 
 def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], LinesUsed]:
-    """The lens of each camera, and the lines that it comes from: a table ``camera,line,u,v``, with this header.
+    """Lens of each camera, and the lines it was estimated from: a table ``camera,line,u,v``, with this header.
 
     Raises CommandError naming the row, or the camera whose lines do not tell its lens.
     """

@@ -47,7 +47,7 @@ class CameraRecord:
 
     @property
     def name(self) -> str:
-        """Of the camera in the cell file."""
+        """Name of the camera in the cell file."""
         return self.description.name
 
     @property
@@ -57,7 +57,7 @@ class CameraRecord:
 
 
 def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Finding]:
-    """Findings on one camera by itself. ``min_markers``: what calibration asks of every stop."""
+    """Findings on one camera by itself. ``min_markers``: number that calibration requires at every stop."""
     what = f"camera {record.name}"
     if record.error:
         yield Finding(what, False, record.error)
@@ -142,7 +142,9 @@ def _markers(record: CameraRecord, min_markers: int) -> Finding:
 
 
 def _scatter(record: CameraRecord) -> str:
-    """Scatter of the markers over the frames, of an arm at rest, beside what the detector states."""
+    """Finding on the scatter of the markers over the frames, with the arm at rest, against the detector's stated
+    noise.
+    """
     seen: dict[int, list[FloatArray]] = {}
     for observation in record.seen:
         for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
@@ -200,7 +202,7 @@ def _picture_quality(name: str, image: ImageArray, observation: CameraObservatio
 
 
 def examine_skew(records: Sequence[CameraRecord]) -> Iterator[Finding]:
-    """Finding on the time between the cameras' shutters. Not a fault: each image counts at its own time."""
+    """Finding on the time between the cameras' shutters; not a fault, since each image counts at its own time."""
     shown = [record for record in records if len(record.seen) >= 2]
     for first, second in pairwise(shown):
         apart = first.shutters_ns[:, None] - second.shutters_ns[None, :]
@@ -212,7 +214,7 @@ def examine_skew(records: Sequence[CameraRecord]) -> Iterator[Finding]:
 
 
 def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Markers seen in most frames: ids (k,), mean raw pixels (k, 2), standard deviations (k,) of one sight."""
+    """Markers seen in most frames: ids (k,), mean raw pixels (k, 2), standard deviations (k,) of one observation."""
     pixels: dict[int, list[FloatArray]] = {}
     variances: dict[int, list[float]] = {}
     for observation in record.seen:
@@ -230,7 +232,7 @@ def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray
 
 
 def near_border(record: CameraRecord) -> Finding | None:
-    """Markers that are about to leave the picture."""
+    """Markers that are close to the image border."""
     ids, pixels, _ = mean_sights(record)
     size = np.array([record.description.width, record.description.height])
     close = ids[((pixels < EDGE_PX) | (pixels > size - 1 - EDGE_PX)).any(axis=1)]

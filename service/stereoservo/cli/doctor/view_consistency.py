@@ -26,7 +26,7 @@ WORKSPACE_SHARE = 0.9
 
 
 def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[Finding]:
-    """Findings on what pairs of cameras see at once."""
+    """Findings on the simultaneous observations of pairs of cameras."""
     seen = [record for record in records if len(record.seen) >= 2]
     if len(seen) < 2:
         return
@@ -39,7 +39,7 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
 
 
 def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
-    """Markers that all see, and their raw pixels (c, k, 2)."""
+    """Markers seen by all cameras, and their raw pixels (c, k, 2)."""
     sights = [mean_sights(record) for record in records]
     ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in sights)))
     pixels = [
@@ -49,7 +49,9 @@ def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
 
 
 def reprojection_rms(cameras: Sequence[CameraModel], pixels: FloatArray) -> float:
-    """Root mean square [px] a coordinate that triangulated points leave in raw pixels (c, k, 2); NaN without points."""
+    """Rms reprojection error [px] per coordinate of triangulated points in raw pixels (c, k, 2); NaN without
+    points.
+    """
     Ps = np.array([camera.matrix for camera in cameras])
     ideal = np.array([undistort(camera.lens, p) for camera, p in zip(cameras, pixels, strict=True)])
     points = triangulate(Ps, ideal)
@@ -118,7 +120,9 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
 def examine_coverage(
     model: CellModel, trials: TrialSettings, records: Sequence[CameraRecord]
 ) -> Iterator[Finding]:
-    """Findings on the share of the trial motions in each camera's image, by the model, at all corners of two joints."""
+    """Findings on the share of the trial motions inside each camera's image, by the model, at all corners of two
+    joints.
+    """
     configurations = _corners(trials)
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
     points = np.array([model.marker_points @ chain.displacement(q).T for q in configurations])

@@ -228,7 +228,7 @@ def goal(
 
 
 def _followed(source: str) -> tuple[dict[str, Any], Stream]:
-    """The target at which a stream begins, as on the wire, and the stream. Raises CommandError for an empty one."""
+    """First target of a stream, as on the wire, and the stream. Raises CommandError for an empty one."""
     stream = stream_lines(source)
     first = next(stream, None)
     if first is None:
@@ -272,7 +272,7 @@ def follow(handle: GoalHandle, as_json: bool) -> None:
 
 
 def plan_table(plan: PlanReport) -> str:
-    """Way, time, and the closest approach to every limit."""
+    """Path, duration, and the closest approach to every limit, as text."""
     lines = [f"law {plan.law}, way {plan.way}, {plan.seconds:.2f} s"]
     if not plan.approaches:
         return lines[0]

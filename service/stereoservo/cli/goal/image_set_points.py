@@ -18,7 +18,7 @@ FRAMES = 20
 def read_images(
     cell: str, endpoint: str | None, images: Path, at_s: float, frames: int
 ) -> tuple[SetPoints, ...]:
-    """Set-points of every recorded camera, told on stderr.
+    """Set-points of every recorded camera; reports them on stderr.
 
     Raises CommandError, SetPointError, ImageFileError, DriverError, PluginError, CellFileError, NotRunningError.
     """
@@ -50,7 +50,7 @@ def feature_tree(found: tuple[SetPoints, ...]) -> dict[str, Any]:
 
 
 def require_cameras(client: Client, found: tuple[SetPoints, ...]) -> None:
-    """Raise CommandError where a recording is not of a camera of the live cell, as it is now."""
+    """Raise CommandError where a recording does not match a camera of the live cell in its present setup."""
     if not found:
         return
     cameras = {camera.name: (camera.width, camera.height) for camera in client.info().cameras}

@@ -1,4 +1,4 @@
-"""Trial data from a recording with images: the cell's detectors run on the pictures taken while the arm rested."""
+"""Trial data from a recording with images: the cell's detectors run on the frames taken while the arm was at rest."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class RecordedTrials:
-    """Trial data out of recorded images; ``left_out``: why rests were not used, with their number; ``frames`` averaged;
-    ``standing``: static markers.
+    """Trial data from recorded images; ``left_out``: why rests were not used, with their number; ``frames``
+    averaged; ``standing``: static markers.
     """
 
     trials: TrialData
@@ -47,12 +47,12 @@ class RecordedTrials:
 
 
 def flight_of(images: Path) -> Path:
-    """The flight recording that a directory of images belongs to: ``NAME.mcap`` beside ``NAME.images``."""
+    """Flight recording that a directory of images belongs to: ``NAME.mcap`` beside ``NAME.images``."""
     return images.absolute().with_suffix(".mcap")
 
 
 def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Progress) -> RecordedTrials:
-    """Run the cell's detectors over the recorded cameras and average as the trial motions do.
+    """Run the cell's detectors on the recorded cameras and average as the trial motions do.
 
     ``progress`` hears the camera and the number of its frame. Raises CalibrationError (``bad_data``,
     ``too_few_stops``), RecordingError, ImageFileError, PluginError, DriverError, CellFileError.
@@ -142,7 +142,7 @@ BEFORE_NS = 500_000_000
 
 @dataclass
 class _Stop:
-    """A rest while its frames are gathered."""
+    """A rest whose frames are being collected."""
 
     rest: RestInterval
     sums: ObservationStatistics
@@ -152,7 +152,7 @@ class _Stop:
 
 @dataclass
 class RecordedTrialCollector:
-    """Gathers observations of all cameras, in any order of cameras, into the stops of the trial motions.
+    """Collects the observations of all cameras, in any order of cameras, into the stops of the trial motions.
 
     ``settings``: of the flight, with the cameras and markers of the detectors that are used now. ``left_out``: why
     rests were not used, with their number.
@@ -173,8 +173,8 @@ class RecordedTrialCollector:
         self.used = 0
 
     def wants(self, camera: str, t_ns: int) -> bool:
-        """Whether a frame of this time may count, or comes so little before one that does that a tracking
-        detector must see it.
+        """Whether a frame of this time may be used, or shortly precedes one that is, so that a tracking detector
+        must see it.
         """
         column = next(k for k, one in enumerate(self.settings.cameras) if one.name == camera)
         newest = bisect_right(self._settled, t_ns + BEFORE_NS) - 1
@@ -184,7 +184,7 @@ class RecordedTrialCollector:
         )
 
     def add(self, observations: Iterable[CameraObservation]) -> None:
-        """Take one camera's observations in the order of time; what was seen in motion is passed over."""
+        """Add one camera's observations in the order of time; those made in motion are skipped."""
         for observation in observations:
             number = bisect_right(self._settled, observation.t_shutter_ns - 1) - 1
             if number < 0:
@@ -244,8 +244,8 @@ class RecordedTrialCollector:
         self.left_out[why] = self.left_out.get(why, 0) + 1
 
     def _base(self, places: list[FloatArray]) -> FloatArray:
-        """Positions (n,) of the joints that do not move: the cell file's base, or, where most of ``places`` (n,) are
-        more than one joint away from that, the place that the most others are one joint away from.
+        """Positions (n,) of the joints that do not move: the cell file's base, or, where most of ``places`` (n,)
+        differ from that in more than one joint, the configuration from which most others differ in one joint.
         """
         candidates = np.array([self.trial.base, *places])
         away = np.abs(candidates[:, None] - np.array(places)) > SAME_POSITION_TOLERANCE

@@ -33,7 +33,7 @@ class TrialCollector:
         return len(self._stops)
 
     def add(self, event: Event) -> None:
-        """Take an event: ``calibration_sample``, or ``calibration_finished`` with the joints' loads."""
+        """Add an event: ``calibration_sample``, or ``calibration_finished`` with the joints' loads."""
         if event.kind == "calibration_finished" and event.id == self.id:
             self._loads = event.loads
         if event.kind != "calibration_sample":
@@ -107,8 +107,8 @@ class TrialCollector:
         )
 
     def _noise_factor(self, camera: CameraSettings) -> float:
-        """Variance of the pixels over the frames of a stop, over what the detector states: the most likely one of all
-        stops, the mean of the ratios by degrees of freedom.
+        """Variance of the pixels over the frames of a stop, relative to the detector's stated one: maximum
+        likelihood over all stops, the mean of the ratios by degrees of freedom.
 
         Not a ratio of sums, which few markers of great variance would rule: one of 0.16 px among thousands of 0.005 px
         changes it by a sixth. Markers beyond MOST_NOISE do not count at all: what is stated of them is doubt (dots

@@ -1,4 +1,6 @@
-"""What a subproblem in closed form answers: candidates, joint by joint, not yet checked against the whole chain."""
+"""Closed-form solutions of inverse kinematics subproblems: candidates per joint, not yet checked against the whole
+chain.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ FREE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Branches:
-    """k candidates for n joints, as motions from the zero.
+    """k candidate solutions of n joints, as displacements from the zero.
 
     ``steps`` (k, n) [rad or m]. ``excess`` (k, n): by how much a joint's equation fails to have a root, as a share of
     its amplitude; 0 where it has one, infinite where the joint moves nothing that matters. The step is then that of
@@ -30,12 +32,12 @@ class Branches:
 
 
 def single(step: float, excess: float = 0.0, free: bool = False) -> Branches:
-    """One candidate of one joint."""
+    """One candidate of one joint as branches."""
     return Branches(np.array([[step]]), np.array([[excess]]), np.array([[free]]))
 
 
 def beside(first: Branches, second: Branches) -> Branches:
-    """Joints of ``second`` after those of ``first``; the one with a single candidate goes with all of the other."""
+    """Joints of ``second`` appended to those of ``first``; a single candidate is repeated for all of the other."""
     k = max(len(first.steps), len(second.steps))
 
     def wide(left: npt.NDArray, right: npt.NDArray) -> npt.NDArray:  # type: ignore[type-arg]
@@ -48,7 +50,7 @@ def beside(first: Branches, second: Branches) -> Branches:
 
 
 def together(several: list[Branches]) -> Branches:
-    """All candidates of ``several``, one list."""
+    """Concatenation of the candidates of ``several``."""
     return Branches(
         np.concatenate([branches.steps for branches in several]),
         np.concatenate([branches.excess for branches in several]),
@@ -57,7 +59,7 @@ def together(several: list[Branches]) -> Branches:
 
 
 def one_of(branches: Branches, i: int) -> Branches:
-    """Candidate ``i`` alone."""
+    """Candidate ``i`` as branches."""
     part = slice(i, i + 1)
     return Branches(branches.steps[part], branches.excess[part], branches.free[part])
 
@@ -90,8 +92,8 @@ def prismatic_joints(operators: FloatArray, A: FloatArray, target: FloatArray) -
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one where it only comes near, or the seed
-    where it lies there all the time. ``excess`` and ``free`` as in `Branches`.
+    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one at the closest approach where they
+    do not meet, or the seed where the whole circle lies in the plane. ``excess`` and ``free`` as in `Branches`.
     """
 
     angles: FloatArray
@@ -122,7 +124,8 @@ def circle_meets_plane(G: FloatArray, A: FloatArray, plane: FloatArray, seed: fl
 
 
 def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float = 0.0) -> Branches:
-    """The angle [rad] about a revolute operator ``G`` (4, 4) that takes points ``A`` (..., 4) nearest to ``target``.
+    """Rotation angle [rad] about a revolute operator ``G`` (4, 4) that moves points ``A`` (..., 4) closest to
+    ``target``.
 
     Points and targets of equal heights. The radial part of the target, ``-Ĥ²A*``, is resolved along those of the point
     and of its motion, ``-Ĥ²A`` and ``ĤA``: the plane of (6.11) through axis and target in one linear step, with
@@ -141,7 +144,8 @@ def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float =
 
 
 def plane_across(G: FloatArray, A: FloatArray) -> FloatArray:
-    """The plane (4,) across the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0`` that stays fixed.
+    """Plane (4,) normal to the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0``, which is
+    invariant.
 
     Also where A lies on the axis, and spans no circle with ``ĤA`` and ``Ĥ²A``.
     """
@@ -156,7 +160,7 @@ def axis_points(G: FloatArray) -> FloatArray:
 
 
 def common_point(operators: FloatArray) -> FloatArray:
-    """The point (4,), at unit norm, nearest to all axes of revolute ``operators`` (k, 4, 4), each at unit norm."""
+    """Point (4,), of unit norm, nearest to all axes of revolute ``operators`` (k, 4, 4), each of unit norm."""
     unit = operators / np.linalg.norm(operators, axis=(1, 2), keepdims=True)
     return np.asarray(np.linalg.svd(unit.reshape(-1, 4))[2][3], dtype=np.float64)
 
@@ -272,7 +276,9 @@ def arm_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
 
 
 def gantry_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
-    """Three prismatic joints under a spherical wrist, ``G`` (6, 4, 4): up to two ways to ``H`` (4, 4)."""
+    """Positions of three prismatic joints under a spherical wrist, ``G`` (6, 4, 4), whose product is ``H`` (4, 4),
+    up to two.
+    """
     centre = common_point(G[3:])
     place = prismatic_joints(G[:3], centre[None], (H @ centre)[None])
     return _with_wrist(G, H, seed, place, exp_translation)

@@ -1,4 +1,4 @@
-"""Which case with a closed form a chain is: axes that are parallel, axes that meet in one point (thesis 6.3 to 6.7).
+"""Recognition of the structure of a chain with a closed form: parallel axes, concurrent axes (thesis 6.3 to 6.7).
 
 A calibrated chain is so only within its covariance. Each condition is a set of incidences that vanish: they are tested
 by chi-square against the covariance propagated to them. A small deviation that the calibration cannot tell from none
@@ -35,7 +35,7 @@ Test = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Evidence:
-    """A condition on joints (counted from the base), and what was found.
+    """Test result of a condition on joints (counted from the base).
 
     ``deviation``: sine, in the model's frame, of how far it is from holding exactly. ``chi2`` of ``freedom``
     conditions, at most ``threshold`` where it holds. None without a covariance, where ``deviation`` is held against
@@ -53,7 +53,9 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Recognition:
-    """The ``case`` of a chain. ``inverted``: of its factors in opposite order, so for the inverse displacement."""
+    """Structure ``case`` of a chain. ``inverted``: that of its factors in reverse order, so for the inverse
+    displacement.
+    """
 
     case: Case
     inverted: bool
@@ -93,7 +95,7 @@ def common_point_incidence(operators: FloatArray) -> Test:
 
 
 class _Judge:
-    """Tests conditions on one chain, each once."""
+    """Tests conditions on one chain, with cached results."""
 
     def __init__(self, chain: ProjectiveChain, model: CellModel | None) -> None:
         self.chain = chain
@@ -142,7 +144,7 @@ class _Judge:
 
 
 def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
-    """The case of a chain, or of a calibrated model, whose covariance then says what counts as exact.
+    """Structure of a chain, or of a calibrated model, whose covariance then sets the tolerance of each condition.
 
     Conditions are incidences of operators, in any stratum. ``numerical`` where no closed form fits.
     """
@@ -196,5 +198,5 @@ def _case(judge: _Judge, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Cas
 
 
 def _is_arm(judge: _Judge, joints: tuple[int, ...]) -> bool:
-    """The second and third axis parallel, the first across."""
+    """Whether the second and third axis are parallel and the first is normal to them."""
     return judge.parallel(*joints[1:]) and not judge.parallel(*joints[:2])

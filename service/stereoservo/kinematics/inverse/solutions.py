@@ -1,4 +1,4 @@
-"""Answers of inverse kinematics: all solutions, a continuum of them, or how far the goal is from being reached."""
+"""Results of inverse kinematics: all solutions, a continuum of them, or the distance to an unreachable goal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Outcome = Literal["isolated", "continuum", "beyond_limits", "unreachable"]
 
 
 class InverseKinematicsError(ValueError):
-    """A goal, a seed or limits with which the question makes no sense. The text says what would be valid.
+    """Invalid goal, seed or limits of inverse kinematics; the text states what would be valid.
 
     Attributes:
         code: ``shape``, ``not_finite``, ``mirrored`` (no rigid motion takes the points there), ``not_rigid``,
@@ -40,7 +40,7 @@ class InverseKinematicsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Shortfall:
-    """The nearest that an arm comes to a goal out of its reach.
+    """Closest approach of an arm to a goal that is out of its reach.
 
     ``joints`` (n,) of least residual among the approaches tried, ``residual`` as in `InverseSolutions`. ``joint``:
     whose equation has no root, in closed form; ``excess``: by which share of its amplitude (1.0: twice as far as it

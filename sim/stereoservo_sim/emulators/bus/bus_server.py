@@ -1,4 +1,4 @@
-"""A rack in real time: bus time is CLOCK_MONOTONIC, the master sits behind an endpoint."""
+"""Real-time server of emulated drives: bus time is CLOCK_MONOTONIC, the master is connected by an endpoint."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ ENDING_NS = 500_000_000
 
 
 class Stalls(msgspec.Struct):
-    """How late the serving loop came: the largest lateness and gap, how often it was later than STALL_NS, and how many
-    frames left more than LATE_FRAME_NS after their end on the bus.
+    """Lateness of the serving loop: the largest lateness and gap, how often it was later than STALL_NS, and how
+    many frames left more than LATE_FRAME_NS after their end on the bus.
     """
 
     turns: int = 0
@@ -49,7 +49,7 @@ class Stalls(msgspec.Struct):
     longest_gap_ns: int = 0
 
     def words(self) -> str:
-        """For people."""
+        """The statistics as text."""
         return (
             f"server loop: {self.turns} turns, latest {self.latest_ns * 1e-6:.2f} ms, longest gap "
             f"{self.longest_gap_ns * 1e-6:.2f} ms, {self.stalls} stalls over {STALL_NS * 1e-6:g} ms; "
@@ -58,7 +58,7 @@ class Stalls(msgspec.Struct):
 
 
 class _Request:
-    """An order of another thread, and its answer."""
+    """A fault command of another thread, and its reply."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -68,7 +68,7 @@ class _Request:
 
 
 class RackServer:
-    """Serves ``rack`` at ``endpoint`` until told to end.
+    """Serves the emulated bus ``rack`` at ``endpoint`` until terminated.
 
     ``on_event`` gets every event of the rack, in the serving thread. ``run`` serves in the calling thread; as a context
     manager the server runs in a thread of its own, and what failed there is raised at the end.
@@ -100,12 +100,12 @@ class RackServer:
 
     @property
     def start_ns(self) -> int:
-        """When the drives were switched on."""
+        """Time at which the drives were switched on."""
         return self.rack.start_ns
 
     @property
     def channel(self) -> str:
-        """How a master reaches the drives."""
+        """Channel by which a master connects to the drives."""
         return self.endpoint.channel
 
     def watch(self, descriptor: int, act: Callable[[], None]) -> None:
@@ -113,16 +113,16 @@ class RackServer:
         self._watched[descriptor] = act
 
     def unwatch(self, descriptor: int) -> None:
-        """End it."""
+        """Stop watching a descriptor."""
         self._watched.pop(descriptor, None)
 
     def obey(self, text: str) -> str:
-        """An order, from the serving thread itself. Raises FaultCommandError."""
+        """Execute a fault command, from the serving thread itself. Raises FaultCommandError."""
         answer = self.rack.order(text, self._clock_ns())
         return f"{answer}\n{self.stalls.words()}" if text.split()[:1] == ["status"] else answer
 
     def order(self, text: str, timeout_s: float = 10.0) -> str:
-        """An order, from any other thread. Raises FaultCommandError."""
+        """Execute a fault command, from any other thread. Raises FaultCommandError."""
         request = _Request(text)
         with self._lock:
             if self._over:
@@ -136,7 +136,7 @@ class RackServer:
         return request.answer
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until ``ended``; then power off, and the arm comes to rest. Closes endpoint and rack."""
+        """Serve until ``ended``; then power off, and let the arm come to rest. Closes endpoint and emulator."""
         try:
             self._turned_ns = self._clock_ns()
             self.rack.run_until(self._turned_ns)
@@ -165,7 +165,7 @@ class RackServer:
                 request.done.set()
 
     def turn(self) -> None:
-        """Wait for the next event or input, and let the bus go on to the present."""
+        """Wait for the next event or input, and advance the bus to the present."""
         descriptors = self.endpoint.descriptors()
         wanted = self.rack.due_ns()
         if not descriptors:
@@ -186,13 +186,16 @@ class RackServer:
         self._turned_ns = now
 
     def _sleep(self, descriptors: list[int], until_ns: int) -> list[int]:
-        """Wait for input or for ``until_ns``; what is readable. With bit times the end is waited for awake."""
+        """Wait for input or for ``until_ns``; returns what is readable. With bit times the end is waited for by
+        polling.
+        """
         spin = SPIN_NS if self.rack.wire.bitrate is not None else 0
         left_ns = until_ns - self._clock_ns() - spin
         return select.select(descriptors, [], [], max(left_ns, 0) * 1e-9)[0]
 
     def _stamped(self, frames: list[CanFrame], wanted: int, now: int) -> list[tuple[int, CanFrame]]:
-        """When the master sent its frames: now; those that came while the loop was stalled, evenly since then.
+        """Send times of the master's frames: now; those that arrived while the loop was stalled are spread evenly
+        over that time.
 
         Otherwise the drives would watch their time-outs run off before they hear what had come in time.
         """
@@ -209,7 +212,9 @@ class RackServer:
         stalls.stalls += now - wanted > STALL_NS
 
     def _catch_up(self, now: int) -> None:
-        """Everything up to ``now``. What has ended on the bus does not wait for the arm's next step to be computed."""
+        """Advance to ``now``. Frames that have ended on the bus are delivered before the arm's next step is
+        computed.
+        """
         while (due := self.rack.due_ns()) <= now:
             self.rack.run_until(due)
             self._give()
@@ -286,7 +291,7 @@ def open_endpoint(channel: str, bus_bitrate: int) -> Endpoint:
 
 
 def served_channel(options: CanOptions) -> str:
-    """The channel at which a cell's master looks for its drives. Raises EndpointError where it cannot be served."""
+    """The channel at which a cell's master expects its drives. Raises EndpointError where it cannot be served."""
     channel = str(options.channel)
     if channel.startswith("socket://"):
         return channel

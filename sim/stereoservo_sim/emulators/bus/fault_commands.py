@@ -1,4 +1,4 @@
-"""Fault commands of the emulated bus: the table of verbs, what their words mean and what each does."""
+"""Fault commands of the emulated bus: the verbs, their arguments, and their effects."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ REMAPPING = ((0x1800, 1, None), (0x1A00, 0, 0), (0x1A00, 1, 0x60410010), (0x1A00
 
 
 class BusCommand(FaultCommand, frozen=True):
-    """One command to the bus. ``node``: 0 is the whole bus. ``number``: an error code, a count, an NMT command, as the
-    verb has it."""
+    """One fault command. ``node``: 0 is the whole bus. ``number``: an error code, a count, an NMT command, by the
+    verb.
+    """
 
     node: int = 0
     number: int = 0
@@ -105,7 +106,7 @@ def _check_emergency(command: BusCommand) -> None:
 
 
 def _cable_words(words: list[str]) -> dict[str, Any]:
-    """The node may be left out, before the word that must be there."""
+    """Parse arguments whose node may be left out, before the required word."""
     fields = _node(words[0]) if words and words[0] not in IN_OR_OUT else {}
     rest = words[len(fields) :]
     at_most(rest, 1)
@@ -272,7 +273,7 @@ def _invert(rack: BusEmulator, command: BusCommand) -> str:
 
 
 def _update_inputs(rack: BusEmulator, command: BusCommand) -> None:
-    """Let the drive read its inputs at once."""
+    """Let the drive read its inputs immediately."""
     slot = rack.slot(command.node)
     rack.plant.observe(rack.t_ns)
     slot.node.advance(rack.t_ns)
@@ -322,7 +323,7 @@ def _help(rack: BusEmulator, command: BusCommand) -> str:
 
 
 def frame_id(node_id: int, what: str) -> int:
-    """Id of a frame of a node: by its name in the predefined connection set, or itself as ``0x…``."""
+    """CAN id of a node's frame: by its name in the predefined connection set, or itself as ``0x…``."""
     return int(what, 16) if what.startswith("0x") else COB_IDS[what] + node_id
 
 

@@ -1,4 +1,6 @@
-"""The master's computer in the rack's virtual time: bring-up, the cycle, and how it can fail. No thread, no clock."""
+"""The master's computer in the emulated bus's virtual time: bring-up, cycle, and its failures; without threads or
+clock.
+"""
 
 from __future__ import annotations
 
@@ -35,12 +37,12 @@ class VirtualHost(Subscriptions):
     # -- link -----------------------------------------------------------------------------------------------
 
     def send(self, frames: list[CanFrame]) -> None:
-        """Queue on the wire now."""
+        """Queue frames on the wire now."""
         for frame in frames:
             self.rack.inject(frame, self.t_ns)
 
     def wait(self, seconds: float) -> None:
-        """Let the bus go on."""
+        """Let the bus run for some time."""
         self.run_until(self.t_ns + round(seconds * 1e9))
 
     def now_ns(self) -> int:
@@ -50,21 +52,21 @@ class VirtualHost(Subscriptions):
     # -- cycle ----------------------------------------------------------------------------------------------
 
     def begin_cycle(self) -> None:
-        """From now on tick the master instead of pumping."""
+        """Start ticking the master."""
         self.master.clear()
         self._next_ns = self.t_ns
 
     def resume_cycle(self) -> None:
-        """Tick again after a reset that failed: what is latched stays."""
+        """Tick again after a failed reset: latched faults stay."""
         self._next_ns = self.t_ns
 
     def end_cycle(self) -> None:
-        """Pump again, for a reset."""
+        """Stop ticking, for a reset; the bus is still served."""
         self._next_ns = None
         self._heartbeat_ns = self.t_ns
 
     def run_until(self, t_ns: int) -> None:
-        """Bus and host up to ``t_ns``, included."""
+        """Run bus and host up to ``t_ns``, included."""
         while (due := self._due_ns()) <= t_ns:
             self._advance(due)
             self._act()
@@ -85,7 +87,7 @@ class VirtualHost(Subscriptions):
             self.tell(frame)
 
     def _act(self) -> None:
-        """What is due at ``t_ns``: a heartbeat between the cycles, else a tick."""
+        """Execute what is due at ``t_ns``: a heartbeat between the cycles, else a tick."""
         if self._next_ns is None:
             self._heartbeat_ns = self.t_ns + self.master.settings.heartbeat_ms * 1_000_000
             self.send(self.master.codec.heartbeat())
@@ -98,7 +100,7 @@ class VirtualHost(Subscriptions):
         self.send(self.master.tick(self.t_ns))
 
     def _adapter(self, plugged: bool) -> None:
-        """As the bus thread takes an exception of its channel: latch, and end."""
+        """Handle an exception of the channel like the bus thread: latch, and end."""
         self.plugged = plugged
         if not plugged:
             self.master.latch(

@@ -1,4 +1,4 @@
-"""Emulated cameras of a cell from start to end, as ``stereoservo emulate cameras`` runs them."""
+"""Lifetime of a cell's emulated cameras, as run by ``stereoservo emulate cameras``."""
 
 from __future__ import annotations
 

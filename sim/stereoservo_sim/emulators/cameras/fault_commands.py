@@ -1,4 +1,4 @@
-"""Fault commands of emulated cameras: the table of verbs, what their words mean and what each does."""
+"""Fault commands of emulated cameras: the verbs, their arguments, and their effects."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ LARGEST_SIZE = 4096
 
 
 class CameraCommand(FaultCommand, frozen=True):
-    """One command. ``camera``: its name, or ``all``. ``number``: a count, a share, a gain, an angle [deg], as the verb
-    has it; ``length_m``; ``size`` (width, height); ``what``: a second word."""
+    """One fault command. ``camera``: its name, or ``all``. ``number``: a count, a share, a gain, an angle [deg], by
+    the verb; ``length_m``; ``size`` (width, height); ``what``: a second word.
+    """
 
     camera: str = ""
     number: float = 0.0
@@ -46,7 +47,7 @@ class CameraCommand(FaultCommand, frozen=True):
 
 
 def _number_word(what: str, low: float, high: float, default: float | None = None) -> Word:
-    """A number, or a percentage, from ``low`` to ``high``."""
+    """Argument: a number, or a percentage, from ``low`` to ``high``."""
 
     def read(text: str) -> dict[str, Any]:
         try:
@@ -80,7 +81,7 @@ def _check_two(command: CameraCommand) -> None:
 
 
 def _bump_words(words: list[str]) -> dict[str, Any]:
-    """``CAM back``, or an angle and a length in any order and the axis of the rotation."""
+    """Arguments: ``CAM back``, or an angle and a length in any order and the axis of the rotation."""
     if not words:
         raise FaultCommandError(str(CAMERA.missing))
     fields = CAMERA.read(words[0])
@@ -121,7 +122,7 @@ CameraAction = Callable[["CameraEmulator", EmulatedCamera, CameraCommand], Answe
 
 
 def _each(act: CameraAction) -> Callable[[CameraEmulator, CameraCommand], Answer]:
-    """The action done to every camera that the command names, and taken back of each."""
+    """Action on every camera that the command names, with its undo."""
 
     def act_on_all(studio: CameraEmulator, command: CameraCommand) -> Answer:
         answers, undos = [], []
@@ -142,7 +143,7 @@ def _each(act: CameraAction) -> Callable[[CameraEmulator, CameraCommand], Answer
 
 
 def _set(camera: EmulatedCamera, answer: str, **marks: object) -> tuple[str, Undo]:
-    """Set fields of the camera's condition; the undo restores them."""
+    """Action that sets fields of the camera's condition; the undo restores them."""
     before = {name: getattr(camera.condition, name) for name in marks}
 
     def undo() -> None:
@@ -155,7 +156,7 @@ def _set(camera: EmulatedCamera, answer: str, **marks: object) -> tuple[str, Und
 
 
 def _setter(answer: str, **marks: object) -> Callable[[CameraEmulator, CameraCommand], Answer]:
-    """An action that sets fixed fields of the condition."""
+    """Factory of actions that set fixed fields of the condition."""
     return _each(lambda studio, camera, command: _set(camera, answer, **marks))
 
 

@@ -1,4 +1,6 @@
-"""The streams of a studio over HTTP on loopback, in real time: one loop for all clients, one thread that renders."""
+"""HTTP server of the emulated cameras' streams on loopback, in real time: one loop for all clients, one rendering
+thread.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ BACKLOG = 16
 
 
 class _Client:
-    """A connection. ``stream``: once it has asked for one; ``once``: for one picture of it."""
+    """A client's connection. ``stream``: once it has requested one; ``once``: for one image of it."""
 
     def __init__(self, link: socket.socket, now_ns: int) -> None:
         self.link = link
@@ -82,17 +84,17 @@ class CameraServer:
 
     @property
     def url(self) -> str:
-        """Where the streams are."""
+        """URL of the streams."""
         return f"http://127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
     def start_ns(self) -> int:
-        """What the times of orders count from."""
+        """Zero of the fault commands' times."""
         return self.studio.start_ns
 
     @property
     def streams(self) -> dict[str, str]:
-        """Paths by the cameras' names."""
+        """Paths of the streams by camera name."""
         return {camera.name: camera.stream for camera in self.studio.cameras}
 
     def watch(self, descriptor: int, act: Callable[[], None]) -> None:
@@ -103,25 +105,25 @@ class CameraServer:
             self._watched[descriptor] = act
 
     def unwatch(self, descriptor: int) -> None:
-        """End it."""
+        """Stop watching a descriptor."""
         if self._watched.pop(descriptor, None) is None:
             self._selector.unregister(descriptor)
 
     def obey(self, text: str) -> str:
-        """An order, from the serving thread itself. Raises FaultCommandError."""
+        """Execute a fault command, from the serving thread itself. Raises FaultCommandError."""
         answer = self.studio.order(text, time.monotonic_ns())
         self._look.set()
         return f"{answer}\n{self.words()}" if text.split()[:1] == ["status"] else answer
 
     def words(self) -> str:
-        """For people."""
+        """The statistics as text."""
         return (
             f"{len(self._clients)} connections; {self.pictures} pictures sent, {self.withheld} withheld since this "
             f"computer was busy (at most {self.late_ns * 1e-6:.1f} ms after their time)"
         )
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until ``ended``; then close all. What fails in rendering is raised here."""
+        """Serve until ``ended``; then close all. Rendering errors are raised here."""
         darkroom = threading.Thread(target=self._render, name="darkroom", daemon=True)
         darkroom.start()
         try:
@@ -220,7 +222,7 @@ class CameraServer:
             self._feed(client)
 
     def _hear(self, client: _Client) -> bool:
-        """What a client says; False where it has gone."""
+        """Read from a client; False where it has gone."""
         try:
             data = client.link.recv(4096)
         except BlockingIOError:
@@ -241,7 +243,7 @@ class CameraServer:
         return True
 
     def _answer(self, client: _Client, request: http_pages.HttpRequest) -> None:
-        """Raises BadRequestError."""
+        """Respond to a request. Raises BadRequestError."""
         streams = list(self.streams.values())
         stream = next((s for s in streams if request.path in (s, http_pages.still_path(s))), None)
         if stream is None and request.path != "/":
@@ -266,12 +268,12 @@ class CameraServer:
         self._say(client, http_pages.failure(error, list(self.streams.values())))
 
     def _say(self, client: _Client, data: bytes) -> None:
-        """Send, then close."""
+        """Send a response, then close."""
         client.waiting, client.last = memoryview(data), True
         self._feed(client)
 
     def _feed(self, client: _Client) -> None:
-        """Send what waits; once nothing does, begin with the newest picture."""
+        """Send queued data; once there are none, start with the newest image."""
         if not client.waiting and client.stream and not client.last:
             self._next(client)
         stalled = client.stream in self.studio.stalled

@@ -1,5 +1,6 @@
-"""``tasks-abc`` (8.6, figs 8.6 to 8.12): three alignments with the RX 90, image-based stereo control, self-calibrated
-projectively or metric with coarse errors."""
+"""Experiment ``tasks-abc`` (8.6, figs 8.6 to 8.12): three alignments with the RX 90 by image-based stereo control,
+self-calibrated projectively or metric with coarse errors.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +81,7 @@ def abc_tasks(seed: int) -> tuple[AlignmentTask, ...]:
 def drawn(
     rng: np.random.Generator, number: int, seed: int, angle_deg: float, distance_m: float
 ) -> AlignmentTask:
-    """A task about 1 m off that the RX 90 reaches and whose straight way keeps the plate in view."""
+    """A random task about 1 m away that the RX 90 reaches and whose straight path keeps the plate in view."""
     cell = rx90_cell()
     while True:
         start, goal = random_ends(rng, angle_deg, distance_m)
@@ -94,7 +95,8 @@ def drawn(
 def run_tasks_abc(
     *, seeds: int, seed: int, progress: ProgressCall, gains: tuple[float, ...] = GAINS
 ) -> dict[str, Any]:
-    """All tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's kind.
+    """All tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's
+    kind.
 
     Raises CalibrationError.
     """
@@ -173,7 +175,7 @@ def _row(
 def _curve(
     name: str, calibration: str, settings: LoopSettings, trace: Trace, task: AlignmentTask
 ) -> dict[str, Any]:
-    """What the figures show of a run."""
+    """Data of a run for the figures."""
     return {
         "task": name,
         "calibration": calibration,
@@ -187,7 +189,7 @@ def _curve(
 
 
 def _beside(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Who solves what, over the gains, with the thesis's law."""
+    """Success of each calibration, over the gains, beside the thesis's."""
     found = []
     for name in DRAWN:
         for calibration in CALIBRATIONS:
@@ -209,7 +211,7 @@ def _beside(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _drawn_more(reasons: dict[str, list[str]]) -> list[dict[str, Any]]:
-    """How often poses of B's angle and distance are solved, whoever solves them."""
+    """Success rates of random poses of B's angle and distance."""
     return [
         {
             "task": "B drawn",

@@ -1,4 +1,4 @@
-"""``homing`` (fig. 4.10): a pan-tilt head finds home from the stereo image of one point.
+"""Experiment ``homing`` (fig. 4.10): homing of a pan-tilt head from the stereo image of one point.
 
 The bound is that of an estimator which knows the calibration only as well as its own trial motions tell: the noise of
 the current image and of the home image, new in each trial, and that of the calibration, common to all of a seed.
@@ -78,8 +78,8 @@ def homings(
     positions: FloatArray,
     pixels: FloatArray,
 ) -> Homings:
-    """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), known to the judge alone, to what ``home_pixels``
-    (t, c, m, 2) show at ``home`` (2,).
+    """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), unknown to the estimator, to what
+    ``home_pixels`` (t, c, m, 2) show at ``home`` (2,).
 
     Without ``calibration`` the head counts as exactly known. Raises JointAnglesError as `way_home` does.
     """
