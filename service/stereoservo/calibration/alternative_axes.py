@@ -52,8 +52,8 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
     base = np.median(data.offsets[used], axis=0)
     still = np.asarray((np.delete(np.abs(data.offsets - base), joint, axis=1) <= STILL).all(axis=1))
     own = data.select(still[data.stop])
-    way = data.offsets[:, joint]
-    span = float(np.ptp(way[still])) if still.any() else 0.0
+    displacement = data.offsets[:, joint]
+    span = float(np.ptp(displacement[still])) if still.any() else 0.0
     if span == 0.0:
         return None
     base[joint] = 0.0
@@ -67,10 +67,12 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
     )
     own = replace(own, offsets=data.offsets[:, joint : joint + 1], lens_priors=None)
     now = _solved(single, own)
-    middles = [_middle(single, float(end)) for end in (way[still].min(), way[still].max())]
+    centroids = [
+        _centroid(single, float(end)) for end in (displacement[still].min(), displacement[still].max())
+    ]
     best: Solution | None = None
     for direction in DIRECTIONS:
-        start = replace(single, generators=twist_about(direction, middles, span)[None])
+        start = replace(single, generators=twist_about(direction, centroids, span)[None])
         try:
             fit = _solved(start, own)
         except np.linalg.LinAlgError:
@@ -84,7 +86,7 @@ def _solved(rig: RigModel, data: Measurements) -> Solution:
     return solve(rig, data, "metric", cameras=False, points=False, max_evaluations=40, tolerance=1e-4)
 
 
-def _middle(rig: RigModel, angle: float) -> FloatArray:
+def _centroid(rig: RigModel, angle: float) -> FloatArray:
     """Centroid (3,) of a single joint's markers at ``angle``."""
     _, after = partial_products(rig, np.array([[angle]]))
     points = rig.points @ after[0, 0].T

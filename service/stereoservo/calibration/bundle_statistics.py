@@ -95,8 +95,8 @@ def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) ->
     left = np.maximum(2.0 - variances / sigmas**2, 0.0)
     expected = float((sigmas**2 * left).sum()) / n
     # Of Gaussian residuals r = (I - H) e: var(rᵀr) <= 2 σ⁴ trace(I - H_g).
-    spread = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
-    error = 0.5 * spread / np.sqrt(expected) if expected > 0.0 else 0.0
+    deviation = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
+    error = 0.5 * deviation / np.sqrt(expected) if expected > 0.0 else 0.0
     return GroupRms(float(np.sqrt(squares.mean())), float(np.sqrt(expected)), float(error))
 
 

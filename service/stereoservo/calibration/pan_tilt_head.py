@@ -148,7 +148,7 @@ def tracking_velocity(
             "too_few", "no set-point belongs to a point with a track; at least one is needed"
         )
     n = seen.chain.joints
-    rows, wanted = J[required].reshape(-1, n), -(gain * error + own)[required].ravel()
-    velocity, _, _, singular = np.linalg.lstsq(rows, wanted, rcond=CONDITIONING)
+    rows, target_velocity = J[required].reshape(-1, n), -(gain * error + own)[required].ravel()
+    velocity, _, _, singular = np.linalg.lstsq(rows, target_velocity, rcond=CONDITIONING)
     conditioning = float(singular[-1] / singular[0]) if len(singular) == n and singular[0] > 0 else 0.0
     return TrackingStep(velocity, float(np.linalg.norm(error[required], axis=1).max()), conditioning)

@@ -135,7 +135,7 @@ def _fit(
     report_progress("rigid bundle", 0.6)
     decided = options.lens != "auto" or bool(priors)
     solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
-    _refuse_misfit(trials, solution, every, inliers, options)
+    _refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
     raised = select_stratum(solution, every.select(inliers), options)
     final, inliers = refine_to_convergence(
@@ -148,8 +148,8 @@ def _fit(
         final, inliers = refine_to_convergence(
             raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS
         )
-    _refuse_misfit(trials, final, every, inliers, options)
-    _refuse_open(final, raised.notes)
+    _refuse_poor_fit(trials, final, every, inliers, options)
+    _refuse_undetermined(final, raised.notes)
     report_progress("report", 0.95)
     result = build_fit(
         trials,
@@ -311,7 +311,7 @@ def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> Bool
     return inside
 
 
-def _refuse_misfit(
+def _refuse_poor_fit(
     trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
 ) -> None:
     share = float((~inliers).mean())
@@ -365,7 +365,7 @@ def _refuse_misfit(
         )
 
 
-def _refuse_open(solution: Solution, notes: tuple[str, ...]) -> None:
+def _refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
     """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
     rank = rank_of(solution)
     because = f" ({'; '.join(notes)})" if notes else ""

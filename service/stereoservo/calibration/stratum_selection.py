@@ -157,12 +157,12 @@ class StratumSelector:
             return None
         for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _solve_to_convergence(solution, data)
-            spread = (
+            deviation = (
                 max(_relative_deviations(final).values()) if rank_of(final) == final.charts.size else np.inf
             )
             if (
                 final.converged
-                and spread <= LOOSE_SPREAD
+                and deviation <= LOOSE_SPREAD
                 and not self._worse(final, PLAUSIBLE_TAIL, projective)
             ):
                 self.notes.append(
@@ -207,9 +207,9 @@ class StratumSelector:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
         limit = self.options.max_spread
         return "; ".join(
-            f"{what} known to {spread:.0%} only, {limit:.0%} needed"
-            for what, spread in _relative_deviations(solution).items()
-            if spread > limit
+            f"{what} known to {deviation:.0%} only, {limit:.0%} needed"
+            for what, deviation in _relative_deviations(solution).items()
+            if deviation > limit
         )
 
     def _note(self, solution: Solution, text: str) -> None:

@@ -33,8 +33,11 @@ def describe(state: StateMessage) -> str:
     if state.efforts or state.following_errors:
         lines.append("  loads   " + _loads(state))
     if state.goal:
-        said = progress_words(state)
-        lines.append(f"  goal    {state.goal} ({state.law or 'joints'})" + (f": {said}" if said else ""))
+        progress_text = progress_words(state)
+        lines.append(
+            f"  goal    {state.goal} ({state.law or 'joints'})"
+            + (f": {progress_text}" if progress_text else "")
+        )
     lines += [
         f"  {reason.level:7} {' '.join(filter(None, (reason.code, reason.subject)))}: {reason.hint}"
         for reason in state.reasons

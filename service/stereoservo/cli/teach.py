@@ -53,9 +53,9 @@ def teach(
             raise CommandError(
                 "usage", "--tool goes with what the cameras see; in a drawing, its tool is named"
             )
-        wanted = read_drawing(drawing, name)
+        request = read_drawing(drawing, name)
         with Client(cell, endpoint=endpoint, operator=operator) as client:
-            reply = client.synthesise(wanted)
+            reply = client.synthesise(request)
         emit(reply, reply.message, json)
         return
     markers = () if tool is None else tuple(marker_ids(tool, "--tool"))

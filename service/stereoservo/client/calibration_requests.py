@@ -67,7 +67,7 @@ def _run(
     lease: Lease | None = None
 
     def until(*ends: str) -> Callable[[EventMessage], bool]:
-        def wanted(event: EventMessage) -> bool:
+        def matches(event: EventMessage) -> bool:
             if event.id != command.id:
                 return False
             if lease is not None and event.kind in ("calibration_finished", "check_finished"):
@@ -76,7 +76,7 @@ def _run(
                 progress(event)
             return event.kind in ends
 
-        return wanted
+        return matches
 
     with EventWatch(connection) as watch:
         connection.command("calibrate", command)

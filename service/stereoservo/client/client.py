@@ -265,7 +265,7 @@ class Client(Connection):
         subscribers = [
             (self._session.declare_subscriber(key, RingChannel(size)), kind) for key, kind, size in kinds
         ]
-        heard = time.monotonic()
+        last_heard_s = time.monotonic()
         try:
             while True:
                 idle = True
@@ -275,10 +275,10 @@ class Client(Connection):
                         if sample is None:
                             break
                         idle = False
-                        heard = time.monotonic()
+                        last_heard_s = time.monotonic()
                         yield read_message(str(sample.key_expr), sample.payload.to_bytes(), kind)
                 if idle:
-                    if time.monotonic() - heard > 2.0:
+                    if time.monotonic() - last_heard_s > 2.0:
                         raise DaemonLostError(f"cell {self.cell!r} has been silent for 2 s")
                     time.sleep(POLL_S)
         finally:

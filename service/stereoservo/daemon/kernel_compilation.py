@@ -102,8 +102,8 @@ def warm_up() -> None:
 def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
     """Run the core on frames of a camera that was moved: fault isolation runs at no other time."""
     settings = example_settings()
-    standing = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
-    core = ServoCore(msgspec.structs.replace(settings, cameras=standing))
+    static_cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
+    core = ServoCore(msgspec.structs.replace(settings, cameras=static_cameras))
     moved = pixels + np.array([30.0, 0.0]) * np.array([1.0, 0.0])[:, None, None]
     for step in range(1, 12):
         now_ns = 1_000_000_000 + step * PERIOD_NS

@@ -52,11 +52,11 @@ class Histogram:
         """Value that ``fraction`` of the counted ones do not exceed (upper edge of its bin, at most the maximum)."""
         if not self.count:
             return 0.0
-        wanted = fraction * self.count
+        rank = fraction * self.count
         seen = 0
         for index, count in enumerate(self._bins):
             seen += count
-            if count and seen >= wanted:
+            if count and seen >= rank:
                 return float(min(_upper_edge(index), self.maximum))
         return float(self.maximum)
 

@@ -57,12 +57,12 @@ def create_slot(path: Path, capacity: int, layout: str) -> None:
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         header = os.pread(fd, 24, 0)
-        wanted = struct.pack("=QQQ", _MAGIC, layout_hash(layout), capacity)
-        if header == wanted and os.fstat(fd).st_size == size:
+        expected = struct.pack("=QQQ", _MAGIC, layout_hash(layout), capacity)
+        if header == expected and os.fstat(fd).st_size == size:
             return
         os.ftruncate(fd, 0)
         os.ftruncate(fd, size)
-        os.pwrite(fd, wanted, 0)
+        os.pwrite(fd, expected, 0)
     finally:
         os.close(fd)
 

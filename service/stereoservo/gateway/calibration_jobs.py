@@ -64,13 +64,13 @@ class CalibrationJobs:
         elif event.kind == "model" and self._handed is not None:
             handed, self._handed = self._handed, None
             self.notes = ()
-            self._tell_taken(*handed)
+            self._report_applied(*handed)
         elif event.kind == "warning" and event.message.startswith("model refused"):
             goal_id = self._fit_id if self._handed is None else self._handed[0]
             self._handed = None
             self._failed(goal_id, event.message)
 
-    def _tell_taken(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
+    def _report_applied(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
         """Report that the core has applied the model that was sent."""
         if isinstance(what, ZeroReset):
             self._log.add("zeros_reset", message=what.message, id=goal_id, reset=what, origin="gateway")
@@ -173,9 +173,9 @@ class CalibrationJobs:
             kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
             self._failed(self._fit_id, f"{assess_failure(code, str(error)).text} {kept}", code)
             return
-        self._hand_over(model, self._fit_id, result, fit.model_path)
+        self._send_to_core(model, self._fit_id, result, fit.model_path)
 
-    def _hand_over(
+    def _send_to_core(
         self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path
     ) -> None:
         """Send a model to the core, which applies it once the arm is at rest; ``what`` is reported then."""
@@ -210,7 +210,7 @@ class CalibrationJobs:
         except ModelFileError as error:
             self._failed(self._check_id, str(error))
         else:
-            self._hand_over(model, self._check_id, reset, path)
+            self._send_to_core(model, self._check_id, reset, path)
 
     def _failed(self, goal_id: str, message: str, code: str = "") -> None:
         self._log.add("calibration_failed", message=message, id=goal_id, name=code, origin="gateway")

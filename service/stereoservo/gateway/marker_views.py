@@ -80,11 +80,11 @@ class MarkerViews:
     def points(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 4) at depth 1 in the first camera and their covariances (n, 4, 4); NaN where not seen twice."""
         points = triangulate(self.Ps, self.pixels, self.sigmas, iterations=6)
-        spread = np.full((len(points), 4, 4), np.nan)
+        covariance = np.full((len(points), 4, 4), np.nan)
         known = np.isfinite(points).all(axis=1)
         if known.any():
-            spread[known] = triangulation_covariance(self.Ps, points[known], self.sigmas[:, known])
-        return points, spread
+            covariance[known] = triangulation_covariance(self.Ps, points[known], self.sigmas[:, known])
+        return points, covariance
 
     def front_signs(self) -> FloatArray:
         """``(c,)``: the sign of the third row's product with a point in front of each camera, 1 for the first."""

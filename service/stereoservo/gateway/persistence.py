@@ -72,14 +72,14 @@ class ModelStore:
             except ModelFileError as error:
                 passed.append(str(error))
                 continue
-            misfit = _misfit(model, settings)
-            if not misfit:
+            mismatch = _mismatch(model, settings)
+            if not mismatch:
                 return model, passed
-            passed.append(f"{path}: {misfit}")
+            passed.append(f"{path}: {mismatch}")
         return None, passed
 
 
-def _misfit(model: CellModel, settings: CoreSettings) -> str:
+def _mismatch(model: CellModel, settings: CoreSettings) -> str:
     """Reason why ``model`` does not belong to this cell; empty where it does."""
     if model.joint_names != settings.joint_names or model.joint_kinds != settings.joint_kinds:
         return f"is of joints {_joints(model)}; the cell has {_joints(settings)}"

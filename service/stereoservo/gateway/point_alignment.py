@@ -44,7 +44,7 @@ def align_points(
     old: AlignmentFrame,
     new: AlignmentFrame,
     points: FloatArray,
-    spread: FloatArray | None,
+    covariance: FloatArray | None,
     now: MarkerViews,
     common: list[int],
     what: str,
@@ -53,7 +53,7 @@ def align_points(
 
     def fit(rows: BoolArray) -> tuple[FrameChange, FloatArray]:
         kept = np.flatnonzero(rows)
-        own = None if spread is None else spread[kept]
+        own = None if covariance is None else covariance[kept]
         change = align(
             family, old, new, points[kept], now.pixels[:, kept], now.sigmas[:, kept], own, [common[k] for k in kept]
         )  # fmt: skip
@@ -101,7 +101,7 @@ def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float
 
 
 def reproject_set_points(
-    model: CellModel, names: list[int], points: FloatArray, spread: FloatArray, what: str
+    model: CellModel, names: list[int], points: FloatArray, covariance: FloatArray, what: str
 ) -> tuple[Pixels, Deviations, str]:
     """Raw set-points of points (n, 4) by camera and marker, their deviations [px], and a description of their
     accuracy.
@@ -109,7 +109,7 @@ def reproject_set_points(
     A point outside of an image is none there. Raises TransferError behind a camera, and where too few remain.
     """
     views = MarkerViews.empty(model, names)
-    pixels, deviations = reprojected(views.Ps, points, spread)
+    pixels, deviations = reprojected(views.Ps, points, covariance)
     depths = np.einsum("cj,nj->cn", views.Ps[:, 2], points) * views.front_signs()[:, None]
     if not (depths > 0).all():
         camera, k = (int(i) for i in np.argwhere(~(depths > 0))[0])

@@ -244,14 +244,14 @@ class Gateway:
             return encode(self._record(decode(payload, Record)))
         return encode(Reply(True, self._teaching.synthesise(decode(payload, Synthesise)), boot=self.boot))
 
-    def _record(self, wanted: Record) -> Reply:
+    def _record(self, request: Record) -> Reply:
         try:
-            if wanted.on and wanted.images:
+            if request.on and request.images:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._servo.records = wanted.on
-        if not wanted.on:
+        self._servo.records = request.on
+        if not request.on:
             steps = self._recordings.stop()
             return Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
         if self._recordings.running:

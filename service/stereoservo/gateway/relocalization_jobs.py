@@ -26,11 +26,11 @@ class RelocalizationJob(ChildJob):
     def __init__(self, job: RelocalizationPoses, model_path: Path, new_path: Path, epoch: int) -> None:
         self.cameras = job.events[-1].cameras
         self.goal = job.events[-1].id
-        sights = new_path.with_name("reanchor.msgpack")
-        save_events(sights, job.events)
+        events_file = new_path.with_name("reanchor.msgpack")
+        save_events(events_file, job.events)
         super().__init__(
             "stereoservo.daemon.jobs.relocalization_job",
-            str(sights),
+            str(events_file),
             str(model_path),
             str(new_path),
             "--epoch",

@@ -159,8 +159,10 @@ def align(
             points=called[both].tolist(),
         )
     own = None if M_covariance is None else np.asarray(M_covariance, dtype=np.float64)
-    spread = triangulation_covariance(new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both])
-    _refuse_flat(family, M_new[both], spread, called[both].tolist())
+    covariance_px = triangulation_covariance(
+        new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both]
+    )
+    _refuse_flat(family, M_new[both], covariance_px, called[both].tolist())
     up_old, up_new = _upgrades(family, old, new)
     T = _start(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
@@ -295,8 +297,8 @@ def reprojected(Ps: FloatArray, M: FloatArray, covariance: FloatArray) -> tuple[
     ``covariance`` (n, 4, 4) of the points.
     """
     J = projection_jacobian_many(Ps, M)
-    spread = np.einsum("cnij,njk,cnlk->cnil", J, covariance, J)
-    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[..., -1], 0.0))
+    covariance_px = np.einsum("cnij,njk,cnlk->cnil", J, covariance, J)
+    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_px)[..., -1], 0.0))
     return project_many(Ps, M), deviations
 
 

@@ -66,6 +66,6 @@ def pixel_whitening(
     if M_covariance is None:
         return w[:, :, None] * np.eye(w.shape[1])
     J = projection_jacobian_many(Ps @ H, M).transpose(1, 0, 2, 3).reshape(len(M), -1, 4) * w[..., None]
-    spread = np.linalg.cholesky(np.eye(w.shape[1]) + J @ M_covariance @ J.transpose(0, 2, 1))
-    whitening: FloatArray = np.linalg.inv(spread) * w[:, None, :]
+    root = np.linalg.cholesky(np.eye(w.shape[1]) + J @ M_covariance @ J.transpose(0, 2, 1))
+    whitening: FloatArray = np.linalg.inv(root) * w[:, None, :]
     return whitening

@@ -196,8 +196,8 @@ def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray,
             singular=singular,
         )
     # Of the determinant, relative: tr(H⁻¹ dH) over the covariance of dH.
-    spread = np.linalg.inv(H).T.ravel() @ chart @ (rows.T / singular)
-    deviations = 1.0 / max(float(np.linalg.norm(spread)), 1e-300)
+    covariance_px = np.linalg.inv(H).T.ravel() @ chart @ (rows.T / singular)
+    deviations = 1.0 / max(float(np.linalg.norm(covariance_px)), 1e-300)
     if deviations < REGULAR:
         raise GeometryError(
             "degenerate",
@@ -275,7 +275,9 @@ class _PixelTargets:
         for size, at in self.plane_at.items():
             X = moved[at] / (moved[at] @ Ps[0, 2])[:, None]
             B = self.planes[size]
-            spread = B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
+            covariance_px = (
+                B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
+            )
             offset = np.einsum("nij,nj->ni", B, X)
-            parts.append(np.linalg.solve(np.linalg.cholesky(spread), offset[..., None]).ravel())
+            parts.append(np.linalg.solve(np.linalg.cholesky(covariance_px), offset[..., None]).ravel())
         return np.concatenate(parts)

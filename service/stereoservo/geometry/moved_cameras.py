@@ -46,10 +46,10 @@ def plane_deviations(points: FloatArray, covariance: FloatArray | None = None) -
         Q, R = np.linalg.qr(stack)
         plane: FloatArray = np.asarray(np.linalg.solve(R, np.linalg.svd(Q[:n])[2][3]), dtype=np.float64)
         plane = plane / np.linalg.norm(plane)
-        spread = np.sqrt(np.einsum("i,nij,j->n", plane, covariance, plane))
-        weights = 1.0 / np.where(spread > 0, spread, 1.0)
+        deviation = np.sqrt(np.einsum("i,nij,j->n", plane, covariance, plane))
+        weights = 1.0 / np.where(deviation > 0, deviation, 1.0)
         weights = weights / weights.max()
-    deviations = (points @ plane) / np.where(spread > 0, spread, 1.0)
+    deviations = (points @ plane) / np.where(deviation > 0, deviation, 1.0)
     return plane, float(np.sqrt(np.mean(deviations**2)))
 
 
@@ -144,20 +144,22 @@ def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -
     whitened = chart @ (rows.T / singular)
     _refuse_flat_view(moved, whitened)
     # Back from the whitened frame, and to the gauge of unit norm.
-    spread = (whitened.T.reshape(-1, 3, 4) @ root).reshape(-1, 12).T
-    spread = spread - np.outer(P.ravel(), P.ravel() @ spread)
+    deviation = (whitened.T.reshape(-1, 3, 4) @ root).reshape(-1, 12).T
+    deviation = deviation - np.outer(P.ravel(), P.ravel() @ deviation)
     residuals = reprojection_residuals(P[None], M, pixels[None]).ravel() / sigma
     freedom = residuals.size - 11
-    return ResectedCamera(P, spread @ spread.T, float(np.sqrt(residuals @ residuals / freedom)), freedom)
+    return ResectedCamera(
+        P, deviation @ deviation.T, float(np.sqrt(residuals @ residuals / freedom)), freedom
+    )
 
 
-def _refuse_flat_view(P: FloatArray, spread: FloatArray) -> None:
+def _refuse_flat_view(P: FloatArray, deviation: FloatArray) -> None:
     """Raise GeometryError where a homography of the points' plane explains the pixels within noise.
 
     ``P`` (3, 4) with the points' best plane as first coordinate, and a root ``spread`` (12, 11) of its covariance:
     without a significant first column the images are those of points in the plane.
     """
-    column, root = P[:, 0], spread[[0, 4, 8]]
+    column, root = P[:, 0], deviation[[0, 4, 8]]
     deviations = float(np.sqrt(column @ np.linalg.solve(root @ root.T, column) / 3.0))
     if deviations < OFF_PLANE:
         raise GeometryError(

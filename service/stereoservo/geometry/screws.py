@@ -94,6 +94,6 @@ def twist_vectors(T: FloatArray, tolerance: float = 1e-9) -> tuple[FloatArray, F
             f"a matrix is no Euclidean twist: {worst:.3g} of it is not; conjugate it by H_PE first",
             excess=worst,
         )
-    odd = 0.5 * (block - np.swapaxes(block, -1, -2))
-    w = np.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], axis=-1)
+    odd_part = 0.5 * (block - np.swapaxes(block, -1, -2))
+    w = np.stack([odd_part[..., 2, 1], odd_part[..., 0, 2], odd_part[..., 1, 0]], axis=-1)
     return w, T[..., :3, 3].copy()

@@ -292,9 +292,9 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
         reason = "conditioning"
     if reason:
         return _Single(None, None, MotionJudgement(reason, conditioning, least, excess))
-    z, spread = _height_one(W, rest, fit.plane, fit.plane_covariance)
+    z, variance = _height_one(W, rest, fit.plane, fit.plane_covariance)
     deviation = scene.deviation(fit)
-    return _Single(z, spread, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
+    return _Single(z, variance, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
 
 
 def _second_singular_noise(
@@ -309,9 +309,9 @@ def _second_singular_noise(
     errors = left @ (slopes / gamma - traces[:, None, None] * H / (4.0 * gamma**2))
     errors = errors.reshape(len(slopes), 16)
     C = errors.T @ covariance @ errors
-    mean, spread = float(np.trace(C)), float((C * C).sum())
-    freedom = mean**2 / spread
-    return float(np.sqrt(spread / mean * chi2_distribution.isf(TAIL, freedom)))
+    mean, variance = float(np.trace(C)), float((C * C).sum())
+    freedom = mean**2 / variance
+    return float(np.sqrt(variance / mean * chi2_distribution.isf(TAIL, freedom)))
 
 
 def _height_one(
@@ -321,12 +321,12 @@ def _height_one(
     centroid.
     """
     M = points[np.isfinite(points).all(axis=1)] @ W.T
-    middle = (M / np.linalg.norm(M, axis=1, keepdims=True)).mean(axis=0)
-    across = np.linalg.svd(middle[None])[2][1:]
+    centroid = (M / np.linalg.norm(M, axis=1, keepdims=True)).mean(axis=0)
+    across = np.linalg.svd(centroid[None])[2][1:]
     back = np.linalg.inv(W).T
     h = back @ plane
-    height = float(h @ middle)
-    J = across @ (np.eye(4) - np.outer(h / height, middle)) @ back / height
+    height = float(h @ centroid)
+    J = across @ (np.eye(4) - np.outer(h / height, centroid)) @ back / height
     return across @ h / height, np.asarray(J @ covariance @ J.T, dtype=np.float64)
 
 

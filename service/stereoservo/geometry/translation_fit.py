@@ -286,9 +286,9 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
     basis = plane_basis(M)
     B, normal = basis[:, :3], basis[:, 3]
     m = M @ B
-    spread = np.linalg.qr(m / np.linalg.norm(m, axis=1, keepdims=True))[1]
+    factor = np.linalg.qr(m / np.linalg.norm(m, axis=1, keepdims=True))[1]
     depth = np.einsum("cj,nj->cn", Ps[:, 2], M)
-    unit = M / np.linalg.norm(m @ np.linalg.inv(spread), axis=1, keepdims=True)
+    unit = M / np.linalg.norm(m @ np.linalg.inv(factor), axis=1, keepdims=True)
     jacobian = projection_jacobian_many(Ps, unit)
     left = np.linalg.cholesky(np.einsum("cnai,cnaj->ij", jacobian, jacobian)).T
     weighted = []
@@ -298,9 +298,9 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
         values = np.linalg.eigvals(B.T @ D)
         pairs = [(abs(values[i] - values[j]), values[i] + values[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
         gamma = 0.5 * float(min(pairs, key=lambda pair: float(pair[0]))[1].real)
-        weighted.append(left @ (D / gamma - B) @ spread.T)
+        weighted.append(left @ (D / gamma - B) @ factor.T)
     v = np.linalg.svd(np.concatenate(weighted))[2][0]
-    g = np.linalg.solve(spread, v)
+    g = np.linalg.solve(factor, v)
     k = np.stack([np.linalg.solve(left, G @ v) for G in weighted])
     return _last_freedom(B @ g, normal, k, left)
 

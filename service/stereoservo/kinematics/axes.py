@@ -102,9 +102,9 @@ def common_normal(
     """Feet (3,), (3,) of the common normal on two lines that are not parallel."""
     normal = np.cross(u1, u2)
     square = float(normal @ normal)
-    apart = c2 - c1
-    foot1 = c1 + u1 * (np.cross(apart, u2) @ normal / square)
-    foot2 = c2 + u2 * (np.cross(apart, u1) @ normal / square)
+    between = c2 - c1
+    foot1 = c1 + u1 * (np.cross(between, u2) @ normal / square)
+    foot2 = c2 + u2 * (np.cross(between, u1) @ normal / square)
     return foot1, foot2
 
 

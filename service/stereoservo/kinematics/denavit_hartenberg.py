@@ -122,12 +122,19 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
 
     values = read(model).reshape(-1, 6)
     if not np.isfinite(values[:, :5]).all():
-        raise ReadOutError("length", f"the model's {_told(known)} is zero: it gives no scale")
+        raise ReadOutError("length", f"the model's {_length_name(known)} is zero: it gives no scale")
     deviations = standard_deviations(model, read)
-    spread = None if deviations is None else deviations.reshape(-1, 6)
+    deviations_by_row = None if deviations is None else deviations.reshape(-1, 6)
     chosen = chosen_columns(axes, links)
     return tuple(
-        _row(name, kind, links[j].link, values[j], None if spread is None else spread[j], chosen[j])
+        _row(
+            name,
+            kind,
+            links[j].link,
+            values[j],
+            None if deviations_by_row is None else deviations_by_row[j],
+            chosen[j],
+        )
         for j, (name, kind) in enumerate(zip(model.joint_names, parts.kinds, strict=True))
     )
 
@@ -137,31 +144,31 @@ def _row(
     kind: str,
     link: LinkKind,
     values: FloatArray,
-    spread: FloatArray | None,
+    deviations_by_row: FloatArray | None,
     chosen: tuple[str, ...],
 ) -> DhRow:
     """A row from its six values and their standard deviations, if any."""
     slides = kind == "prismatic"
-    told = {column: float(value) for column, value in zip(COLUMNS, values, strict=False)}
+    columns = {column: float(value) for column, value in zip(COLUMNS, values, strict=False)}
 
     def std(column: str) -> float | None:
-        if spread is None:
+        if deviations_by_row is None:
             return None
-        return 0.0 if column in chosen else float(spread[COLUMNS.index(column)])
+        return 0.0 if column in chosen else float(deviations_by_row[COLUMNS.index(column)])
 
     return DhRow(
         joint=joint,
         kind=kind,
         link=link,
         scale=float(values[5]) if slides else None,
-        scale_std=float(spread[5]) if slides and spread is not None else None,
+        scale_std=float(deviations_by_row[5]) if slides and deviations_by_row is not None else None,
         chosen=chosen,
         a_std=std("a"),
         alpha_std=std("alpha"),
         beta_std=std("beta"),
         d_std=std("d"),
         theta_std=std("theta"),
-        **told,
+        **columns,
     )
 
 
@@ -219,7 +226,7 @@ def _length(parts: FramedModel, axes: Axes, table: FloatArray, known: KnownLengt
     return float(abs(table[j, 0 if known.what == "a" else 3]))
 
 
-def _told(known: KnownLength) -> str:
+def _length_name(known: KnownLength) -> str:
     return f"{known.what} of {', '.join(str(name) for name in known.of)}"
 
 
@@ -251,7 +258,7 @@ def _check_known(model: CellModel, known: KnownLength) -> None:
     if len(known.of) != count or len(set(known.of)) != count or not set(known.of) <= set(valid):
         raise ReadOutError(
             "unknown_name",
-            f"known length {_told(known)}: {count} of {', '.join(str(name) for name in valid) or 'none'} needed",
+            f"known length {_length_name(known)}: {count} of {', '.join(str(name) for name in valid) or 'none'} needed",
             of=known.of,
             valid=valid,
         )

@@ -99,7 +99,7 @@ def measured_joints(
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
     _refuse_open(problem, q[ordered[0]], largest_deviation)
-    found = _told_apart(problem, q[ordered], costs[ordered])
+    found = _distinct_configurations(problem, q[ordered], costs[ordered])
     inside = tuple(angles for angles in found if _inside(angles, bounds))
     if not inside:
         raise JointAnglesError(
@@ -132,7 +132,7 @@ def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]
     return np.asarray(possible[np.argsort(costs[possible], kind="stable")], dtype=np.int64)
 
 
-def _told_apart(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list[JointAngles]:
+def _distinct_configurations(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list[JointAngles]:
     """Distinct configurations from ends ``q`` (s, n) in order of their ``costs`` (s,)."""
     found: list[JointAngles] = []
     for end, cost in zip(q, costs, strict=True):
@@ -372,13 +372,13 @@ def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
         )
 
 
-def _same(apart: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
+def _same(difference: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
     """Whether two ends of a search, ``apart`` (n,) and ``worse`` in cost, are one configuration: within a tenth of
     a deviation, or in one basin of attraction, where the cost grows as the square of the distance.
     """
     revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
-    apart = np.where(revolute, np.mod(apart + np.pi, 2.0 * np.pi) - np.pi, apart)
-    return bool(np.abs(apart).max() < 1e-6 or apart @ information @ apart < 1e-2 + 4.0 * worse)
+    difference = np.where(revolute, np.mod(difference + np.pi, 2.0 * np.pi) - np.pi, difference)
+    return bool(np.abs(difference).max() < 1e-6 or difference @ information @ difference < 1e-2 + 4.0 * worse)
 
 
 def _inside(angles: JointAngles, bounds: FloatArray) -> bool:

@@ -246,8 +246,8 @@ def points_seen(
     points = triangulate(seen.cameras, np.where(given[..., None], here.pixels[0], np.nan), noise)
     known = np.isfinite(points).all(axis=1)
     covariance = np.zeros((len(points), 4, 4))
-    spread = np.where(given, noise, np.inf)
-    covariance[known] = triangulation_covariance(seen.cameras, points[known], spread[:, known])
+    sigmas = np.where(given, noise, np.inf)
+    covariance[known] = triangulation_covariance(seen.cameras, points[known], sigmas[:, known])
     back: FloatArray = np.asarray(np.linalg.inv(seen.chain.displacement(q)), dtype=np.float64)
     return points @ back.T, back @ covariance @ back.T
 

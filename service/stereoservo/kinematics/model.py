@@ -374,8 +374,8 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
         for i, basis in enumerate(bases):
             where = f"covariance.{key}[{i}]"
             if basis.shape[1:] != shape:
-                wanted = ", ".join(str(n) for n in shape)
-                raise ModelFileError(path, where, f"has shape {basis.shape}; (p, {wanted}) is needed")
+                needed = ", ".join(str(n) for n in shape)
+                raise ModelFileError(path, where, f"has shape {basis.shape}; (p, {needed}) is needed")
             if not np.isfinite(basis).all():
                 raise ModelFileError(path, where, "has entries that are not finite")
             p += len(basis)

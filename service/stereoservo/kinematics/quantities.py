@@ -188,8 +188,8 @@ def _coordinates(model: CellModel, parts: FramedModel, slides: list[int]) -> lis
 
     def values(parts: FramedModel) -> FloatArray:
         steps = parts.generators[basis, :3, 3]
-        apart = parts.points[1:, :3] - parts.points[0, :3]
-        return np.asarray(np.linalg.solve(steps.T, apart.T).T.ravel(), dtype=np.float64)
+        offsets = parts.points[1:, :3] - parts.points[0, :3]
+        return np.asarray(np.linalg.solve(steps.T, offsets.T).T.ravel(), dtype=np.float64)
 
     return [Group(names, values)]
 

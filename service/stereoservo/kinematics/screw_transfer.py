@@ -62,8 +62,8 @@ def screw_of_points(S: FloatArray, S_dot: FloatArray, moving_camera: bool = Fals
     S, rates = _finite("points", S), _finite("velocities", S_dot)
     if len(S) < 3:
         raise GeometryError("too_few", f"{len(S)} points; three fix a screw", points=len(S))
-    spread = np.linalg.svd(S - S.mean(axis=0), compute_uv=False)
-    if not spread[1] > 1e-9 * max(float(spread[0]), float(np.abs(S).max())):
+    singular = np.linalg.svd(S - S.mean(axis=0), compute_uv=False)
+    if not singular[1] > 1e-9 * max(float(singular[0]), float(np.abs(S).max())):
         raise GeometryError("degenerate", "the points lie on one line; a turn about it moves none of them")
     J = point_interaction(S, moving_camera).reshape(-1, 6)
     vector = np.asarray(np.linalg.lstsq(J, rates.ravel(), rcond=None)[0], dtype=np.float64)

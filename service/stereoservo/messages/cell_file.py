@@ -404,8 +404,12 @@ def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:
         return []
     info = msgspec.inspect.type_info(section)
     assert isinstance(info, msgspec.inspect.StructType)
-    wanted = next((field.type for field in info.fields if field.encode_name == name), None)
-    return [str(word) for word in wanted.values] if isinstance(wanted, msgspec.inspect.LiteralType) else []
+    field_type = next((field.type for field in info.fields if field.encode_name == name), None)
+    return (
+        [str(word) for word in field_type.values]
+        if isinstance(field_type, msgspec.inspect.LiteralType)
+        else []
+    )
 
 
 _SECTIONS: dict[str, type[msgspec.Struct]] = {

@@ -98,8 +98,8 @@ def chi2_quantile(tail: float, freedom: int) -> float:
     while chi2_tail(high, freedom) > tail:
         high *= 2.0
     for _ in range(80):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if chi2_tail(middle, freedom) > tail else (low, middle)
+        midpoint = 0.5 * (low + high)
+        low, high = (midpoint, high) if chi2_tail(midpoint, freedom) > tail else (low, midpoint)
     return high
 
 

@@ -239,12 +239,12 @@ def rigid_motion(x: FloatArray, centre: FloatArray, scale: float) -> FloatArray:
 
 
 def _scene(rig: RigModel) -> tuple[FloatArray, float]:
-    middle = rig.points[:, :3].mean(axis=0)
-    return middle, float(np.linalg.norm(middle)) or 1.0
+    centroid = rig.points[:, :3].mean(axis=0)
+    return centroid, float(np.linalg.norm(centroid)) or 1.0
 
 
 def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[State, FloatArray], State]:
-    middle, scale = _scene(rig)
+    centroid, scale = _scene(rig)
     bases = {}
     for c in which:
         matrix = rig.cameras[c].ravel() / np.linalg.norm(rig.cameras[c])
@@ -254,7 +254,7 @@ def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[St
         cameras = state[0].cameras.copy()
         for c in which:
             if metric:
-                cameras[c] = cameras[c] @ rigid_motion(x, middle, scale)
+                cameras[c] = cameras[c] @ rigid_motion(x, centroid, scale)
             else:
                 cameras[c] = cameras[c] + np.einsum("p,pij->ij", x, bases[c])
         return replace(state[0], cameras=cameras), state[1]
@@ -263,10 +263,10 @@ def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[St
 
 
 def _body(rig: RigModel) -> Callable[[State, FloatArray], State]:
-    middle, scale = _scene(rig)
+    centroid, scale = _scene(rig)
 
     def apply(state: State, x: FloatArray) -> State:
-        return replace(state[0], points=state[0].points @ rigid_motion(x, middle, scale).T), state[1]
+        return replace(state[0], points=state[0].points @ rigid_motion(x, centroid, scale).T), state[1]
 
     return apply
 

@@ -164,26 +164,26 @@ def plane_or_baseline(trials: TrialData, error: CalibrationError) -> Calibration
     """Error that states why the epipolar geometry is undetermined: coplanar markers, or a single centre of
     projection.
     """
-    out_of_plane = _leaves_its_plane(trials)
+    out_of_plane = _excludes_plane(trials)
     rms, sigma = error.data["rms_px"], error.data.get("sigma_px", float("nan"))
-    told = f"what two cameras see in common is one homography to {rms:.3g} px, at sigmas of {sigma:.3g} px"
+    summary = f"what two cameras see in common is one homography to {rms:.3g} px, at sigmas of {sigma:.3g} px"
     if out_of_plane:
         return CalibrationError(
             "no_baseline",
-            f"{told}, though the markers do not stay in one plane: the cameras have (nearly) one centre. Their "
+            f"{summary}, though the markers do not stay in one plane: the cameras have (nearly) one centre. Their "
             f"parallax is at most {rms:.3g} px, {rms / sigma:.2g} sigmas. Move them apart",
             parallax_px=rms,
             parallax_sigmas=rms / sigma,
         )
     return CalibrationError(
         "views_degenerate",
-        f"{told}: all markers stay in one plane in all trials, or the cameras have (nearly) one centre (parallax at "
+        f"{summary}: all markers stay in one plane in all trials, or the cameras have (nearly) one centre (parallax at "
         f"most {rms / sigma:.2g} sigmas). Add markers off the plane, or move the cameras apart",
         **error.data,
     )
 
 
-def _leaves_its_plane(trials: TrialData) -> bool:
+def _excludes_plane(trials: TrialData) -> bool:
     """Whether the first camera's tracks exclude coplanar markers that only move within their own plane.
 
     A motion of a plane in itself has, in the image too, eigenvalues of one modulus; markers off one plane have no
@@ -204,9 +204,10 @@ def _leaves_its_plane(trials: TrialData) -> bool:
         if H is None or not np.linalg.det(H) > 0.0:
             continue  # markers on a line at one of the two stops
         mapped = np.hstack([before, np.ones((len(before), 1))]) @ H.T
-        misfit = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - after, axis=1) / sigmas[last, both]
+        residuals_px = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - after, axis=1) / sigmas[last, both]
         moduli = np.abs(np.linalg.eigvals(H / np.cbrt(np.linalg.det(H))))
         signs.append(
-            float(np.median(misfit)) > 10.0 or float(np.ptp(moduli)) > PLANAR_MODULI * float(moduli.max())
+            float(np.median(residuals_px)) > 10.0
+            or float(np.ptp(moduli)) > PLANAR_MODULI * float(moduli.max())
         )
     return bool(signs) and float(np.mean(signs)) >= 0.5

@@ -78,7 +78,7 @@ def diagnose_failure(
     if error.code == "views_degenerate" and "rms_px" in error.data:
         return plane_or_baseline(trials, error)
     try:
-        named = _named(trials, refit, options)
+        named = _first_cause(trials, refit, options)
     except (GeometryError, np.linalg.LinAlgError):
         named = None  # data on which the search for a cause breaks down, too: the first error is returned
     if named is not None and named.code == "noise_understated":
@@ -87,18 +87,18 @@ def diagnose_failure(
     if named is not None:
         return named
     if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
-        return _contradicting(trials, error)
-    return _explained(trials, error, refit, options) if error.code in MISFITS else error
+        return _contradiction_error(trials, error)
+    return _outlier_error(trials, error, refit, options) if error.code in MISFITS else error
 
 
-def _named(
+def _first_cause(
     trials: TrialData, refit: Refit, options: FitOptions, left: TrialData | None = None
 ) -> CalibrationError | None:
     """Error of the first cause that holds, cheap tests first. ``left``: the model's residuals of the trials."""
     for hypothesis in exchange_hypotheses(trials):
         if fit_of_correction(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
-    stepped = _stepped(trials if left is None else left)
+    stepped = _step_error(trials if left is None else left)
     if stepped is not None:
         return stepped
     noisier = underestimated_noise(trials, refit, options)
@@ -126,7 +126,7 @@ def _named(
     return None
 
 
-def _stepped(trials: TrialData) -> CalibrationError | None:
+def _step_error(trials: TrialData) -> CalibrationError | None:
     """Error of a step in the markers' tracks; None where there is none."""
     step = find_step(trials)
     if step is None:
@@ -138,7 +138,7 @@ def _stepped(trials: TrialData) -> CalibrationError | None:
     return moved_together(step.stop)
 
 
-def _explained(
+def _outlier_error(
     trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
 ) -> CalibrationError:
     """Error with what the outliers of a lenient fit have in common, or with a list of possible causes."""
@@ -174,7 +174,7 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
     )
 
 
-def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationError:
+def _contradiction_error(trials: TrialData, error: CalibrationError) -> CalibrationError:
     """Error of a joint whose stops are lost because the cameras contradict each other, not because they see
     nothing.
     """
@@ -212,7 +212,7 @@ def review_notes(
     if not statistics.chi2_ok:
         suspicious = float(outliers.mean()) > SUSPICIOUS_OUTLIERS
         left = residual_trials(trials, result)
-        named = _named(trials, refit, options, left) if suspicious else _stepped(left)
+        named = _first_cause(trials, refit, options, left) if suspicious else _step_error(left)
         if named is not None:
             raise named
     nearly = not statistics.chi2_ok or any("follow" in note for note in result.report.notes)

@@ -129,14 +129,14 @@ def scale_error(
             found[trials.joint_names[scale.joint]] = whole
     if not found:
         return None
-    told = ", ".join(
+    listed = ", ".join(
         f"{name!r} reports {scale.factor:.5g} ± {scale.deviation:.1g} times its motion"
         + (" (degrees, not radians)" if abs(np.degrees(1.0) / scale.factor - 1.0) < 0.02 else "")
         for name, scale in found.items()
     )
     return CalibrationError(
         "wrong_scale",
-        f"joint {told}. Revolute joints must report radians: correct the drive's scale",
+        f"joint {listed}. Revolute joints must report radians: correct the drive's scale",
         joints={
             name: {"factor": scale.factor, "deviation": scale.deviation} for name, scale in found.items()
         },

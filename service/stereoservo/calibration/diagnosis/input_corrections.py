@@ -84,18 +84,19 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
     """Corrections of a joint's kind where its own trial fits the other kind much better."""
     cameras, points, usable = views
     residuals_by_kind: dict[int, tuple[float, float, Kind]] = {}
-    for joint, said in enumerate(trials.joint_kinds):
+    for joint, stated in enumerate(trials.joint_kinds):
         try:
             stops, groups, base = trial_stops(trials, points, joint)
         except CalibrationError:
             continue  # too few stops to determine a kind
-        sights = virtual_markers(trials, points, usable, stops, groups)
-        way = trials.positions[stops, joint] - base[joint]
-        other: Kind = "prismatic" if said == "revolute" else "revolute"
-        as_said, as_other = (
-            best_single_joint(kind, cameras, sights, way, thorough=True)[1] for kind in (said, other)
+        observations = virtual_markers(trials, points, usable, stops, groups)
+        displacement = trials.positions[stops, joint] - base[joint]
+        other: Kind = "prismatic" if stated == "revolute" else "revolute"
+        as_stated, as_other = (
+            best_single_joint(kind, cameras, observations, displacement, thorough=True)[1]
+            for kind in (stated, other)
         )
-        residuals_by_kind[joint] = as_said, as_other, other
+        residuals_by_kind[joint] = as_stated, as_other, other
     # The other kind must reach what the other joints do; a joint that fits neither way is no case of this.
     floor = (
         float(np.median([min(least, instead) for least, instead, _ in residuals_by_kind.values()]))
@@ -105,12 +106,12 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
     for joint, (least, instead, other) in residuals_by_kind.items():
         if not instead < min(KIND_BETTER * floor, least / KIND_BETTER):
             continue
-        name, said = trials.joint_names[joint], trials.joint_kinds[joint]
+        name, stated = trials.joint_names[joint], trials.joint_kinds[joint]
         kinds = tuple(other if j == joint else kind for j, kind in enumerate(trials.joint_kinds))
         yield InputCorrection(
             "joint_kind",
-            f"joint {name!r} is said to be {said}, but is {other}: as such its trial fits to {instead:.3g} sigmas, as "
-            f"stated to {least:.3g}",
+            f"joint {name!r} is said to be {stated}, but is {other}: as such its trial fits to {instead:.3g} sigmas, "
+            f"as stated to {least:.3g}",
             {"joint": name, "kind": other},
             msgspec.structs.replace(trials, joint_kinds=kinds),
         )

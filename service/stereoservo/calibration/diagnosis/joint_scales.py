@@ -69,12 +69,12 @@ def trial_scales(
             stops, groups, base = trial_stops(trials, points, joint)
         except CalibrationError:
             continue  # too few stops to estimate a scale
-        sights = virtual_markers(trials, points, usable, stops, groups)
-        way = trials.positions[stops, joint] - base[joint]
+        observations = virtual_markers(trials, points, usable, stops, groups)
+        displacement = trials.positions[stops, joint] - base[joint]
         if kind == "revolute":
-            factors[joint], residual[joint] = _best_factor(cameras, sights, way)
+            factors[joint], residual[joint] = _best_factor(cameras, observations, displacement)
         else:
-            residual[joint] = best_single_joint(kind, cameras, sights, way)[1]
+            residual[joint] = best_single_joint(kind, cameras, observations, displacement)[1]
     known = np.isfinite(residual)
     if known.any():
         factors[known & (residual > ABOVE_FLOOR * np.median(residual[known]))] = 1.0
@@ -83,29 +83,29 @@ def trial_scales(
 
 def with_scales_removed(trials: TrialData, factors: FloatArray) -> TrialData:
     """The trials with positions divided by ``factors`` (n,) about their medians."""
-    middle = np.median(trials.positions, axis=0)
-    return msgspec.structs.replace(trials, positions=middle + (trials.positions - middle) / factors)
+    centre = np.median(trials.positions, axis=0)
+    return msgspec.structs.replace(trials, positions=centre + (trials.positions - centre) / factors)
 
 
 def _best_factor(
-    cameras: FloatArray, sights: VirtualObservations, reported: FloatArray
+    cameras: FloatArray, observations: VirtualObservations, reported: FloatArray
 ) -> tuple[float, float]:
     """Scale factor of one joint's ``reported`` angles (k,), 1 where no other gains enough, and the median residual
     [sigmas] with it; NaN where the joint fits with none.
     """
-    rough = _rigid_factor(sights, reported)
+    rough = _rigid_factor(observations, reported)
     rigs: dict[float, tuple[RigModel, float]] = {}
     for factor in {1.0, *(rough * step for step in COARSE)}:
         # As reported, the joint must have had every chance before another factor is believed.
         rig, typical = best_single_joint(
-            "revolute", cameras, sights, reported / factor, thorough=factor == 1.0
+            "revolute", cameras, observations, reported / factor, thorough=factor == 1.0
         )
         if rig is not None and np.isfinite(typical):
             rigs[factor] = rig, typical
     if not rigs:
         return 1.0, np.nan
     start = min(rigs, key=lambda factor: rigs[factor][1])
-    camera, stop, marker = np.nonzero(sights.usable)
+    camera, stop, marker = np.nonzero(observations.usable)
     noise = max(1.0, min(typical for _, typical in rigs.values()))
 
     def solved(log_factor: float, rig: RigModel) -> FloatArray:
@@ -115,8 +115,8 @@ def _best_factor(
             camera,
             stop,
             marker,
-            sights.pixels[sights.usable].reshape(-1, 2),
-            noise * sights.sigmas[sights.usable].ravel(),
+            observations.pixels[observations.usable].reshape(-1, 2),
+            noise * observations.sigmas[observations.usable].ravel(),
         )
         return solve(
             rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, max_evaluations=40
@@ -140,11 +140,11 @@ def _best_factor(
     return float(np.exp(found.x)), noise * float(np.sqrt(np.median(squares) / np.log(4.0)))
 
 
-def _rigid_factor(sights: VirtualObservations, reported: FloatArray) -> float:
+def _rigid_factor(observations: VirtualObservations, reported: FloatArray) -> float:
     """Coarse scale factor: reported over rotated angle between distant stops, as if the cameras were nominal ones."""
     scale = np.array([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        euclidean = sights.points[..., :3] * scale / sights.points[..., 3:]
+        euclidean = observations.points[..., :3] * scale / observations.points[..., 3:]
     valid = finite_rows(euclidean)
     far = np.abs(reported[:, None] - reported[None, :]) > 0.4 * np.ptp(reported)
     ratios = []

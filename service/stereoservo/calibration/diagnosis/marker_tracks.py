@@ -218,11 +218,11 @@ def path_basis(trials: TrialData) -> FloatArray:
             base[joint] = middle
             name = tuple(np.round(base / (10 * LOCKED_RANGE)).astype(np.int64).tolist())
             bases.setdefault(name, np.zeros(len(positions)))[group] = 1.0
-            way = np.zeros(len(positions))
+            displacement = np.zeros(len(positions))
             span = max(float(np.ptp(positions[group, joint])), MIN_RANGE)
-            way[group] = 2.0 * (positions[group, joint] - middle) / span
+            displacement[group] = 2.0 * (positions[group, joint] - middle) / span
             degree = min(PATH_DEGREE, (len(group) - 1) // 2)
-            columns += [way**power for power in range(1, degree + 1)]
+            columns += [displacement**power for power in range(1, degree + 1)]
     return np.stack([*bases.values(), *columns], axis=1) if bases else np.zeros((len(positions), 0))
 
 

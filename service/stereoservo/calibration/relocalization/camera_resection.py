@@ -214,7 +214,7 @@ def fit_with_outliers(
             found = fit_matrices(family, part, lenses, views, robust=True)
             if found[1] < best[1]:
                 best = found
-        if _settled(_whitened(best[0], lenses, views, roots)):
+        if _is_good_enough(_whitened(best[0], lenses, views, roots)):
             break
     return best
 
@@ -225,7 +225,7 @@ def _clean(error: FloatArray) -> bool:
     return bool(squares.max() <= OUTSTANDING * max(1.0, float(np.median(squares)) / np.log(4.0)))
 
 
-def _settled(error: FloatArray) -> bool:
+def _is_good_enough(error: FloatArray) -> bool:
     """Whether most whitened errors (k, 2) are about as large as the stated noise, so that no other start can do
     better.
     """

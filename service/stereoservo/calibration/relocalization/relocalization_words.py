@@ -89,14 +89,14 @@ def _displacement(
     angle = float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))))
     euclidean = points @ H.T
     middle = (euclidean[:, :3] / euclidean[:, 3:]).mean(axis=0)
-    way = float(np.linalg.norm(centres[1] - centres[0]))
+    distance_moved = float(np.linalg.norm(centres[1] - centres[0]))
     metre = [
         float(np.linalg.norm((H @ generator @ back)[:3, 3]))
         for generator, kind in zip(model.generators, model.joint_kinds, strict=True)
         if kind == "prismatic"
     ]
     distance = float(np.linalg.norm(middle - centres[0]))
-    return angle, way / distance, way / float(np.median(metre)) if metre else None
+    return angle, distance_moved / distance, distance_moved / float(np.median(metre)) if metre else None
 
 
 def too_few(names: list[str], count: int, ids: int, needed: int, what: str) -> CalibrationError:

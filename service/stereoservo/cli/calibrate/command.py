@@ -142,7 +142,7 @@ def calibrate(
                 return
             if check:
                 report = _with_bar(client, "check motion", client.check_model)
-                _tell_check(report, client.cell, endpoint, json)
+                _print_check(report, client.cell, endpoint, json)
                 if unattended and report.status == "recalibrate":
                     raise typer.Exit(EXIT_FAILED)
                 return
@@ -157,11 +157,11 @@ def calibrate(
     emit(result, table(result), json)
 
 
-def _failure(error: FailedError, **said: Any) -> CommandError:
+def _failure(error: FailedError, **data: Any) -> CommandError:
     """Error with its cause's own code and, where the motion ended early, the reasons with their values."""
     if error.event.reasons:
-        said["reasons"] = msgspec.to_builtins(error.event.reasons)
-    return CommandError(error.code, str(error), **said)
+        data["reasons"] = msgspec.to_builtins(error.event.reasons)
+    return CommandError(error.code, str(error), **data)
 
 
 def _must_be_idle(client: Client) -> None:
@@ -206,7 +206,7 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
 # -- check --------------------------------------------------------------------------------------------------
 
 
-def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
+def _print_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
     """Print the report of a check, with earlier checks where they are stored on this host."""
     past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
     history = [
@@ -239,17 +239,17 @@ def _reset_zeros(client: Client, json: bool) -> None:
     checks: list[CheckReport] = []
 
     def reset(progress: Callable[[EventMessage], None]) -> ZeroReset:
-        def heard(event: EventMessage) -> None:
+        def on_event(event: EventMessage) -> None:
             if event.check is not None:
                 checks.append(event.check)
             progress(event)
 
-        return client.reset_zeros(heard)
+        return client.reset_zeros(on_event)
 
     try:
         done: ZeroReset = _with_bar(client, "check motion", reset)
     except FailedError as error:
-        said = {"check": msgspec.to_builtins(checks[-1])} if checks else {}
-        raise _failure(error, **said) from error
+        data = {"check": msgspec.to_builtins(checks[-1])} if checks else {}
+        raise _failure(error, **data) from error
     tree = {"check": msgspec.to_builtins(checks[-1]), "reset": msgspec.to_builtins(done)}
     emit(tree, f"{checks[-1].message}\n{done.message}\n  model {done.model}", json)

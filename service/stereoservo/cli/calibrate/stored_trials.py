@@ -92,18 +92,20 @@ def fit_again(
     priors, used = (None, None) if lines is None else read_lines(lines, lines_sigma, data)
     started = time.monotonic()
     try:
-        result, said = fit_trials(data, output, epoch, lens_priors=priors)
+        result, assessment = fit_trials(data, output, epoch, lens_priors=priors)
     except CalibrationError as error:
-        told = assess_failure(error.code, error.message)
-        kept = report_fit(data, path, output, None, told)
-        raise CommandError(error.code, f"{told.text} A report is in {kept}", report=str(kept)) from error
+        failure = assess_failure(error.code, error.message)
+        page_path = report_fit(data, path, output, None, failure)
+        raise CommandError(
+            error.code, f"{failure.text} A report is in {page_path}", report=str(page_path)
+        ) from error
     seconds = time.monotonic() - started
     try:
-        page: Path | None = report_fit(data, path, output, result, said)
+        page: Path | None = report_fit(data, path, output, result, assessment)
     except OSError as error:
         note(f"no report could be written into {report_folder(output)}: {error}")
         page = None
-    figures = calibration_result(result.model, output, said, page, path, seconds)
+    figures = calibration_result(result.model, output, assessment, page, path, seconds)
     use = (
         f"the daemon of cell {name!r} takes this model at its next start, where it fits the cell's joints, cameras and "
         "markers (`stereoservo doctor` tells); remove the file if it is not to"

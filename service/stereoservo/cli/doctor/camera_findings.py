@@ -90,28 +90,28 @@ def _rate(record: CameraRecord) -> Finding:
             for name, (want, got) in counted.settings.items()
             if want is not None and got is not None and abs(want - got) > 1e-3 * max(abs(want), 1.0)
         ]
-        extra += "".join(f", {told}" for told in differing)
-    told = (
+        extra += "".join(f", {summary}" for summary in differing)
+    summary = (
         f"{rate:.1f} Hz of {asked:g}, frames {np.median(gaps_ms):.1f} ms apart, at most {gaps_ms.max():.1f}, "
         f"{max(missing, 0)} not looked at{extra}"
     )
     if rate >= HELD_RATE * asked:
-        return Finding(f"{record.name} rate", True, told)
+        return Finding(f"{record.name} rate", True, summary)
     return Finding(
-        f"{record.name} rate", None, told,
+        f"{record.name} rate", None, summary,
         f"more light for a shorter exposure, or rate_hz = {rate:.0f}, which is what it holds",
     )  # fmt: skip
 
 
 def _latency(record: CameraRecord) -> Finding:
     ms = np.array([(o.t_received_ns - o.t_shutter_ns) * 1e-6 for o in record.seen])
-    told = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
+    summary = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
     if ms.max() <= 0.0:
         return Finding(
-            f"{record.name} latency", None, f"{told}: none is stated",
+            f"{record.name} latency", None, f"{summary}: none is stated",
             "latency_s of its options; `stereoservo status` tells it once the arm has moved",
         )  # fmt: skip
-    return Finding(f"{record.name} latency", True, told)
+    return Finding(f"{record.name} latency", True, summary)
 
 
 def _markers(record: CameraRecord, min_markers: int) -> Finding:
@@ -119,7 +119,7 @@ def _markers(record: CameraRecord, min_markers: int) -> Finding:
     counts = np.array([o.ids.size for o in record.seen])
     known = len(record.description.marker_ids)
     steady = float((counts >= min_markers).mean())
-    told = (
+    summary = (
         f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
     )
     if counts.max() == 0 and record.flipped:
@@ -134,11 +134,11 @@ def _markers(record: CameraRecord, min_markers: int) -> Finding:
         )  # fmt: skip
     if steady < STEADY_MARKERS:
         return Finding(
-            name, False, f"{told}; enough in {100 * steady:.0f} % of the frames",
+            name, False, f"{summary}; enough in {100 * steady:.0f} % of the frames",
             "more light, a nearer or larger plate, less tilt; or calibration.min_markers",
         )  # fmt: skip
     sigma = float(np.median([np.sqrt(0.5 * np.trace(C)) for C in record.seen[-1].covariances]))
-    return Finding(name, True, f"{told}; standard deviation {sigma:.3f} px{_scatter(record)}")
+    return Finding(name, True, f"{summary}; standard deviation {sigma:.3f} px{_scatter(record)}")
 
 
 def _scatter(record: CameraRecord) -> str:
@@ -179,34 +179,34 @@ def _picture_quality(name: str, image: ImageArray, observation: CameraObservatio
     if not len(measured):
         return
     contrast, blur, saturated = np.median(measured, axis=0)
-    told = f"contrast {contrast:.0f} grey levels (least {measured[:, 0].min():.0f})"
+    summary = f"contrast {contrast:.0f} grey levels (least {measured[:, 0].min():.0f})"
     if contrast < LOW_CONTRAST:
         yield Finding(
             f"{name} contrast",
             None,
-            f"{told}; {LOW_CONTRAST:g} are wanted",
+            f"{summary}; {LOW_CONTRAST:g} are wanted",
             "more light, longer exposure, matt print",
         )
     else:
-        yield Finding(f"{name} contrast", True, told)
+        yield Finding(f"{name} contrast", True, summary)
     if saturated > MUCH_SATURATED:
         yield Finding(
             f"{name} exposure", None,
             f"{100 * saturated:.0f} % of the pixels around the markers are white to the limit: edges are cut",
             "shorter exposure, less gain",
         )  # fmt: skip
-    told = f"edges at the markers are blurred by {blur:.1f} px"
+    summary = f"edges at the markers are blurred by {blur:.1f} px"
     sharp = bool(blur <= WIDE_EDGE_PX)
-    cure = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
-    yield Finding(f"{name} focus", True if sharp else None, told, cure)
+    remedy = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
+    yield Finding(f"{name} focus", True if sharp else None, summary, remedy)
 
 
 def examine_skew(records: Sequence[CameraRecord]) -> Iterator[Finding]:
     """Finding on the time between the cameras' shutters; not a fault, since each image counts at its own time."""
     shown = [record for record in records if len(record.seen) >= 2]
     for first, second in pairwise(shown):
-        apart = first.shutters_ns[:, None] - second.shutters_ns[None, :]
-        nearest = apart[np.arange(len(apart)), np.abs(apart).argmin(axis=1)] * 1e-6
+        intervals = first.shutters_ns[:, None] - second.shutters_ns[None, :]
+        nearest = intervals[np.arange(len(intervals)), np.abs(intervals).argmin(axis=1)] * 1e-6
         yield Finding(
             f"skew {first.name}-{second.name}", True,
             f"{np.median(nearest):+.1f} ms (median; {np.abs(nearest).max():.1f} at most): used, each at its own time",
@@ -223,7 +223,9 @@ def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray
         ):
             pixels.setdefault(marker, []).append(pixel)
             variances.setdefault(marker, []).append(0.5 * float(np.trace(C)))
-    kept = sorted(marker for marker, sights in pixels.items() if 2 * len(sights) >= len(record.seen))
+    kept = sorted(
+        marker for marker, observations in pixels.items() if 2 * len(observations) >= len(record.seen)
+    )
     return (
         np.array(kept, dtype=np.int64),
         np.array([np.mean(pixels[marker], axis=0) for marker in kept]).reshape(-1, 2),

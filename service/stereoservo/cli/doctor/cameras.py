@@ -187,8 +187,8 @@ def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
         cv2.putText(
             picture, str(marker), (round(u) + 10, round(v) - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, GREEN, 1, cv2.LINE_AA
         )  # fmt: skip
-    told = f"{observation.camera}: {observation.ids.size} markers; red: 100 standard deviations"
-    cv2.putText(picture, told, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, GREEN, 1, cv2.LINE_AA)
+    caption = f"{observation.camera}: {observation.ids.size} markers; red: 100 standard deviations"
+    cv2.putText(picture, caption, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, GREEN, 1, cv2.LINE_AA)
     return np.asarray(picture, dtype=np.uint8)
 
 

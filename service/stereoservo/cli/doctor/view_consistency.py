@@ -40,10 +40,10 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
 
 def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
     """Markers seen by all cameras, and their raw pixels (c, k, 2)."""
-    sights = [mean_sights(record) for record in records]
-    ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in sights)))
+    means = [mean_sights(record) for record in records]
+    ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in means)))
     pixels = [
-        np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in sights
+        np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in means
     ]
     return ids, np.array(pixels)
 
@@ -69,9 +69,9 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
     if not ids:
         return Finding(name, None, "no marker is seen by all of them at once: nothing to compare")
     rms = reprojection_rms(cameras, pixels)
-    told = f"{len(ids)} markers seen by all leave {rms:.3f} px by the model's cameras"
+    summary = f"{len(ids)} markers seen by all leave {rms:.3f} px by the model's cameras"
     if rms <= FITS_PX:
-        return Finding(name, True, told)
+        return Finding(name, True, summary)
     for order in permutations(range(len(cameras))):
         if order == tuple(range(len(cameras))):
             continue
@@ -82,11 +82,14 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
                 if r.name != cameras[k].name
             )
             return Finding(
-                name, False, f"{told}: {swapped}", "exchange their sources, or their cables; none has moved"
+                name,
+                False,
+                f"{summary}: {swapped}",
+                "exchange their sources, or their cables; none has moved",
             )
     return Finding(
         name, False,
-        f"{told}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
+        f"{summary}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
         "re-anchor it (the running daemon does, once it sees enough), or `stereoservo calibrate`",
     )  # fmt: skip
 
@@ -107,12 +110,12 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
         return Finding(name, None, f"no epipolar constraint yet: {error}")
     distances = epipolar_distances(F, pixels[0], pixels[1])
     rms = float(np.sqrt(np.mean(distances[inliers] ** 2)))
-    told = f"{int(inliers.sum())} of {len(ids)} markers agree on one epipolar geometry, {rms:.3f} px"
+    summary = f"{int(inliers.sum())} of {len(ids)} markers agree on one epipolar geometry, {rms:.3f} px"
     if inliers.all():
-        return Finding(name, True, told)
+        return Finding(name, True, summary)
     off = [marker for marker, inside in zip(ids, inliers, strict=True) if not inside]
     return Finding(
-        name, False, f"{told}; markers {off} do not",
+        name, False, f"{summary}; markers {off} do not",
         "are they mistaken for others, or is there a second plate in view?",
     )  # fmt: skip
 
@@ -134,10 +137,10 @@ def examine_coverage(
         raw = distort(camera.lens, m[:, :2] / m[:, 2:])
         inside = (raw >= 0).all(axis=1) & (raw[:, 0] <= camera.width - 1) & (raw[:, 1] <= camera.height - 1)
         share = float(inside.mean())
-        told = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
+        summary = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
         wide = share >= WORKSPACE_SHARE
         yield Finding(
-            f"{record.name} coverage", True if wide else None, told,
+            f"{record.name} coverage", True if wide else None, summary,
             "" if wide else "a shorter lens, more distance, or goals that keep to the middle",
         )  # fmt: skip
 

@@ -207,24 +207,24 @@ def goal(
         files = {"points": points, "displacement": displacement, "incidence": incidence}
         target = target_tree(name, joint, set_points, files, relative_to, common)
     if file is not None:
-        wanted = decode(read_file(file), Goal)
+        requested = decode(read_file(file), Goal)
     else:
-        wanted = make_goal(
+        requested = make_goal(
             target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
             cameras=camera or None, profile=profile, gain=gain if adaptive_gain is None else adaptive(adaptive_gain),
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
         )  # fmt: skip
-    if wait and wanted.lease_s is None:
-        wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
+    if wait and requested.lease_s is None:
+        requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
     with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
         require_cameras(client, found)
-        if check or wanted.check:
-            reply = client.check(wanted)
+        if check or requested.check:
+            reply = client.check(requested)
             emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)
         else:
-            _run(client, wanted, stream, wait, json)
+            _run(client, requested, stream, wait, json)
 
 
 def _followed(source: str) -> tuple[dict[str, Any], Stream]:
@@ -239,25 +239,25 @@ def _followed(source: str) -> tuple[dict[str, Any], Stream]:
 
 def _run(
     client: Client,
-    wanted: Goal,
+    requested: Goal,
     stream: Stream | None,
     wait: bool,
     as_json: bool,
 ) -> None:
     try:
-        handle = client.send(wanted)
+        handle = client.send(requested)
         note(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
         if stream is not None:
             note(f"{handle.stream(stream)} set-points followed")
         if wait:
             follow(handle, as_json)
-            if wanted.acknowledge_s is not None:
+            if requested.acknowledge_s is not None:
                 note(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
         else:
             emit({"id": handle.id, "accepted": True}, handle.id, as_json)
     except KeyboardInterrupt:
         with suppress(ClientError):  # not accepted yet, or ended already
-            client.cancel(wanted.id)
+            client.cancel(requested.id)
         raise
 
 

@@ -57,9 +57,9 @@ def require_cameras(client: Client, found: tuple[SetPoints, ...]) -> None:
     for one in found:
         if cameras.get(one.camera) != one.size:
             has = cameras.get(one.camera)
-            told = "has no such camera" if has is None else f"has it with {has[0]}x{has[1]} px"
+            live = "has no such camera" if has is None else f"has it with {has[0]}x{has[1]} px"
             raise CommandError(
                 "other_cell",
-                f"camera {one.camera!r} is recorded with pictures of {one.size[0]}x{one.size[1]} px; the cell {told}",
+                f"camera {one.camera!r} is recorded with pictures of {one.size[0]}x{one.size[1]} px; the cell {live}",
                 camera=one.camera,
             )

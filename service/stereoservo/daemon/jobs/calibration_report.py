@@ -388,8 +388,8 @@ def draw_histograms(model: CellModel, rest: Residuals) -> Figure:
         if values.size:
             axes.hist(np.clip(values, -5.0, 5.0), HISTOGRAM, density=True, color="0.75")
         axes.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), "C3", lw=1.0)
-        spread = float(np.sqrt((values**2).mean())) if values.size else 0.0
-        axes.set(title=f"{name}: {spread:.2f} sigmas", yticks=[])
+        rms_sigmas = float(np.sqrt((values**2).mean())) if values.size else 0.0
+        axes.set(title=f"{name}: {rms_sigmas:.2f} sigmas", yticks=[])
         axes.title.set_size("small")
     for axes in panels[len(groups) :]:
         axes.axis("off")

@@ -83,14 +83,18 @@ def fit_trials(
 
 
 def report_fit(
-    trials: TrialData, trials_path: Path, model_path: Path, result: CalibrationFit | None, said: Acceptance
+    trials: TrialData,
+    trials_path: Path,
+    model_path: Path,
+    result: CalibrationFit | None,
+    assessment: Acceptance,
 ) -> Path:
     """Write the report of a fit, or of a failure (``result`` None), beside the model. Raises OSError."""
     # matplotlib is slow to import; the model must not wait for it.
     from stereoservo.daemon.jobs.calibration_report import write_report
 
     return write_report(
-        report_folder(model_path), trials, said, trials_path=trials_path,
+        report_folder(model_path), trials, assessment, trials_path=trials_path,
         model=None if result is None else result.model, report=None if result is None else result.report,
     )  # fmt: skip
 
@@ -111,18 +115,22 @@ def main() -> int:
         print_line(error_line(error))
         return 1
     try:
-        result, said = fit_trials(trials, arguments.model, arguments.epoch, progress=_progress)
+        result, assessment = fit_trials(trials, arguments.model, arguments.epoch, progress=_progress)
         print_line(
-            {"model": str(arguments.model), "epoch": arguments.epoch, "verdict": msgspec.to_builtins(said)}
+            {
+                "model": str(arguments.model),
+                "epoch": arguments.epoch,
+                "verdict": msgspec.to_builtins(assessment),
+            }
         )
     except CalibrationError as error:
         print_line(error_line(error))
-        said = assess_failure(error.code, error.message)
+        assessment = assess_failure(error.code, error.message)
     except (ModelFileError, OSError) as error:
         print_line(error_line(error))
         return 1
     try:
-        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, said))})
+        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, assessment))})
     except OSError as error:
         print_line({"report_error": str(error)})
     return 0 if result is not None else 1

@@ -64,18 +64,18 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
             f"{images} is no directory of recorded images; `stereoservo record CELL --images` makes one, "
             f"NAME{IMAGES_SUFFIX} beside NAME.mcap",
         )
-    flight = read_motion(flight_of(images))
+    motion = read_motion(flight_of(images))
     cameras = [
         recorded_camera(cell, cell_path, section.name, video_of(images, section.name))
         for section in cell.camera
     ]
-    settings = _settings(cell, cell_path, flight, cameras)
+    settings = _settings(cell, cell_path, motion, cameras)
     if settings.trials is None:
         raise CalibrationError(
             "bad_data",
             f"{cell_path} has no [calibration] section; base, frames and settle_s of the trial motions are needed",
         )
-    gathered = RecordedTrialCollector(flight, settings, settings.trials)
+    gathered = RecordedTrialCollector(motion, settings, settings.trials)
     for camera in cameras:
         gathered.add(_observations(camera, gathered, note, progress))
     job = TrialCollector(settings)
@@ -91,20 +91,20 @@ def _observations(
 ) -> Iterator[CameraObservation]:
     name, frames = camera.description.name, 0
 
-    def wanted(t_shutter_ns: int) -> bool:
+    def is_usable(t_shutter_ns: int) -> bool:
         nonlocal frames
         frames += 1
         progress(name, frames)
         return gathered.wants(name, t_shutter_ns)
 
-    return camera.observations(note, wanted)
+    return camera.observations(note, is_usable)
 
 
 def _settings(
-    cell: CellFile, cell_path: Path, flight: RecordedMotion, cameras: list[RecordedCamera]
+    cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]
 ) -> CoreSettings:
     """The core's settings for the current cell file, the recorded joints, and the detectors on the recorded cameras."""
-    recorded = flight.settings
+    recorded = motion.settings
     limits = {limit.joint: limit for limit in cell.safety.limit}
     if set(limits) != set(recorded.joint_names):
         raise CalibrationError(
@@ -116,11 +116,11 @@ def _settings(
         was = next((one for one in recorded.cameras if one.name == camera.description.name), None)
         size = camera.description.width, camera.description.height
         if was is None or (was.width, was.height) != size:
-            told = "has no such camera" if was is None else f"has it with {was.width}x{was.height} px"
+            stated = "has no such camera" if was is None else f"has it with {was.width}x{was.height} px"
             raise CalibrationError(
                 "bad_data",
                 f"{camera.file} holds pictures of {size[0]}x{size[1]} px of camera {camera.description.name!r}; the "
-                f"flight recording {told}: do they belong together?",
+                f"flight recording {stated}: do they belong together?",
             )
     joints = JointDriverDescription(
         driver=cell.joints.driver,
@@ -158,16 +158,16 @@ class RecordedTrialCollector:
     rests were not used, with their number.
     """
 
-    flight: RecordedMotion
+    motion: RecordedMotion
     settings: CoreSettings
     trial: TrialSettings
     left_out: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n = len(self.flight.settings.joint_names)
+        n = len(self.motion.settings.joint_names)
         self._stops = [
             _Stop(rest, ObservationStatistics(**measurement_buffers(self.settings)), np.zeros(n))
-            for rest in rest_intervals(self.flight, self.trial.settle_s)
+            for rest in rest_intervals(self.motion, self.trial.settle_s)
         ]
         self._settled = [stop.rest.settled_ns for stop in self._stops]
         self.used = 0
@@ -190,7 +190,7 @@ class RecordedTrialCollector:
             if number < 0:
                 continue
             stop = self._stops[number]
-            joints = self.flight.joints_at(observation.t_shutter_ns)
+            joints = self.motion.joints_at(observation.t_shutter_ns)
             if observation.t_shutter_ns > stop.rest.end_ns or joints is None:
                 continue
             if add_observation(

@@ -42,8 +42,8 @@ class RelocalizationReport(msgspec.Struct, frozen=True):
     @property
     def message(self) -> str:
         """The result as text."""
-        said = "; ".join([*self.cameras.values(), *self.notes])
-        return f"model epoch {self.epoch}: {said}; predictions are good to {self.predicted_px:.2g} px"
+        described = "; ".join([*self.cameras.values(), *self.notes])
+        return f"model epoch {self.epoch}: {described}; predictions are good to {self.predicted_px:.2g} px"
 
 
 def main() -> int:

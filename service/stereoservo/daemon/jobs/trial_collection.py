@@ -120,16 +120,16 @@ class TrialCollector:
         ]
         if not samples:
             return 1.0
-        sights = np.concatenate([sample.sights for sample in samples])
+        frame_counts = np.concatenate([sample.sights for sample in samples])
         scatter = np.concatenate([sample.scatter for sample in samples])
         variance = np.concatenate([0.5 * np.trace(s.covariances, axis1=1, axis2=2) for s in samples])
         noise = variance - camera.systematic_px**2
-        single = noise * sights
-        known = (noise > LEAST_NOISE * variance) & (sights > 1.0)
+        single = noise * frame_counts
+        known = (noise > LEAST_NOISE * variance) & (frame_counts > 1.0)
         if not known.any():
             return 1.0
         known &= single <= MOST_NOISE * np.median(single[known])
-        factor = float(np.average(scatter[known] / single[known], weights=sights[known] - 1.0))
+        factor = float(np.average(scatter[known] / single[known], weights=frame_counts[known] - 1.0))
         return factor if factor > 0.0 else 1.0
 
 

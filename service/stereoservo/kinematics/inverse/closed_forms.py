@@ -114,13 +114,13 @@ def circle_meets_plane(G: FloatArray, A: FloatArray, plane: FloatArray, seed: fl
     if amplitude <= FREE * scale:
         held = abs(p_0) <= FREE * scale
         return Crossing(np.array([seed]), 0.0 if held else np.inf, held)
-    middle = -np.arctan2(p_s, p_c)
-    room = (amplitude - p_0) * (amplitude + p_0)
-    if room <= 0.0:
-        nearest = middle if p_0 > 0.0 else middle + np.pi
+    central = -np.arctan2(p_s, p_c)
+    discriminant = (amplitude - p_0) * (amplitude + p_0)
+    if discriminant <= 0.0:
+        nearest = central if p_0 > 0.0 else central + np.pi
         return Crossing(np.array([nearest]), abs(p_0) / amplitude - 1.0, False)
-    half = np.arctan2(np.sqrt(room), p_0)
-    return Crossing(np.array([middle + half, middle - half]), 0.0, False)
+    half = np.arctan2(np.sqrt(discriminant), p_0)
+    return Crossing(np.array([central + half, central - half]), 0.0, False)
 
 
 def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float = 0.0) -> Branches:
@@ -134,12 +134,12 @@ def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float =
     """
     points, goals = np.reshape(A, (-1, 4)), np.reshape(target, (-1, 4))
     square = G @ G
-    radial, along, wanted = -points @ square.T, points @ G.T, -goals @ square.T
+    radial, along, required = -points @ square.T, points @ G.T, -goals @ square.T
     size = float(np.linalg.norm(radial))
     if size <= FREE * float(np.linalg.norm(square) * np.linalg.norm(points)):
         return single(seed, free=True)
     basis = np.stack([radial.ravel(), along.ravel()])
-    cosine, sine = np.linalg.solve(basis @ basis.T, basis @ wanted.ravel())
+    cosine, sine = np.linalg.solve(basis @ basis.T, basis @ required.ravel())
     return single(float(np.arctan2(sine, cosine)), abs(float(np.hypot(cosine, sine)) - 1.0))
 
 
@@ -203,26 +203,26 @@ def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatAr
     turning = -G[1] if opposite else G[1]
     radial = -turning @ (turning @ A)
     arm, between = direction(radial), direction(square @ (A - radial))
-    wanted = direction(square @ target)
-    size = max(abs(arm), abs(between), abs(wanted))
+    required = direction(square @ target)
+    size = max(abs(arm), abs(between), abs(required))
     if abs(between) <= FREE * size:
-        whole = float(np.angle(wanted / arm)) if abs(arm) > FREE * size else 0.0
+        whole = float(np.angle(required / arm)) if abs(arm) > FREE * size else 0.0
         second = single(_signed(whole - seed[0], opposite), free=True)
         return beside(single(float(seed[0]), free=True), second)
     if abs(arm) <= FREE * size:
-        return beside(single(float(np.angle(wanted / between))), single(float(seed[1]), free=True))
-    cosine = (abs(wanted) ** 2 - abs(between) ** 2 - abs(arm) ** 2) / (2.0 * abs(between) * abs(arm))
+        return beside(single(float(np.angle(required / between))), single(float(seed[1]), free=True))
+    cosine = (abs(required) ** 2 - abs(between) ** 2 - abs(arm) ** 2) / (2.0 * abs(between) * abs(arm))
     bend = np.arctan2(np.sqrt(max(0.0, (1.0 - cosine) * (1.0 + cosine))), cosine)
-    middle = np.angle(between / arm)
+    central = np.angle(between / arm)
     excess = max(0.0, abs(cosine) - 1.0)
     found = []
-    for turn in (middle + bend, middle - bend) if excess == 0.0 else (middle + bend,):
+    for turn in (central + bend, central - bend) if excess == 0.0 else (central + bend,):
         reach = between + np.exp(1j * turn) * arm
         second = single(_signed(float(turn), opposite), excess)
-        if min(abs(reach), abs(wanted)) <= FREE * size:
-            found.append(beside(single(float(seed[0]), free=abs(wanted) <= FREE * size), second))
+        if min(abs(reach), abs(required)) <= FREE * size:
+            found.append(beside(single(float(seed[0]), free=abs(required) <= FREE * size), second))
         else:
-            found.append(beside(single(float(np.angle(wanted / reach))), second))
+            found.append(beside(single(float(np.angle(required / reach))), second))
     return together(found)
 
 

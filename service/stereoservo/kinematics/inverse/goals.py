@@ -30,9 +30,9 @@ def finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> Float
     array = np.asarray(array, dtype=np.float64)
     fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
     if not fits:
-        wanted = ", ".join("m" if size is None else str(size) for size in shape)
+        expected = ", ".join("m" if size is None else str(size) for size in shape)
         raise InverseKinematicsError(
-            "shape", f"{name} has shape {array.shape}; ({wanted}) is needed", shape=array.shape
+            "shape", f"{name} has shape {array.shape}; ({expected}) is needed", shape=array.shape
         )
     if not np.isfinite(array).all():
         raise InverseKinematicsError("not_finite", f"{name} {array.tolist()} must be finite")

@@ -117,8 +117,8 @@ class _Known:
         return fresh
 
     def _near(self, rows: FloatArray, q: FloatArray) -> npt.NDArray[np.bool_]:
-        apart = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
-        return np.asarray(np.abs(apart).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
+        difference = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
+        return np.asarray(np.abs(difference).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
 
 
 def _twins(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:

@@ -94,7 +94,7 @@ def common_point_incidence(operators: FloatArray) -> Test:
     return values
 
 
-class _Judge:
+class _ConditionTest:
     """Tests conditions on one chain, with cached results."""
 
     def __init__(self, chain: ProjectiveChain, model: CellModel | None) -> None:
@@ -150,7 +150,7 @@ def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
     """
     model = arm if isinstance(arm, CellModel) else None
     chain = chain_of(arm)
-    judge = _Judge(chain, model)
+    judge = _ConditionTest(chain, model)
     order = chain.order
     for inverted, joints in ((False, order), (True, order[::-1])):
         case = _case(judge, chain.kinds, joints)
@@ -164,7 +164,7 @@ def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tup
     """One condition on revolute ``joints``: two ``parallel``, two or more with a ``common_point``, or prismatic ones
     that are ``independent``.
     """
-    judge = _Judge(chain_of(arm), arm if isinstance(arm, CellModel) else None)
+    judge = _ConditionTest(chain_of(arm), arm if isinstance(arm, CellModel) else None)
     {"parallel": judge.parallel, "common_point": judge.common_point, "independent": judge.independent}[
         condition
     ](*joints)
@@ -178,7 +178,7 @@ def chain_of(arm: ProjectiveChain | CellModel) -> ProjectiveChain:
     return ProjectiveChain(arm.joint_kinds, arm.generators, arm.zero, arm.tip_first)
 
 
-def _case(judge: _Judge, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Case | None:
+def _case(judge: _ConditionTest, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Case | None:
     letters = "".join(kinds[j][0] for j in joints)
     if letters in ("p", "pp", "ppp"):
         return "prismatic" if judge.independent(*joints) else None
@@ -197,6 +197,6 @@ def _case(judge: _Judge, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Cas
     return None
 
 
-def _is_arm(judge: _Judge, joints: tuple[int, ...]) -> bool:
+def _is_arm(judge: _ConditionTest, joints: tuple[int, ...]) -> bool:
     """Whether the second and third axis are parallel and the first is normal to them."""
     return judge.parallel(*joints[1:]) and not judge.parallel(*joints[:2])

@@ -62,12 +62,12 @@ def self_motions(
     """
     kept = []
     for direction in null_directions(chain, points, q):
-        if all(_leads_on(chain, points, targets, q, probe * direction, tolerance) for probe in PROBES):
+        if all(_stays_reached(chain, points, targets, q, probe * direction, tolerance) for probe in PROBES):
             kept.append(direction)
     return np.array(kept).reshape(-1, chain.joints)
 
 
-def _leads_on(
+def _stays_reached(
     chain: ProjectiveChain,
     points: FloatArray,
     targets: FloatArray,

@@ -135,7 +135,7 @@ def distinct(kinds: tuple[str, ...], joints: FloatArray, tolerance: float = SAME
     """Indices of rows (s, n) of which none equals an earlier one, up to whole turns."""
     kept: list[int] = []
     for i, row in enumerate(joints):
-        apart = nearest_turns(kinds, joints[kept] - row, np.zeros(len(row)))
-        if not len(kept) or np.abs(apart).max(axis=1).min() > tolerance:
+        difference = nearest_turns(kinds, joints[kept] - row, np.zeros(len(row)))
+        if not len(kept) or np.abs(difference).max(axis=1).min() > tolerance:
             kept.append(i)
     return kept
