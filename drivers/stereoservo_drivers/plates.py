@@ -312,7 +312,7 @@ def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence
     """
     width, height = paper
     footer = BAR + LINE * len(below)
-    room = (
+    space = (
         width - 2 * BORDER - 2 * (MARK + CLEARANCE),
         height - 2 * BORDER - HEADER - footer - MARK - CLEARANCE,
     )
@@ -320,14 +320,14 @@ def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence
     while rest:
         first = rest[0]
         gap = 0.0 if first.joins else 2 * (MARK + CLEARANCE)
-        across, down = (int((side + gap + 1e-6) // (first.side + gap)) for side in room)
+        across, down = (int((side + gap + 1e-6) // (first.side + gap)) for side in space)
         if across < 1 or down < 1:
             raise PlateError(
                 "too_large",
                 f"{first.name} is {first.side:.1f} mm wide; on {width:g} x {height:g} mm there is room for "
-                f"{max(min(room), 0.0):.1f} mm: a larger --page or smaller dots or tags",
+                f"{max(min(space), 0.0):.1f} mm: a larger --page or smaller dots or tags",
                 side_mm=first.side,
-                room_mm=min(room),
+                room_mm=min(space),
             )
         if first.joins:  # a strip, so that only neighbours share an edge
             across, down = (across, 1) if across > down else (1, down)

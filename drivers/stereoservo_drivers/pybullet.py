@@ -79,10 +79,10 @@ class PybulletCameraDriver(SimulatedCamera):
         """Load the renderer and draw once, so that no later frame waits for compilation. Raises DriverError."""
         super().configure()
         if self._renderer is None:
-            self._renderer = self._draw_anew()
+            self._renderer = self._redraw()
             self._renderer.render(self.cell.base, np.random.default_rng(0))
 
-    def _draw_anew(self) -> Renderer:
+    def _redraw(self) -> Renderer:
         from stereoservo_sim.world.rendering import Renderer, RenderSettings
 
         options = self._render
@@ -97,7 +97,7 @@ class PybulletCameraDriver(SimulatedCamera):
         """The image with the arm at ``q`` (n,)."""
         assert self._renderer is not None  # active: the lifecycle was checked
         if self._renderer.camera is not self.camera:  # it was bumped
-            self._renderer = self._draw_anew()
+            self._renderer = self._redraw()
         return Frame(
             camera=self.name,
             seq=seq,

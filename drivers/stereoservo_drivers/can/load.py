@@ -108,11 +108,11 @@ def refusal(load: BusLoad, max_share: float) -> str | None:
     if load.share <= max_share:
         return None
     fitting = math.floor(load.rate_at(max_share))
-    cure = f"rate_hz up to {fitting} fits" if fitting >= 1 else "no cycle rate fits beside the heartbeats"
+    remedy = f"rate_hz up to {fitting} fits" if fitting >= 1 else "no cycle rate fits beside the heartbeats"
     return (
         f"worst-case bus load {load.share:.1%}, max_bus_load {max_share:.1%}: cycles of {load.cycle_bits} bits at "
         f"{load.rate_hz:g} Hz and {load.background:.0f} bit/s of heartbeats on {load.bitrate} bit/s (this bus carries "
-        f"{load.max_rate_hz:.0f} Hz at most). {cure}; less feedback per joint or a higher bitrate leave more room"
+        f"{load.max_rate_hz:.0f} Hz at most). {remedy}; less feedback per joint or a higher bitrate leave more room"
     )
 
 

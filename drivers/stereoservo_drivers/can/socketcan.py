@@ -63,13 +63,13 @@ def objection(state: SocketcanState, channel: str, bitrate: int) -> str | None:
     """Text: why ``channel`` cannot be used at ``bitrate`` [bit/s], with the remedy; None where it can."""
     if state.kind not in ("can", "vcan", "vxcan", "slcan"):
         return f"it is a network interface of kind {state.kind or 'unknown'!r}, not of CAN"
-    cure = f"ip link set {channel} down; ip link set {channel} up type can bitrate {bitrate} restart-ms 0"
+    remedy = f"ip link set {channel} down; ip link set {channel} up type can bitrate {bitrate} restart-ms 0"
     if not state.up:
-        return f"the interface is down. Cure: {cure}, or the units in deploy/can"
+        return f"the interface is down. Cure: {remedy}, or the units in deploy/can"
     if state.bitrate is not None and state.bitrate != bitrate:
-        return f"it runs at {state.bitrate} bit/s, the cell says {bitrate}. Cure: {cure}"
+        return f"it runs at {state.bitrate} bit/s, the cell says {bitrate}. Cure: {remedy}"
     if state.state == "BUS-OFF":
-        return f"its controller is in bus-off. Find the cause (cable, terminators, bit rate), then: {cure}"
+        return f"its controller is in bus-off. Find the cause (cable, terminators, bit rate), then: {remedy}"
     return None
 
 

@@ -22,11 +22,11 @@ class Link(Protocol):
         """Send frames in order. Raises DriverError (``connection_lost``)."""
         ...
 
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+    def subscribe(self, can_id: int, received: list[CanFrame]) -> None:
         """Append every frame of ``can_id`` that arrives from now on to ``heard``, until ``unsubscribe``."""
         ...
 
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+    def unsubscribe(self, can_id: int, received: list[CanFrame]) -> None:
         """End a subscription."""
         ...
 
@@ -69,30 +69,30 @@ class Subscriptions:
     def __init__(self) -> None:
         self._subscribers: defaultdict[int, list[list[CanFrame]]] = defaultdict(list)
 
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+    def subscribe(self, can_id: int, received: list[CanFrame]) -> None:
         """Append frames of ``can_id`` to ``heard`` from now on."""
-        self._subscribers[can_id] = [*self._subscribers[can_id], heard]
+        self._subscribers[can_id] = [*self._subscribers[can_id], received]
 
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+    def unsubscribe(self, can_id: int, received: list[CanFrame]) -> None:
         """End a subscription."""
-        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not heard]
+        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not received]
 
     def tell(self, frame: CanFrame) -> None:
         """Deliver a frame that has arrived."""
-        for heard in self._subscribers.get(frame.id, ()):
-            heard.append(frame)
+        for received in self._subscribers.get(frame.id, ()):
+            received.append(frame)
 
 
 @contextmanager
 def listening(link: Link, ids: list[int]) -> Iterator[dict[int, list[CanFrame]]]:
     """Context manager: frames that arrive meanwhile, by identifier."""
-    heard: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
-    for can_id, frames in heard.items():
+    received: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
+    for can_id, frames in received.items():
         link.subscribe(can_id, frames)
     try:
-        yield heard
+        yield received
     finally:
-        for can_id, frames in heard.items():
+        for can_id, frames in received.items():
             link.unsubscribe(can_id, frames)
 
 

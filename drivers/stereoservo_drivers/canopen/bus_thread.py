@@ -52,7 +52,7 @@ class BusThread(Subscriptions):
         self._period_ns = round(1e9 / master.settings.rate_hz)
         self._read_every_ns = self._period_ns // READS_A_PERIOD
         self._send_lock = threading.Lock()
-        self._cycle_wanted = False
+        self._cycle_requested = False
         self._cycling = False
         self._ending = False
         self._next_ns = 0
@@ -106,7 +106,7 @@ class BusThread(Subscriptions):
             raise self.error
 
     def _hand_over(self, cycle: bool) -> None:
-        self._cycle_wanted = cycle
+        self._cycle_requested = cycle
         until = time.monotonic() + HAND_OVER_S
         while self._cycling is not cycle:
             self._require()
@@ -146,8 +146,8 @@ class BusThread(Subscriptions):
 
     def _step(self) -> None:
         now = time.monotonic_ns()
-        if self._cycle_wanted is not self._cycling:
-            self._cycling = self._cycle_wanted
+        if self._cycle_requested is not self._cycling:
+            self._cycling = self._cycle_requested
             self._next_ns = now
         if now >= self._follow_ns:
             self._follow_ns = now + FOLLOW_EVERY_NS

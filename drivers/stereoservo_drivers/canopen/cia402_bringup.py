@@ -237,18 +237,18 @@ class Cia402Bringup:
         for drive in drives:
             drive.write(*HEARTBEAT_CONSUMER, value)
             self._compare(drive, Write(*HEARTBEAT_CONSUMER, value))
-            _look(drive)
-        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+            _read_initial_state(drive)
+        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
             for drive in drives:
                 drive.nmt("OPERATIONAL")
             limit_s = max(STATE_S, 10e-3 * self._options.heartbeat_ms)
             for drive in drives:
-                said = heard[HEARTBEAT_ID + drive.node_id]
-                if not until(link, _says(said, NmtState.OPERATIONAL), limit_s):
+                heartbeats = received[HEARTBEAT_ID + drive.node_id]
+                if not until(link, _reports(heartbeats, NmtState.OPERATIONAL), limit_s):
                     raise DriverError(
                         "not_operational",
                         f"{drive.name}: no heartbeat says operational within {limit_s:g} s after NMT start; "
-                        f"{len(said)} heartbeats came",
+                        f"{len(heartbeats)} heartbeats came",
                         retry=True,
                         node_id=drive.node_id,
                     )
@@ -258,12 +258,12 @@ class Cia402Bringup:
 
     def _reset_communication(self, link: Link, drives: list[RemoteDrive]) -> None:
         """Reset communication by NMT, without which some drives (EPOS4) keep a lost heartbeat or bus as a fault."""
-        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
             for drive in drives:
                 drive.nmt("RESET COMMUNICATION")
             for drive in drives:
-                said = heard[HEARTBEAT_ID + drive.node_id]
-                if not until(link, _says(said, NmtState.BOOT_UP), BOOT_S):
+                heartbeats = received[HEARTBEAT_ID + drive.node_id]
+                if not until(link, _reports(heartbeats, NmtState.BOOT_UP), BOOT_S):
                     raise DriverError(
                         "no_boot_up",
                         f"{drive.name}: no boot-up within {BOOT_S:g} s after NMT reset communication; switch its "
@@ -286,10 +286,10 @@ class Cia402Bringup:
 
     def _settle(self, link: Link, drives: list[RemoteDrive]) -> None:
         """Wait for causes that are still present to appear again. Raises DriverError (``fault_stays``)."""
-        with listening(link, [EMCY_ID + drive.node_id for drive in drives]) as heard:
+        with listening(link, [EMCY_ID + drive.node_id for drive in drives]) as received:
             link.wait(SETTLE_S)
         for drive in drives:
-            codes = [int.from_bytes(frame.data[:2], "little") for frame in heard[EMCY_ID + drive.node_id]]
+            codes = [int.from_bytes(frame.data[:2], "little") for frame in received[EMCY_ID + drive.node_id]]
             tripping = [code for code in codes if code and code not in self._options.emcy_ignore]
             if tripping or _state(drive) is not DriveState.SWITCH_ON_DISABLED:
                 drive.axis.codes = [*drive.axis.codes, *tripping]
@@ -323,7 +323,7 @@ def _at_rest(drive: RemoteDrive) -> bool:
     return drive.axis.state is DriveState.QUICK_STOP_ACTIVE and abs(drive.read(0x606C)) <= slow
 
 
-def _look(drive: RemoteDrive) -> None:
+def _read_initial_state(drive: RemoteDrive) -> None:
     """Read state, error code and limit switches before the first cycle."""
     axis = drive.axis
     if _state(drive) in FAULTY:
@@ -339,5 +339,5 @@ def _lost_the_bus(drive: RemoteDrive) -> bool:
     return any(is_communication_error(known) for known in (*axis.codes, code))
 
 
-def _says(said: list[CanFrame], state: NmtState) -> Callable[[], bool]:
-    return lambda: any(len(frame.data) == 1 and frame.data[0] & 0x7F == state for frame in said)
+def _reports(heartbeats: list[CanFrame], state: NmtState) -> Callable[[], bool]:
+    return lambda: any(len(frame.data) == 1 and frame.data[0] & 0x7F == state for frame in heartbeats)

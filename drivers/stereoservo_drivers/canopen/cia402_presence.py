@@ -45,10 +45,10 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
     """Check, before anything is sent, that no other master commands these drives. Raises DriverError
     (``second_master``).
     """
-    with listening(link, [RPDO_IDS[0] + drive.node_id for drive in drives]) as heard:
+    with listening(link, [RPDO_IDS[0] + drive.node_id for drive in drives]) as received:
         link.wait(ALONE_S)
     for drive in drives:
-        count = len(heard[RPDO_IDS[0] + drive.node_id])
+        count = len(received[RPDO_IDS[0] + drive.node_id])
         if count:
             raise DriverError(
                 "second_master",
@@ -66,20 +66,20 @@ def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
     """Context manager that raises DriverError (``rebooted``) at its end where a drive has booted meanwhile and lost
     its configuration.
     """
-    with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+    with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
         try:
             yield
         except DriverError as error:
-            _check_boots(drives, heard, error)
+            _check_boots(drives, received, error)
             raise
-    _check_boots(drives, heard, None)
+    _check_boots(drives, received, None)
 
 
 def _check_boots(
-    drives: list[RemoteDrive], heard: dict[int, list[CanFrame]], consequence: DriverError | None
+    drives: list[RemoteDrive], received: dict[int, list[CanFrame]], consequence: DriverError | None
 ) -> None:
     for drive in drives:
-        if any(frame.data == BOOT_UP for frame in heard[HEARTBEAT_ID + drive.node_id]):
+        if any(frame.data == BOOT_UP for frame in received[HEARTBEAT_ID + drive.node_id]):
             raise DriverError(
                 "rebooted",
                 f"{drive.name}: booted while it was configured and has forgotten what was written; is its supply "
@@ -94,14 +94,14 @@ def ask(
 ) -> dict[int, list[CanFrame]]:
     """All replies of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
     request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
-    with listening(link, [0x580 + node for node in nodes]) as heard:
+    with listening(link, [0x580 + node for node in nodes]) as received:
         for node in nodes:
             link.send([CanFrame(0x600 + node, request)])
         link.wait(PROBE_S)
-        if patience_s > PROBE_S and not all(heard.values()):
-            until(link, lambda: all(heard.values()), patience_s - PROBE_S)
+        if patience_s > PROBE_S and not all(received.values()):
+            until(link, lambda: all(received.values()), patience_s - PROBE_S)
             link.wait(PROBE_S)
-    return {node: heard[0x580 + node] for node in nodes}
+    return {node: received[0x580 + node] for node in nodes}
 
 
 def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
@@ -164,16 +164,16 @@ def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
         )
     identity = Identity(*(drive.read(0x1018, subindex) for subindex in (1, 2, 3, 4)))
     for key in IDENTITY:
-        wanted, found = getattr(drive.axis.joint, key), getattr(identity, key)
-        if wanted is not None and wanted != found:
+        expected, found = getattr(drive.axis.joint, key), getattr(identity, key)
+        if expected is not None and expected != found:
             raise DriverError(
                 "identity",
-                f"{drive.name}: {key} is {found} (0x{found:X}), the cell file says {wanted} (0x{wanted:X}); was "
+                f"{drive.name}: {key} is {found} (0x{found:X}), the cell file says {expected} (0x{expected:X}); was "
                 "the drive exchanged, or are node ids swapped?",
                 node_id=drive.node_id,
                 key=key,
                 found=found,
-                wanted=wanted,
+                wanted=expected,
             )
     _check_eds(drive, identity, eds)
     mode = MODES[options.mode]

@@ -65,7 +65,7 @@ class CanJointDriver:
         self._bringup = make_bringup(self.options, self._codec, context.cell_dir)
         self.master = Master(self._codec, MasterSettings.of(self.options))
         self.bus: BusThread | None = None
-        self._told: MasterFault | None = None
+        self._reported_fault: MasterFault | None = None
         self._write_seq = 0
 
     def describe(self) -> JointDriverDescription:
@@ -122,7 +122,7 @@ class CanJointDriver:
     def _begin_cycle(self, bus: BusThread) -> None:
         """Begin the cycle and wait for a complete set. Raises DriverError where none comes."""
         self.master.clear()
-        self._told = None
+        self._reported_fault = None
         bus.begin_cycle()
         cycles = self.master.statistics.cycles + 2
 
@@ -247,7 +247,7 @@ class CanJointDriver:
         """The newest complete set, stamped with its poll. Raises DriverError, for a latched fault once."""
         self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         self.master.port_called(time.monotonic_ns())
-        if self.master.fault is not self._told:
+        if self.master.fault is not self._reported_fault:
             self._require_no_fault()
         sample = self.master.sample()
         if sample is None:
@@ -277,7 +277,7 @@ class CanJointDriver:
     def _require_no_fault(self) -> None:
         fault = self.master.fault
         if fault is not None:
-            self._told = fault
+            self._reported_fault = fault
             raise DriverError(
                 fault.code,
                 f"{fault.text()} [all axes are stopped until a reset]",

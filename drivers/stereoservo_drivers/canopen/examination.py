@@ -53,7 +53,7 @@ def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterat
             yield Finding("bus", False, str(error))
             return
         yield Finding("bus", True, f"{channel.name} is open at {options.bitrate} bit/s")
-        yield from _look(driver, channel, cell_dir)
+        yield from _examine_bus(driver, channel, cell_dir)
         yield from _run(driver, may_move)
     except DriverError as error:
         yield Finding("drives", False, str(error))
@@ -72,18 +72,18 @@ def load_finding(options: CanOptions) -> Finding:
     )
 
 
-def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[Finding]:
+def _examine_bus(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[Finding]:
     """Listen, then query the drives. Closes the channel."""
     try:
-        heard = _listen(channel)
+        received = _listen(channel)
         errors = [error.message for _, error in channel.take_errors()]
     except DriverError:
         channel.close()
         raise
-    yield traffic_finding(driver.options, heard)
+    yield traffic_finding(driver.options, received)
     if errors:
-        cure = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
-        yield Finding("bus errors", False, "; ".join(dict.fromkeys(errors)), cure)
+        remedy = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
+        yield Finding("bus errors", False, "; ".join(dict.fromkeys(errors)), remedy)
     bus = BusThread(channel, driver.master)
     try:
         if isinstance(driver.master.codec, Cia402Codec):
@@ -93,25 +93,25 @@ def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[
 
 
 def _listen(channel: Channel) -> list[CanFrame]:
-    heard: list[CanFrame] = []
+    received: list[CanFrame] = []
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end:
-        heard += [frame for _, frame in channel.receive(0.01)]
-    return heard
+        received += [frame for _, frame in channel.receive(0.01)]
+    return received
 
 
-def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> Finding:
+def traffic_finding(options: CanOptions, received: list[CanFrame]) -> Finding:
     """Finding on other masters on this bus, by frames (received in ``LISTEN_S``) that only a master sends."""
     commands = {RPDO_IDS[0] + joint.node_id for joint in options.joint}
     of_a_master = {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}
-    found = {frame.id for frame in heard if not frame.extended} & of_a_master
+    found = {frame.id for frame in received if not frame.extended} & of_a_master
     if options.protocol == "cia402" and found:
         foreign = ", ".join(f"0x{can_id:X}" for can_id in sorted(found))
         return Finding(
             "traffic", False, f"another master is on this bus: it sends {foreign}",
             "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
         )  # fmt: skip
-    return Finding("traffic", True, f"{len(heard)} frames in {LISTEN_S:g} s, none of another master")
+    return Finding("traffic", True, f"{len(received)} frames in {LISTEN_S:g} s, none of another master")
 
 
 # -- in the cycle -----------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ def _watch(driver: CanJointDriver) -> Iterator[Finding]:
     ids = [HEARTBEAT_ID + joint.node_id for joint in driver.options.joint] if cia402 else []
     positions, answered = [], []
     assert driver.bus is not None  # configured
-    with listening(driver.bus, ids) as heard:
+    with listening(driver.bus, ids) as received:
         for _ in range(round(WATCH_S / period_s)):
             positions.append(_sample(driver))
             answered.append(driver.master.statistics.answered_ns)
@@ -156,7 +156,7 @@ def _watch(driver: CanJointDriver) -> Iterator[Finding]:
     yield latency_finding(np.array(answered) * 1e-9, period_s)
     if cia402:
         yield from heartbeat_findings(
-            driver.options, [frame for frames in heard.values() for frame in frames]
+            driver.options, [frame for frames in received.values() for frame in frames]
         )
     return np.array(positions)
 
@@ -181,8 +181,8 @@ def cycles_finding(cycles: int, missed: int, skipped: int) -> Finding:
             message,
             "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz",
         )
-    cure = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
-    return Finding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, cure)
+    remedy = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
+    return Finding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, remedy)
 
 
 def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
@@ -199,10 +199,10 @@ def latency_finding(answered_s: FloatArray, period_s: float) -> Finding:
     )
 
 
-def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[Finding]:
+def heartbeat_findings(options: CanOptions, received: list[CanFrame]) -> Iterator[Finding]:
     """Findings on the heartbeats received in ``WATCH_S``, against the configured ones."""
     expected = WATCH_S * 1e3 / options.heartbeat_ms
-    counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in heard) for joint in options.joint]
+    counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in received) for joint in options.joint]
     rare = [
         (joint, count)
         for joint, count in zip(options.joint, counts, strict=True)
@@ -238,19 +238,19 @@ def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> I
         if error is None:
             yield jog_finding(trace)
             continue
-        cure = jog_finding(trace).remedy if trace.asked else ""
-        yield Finding(name, False, str(error), cure)
+        remedy = jog_finding(trace).remedy if trace.asked else ""
+        yield Finding(name, False, str(error), remedy)
         return
 
 
 def _question(joint: CanJoint, sign: float) -> str:
-    way = (
+    travel = (
         f"{math.degrees(sign * JOG['revolute']):+.0f}°"
         if joint.kind == "revolute"
         else f"{sign * JOG['prismatic'] * 1e3:+.0f} mm"
     )
     return (
-        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {way}, slowly. Is its "
+        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {travel}, slowly. Is its "
         "surrounding clear and a hand on the emergency stop?"
     )
 

@@ -154,7 +154,7 @@ def _check_range(joint: CanJoint) -> None:
     """Check the range of the drive's objects: 0x60FF is INTEGER32, 0x6083 to 0x6085 are UNSIGNED32."""
     scale = JointScale.of(joint)
     units = abs(scale.velocity_units_per_unit)
-    cure = "check counts_per_rev, gear_ratio and velocity_units_per_rev_s"
+    remedy = "check counts_per_rev, gear_ratio and velocity_units_per_rev_s"
     for option, largest in (
         ("max_velocity", INT32_MAX),
         ("max_acceleration", UINT32_MAX),
@@ -162,10 +162,10 @@ def _check_range(joint: CanJoint) -> None:
     ):
         value = getattr(joint, option)
         if not value * units <= largest:
-            what = f"{value * units:.4g} drive units; valid: up to {largest / units:.4g}, which is {largest}; {cure}"
+            what = f"{value * units:.4g} drive units; valid: up to {largest / units:.4g}, which is {largest}; {remedy}"
             raise _refusal(option, f"{value:g} is {what}", "", joint)
         if value * units < 0.5:
-            what = f"{value * units:.3g} drive units, which is nothing; valid: at least {0.5 / units:.4g}; {cure}"
+            what = f"{value * units:.3g} drive units, which is nothing; valid: at least {0.5 / units:.4g}; {remedy}"
             raise _refusal(option, f"{value:g} is {what}", "", joint)
     if joint.multi_turn:
         return  # the counter may wrap on its way

@@ -43,25 +43,25 @@ def position_finding(joint: CanJoint, position: float) -> Finding:
     outside = max(joint.position_min - position, position - joint.position_max)
     message = f"{position:+.4f} {unit} is {outside:.3g} {unit} outside {limits}"
     zero = joint.offset_rad + position
-    cure = f"if the joint stands at its zero now, offset_rad = {zero:.4f}"
+    remedy = f"if the joint stands at its zero now, offset_rad = {zero:.4f}"
     if joint.kind == "revolute" and abs(zero) > math.pi:
-        cure = (
+        remedy = (
             "so far outside, counts_per_rev (of the motor, after quadrature) or gear_ratio is wrong, limits are in "
             "degrees, or the encoder has lost its zero: home the drive"
         )
-    return Finding(name, False, message, cure)
+    return Finding(name, False, message, remedy)
 
 
 def noise_finding(joint: CanJoint, positions: FloatArray) -> Finding:
     """Finding on positions (k,) of a joint that should be at rest."""
     name, unit = f"{joint.name} at rest", _unit(joint)
     counts = abs(JointScale.of(joint).counts_per_unit)
-    spread = float(np.ptp(positions))
+    range_seen = float(np.ptp(positions))
     drift = float(positions[-1] - positions[0])
-    message = f"wavers by {spread:.2g} {unit} ({spread * counts:.0f} counts)"
-    if spread <= max(NOISE, NOISE_COUNTS / counts):
+    message = f"wavers by {range_seen:.2g} {unit} ({range_seen * counts:.0f} counts)"
+    if range_seen <= max(NOISE, NOISE_COUNTS / counts):
         return Finding(name, True, message)
-    if abs(drift) > 0.8 * spread:
+    if abs(drift) > 0.8 * range_seen:
         return Finding(
             name, False, f"moves by {drift:+.2g} {unit} while nobody drives it",
             "it sinks: see to its brake; or it was pushed: leave it alone and repeat",
@@ -134,14 +134,14 @@ def jog_finding(trace: JogTrace) -> Finding:
     """Finding on a finished jog: direction, travel, and the factor by which the units are wrong."""
     joint = trace.joint
     name = f"{joint.name} jog"
-    asked, travel = _told(joint, trace.asked), _told(joint, trace.travel)
+    asked, travel = _travel_text(joint, trace.asked), _travel_text(joint, trace.travel)
     ratio = trace.travel / trace.asked if trace.asked else math.inf
     if trace.runs_away():
-        cure = _units_cure(joint, ratio, at_least=True)
-        return Finding(name, False, f"asked for {asked}, moved {travel} before it was stopped", cure)
+        remedy = _units_remedy(joint, ratio, at_least=True)
+        return Finding(name, False, f"asked for {asked}, moved {travel} before it was stopped", remedy)
     if ratio > 1.0 + TOLERANCE:
         return Finding(
-            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
+            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_remedy(joint, ratio)
         )
     if ratio < -0.05:
         return Finding(
@@ -151,19 +151,19 @@ def jog_finding(trace: JogTrace) -> Finding:
     if ratio < 0.05:
         return Finding(
             name, False, f"asked for {asked}, moved {travel}: it stands",
-            f"brake, safe torque off, the drive's mode; or {_units_cure(joint, ratio)}"
+            f"brake, safe torque off, the drive's mode; or {_units_remedy(joint, ratio)}"
             if ratio > 1e-5 else "brake, safe torque off, the drive's mode, its velocity limit",
         )  # fmt: skip
     if ratio < 1.0 - TOLERANCE:
         return Finding(
-            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
+            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_remedy(joint, ratio)
         )
     share = trace.reported / trace.travel
     if not 1.0 - 2 * TOLERANCE < share < 1.0 + 2 * TOLERANCE:
         return Finding(
             name, False,
             f"moved {travel}, but the velocity that the drive reports (0x606C) adds up to "
-            f"{_told(joint, trace.reported)}: {share:.3g} times",
+            f"{_travel_text(joint, trace.reported)}: {share:.3g} times",
             "actual and target velocity differ in units: see the drive's manual; or leave velocity out of feedback",
         )  # fmt: skip
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
@@ -177,7 +177,7 @@ def jog_finding(trace: JogTrace) -> Finding:
     )  # fmt: skip
 
 
-def _units_cure(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:
+def _units_remedy(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:
     """Remedy for wrong units. ``at_least``: the joint was stopped while accelerating; the true ratio is larger."""
     configured = joint.velocity_units_per_rev_s or joint.counts_per_rev
     if not 0.0 < abs(ratio) < math.inf:
@@ -203,5 +203,5 @@ def _unit(joint: CanJoint) -> str:
     return "rad" if joint.kind == "revolute" else "m"
 
 
-def _told(joint: CanJoint, travel: float) -> str:
+def _travel_text(joint: CanJoint, travel: float) -> str:
     return f"{math.degrees(travel):+.3f}°" if joint.kind == "revolute" else f"{travel * 1e3:+.3f} mm"

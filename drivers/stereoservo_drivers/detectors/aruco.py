@@ -168,11 +168,11 @@ class TagDetector:
     ) -> _Found | None:
         corners, sigmas = places
         low, high = corners.min(axis=0), corners.max(axis=0)
-        room = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
+        margin = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
         height, width = image.shape
-        left, top = np.maximum(np.floor(low - room), 0).astype(int).tolist()
-        right = int(min(high[0] + room + 1, width))
-        bottom = int(min(high[1] + room + 1, height))
+        left, top = np.maximum(np.floor(low - margin), 0).astype(int).tolist()
+        right = int(min(high[0] + margin + 1, width))
+        bottom = int(min(high[1] + margin + 1, height))
         if right - left < SMALLEST_IMAGE or bottom - top < SMALLEST_IMAGE:
             return None
         quads = self._quads(image[top:bottom, left:right], {tag}).get(tag, [])

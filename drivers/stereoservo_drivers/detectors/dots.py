@@ -164,14 +164,14 @@ class DotDetector:
             image, self._dark, windows, predicted, options.min_contrast, least, self._labels, self._stack,
             dots, status
         )  # fmt: skip
-        spread, limit = np.zeros((m, 3)), np.inf
+        covariance, limit = np.zeros((m, 3)), np.inf
         if options.gate_probability:
             limit = -2.0 * np.log1p(-options.gate_probability)
             for k, marker in enumerate(ids.tolist()):
                 if marker in self._place:
-                    spread[self._place[marker]] = uncertain[k].ravel()[[0, 1, 3]]
+                    covariance[self._place[marker]] = uncertain[k].ravel()[[0, 1, 3]]
         judge(
-            self._positions, self._radii, predicted, present, shapes, status, spread, limit, options.lopsided,
+            self._positions, self._radii, predicted, present, shapes, status, covariance, limit, options.lopsided,
             options.consistency_px, dots, used,
         )  # fmt: skip
         return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
@@ -185,8 +185,8 @@ class DotDetector:
         if not unknown.any():
             return tracked
         dots, used = tracked
-        wanted = np.flatnonzero(unknown).tolist()
-        found, seen = self._acquire(image, wanted, [None] * len(unknown), taken=dots[used, :2])
+        missing_faces = np.flatnonzero(unknown).tolist()
+        found, seen = self._acquire(image, missing_faces, [None] * len(unknown), taken=dots[used, :2])
         return np.where(unknown[:, None, None], found, dots), np.where(unknown[:, None], seen, used)
 
     def _acquire(
@@ -236,8 +236,8 @@ class DotDetector:
         dots, used = found
         rows = self._order[used.ravel()[self._order]]
         ids, chosen = self._every_id.ravel()[rows], dots.reshape(-1, FIELDS)[rows]
-        spread = np.empty((len(ids), 2, 2))
-        levels.covariances(chosen, self.options.floor_px, spread)
+        covariance = np.empty((len(ids), 2, 2))
+        levels.covariances(chosen, self.options.floor_px, covariance)
         return CameraObservation(
             camera=frame.camera,
             seq=frame.seq,
@@ -245,5 +245,5 @@ class DotDetector:
             t_received_ns=frame.t_received_ns,
             ids=ids,
             pixels=np.ascontiguousarray(chosen[:, :2]),
-            covariances=spread,
+            covariances=covariance,
         )

@@ -296,9 +296,9 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
                 return 0
             areas[i] = circle[4]
     dark = max(_median(dots[:, NOISE], used), 0.08)
-    misfit = UNEVEN_INSIDE * _median(dots[:, CONTRAST], used)
+    tolerance_inside = UNEVEN_INSIDE * _median(dots[:, CONTRAST], used)
     inside = max(_median(dots[:, BRIGHT], used), dark)
-    bright = max(inside - misfit * misfit, dark)
+    bright = max(inside - tolerance_inside * tolerance_inside, dark)
     # slopes inside have that misfit, too
     flat_field(areas, used, dark, inside, dots, raw)
     variance = 0.0

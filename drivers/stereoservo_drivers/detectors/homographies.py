@@ -212,7 +212,7 @@ def misfits(pattern, pixels, used, H, out):
 
 
 @kernel
-def _left_out(pattern, pixels, used, frame, h, A, b, out):
+def _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
     """Leave-one-out residual of each dot: ``out`` (n, 3) = its distance from the homography of the others [px], the
     smallest root of I - L, its squared studentised residual [px²].
 
@@ -275,7 +275,7 @@ def outlier_dot(pattern, pixels, used, sigma, out):
         n += 1 if used[i] else 0
     if n < 6 or not _fit(pattern, pixels, used, frame, h, A, b):
         return -1
-    if not _left_out(pattern, pixels, used, frame, h, A, b, out):
+    if not _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
         return -1
     total = 0.0
     for i in range(used.size):
@@ -296,14 +296,14 @@ def outlier_dot(pattern, pixels, used, sigma, out):
 
 
 @kernel
-def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
+def _worst_outlier(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
     """The dot with the largest leave-one-out residual, -1 where all are within tolerance.
 
     It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root of
     (I - L)⁻¹. Of the dots beyond, the one with the largest studentised residual goes. -2 where the fit is degenerate.
     """
     out = np.zeros((used.size, 3))
-    if not _left_out(pattern, pixels, used, frame, h, A, b, out):
+    if not _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
         return -2
     worst = -1
     largest = 0.0
@@ -334,7 +334,7 @@ def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
     while count >= least:
         if not _fit(pattern, pixels, used, frame, h, A, b):
             return False
-        worst = _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma)
+        worst = _worst_outlier(pattern, pixels, used, frame, h, A, b, tolerance, sigma)
         if worst == -1:
             _in_pixels(frame, h, H)
             return True

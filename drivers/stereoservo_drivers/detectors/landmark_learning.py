@@ -99,7 +99,7 @@ class LearningReport:
 
 
 def learn_landmarks(
-    sights: Mapping[str, Sequence[ImageArray]],
+    views: Mapping[str, Sequence[ImageArray]],
     moved: Mapping[str, Sequence[ImageArray]] | None = None,
     settings: LearningSettings | None = None,
 ) -> tuple[Landmarks, LearningReport]:
@@ -110,7 +110,7 @@ def learn_landmarks(
     Raises DriverError: ``images`` (cameras or sizes do not fit, no texture), ``too_few_matches``, ``no_landmarks``.
     """
     options = settings or LearningSettings()
-    pictures = _means(sights, "images")
+    pictures = _means(views, "images")
     if len(pictures) < 2:
         raise DriverError(
             "images",
@@ -124,7 +124,7 @@ def learn_landmarks(
     reports, seen = [], np.zeros(m, np.bool_)
     for name in names[1:]:
         found, kept, report = _match_pair(
-            (base, name), pictures[base], pictures[name], corners, len(sights[base]), options
+            (base, name), pictures[base], pictures[name], corners, len(views[base]), options
         )
         reports.append(report)
         pixels[name] = np.where(kept[:, None], found.pixels, np.nan)
@@ -147,7 +147,7 @@ def learn_landmarks(
         CameraReference(
             name,
             pictures[name],
-            len(sights[name]),
+            len(views[name]),
             np.ascontiguousarray(pixels[name][rows]),
             np.ascontiguousarray(sigmas[name][rows]),
         )
@@ -187,9 +187,9 @@ def find_corners(picture: ImageArray, settings: LearningSettings) -> FloatArray:
     return corners
 
 
-def _means(sights: Mapping[str, Sequence[ImageArray]], what: str) -> dict[str, ImageArray]:
+def _means(views: Mapping[str, Sequence[ImageArray]], what: str) -> dict[str, ImageArray]:
     pictures = {}
-    for name, images in sights.items():
+    for name, images in views.items():
         shapes = {np.shape(image) for image in images}
         if len(shapes) != 1 or len(next(iter(shapes))) != 2 or min(next(iter(shapes))) < SMALLEST_PICTURE:
             raise DriverError(
@@ -242,7 +242,7 @@ def _match_pair(
     for rows, warps, where in starts_from_planes(planes, corners, settings.radius_px):
         if len(rows):
             take_better(found, rows, *seek(patches, pyramid, rows, warps, where, settings.least_correlation))
-    aligned = _that_come_back(found, left, right, corners, settings)
+    aligned = _passes_backward_check(found, left, right, corners, settings)
     count = int(aligned.sum())
     if count < MIN_MATCHES:
         raise _too_few(names, len(corners), len(matches), count)
@@ -273,7 +273,7 @@ def _too_few(names: tuple[str, str], corners: int, matches: int, agreeing: int) 
     )
 
 
-def _that_come_back(
+def _passes_backward_check(
     found: Alignment, left: ImageArray, right: ImageArray, corners: FloatArray, settings: LearningSettings
 ) -> BoolArray:
     """Mask of matches that pass the backward check: aligned in reverse, by patches of the right image."""

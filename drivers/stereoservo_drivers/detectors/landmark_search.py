@@ -64,9 +64,9 @@ class Surroundings:
         counted = use[self.near] & self._there & use[:, None]
         counted &= np.cumsum(counted, axis=1) <= 2 * NEIGHBOURS
         x = np.nan_to_num(self.pixels[self.near] - self.pixels[:, None])
-        told = found[:, None] + np.einsum("mij,mkj->mki", A, x)
-        misses = np.linalg.norm(told - found[self.near], axis=2)
-        allowed = LOOSE_PX + BENT * np.linalg.norm(told - found[:, None], axis=2)
+        predicted = found[:, None] + np.einsum("mij,mkj->mki", A, x)
+        misses = np.linalg.norm(predicted - found[self.near], axis=2)
+        allowed = LOOSE_PX + BENT * np.linalg.norm(predicted - found[:, None], axis=2)
         agreed: BoolArray = counted & (misses <= allowed)
         return agreed
 
@@ -243,8 +243,8 @@ def _nearest(
         for _ in range(TWINS):
             d2[rows, last] = np.inf
             last = d2.argmin(axis=1)
-            apart = np.linalg.norm(among.pixels[last] - among.pixels[nearest], axis=1) > NEAR_PX
-            rival = np.where(np.isnan(rival) & apart, d2[rows, last], rival)
+            distinct = np.linalg.norm(among.pixels[last] - among.pixels[nearest], axis=1) > NEAR_PX
+            rival = np.where(np.isnan(rival) & distinct, d2[rows, last], rival)
         other[at] = np.where(np.isnan(rival), d2[rows, last], rival)
     return best, np.sqrt(np.maximum(distance, 0.0)), np.sqrt(np.maximum(other, 0.0)), back
 

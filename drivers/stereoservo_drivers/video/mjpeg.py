@@ -102,14 +102,14 @@ class MjpegSource:
 
     def _boundary(self, response: http.client.HTTPResponse) -> str:
         if response.status != 200:
-            cure = {
+            remedy = {
                 401: "Put user and password into the URL: http://user:password@host/...",
                 403: "Look at the rights of the camera's user",
                 404: "Look up the path of its MJPEG stream",
             }.get(response.status, "Look at the camera's own page")
             raise self._place.error(
                 "http_status",
-                f"answered {response.status} {response.reason}. {cure}",
+                f"answered {response.status} {response.reason}. {remedy}",
                 retry=response.status >= 500,
                 status=response.status,
             )

@@ -21,8 +21,8 @@ PICTURE_FLAG = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 def jpeg_flag(channel: Channel) -> int:
     """Decoder flag for JPEG data: luma is coded separately, and faster to decode alone."""
-    wanted = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
-    return wanted | cv2.IMREAD_IGNORE_ORIENTATION
+    expected = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
+    return expected | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def one_channel(image: ImageArray, channel: Channel, flip: Flip) -> ImageArray:

@@ -97,12 +97,12 @@ class CaptureSource:
         try:
             os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError as error:
-            code, cure = {
+            code, remedy = {
                 errno.ENOENT: ("missing", "no such device; `ls /dev/video*` shows those there are"),
                 errno.EACCES: ("permission", "no right to use it; the user must be in the group 'video'"),
                 errno.EBUSY: ("busy", "another program uses it"),
             }.get(error.errno or 0, ("not_opened", f"cannot be opened ({error.strerror})"))
-            raise self._place.error(code, cure, retry=True) from error
+            raise self._place.error(code, remedy, retry=True) from error
 
     def _set(self) -> None:
         options = self._options
