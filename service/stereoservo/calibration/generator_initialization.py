@@ -26,7 +26,7 @@ DIRECTIONS = np.array(
 """Start directions (26, 3): faces, edges and corners of a cube."""
 
 
-def spread_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
+def distant_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
     """First and second stops of the pairs where ``apart`` (k, k) holds, at most ``MAX_PAIRS``, evenly spread."""
     first, second = np.nonzero(apart)
     if len(first) <= MAX_PAIRS:
@@ -54,7 +54,7 @@ def linear_generator(
     ``angles`` (k,). None where the solution is no rotation.
     """
     span = float(np.ptp(angles))
-    first, second = spread_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
+    first, second = distant_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
     valid = finite_rows(points)
     pair, marker = np.nonzero(valid[first] & valid[second])
     here, there = first[pair], second[pair]
@@ -107,7 +107,7 @@ def nominal_generator(
     with np.errstate(divide="ignore", invalid="ignore"):
         euclidean = points @ upgrade.T / points[..., 3:]
     valid = finite_rows(euclidean)
-    first, second = spread_pairs(angles[None, :] - angles[:, None] > 0.5 * np.ptp(angles))
+    first, second = distant_pairs(angles[None, :] - angles[:, None] > 0.5 * np.ptp(angles))
     best, least = None, np.inf
     for k, n in zip(first, second, strict=True):
         both = valid[k] & valid[n]

@@ -111,7 +111,7 @@ def triangular_root(omega: FloatArray) -> FloatArray:
     return K
 
 
-def heights_of_one_side(plane: FloatArray, points: FloatArray) -> FloatArray:
+def oriented_plane(plane: FloatArray, points: FloatArray) -> FloatArray:
     """``plane`` (4,) with the sign that gives points ``(n, 4)`` positive scales ``plane @ M`` (2.47).
 
     The points are scaled so that they are in front (depth 1 in the first camera). Raises GeometryError naming those on

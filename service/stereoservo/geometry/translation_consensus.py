@@ -17,7 +17,7 @@ from stereoservo.geometry.cameras import triangulate, triangulation_covariance
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.reprojection_fit import Images, covariance_of, minimise, read_images, with_rest
-from stereoservo.geometry.strata import heights_of_one_side
+from stereoservo.geometry.strata import oriented_plane
 from stereoservo.geometry.translation_fit import (
     TranslationFit,
     bundle_translations,
@@ -226,7 +226,7 @@ def _require_heights(scene: _Scene, fit: TranslationFit) -> None:
             limit=HEIGHT_DEVIATION,
             coplanar=scene.flat,
         )
-    heights_of_one_side(fit.plane, points)
+    oriented_plane(fit.plane, points)
 
 
 def _joint(scene: _Scene, used: BoolArray) -> TranslationFit:

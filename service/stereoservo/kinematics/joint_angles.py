@@ -177,7 +177,7 @@ def homing_problem(
     return joint_problem(seen, points, pixels, sigma, point_covariance=covariance)
 
 
-def way_home(
+def homing_displacement(
     problem: JointProblem,
     home: FloatArray,
     *,

@@ -107,14 +107,14 @@ def _answer_syncs(fd: int) -> None:
 
 def serve_drives(text: str) -> None:
     """Serve emulated drives with an ideal plant on a free TCP port. ``text``: ``{"bit_time": …, "options": …}``."""
-    from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint
-    from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+    from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint
+    from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 
     wanted: dict[str, Any] = json.loads(text)
     options = msgspec.convert(wanted["options"], CanOptions)
     settings = DrivesSettings(plant="ideal", bit_time=wanted["bit_time"])
-    rack = make_rack(options, settings, t_ns=time.monotonic_ns())
-    server = RackServer(rack, open_endpoint("socket://127.0.0.1:0", options.bitrate))
+    emulator = make_bus_emulator(options, settings, t_ns=time.monotonic_ns())
+    server = BusServer(emulator, open_endpoint("socket://127.0.0.1:0", options.bitrate))
     ended = False
 
     def end() -> None:

@@ -156,11 +156,13 @@ class Controller:
         self._cameras = cameras_used(settings.law)
         self._wanted = np.ones(self._set_points.shape[:2])
         self._wanted[self._cameras :] = 0.0
-        self._middle = np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
+        self._centre_weights = (
+            np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
+        )
         self._task: Task | None = None
         self._plans = settings.law in LAWS and LAWS[settings.law].planned
         self._look_steps = round(LOOK_S * settings.rate_hz) if self._plans else 0
-        self._way: PlannedPath | None = None
+        self._path: PlannedPath | None = None
         self._limits = limits
         self._operators = knowledge.basis
 
@@ -178,15 +180,15 @@ class Controller:
         points = self.estimate.points
         if self._task is None:
             self._task = self._start(points)
-        task = self._task._replace(centre=self._middle @ points)
+        task = self._task._replace(centre=self._centre_weights @ points)
         scene = Scene(
             self._operators, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points,
             self.estimate.pixels, seen * self._wanted,
         )  # fmt: skip
         if self._plans:
-            if self._way is None:
-                self._way = plan_task_path(scene, task, joints, self._limits)
-            task = self._way.task_now(scene, task, joints, self._dt_s)
+            if self._path is None:
+                self._path = plan_task_path(scene, task, joints, self._limits)
+            task = self._path.task_now(scene, task, joints, self._dt_s)
         step = self._law(scene, task, self._options)
         self.task_error = step.error
         if self._joint_speed is None:
@@ -215,8 +217,8 @@ class Controller:
             rates=np.zeros_like(self._set_points),
             target_points=targets,
             target_known=np.ones(len(targets)),
-            centre=self._middle @ points,
-            centre_target=self._middle @ targets,
+            centre=self._centre_weights @ points,
+            centre_target=self._centre_weights @ targets,
             face=FACE,
         )
 

@@ -55,7 +55,7 @@ def in_images(pixels: FloatArray) -> npt.NDArray[np.bool_]:
 
 @kernel
 def _sight(
-    matrices: FloatArray, eyes: FloatArray, markers: FloatArray, pose: FloatArray, used: int
+    matrices: FloatArray, camera_centres: FloatArray, markers: FloatArray, pose: FloatArray, used: int
 ) -> tuple[FloatArray, float, float, float]:
     cameras, count = matrices.shape[0], markers.shape[0]
     pixels = np.empty((cameras, count, 2))
@@ -80,9 +80,9 @@ def _sight(
     for c in range(used):
         along, length = 0.0, 0.0
         for i in range(3):
-            way = eyes[c, i] - pose[i, 3]
-            along -= pose[i, 2] * way
-            length += way * way
+            offset = camera_centres[c, i] - pose[i, 3]
+            along -= pose[i, 2] * offset
+            length += offset * offset
         facing = min(facing, along / math.sqrt(length))
     return pixels, margin, nearest, facing
 
@@ -99,11 +99,11 @@ def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> F
     From the segment: what is overshot counts.
     """
     a, b = start[:3, 3], goal[:3, 3]
-    way = b - a
-    length = float(way @ way)
+    offset = b - a
+    length = float(offset @ offset)
     from_a = poses[:, :3, 3] - a
-    share = np.clip(from_a @ way / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(poses))
-    return np.asarray(np.linalg.norm(from_a - share[:, None] * way, axis=1))
+    share = np.clip(from_a @ offset / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(poses))
+    return np.asarray(np.linalg.norm(from_a - share[:, None] * offset, axis=1))
 
 
 def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, cameras: int) -> float:

@@ -63,7 +63,7 @@ def _task(seed: int, number: int) -> AlignmentTask:
         distance = float(np.linalg.norm(start[:3, 3] - goal[:3, 3]))
         if not (_visible(goal) and _visible(start) and distance <= MAX_DISTANCE_M):
             continue
-        margin, facing = straight_way(start, goal)
+        margin, facing = straight_path_margins(start, goal)
         wanted = {
             "leaves the view": margin < 0.0 and facing > 0.0,
             "shows the back": facing <= 0.0,
@@ -98,7 +98,7 @@ def _angle(rng: np.random.Generator, number: int, kind: str) -> float:
     return float(rng.uniform(0.0, 150.0))
 
 
-def straight_way(start: FloatArray, goal: FloatArray) -> tuple[float, float]:
+def straight_path_margins(start: FloatArray, goal: FloatArray) -> tuple[float, float]:
     """Least distance from the image borders [px] and least cosine to the plate's normal on the straight path.
 
     The middle goes on its line while the plate turns about one axis, the shorter way round.

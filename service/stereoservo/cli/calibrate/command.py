@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from stereoservo.cli import interruption
 from stereoservo.cli.calibrate.recorded_images import fit_images, table_of_images
-from stereoservo.cli.calibrate.stored_trials import fit_again, table, table_of_stored
+from stereoservo.cli.calibrate.stored_trials import fit_stored_trials, table, table_of_stored
 from stereoservo.cli.output import (
     EXIT_FAILED,
     CellArgument,
@@ -115,7 +115,7 @@ def calibrate(
         emit(from_images, table_of_images(from_images), json)
         return
     if trials is not None:
-        result = fit_again(cell, trials, lines, lines_sigma, output)
+        result = fit_stored_trials(cell, trials, lines, lines_sigma, output)
         emit(result, table_of_stored(result), json)
         return
     if lines is not None or output is not None:

@@ -62,7 +62,7 @@ def table_of_stored(result: StoredFit) -> str:
     return "\n".join(lines)
 
 
-def fit_again(
+def fit_stored_trials(
     cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None
 ) -> StoredFit:
     """Fit stored trial data in this process; the model is stored beside the cell's others unless ``output`` is
@@ -77,7 +77,7 @@ def fit_again(
     from stereoservo.calibration.trial_data import CalibrationError, load_trials
     from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
 
-    file, name, directory = may_fit(cell, output)
+    file, name, directory = resolve_cell(cell, output)
     data = load_trials(path)
     if file is not None:
         _must_fit(file, data, path)
@@ -115,7 +115,7 @@ def fit_again(
     return StoredFit(**msgspec.structs.asdict(figures), use=use, lines=used)
 
 
-def may_fit(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
+def resolve_cell(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
     """The cell file, where it was given, the cell's name, and its directory of models.
 
     Raises CommandError where a fit could not be kept, CellFileError.

@@ -213,7 +213,7 @@ def examine_skew(records: Sequence[CameraRecord]) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+def mean_observations(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Markers seen in most frames: ids (k,), mean raw pixels (k, 2), standard deviations (k,) of one observation."""
     pixels: dict[int, list[FloatArray]] = {}
     variances: dict[int, list[float]] = {}
@@ -235,7 +235,7 @@ def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray
 
 def near_border(record: CameraRecord) -> Finding | None:
     """Markers that are close to the image border."""
-    ids, pixels, _ = mean_sights(record)
+    ids, pixels, _ = mean_observations(record)
     size = np.array([record.description.width, record.description.height])
     close = ids[((pixels < EDGE_PX) | (pixels > size - 1 - EDGE_PX)).any(axis=1)]
     if not close.size:

@@ -7,7 +7,7 @@ from itertools import pairwise, permutations, product
 
 import numpy as np
 
-from stereoservo.cli.doctor.camera_findings import CameraRecord, mean_sights
+from stereoservo.cli.doctor.camera_findings import CameraRecord, mean_observations
 from stereoservo.core.settings import TrialSettings
 from stereoservo.geometry.cameras import project_many, triangulate
 from stereoservo.geometry.distortion import distort, undistort
@@ -40,7 +40,7 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
 
 def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
     """Markers seen by all cameras, and their raw pixels (c, k, 2)."""
-    means = [mean_sights(record) for record in records]
+    means = [mean_observations(record) for record in records]
     ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in means)))
     pixels = [
         np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in means
@@ -103,7 +103,7 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> Finding:
             None,
             f"{len(ids)} markers are seen by both; the epipolar constraint needs {MATCHES} to say anything",
         )
-    sigma = float(np.median(np.concatenate([mean_sights(first)[2], mean_sights(second)[2]])))
+    sigma = float(np.median(np.concatenate([mean_observations(first)[2], mean_observations(second)[2]])))
     try:
         F, inliers = fundamental_robust(pixels[0], pixels[1], max(sigma, 0.05))
     except GeometryError as error:

@@ -46,7 +46,7 @@ class RecordedTrials:
     standing: tuple[int, ...]
 
 
-def flight_of(images: Path) -> Path:
+def flight_recording_of(images: Path) -> Path:
     """Flight recording that a directory of images belongs to: ``NAME.mcap`` beside ``NAME.images``."""
     return images.absolute().with_suffix(".mcap")
 
@@ -64,7 +64,7 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
             f"{images} is no directory of recorded images; `stereoservo record CELL --images` makes one, "
             f"NAME{IMAGES_SUFFIX} beside NAME.mcap",
         )
-    motion = read_motion(flight_of(images))
+    motion = read_motion(flight_recording_of(images))
     cameras = [
         recorded_camera(cell, cell_path, section.name, video_of(images, section.name))
         for section in cell.camera

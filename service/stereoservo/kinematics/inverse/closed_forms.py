@@ -143,7 +143,7 @@ def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float =
     return single(float(np.arctan2(sine, cosine)), abs(float(np.hypot(cosine, sine)) - 1.0))
 
 
-def plane_across(G: FloatArray, A: FloatArray) -> FloatArray:
+def normal_plane(G: FloatArray, A: FloatArray) -> FloatArray:
     """Plane (4,) normal to the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0``, which is
     invariant.
 
@@ -173,7 +173,7 @@ def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArr
     """
     if np.linalg.norm(G[1] @ A) <= FREE * np.linalg.norm(G[1]) * np.linalg.norm(A):
         return beside(turn_between(G[0], A, target, seed[0]), single(seed[1], free=True))
-    crossing = circle_meets_plane(-G[0], target, plane_across(G[1], A), seed[0])
+    crossing = circle_meets_plane(-G[0], target, normal_plane(G[1], A), seed[0])
     found = []
     for angle in crossing.angles:
         before = exp_rotation(G[0], -angle) @ target
@@ -236,7 +236,7 @@ def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> B
     Joints 2 and 3 keep the point in the plane across their axes (6.23), which leaves two angles of joint 1; each leaves
     a problem of two parallel joints. Equal heights; ``seed`` (3,).
     """
-    crossing = circle_meets_plane(-G[0], target, plane_across(G[1], A), seed[0])
+    crossing = circle_meets_plane(-G[0], target, normal_plane(G[1], A), seed[0])
     found = []
     for angle in crossing.angles:
         before = exp_rotation(G[0], -angle) @ target

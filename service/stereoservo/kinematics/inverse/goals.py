@@ -86,7 +86,7 @@ def scaled_displacement(generators: FloatArray, H: FloatArray) -> FloatArray:
     return H / scale
 
 
-def equal_heights(
+def equal_scales(
     generators: FloatArray, points: FloatArray, targets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """``points`` (m, 4) unchanged, and ``targets`` (m, 4) scaled to the same value on a plane that all joints leave

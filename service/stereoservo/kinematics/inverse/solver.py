@@ -140,7 +140,7 @@ def _problem(
         # A displacement is what it does to the columns of the identity.
         return _Problem(chain, np.eye(4), np.ascontiguousarray(H.T), H, seed, limits, tolerance)
     if displacement is None and points is not None and targets is not None:
-        at_zero, at_goal = goals.equal_heights(chain.generators, points, targets)
+        at_zero, at_goal = goals.equal_scales(chain.generators, points, targets)
         return _Problem(chain, at_zero, at_goal, None, seed, limits, tolerance)
     raise InverseKinematicsError("shape", "give a displacement, or points and targets: one goal is needed")
 

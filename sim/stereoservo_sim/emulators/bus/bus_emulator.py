@@ -173,7 +173,7 @@ class BusEmulator:
             if slot.node.node_id == node_id:
                 return slot
         there = ", ".join(str(slot.node.node_id) for slot in self.slots)
-        raise FaultCommandError(f"no node {node_id} in this rack; nodes: {there}")
+        raise FaultCommandError(f"no node {node_id} on this bus; nodes: {there}")
 
     def add(self, node: EmulatedNode, *, boots: bool) -> None:
         """Add a node to the bus, whose axis moves nothing."""

@@ -67,21 +67,21 @@ class _Request:
         self.error: Exception | None = None
 
 
-class RackServer:
-    """Serves the emulated bus ``rack`` at ``endpoint`` until terminated.
+class BusServer:
+    """Serves the emulated bus ``emulator`` at ``endpoint`` until terminated.
 
-    ``on_event`` gets every event of the rack, in the serving thread. ``run`` serves in the calling thread; as a context
-    manager the server runs in a thread of its own, and what failed there is raised at the end.
+    ``on_event`` gets every event of the emulated bus, in the serving thread. ``run`` serves in the calling
+    thread; as a context manager the server runs in a thread of its own, and what failed there is raised at the end.
     """
 
     def __init__(
         self,
-        rack: BusEmulator,
+        emulator: BusEmulator,
         endpoint: Endpoint,
         *,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.rack = rack
+        self.emulator = emulator
         self.endpoint = endpoint
         self.stalls = Stalls()
         self.on_event: Callable[[BusEvent], None] | None = None
@@ -96,12 +96,12 @@ class RackServer:
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
         self._turned_ns = clock_ns()
-        rack.on_adapter = endpoint.plug
+        emulator.on_adapter = endpoint.plug
 
     @property
     def start_ns(self) -> int:
         """Time at which the drives were switched on."""
-        return self.rack.start_ns
+        return self.emulator.start_ns
 
     @property
     def channel(self) -> str:
@@ -118,7 +118,7 @@ class RackServer:
 
     def obey(self, text: str) -> str:
         """Execute a fault command, from the serving thread itself. Raises FaultCommandError."""
-        answer = self.rack.order(text, self._clock_ns())
+        answer = self.emulator.order(text, self._clock_ns())
         return f"{answer}\n{self.stalls.words()}" if text.split()[:1] == ["status"] else answer
 
     def order(self, text: str, timeout_s: float = 10.0) -> str:
@@ -139,19 +139,19 @@ class RackServer:
         """Serve until ``ended``; then power off, and let the arm come to rest. Closes endpoint and emulator."""
         try:
             self._turned_ns = self._clock_ns()
-            self.rack.run_until(self._turned_ns)
+            self.emulator.run_until(self._turned_ns)
             while not ended():
                 self.turn()
             now = self._clock_ns()
             self.endpoint.close()
-            self.rack.power_off(now)
-            while not self.rack.at_rest() and self._clock_ns() < now + ENDING_NS:
-                self._sleep([], self.rack.due_ns())
-                self.rack.run_until(self._clock_ns())
+            self.emulator.power_off(now)
+            while not self.emulator.at_rest() and self._clock_ns() < now + ENDING_NS:
+                self._sleep([], self.emulator.due_ns())
+                self.emulator.run_until(self._clock_ns())
             self._pass_events()
         finally:
             self.endpoint.close()
-            self.rack.close()
+            self.emulator.close()
             self._end_requests()
 
     def _end_requests(self) -> None:
@@ -167,7 +167,7 @@ class RackServer:
     def turn(self) -> None:
         """Wait for the next event or input, and advance the bus to the present."""
         descriptors = self.endpoint.descriptors()
-        wanted = self.rack.due_ns()
+        wanted = self.emulator.due_ns()
         if not descriptors:
             wanted = min(wanted, self._clock_ns() + ASKING_NS)
         ready = self._sleep([*descriptors, self._wake_read, *self._watched], wanted)
@@ -176,7 +176,7 @@ class RackServer:
         come = not descriptors or not set(ready).isdisjoint(descriptors)
         frames = self.endpoint.take() if come else []
         for t_ns, frame in self._stamped(frames, wanted, now):
-            self.rack.inject(frame, t_ns)
+            self.emulator.inject(frame, t_ns)
         self._catch_up(now)
         if self._wake_read in ready:
             self._answer()
@@ -189,7 +189,7 @@ class RackServer:
         """Wait for input or for ``until_ns``; returns what is readable. With bit times the end is waited for by
         polling.
         """
-        spin = SPIN_NS if self.rack.wire.bitrate is not None else 0
+        spin = SPIN_NS if self.emulator.wire.bitrate is not None else 0
         left_ns = until_ns - self._clock_ns() - spin
         return select.select(descriptors, [], [], max(left_ns, 0) * 1e-9)[0]
 
@@ -215,14 +215,14 @@ class RackServer:
         """Advance to ``now``. Frames that have ended on the bus are delivered before the arm's next step is
         computed.
         """
-        while (due := self.rack.due_ns()) <= now:
-            self.rack.run_until(due)
+        while (due := self.emulator.due_ns()) <= now:
+            self.emulator.run_until(due)
             self._give()
-        self.rack.run_until(now)
+        self.emulator.run_until(now)
         self._give()
 
     def _give(self) -> None:
-        delivered = self.rack.delivered()
+        delivered = self.emulator.delivered()
         if delivered:
             self.endpoint.give(delivered)
             late_ns = self._clock_ns() - delivered[0][0]
@@ -240,7 +240,7 @@ class RackServer:
             request.done.set()
 
     def _pass_events(self) -> None:
-        news = self.rack.take_news()
+        news = self.emulator.take_news()
         if self.on_event is not None:
             for event in news:
                 self.on_event(event)

@@ -10,7 +10,7 @@ from stereoservo_drivers.can.load import frame_bits
 from stereoservo_sim.emulators.nodes.node import NEVER_NS
 
 MASTER = 0
-"""The sender that is not a node of the rack; nodes are 1, 2, ... in their order."""
+"""The sender that is not a node of the emulated bus; nodes are 1, 2, ... in their order."""
 QUEUE_LIMIT = 2000
 """Frames that a sender may have waiting; further ones are lost, as from a full transmit buffer."""
 SECOND_NS = 1_000_000_000

@@ -73,7 +73,7 @@ def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
     return options, settings
 
 
-def make_rack(
+def make_bus_emulator(
     options: CanOptions,
     settings: DrivesSettings | None = None,
     *,

@@ -13,9 +13,9 @@ Stage = Literal["running", "standing", "start", "reset"]
 class FaultCase(msgspec.Struct, frozen=True, kw_only=True):
     """One fault case of the table.
 
-    ``orders``: given to the rack at the moment of the fault (``stage`` running), when the arm is enabled and about to
-    move (standing; times count from its first command), before bring-up (start), or a fault whose reset is then
-    tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
+    ``orders``: given to the emulated bus at the moment of the fault (``stage`` running), when the arm is
+    enabled and about to move (standing; times count from its first command), before bring-up (start), or a fault
+    whose reset is then tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
     the master may latch first or bring-up may refuse with, one or several by the fault's phase; empty: nothing
     latches, motion goes on. ``bound_ms``: from the fault to all axes at rest. ``by``: who ends motion.
     ``afterwards``: ordered once the axes rest: the cause goes away, and nothing may move again by itself.

@@ -19,7 +19,7 @@ from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.canopen.driver import make_bringup, make_codec
 from stereoservo_drivers.canopen.master import Master, MasterFault, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 from stereoservo_sim.emulators.bus.fault_cases import FaultCase
 from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
 
@@ -97,18 +97,18 @@ class FaultRig:
     def __init__(self, case: FaultCase, protocol: str) -> None:
         self.case = case
         options = trial_options(protocol, **case.options)
-        self.rack = make_rack(options, DrivesSettings(plant="ideal", bit_time=True), t_ns=0)
-        self.axes = [node.axis for node in self.rack.nodes]
+        self.emulator = make_bus_emulator(options, DrivesSettings(plant="ideal", bit_time=True), t_ns=0)
+        self.axes = [node.axis for node in self.emulator.nodes]
         codec = make_codec(options)
         self.bringup = make_bringup(options, codec, Path())
         self.master = Master(codec, MasterSettings.of(options))
-        self.host = VirtualHost(self.rack, self.master)
+        self.host = VirtualHost(self.emulator, self.master)
         self.host.wait(BOOT_S)
 
     def order(self, texts: tuple[str, ...]) -> None:
         """Send fault commands to the emulator now."""
         for text in texts:
-            self.rack.order(text, self.host.t_ns)
+            self.emulator.order(text, self.host.t_ns)
 
     def enable(self) -> None:
         """Request enabling and run until the master has decided."""
@@ -144,7 +144,7 @@ class FaultRig:
 
     def still(self) -> bool:
         """Whether all axes are at rest."""
-        return self.rack.at_rest()
+        return self.emulator.at_rest()
 
 
 def run_trial(
@@ -204,7 +204,7 @@ def _until_rest(rig: FaultRig, t0: int) -> int | None:
     rig.host.wait(max(SETTLE_S, 2e-3 * (rig.case.bound_ms or 0.0)))
     if not rig.still():
         return None
-    rests = [event.t_ns for event in rig.rack.events if event.kind == "all_rest" and event.t_ns >= t0]
+    rests = [event.t_ns for event in rig.emulator.events if event.kind == "all_rest" and event.t_ns >= t0]
     return rests[-1] if rests else None
 
 
@@ -225,7 +225,7 @@ def _restarts(rig: FaultRig, run_on_s: float) -> bool:
         rig.master.request_enable(since)
     rig.host.wait(run_on_s)
     moved = max(abs(axis.position - before) for axis, before in zip(rig.axes, positions, strict=True))
-    again = any(event.kind in ("moves", "power_on") for event in rig.rack.events if event.t_ns > since)
+    again = any(event.kind in ("moves", "power_on") for event in rig.emulator.events if event.t_ns > since)
     return again or moved > 1e-4 or not rig.still()
 
 

@@ -20,11 +20,11 @@ class VirtualHost(Subscriptions):
     waits for it.
     """
 
-    def __init__(self, rack: BusEmulator, master: Master) -> None:
+    def __init__(self, emulator: BusEmulator, master: Master) -> None:
         super().__init__()
-        self.rack = rack
+        self.emulator = emulator
         self.master = master
-        self.t_ns = rack.t_ns
+        self.t_ns = emulator.t_ns
         self.velocities: FloatArray | None = None
         self.cycling = True
         self.plugged = True
@@ -32,14 +32,14 @@ class VirtualHost(Subscriptions):
         self._next_ns: int | None = None
         self._heartbeat_ns = self.t_ns
         self._waiting: list[tuple[int, CanFrame]] = []
-        rack.on_adapter = self._adapter
+        emulator.on_adapter = self._adapter
 
     # -- link -----------------------------------------------------------------------------------------------
 
     def send(self, frames: list[CanFrame]) -> None:
         """Queue frames on the wire now."""
         for frame in frames:
-            self.rack.inject(frame, self.t_ns)
+            self.emulator.inject(frame, self.t_ns)
 
     def wait(self, seconds: float) -> None:
         """Let the bus run for some time."""
@@ -76,9 +76,9 @@ class VirtualHost(Subscriptions):
         return self._heartbeat_ns if self._next_ns is None else self._next_ns
 
     def _advance(self, t_ns: int) -> None:
-        self.rack.run_until(t_ns)
+        self.emulator.run_until(t_ns)
         self.t_ns = t_ns
-        self._waiting += self.rack.delivered() if self.plugged else []
+        self._waiting += self.emulator.delivered() if self.plugged else []
         if not self.cycling:
             return
         arrived, self._waiting = self._waiting, []
@@ -104,5 +104,5 @@ class VirtualHost(Subscriptions):
         self.plugged = plugged
         if not plugged:
             self.master.latch(
-                MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.rack.t_ns)
+                MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.emulator.t_ns)
             )

@@ -43,15 +43,15 @@ class _Client:
 
 
 class CameraServer:
-    """Serves ``studio`` at ``http://127.0.0.1:port`` (0: a free one), in the thread that calls ``run``.
+    """Serves ``emulator`` at ``http://127.0.0.1:port`` (0: a free one), in the thread that calls ``run``.
 
     ``on_event`` gets every event, in that thread. Raises EmulationError where the port is taken.
     """
 
     def __init__(
-        self, studio: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32
+        self, emulator: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32
     ) -> None:
-        self.studio = studio
+        self.emulator = emulator
         self.on_event: Callable[[CameraEvent], None] | None = None
         self.pictures = 0
         self.withheld = 0
@@ -79,8 +79,8 @@ class CameraServer:
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
-        studio.on_hang_up = self._hang_up
-        studio.wanted.clear()
+        emulator.on_hang_up = self._hang_up
+        emulator.wanted.clear()
 
     @property
     def url(self) -> str:
@@ -90,12 +90,12 @@ class CameraServer:
     @property
     def start_ns(self) -> int:
         """Zero of the fault commands' times."""
-        return self.studio.start_ns
+        return self.emulator.start_ns
 
     @property
     def streams(self) -> dict[str, str]:
         """Paths of the streams by camera name."""
-        return {camera.name: camera.stream for camera in self.studio.cameras}
+        return {camera.name: camera.stream for camera in self.emulator.cameras}
 
     def watch(self, descriptor: int, act: Callable[[], None]) -> None:
         """Call ``act`` in the serving loop whenever ``descriptor`` is readable."""
@@ -111,7 +111,7 @@ class CameraServer:
 
     def obey(self, text: str) -> str:
         """Execute a fault command, from the serving thread itself. Raises FaultCommandError."""
-        answer = self.studio.order(text, time.monotonic_ns())
+        answer = self.emulator.order(text, time.monotonic_ns())
         self._look.set()
         return f"{answer}\n{self.words()}" if text.split()[:1] == ["status"] else answer
 
@@ -139,7 +139,7 @@ class CameraServer:
             self._listener.close()
             os.close(self._wake_read)
             os.close(self._wake_write)
-            self.studio.close()
+            self.emulator.close()
         if self._failure is not None:
             raise self._failure
 
@@ -148,9 +148,9 @@ class CameraServer:
     def _render(self) -> None:
         try:
             while not self._ended.is_set():
-                before_ns = self.studio.sending_ns()
-                due_ns = self.studio.take(time.monotonic_ns())
-                if self.studio.sending_ns() != before_ns:
+                before_ns = self.emulator.sending_ns()
+                due_ns = self.emulator.take(time.monotonic_ns())
+                if self.emulator.sending_ns() != before_ns:
                     self._wake()
                 wait_s = LONGEST_WAIT_S if due_ns == NEVER_NS else (due_ns - time.monotonic_ns()) * 1e-9
                 if wait_s > 0 and self._look.wait(min(wait_s, LONGEST_WAIT_S)):
@@ -170,7 +170,7 @@ class CameraServer:
     # -- the loop -----------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        until_ns = self.studio.sending_ns()
+        until_ns = self.emulator.sending_ns()
         wait_s = min(max((until_ns - time.monotonic_ns()) * 1e-9, 0.0), LONGEST_WAIT_S)
         for key, events in self._selector.select(0.0 if self._watched else wait_s):
             if isinstance(key.data, _Client):
@@ -180,8 +180,8 @@ class CameraServer:
         for act in list(self._watched.values()):
             act()
         now_ns = time.monotonic_ns()
-        self.studio.run_until(now_ns)
-        for stream, picture in self.studio.sent(now_ns):
+        self.emulator.run_until(now_ns)
+        for stream, picture in self.emulator.sent(now_ns):
             late_ns = now_ns - picture.t_send_ns
             self.late_ns = max(self.late_ns, late_ns)
             if late_ns > LATEST_NS:
@@ -197,7 +197,7 @@ class CameraServer:
         self._pass_events()
 
     def _pass_events(self) -> None:
-        for event in self.studio.take_news():
+        for event in self.emulator.take_news():
             if self.on_event is not None:
                 self.on_event(event)
 
@@ -248,7 +248,7 @@ class CameraServer:
         stream = next((s for s in streams if request.path in (s, http_pages.still_path(s))), None)
         if stream is None and request.path != "/":
             raise http_pages.BadRequestError("404 Not Found", f"no {request.path[:80]} here")
-        if stream in self.studio.refused:
+        if stream in self.emulator.refused:
             raise http_pages.BadRequestError("503 Service Unavailable", f"{request.path} is refused by order")
         if stream is None or request.head:
             page = http_pages.index(self._cell, streams)
@@ -276,7 +276,7 @@ class CameraServer:
         """Send queued data; once there are none, start with the newest image."""
         if not client.waiting and client.stream and not client.last:
             self._next(client)
-        stalled = client.stream in self.studio.stalled
+        stalled = client.stream in self.emulator.stalled
         allowed = len(client.waiting) - (client.hold if stalled else 0)
         if allowed > 0:
             try:
@@ -325,12 +325,12 @@ class CameraServer:
             self._wanted()
 
     def _say_event(self, kind: str, stream: str) -> None:
-        name = next(camera.name for camera in self.studio.cameras if camera.stream == stream)
-        self.studio.tell(time.monotonic_ns(), kind, name)
+        name = next(camera.name for camera in self.emulator.cameras if camera.stream == stream)
+        self.emulator.tell(time.monotonic_ns(), kind, name)
 
     def _wanted(self) -> None:
-        self.studio.wanted = {client.stream for client in self._clients if client.stream}
+        self.emulator.wanted = {client.stream for client in self._clients if client.stream}
         for stream in list(self._newest):
-            if stream not in self.studio.wanted:
+            if stream not in self.emulator.wanted:
                 del self._newest[stream]
         self._look.set()

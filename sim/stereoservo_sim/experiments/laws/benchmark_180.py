@@ -54,17 +54,22 @@ def benchmark_task(where: str) -> AlignmentTask:
     return AlignmentTask(number, 0, 180.0, 2.0 * ASIDE_M[where], np.array([1.0, 0.0, 0.0]), start, goal)
 
 
-def true_way(task: AlignmentTask, profile: Profile = "linear") -> CartesianPath:
+def true_path(task: AlignmentTask, profile: Profile = "linear") -> CartesianPath:
     """Cartesian path (7.25) of the plate in the rig's own frame."""
     A, A_star = HOMOGENEOUS_MARKERS @ task.start.T, HOMOGENEOUS_MARKERS @ task.goal.T
-    eyes = np.hstack([camera_poses()[:, :3, 3], np.ones((2, 1))])
+    camera_centres = np.hstack([camera_poses()[:, :3, 3], np.ones((2, 1))])
     parts = decompose(
-        cartesian_twists(task.start[:3, 3]), A[FACE], A_star[FACE], A.mean(axis=0), A_star.mean(axis=0), eyes
+        cartesian_twists(task.start[:3, 3]),
+        A[FACE],
+        A_star[FACE],
+        A.mean(axis=0),
+        A_star.mean(axis=0),
+        camera_centres,
     )
     return cartesian_path(parts, profile)
 
 
-def known_way(
+def known_path(
     knowledge: Knowledge, targets: FloatArray, profile: Profile = "linear"
 ) -> tuple[CartesianPath, FloatArray]:
     """Cartesian path by a controller's knowledge, towards points ``targets`` (m, 4); and the current points (m, 4).
@@ -97,8 +102,8 @@ def placed_rx90(task: AlignmentTask, seed: int, tries: int = 2000) -> SyntheticC
     low, high = RX90_LIMITS[:, 0] + LIMIT_MARGIN, RX90_LIMITS[:, 1] - LIMIT_MARGIN
     limits = np.stack([low, high], axis=1)
     back = np.linalg.inv(PLATE_ON_FLANGE)
-    way = true_way(task)
-    poses = [way.displacement(s) @ task.start @ back for s in np.linspace(0.0, 1.0, WAY_STEPS)]
+    path = true_path(task)
+    poses = [path.displacement(s) @ task.start @ back for s in np.linspace(0.0, 1.0, WAY_STEPS)]
     for _ in range(tries):
         q = rng.uniform(low, high)
         base = poses[0] @ np.linalg.inv(np.linalg.inv(cell.base) @ cell.flange(q))
@@ -363,12 +368,12 @@ def _planned(
     knowledge = known_at_start(calibration, task, None)
     set_points = sight(task.goal).pixels
     found, _ = triangulate(knowledge.matrices, set_points, np.ones(set_points.shape[:2]), 5)
-    way, points = known_way(knowledge, found / (found @ knowledge.plane_at_infinity)[:, None], profile)
+    path, points = known_path(knowledge, found / (found @ knowledge.plane_at_infinity)[:, None], profile)
     sigmas = np.linspace(0.0, 1.0, 101)
     planned = np.array(
-        [project_points(knowledge.matrices, points @ way.displacement(s).T)[0] for s in sigmas]
+        [project_points(knowledge.matrices, points @ path.displacement(s).T)[0] for s in sigmas]
     )
-    truth = true_way(task, profile)
+    truth = true_path(task, profile)
     parts = truth.decomposition
     # Half a turn has two senses: the model's is compared with the nearer.
     other = CartesianPath(

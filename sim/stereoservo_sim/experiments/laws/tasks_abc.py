@@ -25,7 +25,7 @@ from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.tasks.arms import rx90_cell, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, calibrate
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, Trace, run_task
-from stereoservo_sim.tasks.hard_tasks import straight_way
+from stereoservo_sim.tasks.hard_tasks import straight_path_margins
 from stereoservo_sim.tasks.random_tasks import random_ends, unit, visible
 from stereoservo_sim.tasks.setting import DEFAULT_RATE_HZ, FOCAL_ERROR, HAND_EYE_ERROR_DEG, HEIGHT, WIDTH
 from stereoservo_sim.tasks.task_file import AlignmentTask
@@ -70,9 +70,9 @@ def abc_tasks(seed: int) -> tuple[AlignmentTask, ...]:
     exact = calibrate("rx90", "exact", 0.0, seed)
     solvable = LoopSettings(law="stereo", arm="rx90", jacobian="current", noise_px=0.0)
     found = []
-    for number, way in enumerate(DRAWN.values()):
+    for number, parameters in enumerate(DRAWN.values()):
         rng = np.random.default_rng([seed, number])
-        while not run_task(task := drawn(rng, number, seed, *way), exact, solvable)[0].success:
+        while not run_task(task := drawn(rng, number, seed, *parameters), exact, solvable)[0].success:
             pass
         found.append(task)
     return tuple(found)
@@ -87,7 +87,7 @@ def drawn(
         start, goal = random_ends(rng, angle_deg, distance_m)
         if abs(goal[2, 3] - DEPTH_M) > DEPTH_SPREAD_M or not (visible(start) and visible(goal)):
             continue
-        margin, facing = straight_way(start, goal)
+        margin, facing = straight_path_margins(start, goal)
         if margin > 0.0 and facing > 0.0 and rx90_reach(cell, start, goal) is not None:
             return AlignmentTask(number, seed, angle_deg, distance_m, unit(rng), start, goal)
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.kinematics.joint_angles import homing_problem, sensitivity, way_home
+from stereoservo.kinematics.joint_angles import homing_displacement, homing_problem, sensitivity
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, seen_chain
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.rotations.thesis_head import (
@@ -81,22 +81,22 @@ def homings(
     """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), unknown to the estimator, to what
     ``home_pixels`` (t, c, m, 2) show at ``home`` (2,).
 
-    Without ``calibration`` the head counts as exactly known. Raises JointAnglesError as `way_home` does.
+    Without ``calibration`` the head counts as exactly known. Raises JointAnglesError as `homing_displacement` does.
     """
     others = [] if calibration is None else list(calibration.deviations())
     errors, levers, own = [], [], []
     ambiguous = 0
     for q, image, at_home in zip(positions, pixels, home_pixels, strict=True):
         problem = homing_problem(seen, home, at_home, image, SIGMA)
-        way = way_home(problem, home, limits=LIMITS)
-        ambiguous += bool(way.alternatives)
-        errors.append(way.displacement - (home - q))
-        own.append(way.covariance)
+        found = homing_displacement(problem, home, limits=LIMITS)
+        ambiguous += bool(found.alternatives)
+        errors.append(found.displacement - (home - q))
+        own.append(found.covariance)
         changes = [
             sensitivity(
                 problem,
                 *(homing_problem(other, home, at_home, image, SIGMA) for other in pair),
-                way.current.q,
+                found.current.q,
             )
             for pair in others
         ]
