@@ -208,7 +208,7 @@ def follow_scheduling() -> None:
     is.
     """
     process = os.getpid()
-    # The servo process sets this flag beside the policy, and the kernel tells it with it.
+    # The servo process sets this flag beside the policy, and the kernel reports both together.
     if os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return
     above = os.sched_getparam(process).sched_priority + 1

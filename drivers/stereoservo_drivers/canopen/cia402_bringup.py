@@ -115,7 +115,7 @@ class Cia402Bringup:
                     self._settle(link, drives)
                 except DriverError as error:
                     stays = error
-                self._start(link, drives)  # with a fault too: the arm's positions are wanted
+                self._start(link, drives)  # with a fault, too: the arm's positions are needed
                 if stays is not None:
                     raise stays
 
@@ -164,7 +164,7 @@ class Cia402Bringup:
             drive.nmt("PRE-OPERATIONAL")
 
     def _prepare(self, link: Link, drives: list[RemoteDrive]) -> None:
-        for drive in drives:  # those first that somebody has left moving
+        for drive in drives:  # those first that were left moving
             status_word = drive.read_if_there(0x6041)
             if status_word is not None and drive_state(status_word) is DriveState.OPERATION_ENABLED:
                 drive.write(0x6040, 0, ControlWord.QUICK_STOP)

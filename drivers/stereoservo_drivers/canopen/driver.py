@@ -113,7 +113,7 @@ class CanJointDriver:
         try:
             self._bringup.connect(self.bus)
             self._begin_cycle(self.bus)
-        except BaseException as error:  # nobody would stop a pump that goes on with its heartbeats
+        except BaseException as error:  # nothing else would stop a thread that keeps sending heartbeats
             self._release()
             code = error.code if isinstance(error, DriverError) else "internal"
             self.master.latch(MasterFault(code, str(error), hint="reset connects again"))

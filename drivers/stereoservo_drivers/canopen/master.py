@@ -149,7 +149,7 @@ class Master:
 
         Call it while nobody ticks. A drive that is still in fault latches again with the next answers.
         """
-        self.codec.faults()  # events of the reset itself: a node that was told to boot has booted
+        self.codec.faults()  # events of the reset itself: a node that was commanded to boot has booted
         self._restart()
         self.also = []
         self.fault = None

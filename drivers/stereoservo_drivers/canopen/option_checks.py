@@ -168,7 +168,7 @@ def _check_range(joint: CanJoint) -> None:
             what = f"{value * units:.3g} drive units, which is nothing; valid: at least {0.5 / units:.4g}; {remedy}"
             raise _refusal(option, f"{value:g} is {what}", "", joint)
     if joint.multi_turn:
-        return  # the counter may wrap on its way
+        return  # the counter may wrap within its range
     farthest = max(abs(joint.position_min + joint.offset_rad), abs(joint.position_max + joint.offset_rad))
     if farthest * abs(scale.counts_per_unit) > INT32_MAX:
         valid = (

@@ -194,7 +194,7 @@ def check_landmarks(landmarks: Landmarks, path: Path | str) -> None:
 
 def _picture(encoded: npt.NDArray[Any]) -> ImageArray:
     data = _typed(encoded, np.uint8)
-    # PNG says its size in bytes 16 to 24: looked at first, so that a small file cannot ask for a huge picture.
+    # PNG has its size in bytes 16 to 24: checked first, so that a small file cannot request a huge picture.
     if len(data) < 33 or data[:8].tobytes() != b"\x89PNG\r\n\x1a\n":
         raise ValueError("a reference picture is no PNG")
     width, height = (int.from_bytes(data[k : k + 4].tobytes(), "big") for k in (16, 20))

@@ -134,7 +134,7 @@ def _weak_parallax(left: FloatArray, right: FloatArray, sigma: float) -> FloatAr
     try:
         F, inliers = fundamental_robust(left, right, sigma, refuse_plane=False)
     except GeometryError:
-        return None  # no geometry at all is left to be said by the other tries
+        return None  # no geometry at all is reported by the other attempts
     enough = PARALLAX_RATIO + PARALLAX_SCATTER / np.sqrt(float(inliers.sum()))
     return F if parallax_ratio(F, left[inliers], right[inliers]) > enough else None
 

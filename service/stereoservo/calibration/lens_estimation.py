@@ -137,7 +137,7 @@ PINHOLE_AGREEMENT = 0.95
 COARSE_PX = 1.5
 """Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
 MOST_BEND = 0.6
-"""Largest radial parameter of a lens to start from, either way."""
+"""Largest magnitude of the radial parameter of a lens to start from."""
 WORTH_SHARE = 0.03
 """By how much a lens must raise the share of matches that fit: misfit that it does not cure is not the lens's."""
 CENTRE_SHARE = 0.1

@@ -68,11 +68,11 @@ def fit_model(
     """Model of a cell fitted to its trial motions, with a report of the fit.
 
     Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
-    joints from the base either way. Static markers become the model's static points. ``lens_priors``: by
+    joints from the base in both cases. Static markers become the model's static points. ``lens_priors``: by
     camera name, an estimate of its lens from straight lines
     (`geometry.distortion_lines`).
 
-    ``progress(stage, fraction)`` is called as the work goes on. Raises CalibrationError with the cause where
+    ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
     Between that and the noise floor the model's ``chi2_ok`` is false and the report's notes contain what is
     known.
@@ -287,8 +287,8 @@ def refine_to_convergence(
         inliers = again
     else:
         if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
-            # A projective bundle on its way along an open valley: a higher stratum may close it. Whether the last
-            # solution has converged is asked at the end.
+            # A projective bundle that still moves along an undetermined direction: a higher stratum may close it.
+            # Whether the last solution has converged is asked at the end.
             return solution, inliers
         raise CalibrationError(
             "no_convergence",

@@ -162,10 +162,10 @@ NOISE = 5.0
 LEAST_PX = 0.3
 """... or than this [px], which a shaking table makes ..."""
 SHARE = 0.1
-"""... and by no more than this share of the way of the marker that moves most."""
+"""... and by no more than this share of the displacement of the marker that moves most."""
 
 STRAYING = 0.25
-"""Share of a camera's stops at which a static marker may be off: behind the arm, say."""
+"""Share of a camera's stops at which a static marker may be off, for example behind the arm."""
 
 STOPS = 4
 """Stops at which one camera must have seen a marker to call it static."""

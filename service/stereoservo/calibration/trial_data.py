@@ -38,7 +38,7 @@ class CalibrationError(Exception):
             ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
             ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``;
             of relocalization ``too_few_points``, ``points_coplanar``, ``not_explained``, ``too_uncertain``.
-        data: the values the message speaks of.
+        data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -56,7 +56,7 @@ def finite_rows(array: FloatArray) -> npt.NDArray[np.bool_]:
 class TrialCamera(msgspec.Struct, frozen=True):
     """A camera of the trials and its image size [px].
 
-    ``mount``: ``eye_to_hand`` where it is static and the arm carries the markers, ``eye_in_hand`` the other way round.
+    ``mount``: ``eye_to_hand`` where it is static and the arm carries the markers, ``eye_in_hand`` the reverse.
     """
 
     name: str
@@ -81,8 +81,8 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     Joints are in base-first order. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1
     for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
     seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
-    one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: what the drives said
-    of their loads on the way, where they did; copied into the model. ``static``: markers that do not move.
+    one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: the loads
+    that the drives reported meanwhile, if any; copied into the model. ``static``: markers that do not move.
     """
 
     joint_names: tuple[str, ...]

@@ -88,6 +88,6 @@ def _run(
         finally:
             lease.end()
         if report and end.kind != "calibration_aborted":
-            with suppress(TimedOutError):  # the model is there; its report is told by an event, if it comes
+            with suppress(TimedOutError):  # the model exists; an event announces its report, if it comes
                 watch.wait(until("calibration_report"), "the report", REPORT_TIMEOUT_S)
     return end

@@ -121,7 +121,7 @@ class Client(Connection):
     def record(self, on: bool = True, images: bool = False) -> Reply:
         """Start or stop a flight recording; the reply's message is its file on the daemon's host.
 
-        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is told by the event
+        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is reported by the event
         ``images_recorded``. Raises RefusedError.
         """
         return self.request("record", self.keys.command("record", self.operator), encode(Record(on, images)))
@@ -147,7 +147,7 @@ class Client(Connection):
         """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
 
         ``lease_s`` is 5 unless given. The lease is renewed by a thread of this client until the goal has ended or the
-        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal goes on without the client.
+        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal continues without the client.
         Raises RefusedError with every problem, NoReplyError, MessageError.
         """
         options.setdefault("lease_s", 5.0)

@@ -95,7 +95,7 @@ class GoalHandle:
         self._lease = Lease(connection, goal.id, goal.lease_s)
 
     def wait(self, timeout_s: float = 600.0) -> GoalResult:
-        """Wait for its terminal event. Raises TimedOutError (the goal goes on), DaemonLostError."""
+        """Wait for its terminal event. Raises TimedOutError (the goal continues), DaemonLostError."""
         if self._result is None:
             event = self._watch.wait(
                 lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
@@ -162,7 +162,7 @@ class GoalHandle:
         self._connection.cancel(self.id)
 
     def abandon(self) -> None:
-        """Stop renewing and watching; the goal goes on until its lease or time limit ends."""
+        """Stop renewing and watching; the goal continues until its lease or time limit ends."""
         self._end()
 
     def _end(self) -> None:

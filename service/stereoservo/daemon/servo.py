@@ -103,7 +103,7 @@ class ServoProcess:
             self.driver.close()
 
     def _stop(self) -> None:
-        # In a dry run somebody else may be driving this arm: not even a stop is sent.
+        # In a dry run another process may be driving this arm: not even a stop is sent.
         if not self._dry_run:
             self.driver.stop()
 

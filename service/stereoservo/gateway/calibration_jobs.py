@@ -130,7 +130,7 @@ class CalibrationJobs:
             self._poll_check(self._check)
 
     def _poll_fit(self, fit: FitJob) -> None:
-        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        ended = fit.ended  # read first, so that the output before the end is processed, too
         for step in fit.poll():
             self._log.add(
                 "fit_progress",

@@ -1,7 +1,7 @@
 """Set-points of taught goals for a moved workpiece, other cameras or a remounted body, by reprojection (thesis 8.6).
 
 A goal keeps the pixels of the moving body (or of a tool on it), of the workpiece, and the cameras that saw them. What
-stood still relative to the goal, the ``common`` markers, gives the map from the frame of teaching to that of now
+stood still relative to the goal, the ``common`` markers, gives the map from the frame of teaching to the present one
 (`geometry.alignment`); the goal's points go along and are projected again. Nothing here waits or moves.
 """
 
@@ -40,7 +40,7 @@ from stereoservo.messages.goals import FeatureTarget, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
 
 MOUNTED_PX = 5.0
-"""Where cameras alone have changed, goal and kinematics agree within this, or the body was mounted anew."""
+"""Where cameras alone have changed, goal and kinematics agree within this, or the body was remounted."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
     """The recorded pixels; those of cameras that were relocalized since are reprojected into the current images.
 
     Re-anchoring keeps the frame, to the bit: the goal's points are still what the cameras of teaching make of it.
-    Mobile cameras are found anew within one epoch.
+    Mobile cameras are re-estimated within one epoch.
     """
     taught = goal.model
     if model is None or taught is None or not _same_frame(taught, model):
@@ -217,8 +217,8 @@ def _points_when_taught(
 ) -> tuple[FloatArray, FloatArray, list[int]]:
     """Points (n, 4) of the body's markers at the goal in the frame of teaching, with covariances and ids.
 
-    By themselves, or, where the goal is meant by a tool's features, by where the body sits on that tool now: mounting
-    the body anew does not change the goal.
+    From the taught pixels or, where the goal is defined by a tool's features, from the present pose of the body on
+    that tool, so that remounting the body does not change the goal.
     """
     tool = list(goal.tool)
     if not set(tool) <= set(model.marker_ids):
@@ -278,7 +278,7 @@ def _relative_to_cameras(
     """Set-points with cameras on the arm: the goal is relative to the common markers, which the static body belongs
     to.
 
-    The common markers stand on a workpiece that has moved within the scene (relative to the model's body).
+    The common markers are on a workpiece that has moved within the scene (relative to the model's body).
     """
     if requested.relative_to != "workpiece" or goal.tool or not same:
         raise TransferError(

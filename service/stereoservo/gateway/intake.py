@@ -40,11 +40,11 @@ REPLY_TIMEOUT_S = 1.0
 PLANNED_REPLY_TIMEOUT_S = 5.0
 """A goal is planned, a slice a cycle, before it is answered."""
 RESET_REPLY_TIMEOUT_S = 10.0
-"""A driver that connects anew and configures its drives answers nothing meanwhile."""
+"""A driver that reconnects and configures its drives does not reply meanwhile."""
 PATIENCE_S: dict[type, float] = {RunGoal: PLANNED_REPLY_TIMEOUT_S, Reset: RESET_REPLY_TIMEOUT_S}
 KNOWN_GOALS = 1000
 TOLD_EVERY_S = 1.0
-"""Refused set-points of a stream, which nobody waits for, are told by events no more often than this."""
+"""Refused set-points of a stream have no reply; events report them no more often than this."""
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Intake:
     def _take(self, query: Any, message: Any, work: Callable[[str, bytes], tuple[str, Command]]) -> None:
         key = str(message.key_expr)
         if query is not None and "*" in key:
-            query.drop()  # somebody looks around; goals and commands are addressed
+            query.drop()  # a wildcard query; goals and commands need exact keys
             return
         payload = payload_of(message)
         streamed = query is None and b'"update"' in payload

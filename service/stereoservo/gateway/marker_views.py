@@ -160,8 +160,6 @@ def _frame(stratum: Stratum, Ps: FloatArray, plane: FloatArray, upgrade: FloatAr
         return AlignmentFrame(Ps)
     try:
         affine: FloatArray | None = projective_to_affine(plane)
-    except (
-        GeometryError
-    ):  # the plane passes through the first camera: a Euclidean frame says where it is, too
+    except GeometryError:  # the plane passes through the first camera; a Euclidean frame determines it, too
         affine = upgrade
     return AlignmentFrame(Ps, affine, upgrade if stratum == "metric" else None)

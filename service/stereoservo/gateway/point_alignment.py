@@ -90,7 +90,7 @@ def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float
         try:
             _, residuals = fit(without)
         except GeometryError:
-            continue  # too few are left, or they are flat: nothing is said of this one
+            continue  # too few are left, or they are coplanar: this one cannot be tested
         best = min(best, (float(np.nanmax(residuals)), int(k)))
     if best[1] < 0:
         return ""

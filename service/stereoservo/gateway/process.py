@@ -286,7 +286,7 @@ class Gateway:
             self._recordings.path if self._recordings.running else "",
         )
 
-    # -- what the core says ---------------------------------------------------------------------------------
+    # -- events of the core --------------------------------------------------------------------------------
 
     def _core_event(self, event: Event) -> None:
         if event.kind == "reply":
@@ -415,7 +415,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
                 time.sleep(IDLE_S)
         for _ in range(
             FINAL_PASSES
-        ):  # what the servo process said last, that it stopped above all, is still told
+        ):  # the last events of the servo process, above all that it stopped, are still published
             if not gateway.run_once():
                 break
     finally:

@@ -20,7 +20,7 @@ from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 LAST_WORD_S = 5.0
-"""How long vision processes have to finish their files before the gateway says that they did not."""
+"""How long vision processes have to finish their files before the gateway reports that they did not."""
 
 
 class CannotRecordError(Exception):

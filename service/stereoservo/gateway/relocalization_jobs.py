@@ -106,7 +106,7 @@ class RelocalizationJobs:
         fit = self._fit
         if fit is None:
             return
-        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        ended = fit.ended  # read first, so that the output before the end is processed, too
         for _ in fit.poll():
             pass
         if not ended:

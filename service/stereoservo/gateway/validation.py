@@ -1,6 +1,6 @@
 """Validation of goals and commands, as far as it does not depend on the state of the arm.
 
-Each problem names the field, its value and what would have been valid; all of them are told at once.
+Each problem names the field, its value and what would have been valid; all of them are reported at once.
 """
 
 from __future__ import annotations

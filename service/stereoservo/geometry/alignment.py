@@ -167,7 +167,8 @@ def align(
     T = _start(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
     views = _Views(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
-    # About the points' middle, in units of their spread: turns and moves are then told apart well.
+    # About the points' centroid, in units of their standard deviation: rotations and translations are then well
+    # distinguished.
     local = _local(family, move_points(up_new, M_new[both])) @ up_new
     generators = np.linalg.inv(local) @ _algebra(family) @ local
     T = _descend(T, generators, views)
@@ -230,7 +231,7 @@ def _descend(T: FloatArray, generators: FloatArray, views: _Views) -> FloatArray
                 break
             step = 0.5 * step
         else:
-            return T  # no direction leads down: this is the minimum, as far as numbers tell
+            return T  # no direction of descent: this is the minimum to rounding
         if float(np.abs(step).max()) < CONVERGED:
             break
     return T

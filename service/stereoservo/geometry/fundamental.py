@@ -231,7 +231,7 @@ def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
     # A transfer carries the left image's noise, too, stretched by the map.
     of_plane = (transfer**2).sum() / (2 * len(left) - 8) / (1.0 + abs(np.linalg.det(H[:2, :2])))
     of_pair = (sampson_distances(F, left, right) ** 2).sum() / max(1, len(left) - 7)
-    # Two copies of one image leave rounding errors, whose ratio says nothing.
+    # Two copies of one image leave rounding errors, whose ratio is meaningless.
     return float(of_plane / max(of_pair, ROUNDING_PX**2))
 
 

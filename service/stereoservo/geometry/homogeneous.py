@@ -117,7 +117,7 @@ def move_points(H: FloatArray, M: FloatArray) -> FloatArray:
 
 
 class GeometryError(ValueError):
-    """Degenerate or malformed geometric input. The text says what, the value, and what would have been
+    """Degenerate or malformed geometric input. The text holds the cause, the value, and what would be
     valid.
 
     Attributes: code: short machine-readable cause: ``"shape"``, ``"not_finite"``, ``"too_few"``,

@@ -245,7 +245,7 @@ def _refuse_epipolar(Ps: FloatArray, segments: FloatArray, sigma: float) -> None
     with np.errstate(divide="ignore"):
         limit = np.maximum(CERTAINTY * np.sqrt(2.0) * sigma / length, 1e-9)
     angles = crossing_angles(Ps, segments)
-    # A pair tells the line where both of its images cross the epipolar lines for certain.
+    # A pair determines the line where both of its images cross the epipolar lines significantly.
     told = (angles > limit[:, None]) & (angles.transpose(1, 0, 2) > limit[None, :])
     lost = np.flatnonzero(~told.any(axis=(0, 1)))
     if len(lost):

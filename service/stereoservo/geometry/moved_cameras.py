@@ -22,7 +22,7 @@ from stereoservo.geometry.homogeneous import GeometryError, unit_rows, whitener
 from stereoservo.numerics.arrays import FloatArray
 
 OFF_PLANE = 5.0
-"""Standard deviations by which points must stand off their best common plane not to count as coplanar."""
+"""Standard deviations by which points must lie off their best common plane not to count as coplanar."""
 EXACT = 1e-9
 """Standard deviation, relative to their norm, that points without a covariance are taken to have."""
 

@@ -80,7 +80,7 @@ def twist_vectors(T: FloatArray, tolerance: float = 1e-9) -> tuple[FloatArray, F
     """``w`` [rad/s] and ``v`` [m/s] (..., 3) of Euclidean twists (..., 4, 4): the reverse of `twist_matrix`.
 
     Raises GeometryError where one is no twist: its last row or its block's symmetric part is above ``tolerance`` of
-    its norm; then it stands in another frame.
+    its norm; then it is in another frame.
     """
     T = np.asarray(T, dtype=np.float64)
     block = T[..., :3, :3]

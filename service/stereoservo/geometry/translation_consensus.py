@@ -57,7 +57,7 @@ class MotionJudgement:
     explain it; ``excess`` the chi-square by which the translation fits worse than the homography, of nine
     freedoms; ``distance`` the squared Mahalanobis distance of its plane from that of the others, of three;
     ``height_deviation`` the largest relative standard deviation of a point's height above its own plane: a motion above
-    `HEIGHT_DEVIATION` tells too little by itself, but adds to others. NaN where not computed.
+    `HEIGHT_DEVIATION` determines too little by itself, but adds to others. NaN where not computed.
     """
 
     reason: Reason
@@ -342,7 +342,7 @@ def _largest_agreement(singles: list[_Single]) -> BoolArray:
     """Largest consensus set: the motions that agree with the one most others agree with; of equals, the one with
     the most accurate plane.
 
-    Motions that tell too little by themselves agree with anything: only where there are no others are they asked.
+    Motions that determine too little by themselves agree with anything; they are used only where there are no others.
     """
     limit = float(chi2_distribution.isf(TAIL, 3))
     best: tuple[int, float, BoolArray] | None = None

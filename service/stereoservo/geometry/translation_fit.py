@@ -1,6 +1,6 @@
 """Maximum likelihood of projective translations that share the plane at infinity (thesis 3.2.3, (3.40)).
 
-Six parameters for one motion, 3 + 3n for n: of the plane ``h`` the largest entry stands still (its scale is
+Six parameters for one motion, 3 + 3n for n: of the plane ``h`` the largest entry is fixed (its scale is
 no parameter), and the entry of each ``k`` beside it follows from ``hᵀk = 0`` (3.39 with errata). Solved by
 `reprojection_fit` in coordinates whitened over the points. Pixels are ideal ones [px], NaN where missing.
 """

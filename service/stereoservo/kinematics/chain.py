@@ -20,7 +20,7 @@ KIND_CODES = {"revolute": 0, "prismatic": 1}
 
 
 class ChainError(ValueError):
-    """A chain or a configuration is malformed; ``data`` holds the values that the message speaks of."""
+    """A chain or a configuration is malformed; ``data`` holds the values in the message."""
 
     def __init__(self, message: str, **data: Any) -> None:
         super().__init__(message)
@@ -33,7 +33,7 @@ class ProjectiveChain:
 
     ``kinds``: ``"revolute"`` [rad] or ``"prismatic"`` [m] for each joint. ``generators`` (n, 4, 4) at the
     zero. ``zero`` (n,): the configuration at which H is the identity. ``tip_first``: cameras ride on the tip and
-    the markers stand still (eye-in-hand), so that the joint next to them, the base's, acts first:
+    the markers are static (eye-in-hand), so that the joint next to them, the base's, acts first:
     ``H(q) = exp((qₙ−zₙ)Ĥₙ)…exp((q₁−z₁)Ĥ₁)``, joints still counted from the base, signs inside the generators.
     Raises ChainError on shapes or kinds
     that do not fit.

@@ -1,8 +1,8 @@
 """Composition of joint displacements: the effect of a small motion of all joints on points and on the operators.
 
-An arm re-zeroed where it stands (Theorem 10) needs no more than its operators there: ``H(q+Δq) H(q)⁻¹`` is their
-product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the loop runs the
-kernels ``displace`` and ``move_operators``.
+An arm re-zeroed at its present configuration (Theorem 10) needs no more than its operators there: ``H(q+Δq)
+H(q)⁻¹`` is their product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the
+loop runs the kernels ``displace`` and ``move_operators``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Composition(IntEnum):
     """The order in which the joints of an arm act on the markers."""
 
     BASE_FIRST = 0
-    """Product of exponentials, the base's joint leftmost (5.18): cameras stand."""
+    """Product of exponentials, the base's joint leftmost (5.18): cameras are static."""
     TIP_FIRST = 1
     """The tip's joint leftmost: cameras ride on the tip."""
     SIMULTANEOUS = 2

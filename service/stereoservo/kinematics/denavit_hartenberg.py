@@ -1,7 +1,7 @@
 """Denavit-Hartenberg parameters of a metric model, scaled by one known length (5.1, 5.2; thesis 5.5.2).
 
 Row j, base first, is what joint j does and the link behind it: ``Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β)``, with ``θ = q +
-theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j stands before joint j: its r_j,
+theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j precedes joint j: its r_j,
 α_j and l_j (r is the length, l the offset; the text under it has them exchanged) are a, α and d of row j-1 here.
 
 Conventions, where the classical ones leave a choice or fail:
@@ -13,11 +13,11 @@ Conventions, where the classical ones leave a choice or fail:
   a small second angle β takes its place (Hayati): x goes from the end of the row before, square to axis j, to axis
   j+1;
 - prismatic joints have no place: their axis is led through the end of the row before (``a = 0``), and through the
-  first revolute axis where they begin the chain; where it is parallel to its neighbour, x goes on as it was;
+  first revolute axis where they begin the chain; where it is parallel to its neighbour, x stays as it was;
 - the base's frame is free: theta and d of row 1 are 0, and so is the d with which the first axis of another direction
   leaves those parallel to the first. What is behind the last axis is the tool's: that row is 0.
 
-``chosen`` names the entries that such a choice sets: no measurement stands behind them.
+``chosen`` names the entries that such a choice sets, without a measurement.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from stereoservo.numerics.arrays import FloatArray
 LinkKind = Literal["skew", "meeting", "parallel", "to_prismatic", "last"]
 
 PARALLEL = np.radians(5.0)
-"""Angle between axes [rad] below which a row is told with β in place of d."""
+"""Angle between axes [rad] below which a row has β in place of d."""
 MEETING = 0.01
 """Distance between axes, as a share of the arm's size, below which they count as meeting."""
 COLUMNS = ("a", "alpha", "beta", "d", "theta")
@@ -58,7 +58,7 @@ class ReadOutError(ValueError):
 
     Attributes:
         code: ``stratum``, ``unknown_name``, ``length``.
-        data: the values the message speaks of.
+        data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:

@@ -28,7 +28,7 @@ from stereoservo.numerics.arrays import FloatArray
 class Quantity(msgspec.Struct, frozen=True):
     """A named quantity. ``std`` is None where the model carries no covariance.
 
-    ``value`` is None where the model does not determine it; ``reason`` then says why.
+    ``value`` is None where the model does not determine it; ``reason`` then holds the cause.
     """
 
     name: str

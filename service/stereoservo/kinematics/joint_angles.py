@@ -1,7 +1,7 @@
 """Joint angles estimated from images: homing and encoder zeros (thesis 4.5.4, (4.45)).
 
 No initial guess is asked for: the search starts all over joint space, and every configuration that the pixels
-leave possible is told. Angles of revolute joints are told modulo 2π, nearest the middle of their limits.
+leave possible is told. Angles of revolute joints are modulo 2π, nearest the centre of their limits.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def measured_joints(
 ) -> tuple[JointAngles, ...]:
     """All configurations that the pixels of ``problem`` admit, the best first.
 
-    ``limits`` (n, 2) [rad or m] confine the search; without them revolute joints may stand anywhere, prismatic ones
+    ``limits`` (n, 2) [rad or m] confine the search; without them revolute joints may be anywhere, prismatic ones
     need theirs. ``start`` (n,) looks only near a configuration. Raises JointAnglesError: ``limits``, ``too_few``
     (fewer coordinates than joints), ``no_agreement`` (no configuration explains the pixels), ``outside_limits``,
     ``not_observable`` with the joints whose deviation exceeds ``largest_deviation`` [rad or m].
@@ -222,7 +222,7 @@ def joint_zeros(
 
     One stop will do where it shows enough; more stops add up. ``limits`` (n, 2) are those of the offsets, default a
     full turn and, for prismatic joints, 1 m to either side. Raises JointAnglesError as `measured_joints` does:
-    ``not_observable`` names the joints on which the images say nothing.
+    ``not_observable`` names the joints that the images do not determine.
     """
     kinds = seen.chain.kinds
     default = np.array([[-np.pi, np.pi] if kind == "revolute" else [-1.0, 1.0] for kind in kinds])

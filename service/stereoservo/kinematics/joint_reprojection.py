@@ -25,7 +25,7 @@ class JointAnglesError(ValueError):
 
     Attributes:
         code: ``shape``, ``too_few``, ``limits``, ``not_observable``, ``no_agreement``, ``outside_limits``.
-        data: the values that the message speaks of; ``joints`` names those that are not observable.
+        data: the values in the message; ``joints`` names those that are not observable.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:

@@ -16,7 +16,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 MODEL_SCHEMA = 2
 READABLE_SCHEMAS = (1, 2)
-"""Schema 1 knew neither lenses nor mounts: pinholes that stand still."""
+"""Schema 1 has neither lenses nor mounts: static pinhole cameras."""
 
 Stratum = Literal["projective", "affine", "metric"]
 
@@ -79,7 +79,7 @@ class JointLoads(msgspec.Struct, frozen=True, eq=False):
     ``efforts`` (n, n) [N m or N, or shares of the rated torque]: entry (j, k) is the farthest that joint j's effort
     went from its moving mean, and stayed for a few samples, while joint k moved. ``largest_efforts`` (n,): largest
     magnitude of all. ``following_errors`` (n,): likewise, from zero [rad or m]. ``velocities`` (n,): highest speed
-    commanded [rad/s or m/s]. None where the drives do not tell.
+    commanded [rad/s or m/s]. None where the drives do not report them.
     """
 
     velocities: FloatArray
@@ -126,7 +126,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     stratum is ``metric``. ``mount``: of all its cameras; eye-in-hand chains
     are ``tip_first``. ``epoch`` is unique for each model a cell ever had.
 
-    Stratum ``projective``: the plane at infinity is not identifiable (all axes parallel, say);
+    Stratum ``projective``: the plane at infinity is not identifiable (such as with all axes parallel);
     ``plane_at_infinity`` is then the least singular vector of (5.59): joints keep the heights ``a @ M`` that
     it gives, but parallelism must not be read from it.
     """

@@ -38,7 +38,7 @@ def algebra(stratum: Stratum, kind: Kind) -> FloatArray:
     """Basis (a, 4, 4) of the Lie algebra that moves a joint of ``kind``: gl(4), aff(3), or that of the
     similarities.
 
-    Affine and metric algebras stand in a frame whose plane at infinity is (0, 0, 0, 1). Metric revolute
+    Affine and metric algebras are those of a frame whose plane at infinity is (0, 0, 0, 1). Metric revolute
     joints do without the scale: a scaling moves no axis that a translation does not, and Cayley's map of both
     at once leaves the group.
     """

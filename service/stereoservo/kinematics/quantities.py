@@ -31,7 +31,7 @@ from stereoservo.numerics.arrays import FloatArray
 Values = Callable[[FramedModel], FloatArray]
 
 FARTHEST_LINE = 1e6
-"""Distance from the image's middle [image widths] up to which the image of an axis is told."""
+"""Distance from the image's middle [image widths] up to which the image of an axis is listed."""
 
 
 @dataclass(frozen=True)

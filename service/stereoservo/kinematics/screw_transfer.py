@@ -33,7 +33,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
 TWIST_TOLERANCE = 1e-4
-"""What an operator may leave beside a Euclidean twist, relative to it, before it is said to be in another frame."""
+"""What an operator may leave beside a Euclidean twist, relative to it, before it counts as one of another frame."""
 
 
 class Screw(NamedTuple):
@@ -122,7 +122,7 @@ def seen_from_other_end(operators: FloatArray, H_other_from_this: FloatArray) ->
     """Joint operators (n, 4, 4) of the motion of one end of the arm relative to cameras at the other end.
 
     ``operators`` at the present configuration, in the frame of this end; ``H_other_from_this`` (4, 4) the present link.
-    What moved by ``Ĥ_j`` now stands, and the world moves by ``−Ĥ_j``. The composition turns with it: BASE_FIRST for
+    What moved by ``Ĥ_j`` is now static, and the world moves by ``−Ĥ_j``. The composition is reversed: BASE_FIRST for
     TIP_FIRST.
     """
     return -conjugate(H_other_from_this, operators)
@@ -203,7 +203,7 @@ def base_link(poses: FloatArray, displacements: FloatArray) -> BaseLink:
     """The link from the model's frame, of any stratum, to the robot's base, from poses that the robot reports.
 
     ``poses`` (k, 4, 4): base from hand [m]; ``displacements`` (k, 4, 4): of the marker body from some zero, in the
-    model's frame, normalised, at the same stops: cameras stand, k >= 3 with turns about two axes. With
+    model's frame, normalised, at the same stops: static cameras, k >= 3 with rotations about two axes. With
     ``B_i = T_i T_0⁻¹`` and ``D_i = H_i H_0⁻¹`` the link fulfils ``H_base D_i = B_i H_base``: linear in it and, where
     the turns are not all about parallel axes, with one solution up to its factor, Euclidean and in metres whatever the
     model's stratum was. ``residual``: rms of the equations at ``|H_base| = 1``. Raises GeometryError naming what is
@@ -251,8 +251,8 @@ def command_operators(H_frame: FloatArray, centre: FloatArray | None = None) -> 
 
     ``H_frame`` (4, 4) as for `cartesian_velocity`; ``centre`` (3,) [m] in the command's frame: the point about which it
     turns, its origin if None (robots that turn about the tool's point give it at every step). They are an arm with
-    ``Composition.SIMULTANEOUS``. With commands in a frame that stands, and about its origin, they stay; in the hand's
-    frame ``H_frame`` moves with the hand.
+    ``Composition.SIMULTANEOUS``. With commands in a static frame, and about its origin, they are constant; in the
+    hand's frame ``H_frame`` moves with the hand.
     """
     units = np.eye(3)
     point = np.zeros(3) if centre is None else np.asarray(centre, dtype=np.float64)

@@ -108,7 +108,7 @@ class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[safety.contact]``: collision detection by joint efforts and following errors.
 
-    ``effort`` [as the driver tells it] and ``following`` [rad or m]: thresholds by joint, in place of those that the
+    ``effort`` [as the driver reports it] and ``following`` [rad or m]: thresholds by joint, in place of those that the
     calibration's motions have taught. These are ``factor`` times what was seen there. A stop takes ``samples`` joint
     samples beyond the threshold, one after the other.
     """

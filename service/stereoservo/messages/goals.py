@@ -73,7 +73,7 @@ class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", 
     """A taught goal, by its name.
 
     ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
-    relative to the ``common`` markers that stand on the workpiece, which may have moved since. ``"cameras"``: the
+    relative to the ``common`` markers on the workpiece, which may have moved since. ``"cameras"``: the
     ``common`` markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen
     when it was taught and now; empty: all that are both.
     """
@@ -235,7 +235,7 @@ class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command",
     """Move the set-points of the active goal: a moving target, streamed at 30 to 200 Hz. It also renews the lease.
 
     ``stamp_s``: the client's time of this set-point; from two of them the target's velocity is fed forward. None: the
-    time of arrival stands in.
+    time of arrival is used.
     """
 
     id: GoalId
@@ -246,7 +246,7 @@ class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command",
 class AcknowledgeGoal(
     msgspec.Struct, frozen=True, tag="acknowledge", tag_field="command", forbid_unknown_fields=True
 ):
-    """A reached goal with ``acknowledge_s`` may be left: the queue goes on."""
+    """Release a reached goal with ``acknowledge_s``, so that the queue continues."""
 
     id: GoalId
 
@@ -297,9 +297,10 @@ class Calibrate(
 ):
     """Run the trial motions of the cell file and fit a model.
 
-    ``check``: run the short check motion instead, and say whether the model still holds. ``lease_s``: the motion ends
-    when no renewal arrives for so long (None: no lease); the fit that follows it needs no client. ``reset_zeros``, with
-    ``check``: where the zeros of joints have drifted, and nothing else, make a model with moved zeros.
+    ``check``: run the short check motion instead, and report whether the model still holds. ``lease_s``: the motion
+    ends when no renewal arrives for so long (None: no lease); the fit that follows it needs no client.
+    ``reset_zeros``, with ``check``: where the zeros of joints have drifted, and nothing else, make a model with
+    moved zeros.
     """
 
     id: GoalId
@@ -354,7 +355,7 @@ Command = (
 
 
 class Request(msgspec.Struct, frozen=True):
-    """A command on its way to the core: answered by exactly one reply event with the same ``request`` number."""
+    """A command for the core: answered by exactly one reply event with the same ``request`` number."""
 
     request: int
     operator: str

@@ -19,7 +19,7 @@ class AlreadyRunningError(Exception):
     """Another process holds the lock.
 
     Attributes:
-        what: what the lock stands for.
+        what: what the lock protects.
         pid: its holder, 0 where unknown.
         path: the lock file.
     """

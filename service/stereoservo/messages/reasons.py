@@ -13,7 +13,7 @@ class Reason(msgspec.Struct, frozen=True):
     """One entry of the status set.
 
     ``code`` is stable and machine-readable, e.g. ``JOINT_LIMIT``; ``subject`` names the joint, camera or marker;
-    ``value`` and ``threshold`` are in ``unit``; ``hint`` tells the person at the cell how to leave.
+    ``value`` and ``threshold`` are in ``unit``; ``hint`` is a remedy for the operator.
     """
 
     code: str

@@ -201,14 +201,14 @@ class StateMessage(msgspec.Struct, frozen=True):
     notes: tuple[str, ...] = ()
     """Remarks for the cell's keeper, on a damaged model file for instance."""
     progress: float | None = None
-    """Of the active goal's way, 0 to 1, where it is known."""
+    """Path parameter of the active goal, 0 to 1, where it is known."""
     seconds_left: float | None = None
     efforts: dict[str, float] = {}
-    """As the drives tell them [N m or N, or shares of the rated torque]; empty where they do not."""
+    """As the drives report them [N m or N, or shares of the rated torque]; empty where they do not."""
     following_errors: dict[str, float] = {}
     """Set less actual position [rad or m]."""
     effort_limits: dict[str, float] = {}
-    """How far efforts may go from their moving mean before the arm stops for a contact; absent where nobody knows."""
+    """How far efforts may go from their moving mean before the arm stops for a contact; absent where unknown."""
     following_limits: dict[str, float] = {}
     """How large following errors may become before the arm stops for a contact."""
     health: Health = Health()
@@ -232,7 +232,7 @@ class CalibrationResult(msgspec.Struct, frozen=True):
     """Result of a calibration. ``covariance_ok``: the residuals are what the measurement noise explains
     (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
     ``seconds``: what the fit took. ``report`` (a page), ``figures`` (for programs), ``trials``: files on the daemon's
-    host; the report is there once ``calibration_report`` was told.
+    host; the report is there once the event ``calibration_report`` was sent.
     """
 
     rms_px: float
@@ -257,7 +257,7 @@ class CalibrationResult(msgspec.Struct, frozen=True):
 
 
 class EventMessage(msgspec.Struct, frozen=True):
-    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal it speaks of."""
+    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal that it concerns."""
 
     seq: int
     boot: str
@@ -417,7 +417,7 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
         value: Any = msgspec.json.decode(data)
     except (
         Exception
-    ):  # what the typed decoder, which ends at the first misfit, did not reach; the place alone is told
+    ):  # values that the typed decoder, which ends at the first error, did not reach; only the place is named
         return f"{place}: {text}"
     for part in place.split("."):
         value = value.get(part) if isinstance(value, dict) and "[" not in part else None

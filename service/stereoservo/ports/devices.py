@@ -30,7 +30,7 @@ class DriverError(Exception):
 
     Attributes:
         code: short machine-readable cause, e.g. ``"not_configured"``, ``"option"``, ``"connection_lost"``.
-        data: the values the message speaks of.
+        data: the values in the message.
         retry: whether the same call may succeed later without a change of configuration.
     """
 
@@ -285,7 +285,7 @@ class CameraStatistics(msgspec.Struct, frozen=True):
     """Counts of a camera driver since ``activate``: ``frames`` received, ``dropped`` ones that never arrived (gaps
     of its sequence or its grid), ``frozen`` ones withheld because they repeat the previous one, ``reconnects``.
 
-    ``settings``: what the source was asked for and what it says it does, by name, e.g. ``{"exposure": (10.0, 12.0)}``.
+    ``settings``: requested and reported settings of the source by name, e.g. ``{"exposure": (10.0, 12.0)}``.
     """
 
     frames: int = 0

@@ -1,6 +1,6 @@
 """Reader and writer of recorded images: ``NAME.avi`` (FFV1, gray, lossless) with stamps and CRCs in ``NAME.jsonl``.
 
-FFV1 with flipped bytes decodes silently into other pixels; the CRC of every frame's pixels is what tells. The sidecar
+FFV1 with flipped bytes decodes silently into other pixels; only the CRC of every frame's pixels shows it. The sidecar
 is JSON Lines: a header, a line a frame, written after its frame, and an end line, which a recording whose process was
 killed lacks. Such a recording is read as far as video and sidecar both go.
 """
@@ -30,7 +30,7 @@ LONGEST_LINE = 4096
 MOST_SURPLUS = 1000
 """Frames without a line are counted up to here."""
 SLOWEST_MS = 10_000
-"""A file that gives no frame for so long, one that goes on in a hole of gigabytes say, is taken to end there."""
+"""A file that gives no frame for so long, for example one with a hole of gigabytes, is taken to end there."""
 GIB = 1 << 30
 
 
@@ -286,7 +286,7 @@ class ImageWriter:
         except OSError as error:
             raise ImageFileError(self.path, "disk", f"cannot be finished: {error.strerror}") from error
         finally:
-            with suppress(OSError):  # told already: by the line that could not be written
+            with suppress(OSError):  # reported already: by the line that could not be written
                 self._sidecar.close()
 
     def __enter__(self) -> ImageWriter:

@@ -50,7 +50,7 @@ class _Recording:
 class ImageRecorder:
     """Records one camera while a recording is requested. ``report(kind, message, images)`` is called with each result.
 
-    Never raises on what the disk or the camera does: a recording that cannot go on ends and is reported.
+    Never raises on what the disk or the camera does: a recording that cannot continue ends and is reported.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class ImageRecorder:
                         raise
                     continue
                 missing = 0
-        except Exception as error:  # a recording may fail in any way; the camera goes on
+        except Exception as error:  # a recording may fail in any way; the camera continues
             recording.failed, recording.why = True, str(error) or type(error).__name__
         finally:
             with recording.lock:

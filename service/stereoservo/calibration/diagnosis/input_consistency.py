@@ -27,7 +27,7 @@ from stereoservo.numerics.arrays import FloatArray
 SUSPICIOUS_OUTLIERS = 0.01
 """Share of outliers from which a fit above the noise floor is looked into."""
 DEGREES, ABOUT = float(np.degrees(1.0)), 2.0
-"""Factor of a joint that reports degrees, and how many times, either way, a coarse factor may be off a true one."""
+"""Factor of a joint that reports degrees, and by what factor, up or down, a coarse factor may be off a true one."""
 UNDERSTATED = 1.5
 """How many times the stated sigmas paths must scatter for the detector to be looked into."""
 UNEVEN = 1.5

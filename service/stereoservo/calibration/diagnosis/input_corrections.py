@@ -97,7 +97,7 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
             for kind in (stated, other)
         )
         residuals_by_kind[joint] = as_stated, as_other, other
-    # The other kind must reach what the other joints do; a joint that fits neither way is no case of this.
+    # The other kind must reach what the other joints do; a joint that fits neither kind has another fault.
     floor = (
         float(np.median([min(least, instead) for least, instead, _ in residuals_by_kind.values()]))
         if residuals_by_kind

@@ -82,7 +82,7 @@ def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ..
     """Notes on the causes of the outliers of ``result``.
 
     Raises CalibrationError (``camera_moved``, ``marker_slipped``, ``moved_together``) for what has changed for good
-    during the trials: the model speaks of a cell that is no more.
+    during the trials: the model describes the cell before that.
     """
     found = predictions(trials, result)
     if not found.outliers.any():

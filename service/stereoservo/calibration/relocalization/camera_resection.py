@@ -26,7 +26,7 @@ ids one in a thousand searches finds no clean start."""
 NOISY, FEW = 4.0, 0.25
 """Variance of the pixels over the stated one, and share of outliers, at which a search for better starts ends."""
 OUTSTANDING = 25.0
-"""Squared distance, in the noise of the median, above which a pixel stands out: two degrees of freedom."""
+"""Squared distance, in the noise of the median, above which a pixel is an outlier: two degrees of freedom."""
 ROBUST_SIGMAS = 3.0
 """Scale of Cauchy's loss [sigmas]."""
 

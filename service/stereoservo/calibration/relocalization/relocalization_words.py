@@ -27,7 +27,7 @@ class MovedCamera:
     """Description of a camera's motion.
 
     ``how``: ``moved`` (a displacement), ``moved_and_refocused`` (its intrinsics have changed, too), ``resected`` (the
-    stratum knows no displacements), ``moved_with_rig``. ``turned_deg`` by its own axes; ``shifted_share``:
+    stratum has no displacements), ``moved_with_rig``. ``turned_deg`` by its own axes; ``shifted_share``:
     displacement of its centre over its distance from the points; ``shifted_m`` where prismatic joints give the scale;
     None where the model is not metric. ``moved_px``: rms image motion of the points that it sees. ``text`` in words.
     """

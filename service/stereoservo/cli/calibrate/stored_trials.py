@@ -169,7 +169,7 @@ def _must_fit(file: CellFile, data: Any, path: Path) -> None:
 def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], LinesUsed]:
     """Lens of each camera, and the lines it was estimated from: a table ``camera,line,u,v``, with this header.
 
-    Raises CommandError naming the row, or the camera whose lines do not tell its lens.
+    Raises CommandError naming the row, or the camera whose lines do not determine its lens.
     """
     if not 0.0 < sigma < np.inf:
         raise CommandError("lines", f"--lines-sigma is {sigma:g} px; a positive finite number is needed")

@@ -16,7 +16,7 @@ from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo.ports.devices import CameraDescription, CameraObservation, CameraStatistics, Finding, Frame
 
 HELD_RATE = 0.95
-"""Share of the stated rate below which a camera is said not to hold it."""
+"""Share of the stated rate below which a camera is reported as too slow."""
 STEADY_MARKERS = 0.9
 """Share of frames that must show enough markers."""
 WINDOW_PX = 10
@@ -42,7 +42,7 @@ class CameraRecord:
     """Markers that the detector finds in the mirror image of ``frame``, asked where it finds none in it."""
     error: str = ""
     statistics: CameraStatistics | None = None
-    """Counts of the driver over ``watched_s`` [s], where it tells them."""
+    """Counts of the driver over ``watched_s`` [s], where it reports them."""
     watched_s: float = 0.0
 
     @property

@@ -22,7 +22,7 @@ MayMove = Callable[[str], bool]
 def permission(jog: bool, yes: bool) -> MayMove:
     """Function that permits the examination to move a joint: never, always (``--yes``), or as the user answers.
 
-    Raises CommandError: there is nobody to ask.
+    Raises CommandError without a terminal to ask on.
     """
     if yes and not jog:
         raise CommandError("argument", "--yes answers what --jog asks; give both")

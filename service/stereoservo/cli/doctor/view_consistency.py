@@ -19,9 +19,9 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Finding
 
 FITS_PX = 0.5
-"""Root mean square that views of one point may leave before the cameras are said not to stand where they stood."""
+"""Root mean square that views of one point may leave before the cameras are reported as moved."""
 MATCHES = 10
-"""Markers seen by two cameras from which the epipolar constraint says anything: 7 are used up."""
+"""Markers seen by two cameras that the epipolar constraint needs for a test: 7 are used up."""
 WORKSPACE_SHARE = 0.9
 
 

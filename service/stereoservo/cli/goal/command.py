@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
-"""Who waits for a goal stands behind it: when that process dies, the arm stops."""
+"""The process that waits for a goal holds its lease: when it dies, the arm stops."""
 
 NameArgument = Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")]
 RelativeToOption = Annotated[

@@ -168,7 +168,7 @@ def common_point(operators: FloatArray) -> FloatArray:
 def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
     """Angles of two joints ``G`` (2, 4, 4) that are not parallel, ``exp(θ₁Ĥ₁) exp(θ₂Ĥ₂) A = A*`` (6.12).
 
-    The target on its way back about joint 1 crosses the plane of the circle of ``A`` about joint 2 twice (6.16);
+    The target, rotated back about joint 1, crosses the plane of the circle of ``A`` about joint 2 twice (6.16);
     each crossing leaves one turn about joint 2. ``A``, ``target`` (4,) of equal heights; ``seed`` (2,).
     """
     if np.linalg.norm(G[1] @ A) <= FREE * np.linalg.norm(G[1]) * np.linalg.norm(A):
@@ -248,8 +248,9 @@ def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> B
 def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     """Angles of three joints ``G`` (3, 4, 4) whose product is the rotation ``H`` (4, 4), up to two (6.27, 6.28).
 
-    A point of the last axis, away from the centre, tells the first two; the rest of the rotation tells the last.
-    Where the first and the last axis fall together, the first joint stays at its ``seed`` (3,) and is marked free.
+    A point of the last axis, away from the centre, determines the first two joints; the rest of the rotation
+    determines the last. Where the first and the last axis fall together, the first joint stays at its ``seed`` (3,)
+    and is marked free.
     """
     centre = common_point(G)
     ends = axis_points(G[2])

@@ -1,8 +1,8 @@
 """Recognition of the structure of a chain with a closed form: parallel axes, concurrent axes (thesis 6.3 to 6.7).
 
 A calibrated chain is so only within its covariance. Each condition is a set of incidences that vanish: they are tested
-by chi-square against the covariance propagated to them. A small deviation that the calibration cannot tell from none
-costs nothing: the closed form then starts a refinement on the chain as it is.
+by chi-square against the covariance propagated to them. A small deviation that the calibration cannot distinguish
+from none costs nothing: the closed form then starts a refinement on the chain as it is.
 """
 
 from __future__ import annotations

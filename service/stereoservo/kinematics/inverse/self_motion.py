@@ -115,7 +115,7 @@ def slid_inside(
 ) -> FloatArray | None:
     """Configuration (n,) inside ``limits`` (n, 2) along the single self-motion of ``q`` (n,), or None.
 
-    Follows the motion both ways for a whole turn, or until it comes to its end.
+    Follows the motion in both directions for a full turn, or until it comes to its end.
     """
     kernel = null_directions(chain, points, q)
     if len(kernel) != 1:

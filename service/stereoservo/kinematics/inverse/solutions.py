@@ -29,7 +29,7 @@ class InverseKinematicsError(ValueError):
     Attributes:
         code: ``shape``, ``not_finite``, ``mirrored`` (no rigid motion takes the points there), ``not_rigid``,
             ``degenerate`` (a goal or point on the fixed plane), ``limits``.
-        data: the values that the message speaks of.
+        data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -107,7 +107,7 @@ def within_limits(
 ) -> tuple[FloatArray, bool]:
     """Joints (n,) by whole turns inside ``limits`` (n, 2), nearest to ``seed`` (n,); whether all of them are.
 
-    A joint that no turn brings inside stands as near to its limits as turns bring it.
+    A joint that no whole turn brings inside is as near to its limits as whole turns allow.
     """
     near = nearest_turns(kinds, joints, seed)
     if limits is None:

@@ -1,7 +1,7 @@
 """Inverse kinematics of a projective chain: structure recognition, closed-form or numerical candidates, refinement,
 checks.
 
-In every stratum: operators and points suffice (thesis 6). Nothing here knows a metric or the plane at infinity.
+In every stratum: operators and points suffice (thesis 6). Neither a metric nor the plane at infinity is used.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ WITNESSES = 4
 POLISH = 1e-9
 """Damping of the refinement of a candidate: next to none."""
 RIGID = 3
-"""Points from which on a goal tells whether it is a rigid motion."""
+"""Number of points from which a goal shows whether it is a rigid motion."""
 ROUNDING = 1e-9
 
 Solver = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], Branches]
