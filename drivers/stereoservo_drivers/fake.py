@@ -35,8 +35,8 @@ class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
     Each call counts from 1 over the driver's life. ``fail_write``, ``fail_read``: that call and later
     ones raise DriverError (``connection_lost``). ``fail_activate``: activate() raises.
-    ``freeze_encoder_after``: from that read on positions, velocities and stamp stand still (no feedback).
-    ``stuck_encoder_after``: positions stand still, the stamp goes on. ``drop_writes_after``: later
+    ``freeze_encoder_after``: from that read on positions, velocities and stamp are frozen (no feedback).
+    ``stuck_encoder_after``: positions are frozen, the stamp continues. ``drop_writes_after``: later
     commands do not reach the drives, though reported as sent. ``delay_s``: states are that old. ``gain``:
     the drives run at this multiple of the command. ``block_after``: from that write on something is in the way of
     the joint ``block_joint`` (empty: of the one that is then fastest), where it stands, in the direction it moves in.

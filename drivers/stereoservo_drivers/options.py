@@ -39,7 +39,7 @@ def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
 def invalid(kind: type[msgspec.Struct], tree: Mapping[str, Any], error: msgspec.ValidationError) -> str:
     """Error text for ``error`` in ``tree``: key, value, and what would be valid, in a cell file's terms.
 
-    An element of a list that has a name is told by it: ``joint 'j3': gear_ratio = 0; valid: a number above 0``.
+    An element of a list that has a name is identified by it: ``joint 'j3': gear_ratio = 0; valid: a number above 0``.
     """
     text, _, path = str(error).partition(" - at `")
     value, wanted, where, key = _walk(tree, inspect.type_info(kind), path.rstrip("`"))

@@ -30,7 +30,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Options of every simulated arm.
 
     ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the
-    simulated cell's base. ``resume``: an arm whose history exists stands where that ends. ``encoder``:
+    simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
     resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept.
     """
 

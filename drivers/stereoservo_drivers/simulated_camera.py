@@ -32,8 +32,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     ``view``: which camera of the simulated rig it is (default: the one with the driver's own name). ``k1``: how its
     lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole. ``moved``: how far the
     camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
-    what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: one stands
-    beside the body; where, the file ``simulated-workpiece.json`` there tells for every frame
+    what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: there
+    is one beside the body; the file ``simulated-workpiece.json`` there has its pose for every frame
     (`stereoservo_sim.world.workpiece`).
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
     ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
@@ -59,7 +59,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class SimulatedCamera:
     """A camera of the simulated cell. It sees the arm at its true pose at the shutter time.
 
-    It stands before the arm, or rides on it before the standing body, as the cell file's ``mount`` says.
+    It is static before the arm, or mounted on it before a static body, by the cell file's ``mount``.
     ``blackout`` may be set while it runs: no frame arrives until it is cleared. Before the simulated arm
     has ever moved the camera shows it at the cell's base; when the arm's process is silent, where it was
     last.

@@ -55,7 +55,7 @@ class SlcanBus(can.BusABC):
     in ``last_malformed``).
 
     Raises:
-        ValueError: channel or bitrate; says what is valid.
+        ValueError: channel or bitrate; states what is valid.
         can.CanInitializationError: device, peer or adapter refuse.
     """
 

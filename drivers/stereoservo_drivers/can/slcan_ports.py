@@ -90,10 +90,10 @@ class SlcanPort:
 def open_port(channel: str, baud: int, *, rtscts: bool = False, connect_timeout_s: float = 2.0) -> SlcanPort:
     """Open ``channel``: ``socket://HOST:PORT``, or a serial device with its speed after an ``@`` or else ``baud``.
 
-    A serial device is locked: nobody else opens it meanwhile.
+    A serial device is locked against other processes.
 
     Raises:
-        ValueError: the channel's text; says what would be valid.
+        ValueError: the channel's text; states what would be valid.
         OSError: the system refuses (``serial.SerialException`` is one).
     """
     if "://" in channel:

@@ -1,6 +1,6 @@
 """Bring-up protocol of drives: find, check and configure them, clear their faults; routing of received frames.
 
-These calls block (tens of milliseconds). While they run, somebody pumps the bus: the driver's receive thread, or a
+These calls block (tens of milliseconds). While they run, the bus must be served: the driver's receive thread, or a
 simulation in virtual time.
 """
 

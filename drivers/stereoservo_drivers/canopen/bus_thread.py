@@ -40,7 +40,7 @@ class BusThread(Subscriptions):
     """The bus thread, a :class:`~stereoservo_drivers.canopen.bringup.Link` that can also run the master's cycle.
 
     It ends by itself when the connection is lost or something unforeseen is raised in it: that fault is latched in the
-    master, the heartbeat ends, and the drives stop by their own watch on it. ``error`` tells why.
+    master, the heartbeat ends, and the drives stop by their own monitoring of it. ``error`` holds the cause.
     """
 
     def __init__(self, channel: Channel, master: Master) -> None:

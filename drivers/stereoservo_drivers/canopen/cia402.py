@@ -80,7 +80,7 @@ def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
 class DriveAxis:
     """State of one drive. ``codes``: its emergencies since the last error reset, newest last.
 
-    ``enabled``, ``faulty``: what ``state`` says. ``heard_poll``: number of the poll before its last heartbeat.
+    ``enabled``, ``faulty``: by ``state``. ``heard_poll``: number of the poll before its last heartbeat.
     ``limit_side``: 1 or -1 where the drive's internal limit is known to lie on that side of the joint, else 0.
     """
 

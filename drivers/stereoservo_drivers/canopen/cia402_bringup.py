@@ -61,7 +61,7 @@ TAKEN_S = 0.01
 SETTLE_S = 0.03
 """A cause that is still there trips a drive again within this time."""
 STANDS_SHARE = 0.01
-"""Of the largest velocity: slower than this a drive stands."""
+"""Of the largest velocity: slower than this a drive is at rest."""
 
 
 class Cia402Bringup:

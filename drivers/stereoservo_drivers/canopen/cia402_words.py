@@ -78,7 +78,7 @@ ENABLE_STEPS: dict[DriveState, ControlWord] = {
     DriveState.SWITCHED_ON: ControlWord.ENABLE_OPERATION,
     DriveState.OPERATION_ENABLED: ControlWord.ENABLE_OPERATION,
 }
-"""Next control word on the way to operation enabled; every other state gets DISABLE_VOLTAGE, never a fault reset."""
+"""Next control word towards operation enabled; every other state gets DISABLE_VOLTAGE, never a fault reset."""
 
 
 class NmtState(IntEnum):

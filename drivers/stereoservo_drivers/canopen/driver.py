@@ -44,7 +44,7 @@ CALL_BUDGET_US = 500.0
 FIRST_SAMPLE_S = 1.0
 OFF_MARGIN_S = 1.0
 SWITCH_INTERVAL_S = 0.0005
-"""How long Python lets another thread of the process compute before the bus thread may go on."""
+"""How long Python lets another thread of the process compute before the bus thread may continue."""
 _POLL_S = 0.001
 _LOADS: dict[Literal["efforts", "following_errors"], str] = {
     "efforts": "effort",

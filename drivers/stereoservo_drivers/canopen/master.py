@@ -37,7 +37,7 @@ __all__ = ["ENABLE_LIMIT_S", "Master", "MasterFault", "MasterSettings", "MasterS
 ENABLE_LIMIT_S = 1.5
 STOP_MARGIN_S = 0.1
 REST_SHARE = 0.01
-"""Of the largest velocity: slower than this a joint that is told to stand counts as at rest."""
+"""Of the largest velocity: slower than this a joint that is commanded to zero counts as at rest."""
 REST_CYCLES = 3
 FRESH_CYCLES = 2
 RESOLUTION_SAID = 1e-3
@@ -147,7 +147,7 @@ class Master:
     def clear(self) -> None:
         """Clear the latched fault and all observations. The axes are off, and stay off until enabled.
 
-        Call it while nobody ticks. A drive that is still in fault latches again with the next answers.
+        Call it while the cycle is not running. A drive that is still in fault latches again with the next answers.
         """
         self.codec.faults()  # events of the reset itself: a node that was commanded to boot has booted
         self._restart()
@@ -470,7 +470,7 @@ def limit_command(
     ``position_limit``).
 
     Beyond a velocity limit all joints are scaled alike, so that the direction of motion is kept. A joint at or
-    beyond a position limit may only move inward; the others go on. Joints whose position is not known
+    beyond a position limit may only move inward; the others continue. Joints whose position is not known
     (NaN) do not move.
     """
     reasons: tuple[str, ...] = ()

@@ -25,7 +25,7 @@ LATE_EVERY = 5
 """Cycles; divides the window."""
 LATE_SHARE = 0.35
 """Of the period: later than its own baseline by so much, compared with the other drives, a drive is late. A quarter,
-and a tenth because arrivals are only told apart as finely as the bus is read (an eighth of the period)."""
+and a tenth because the resolution of arrival times is that of reading the bus (an eighth of the period)."""
 LATE_SHARE_SINGLE = 0.5
 """The same of an only drive, which nothing can be compared with."""
 FLOOD_WINDOW = 5
@@ -60,7 +60,7 @@ class FrameCounter:
         self._names = names
         self._max_missed = max_missed
         self.counts = [0] * len(names)
-        """Frames of the cycle under way, by bit, written by who receives."""
+        """Frames of the cycle under way, by bit, written by the receiver."""
         self._once = [1] * len(names)
         self._clean = False
         self._misses = [0] * len(names)
@@ -154,11 +154,11 @@ class FrameCounter:
 class LatenessMonitor:
     """Monitors the delay of frames after their poll against its baseline.
 
-    A drive that is late by more than a cycle answers as often as one in time: only its phase tells. Of the arrivals in
-    ``LATE_WINDOW`` cycles the one counts that a fifth of them undercut: a drive that is late is so in nearly all
-    cycles, a busy host in some. The baseline is the smallest such value of the first windows in which no frame was
-    owed: after a miss an early frame may be the late one of the cycle before. What all axes have in common is the
-    host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
+    A drive that is late by more than a cycle answers as often as one in time; only its phase shows it. Of the
+    arrivals in ``LATE_WINDOW`` cycles the one counts that a fifth of them undercut: a drive that is late is so in
+    nearly all cycles, a busy host in some. The baseline is the smallest such value of the first windows in which no
+    frame was owed: after a miss an early frame may be the late one of the cycle before. What all axes have in
+    common is the host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
     """
 
     def __init__(self, names: tuple[str, ...], bit_axis: tuple[int, ...], period_ns: int) -> None:
@@ -168,7 +168,7 @@ class LatenessMonitor:
         self._limit_ns = period_ns * (LATE_SHARE if len(set(bit_axis)) > 1 else LATE_SHARE_SINGLE)
         self._arrivals = np.zeros((LATE_WINDOW, len(names)))
         self.arrivals = [0] * len(names)
-        """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one stands."""
+        """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one is kept."""
         self._newest: list[list[int]] = []
         self._cycles = 0
         self._baseline = np.full(len(names), math.inf)

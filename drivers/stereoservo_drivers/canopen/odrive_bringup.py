@@ -25,7 +25,7 @@ HEARTBEAT_WAIT_S = 0.5
 """Heartbeats come every 100 ms unless configured otherwise."""
 ANSWER_WAIT_S = 0.05
 QUIET_S = 0.05
-"""Time in which no encoder estimates may come unasked, and nobody else may command."""
+"""Time in which no unrequested encoder estimates and no commands of another master may come."""
 PROTOCOL_VERSION = 2
 ALL_NODES = tuple(range(63))
 

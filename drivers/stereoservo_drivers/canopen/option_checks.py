@@ -16,7 +16,7 @@ from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import INT32_MAX, UINT32_MAX, JointScale
 
 LONGEST_TURN = 2.0 * math.pi
-"""[rad] A joint that goes further from zero turns more than once: ``multi_turn`` has to say so."""
+"""[rad] A joint that goes further from zero turns more than once, which needs ``multi_turn``."""
 FASTEST_TURN = 4.0 * math.pi
 """[rad/s] No joint of an arm is meant to be faster; the number is in degrees."""
 SDO_KEY = re.compile(r"0[xX][0-9A-Fa-f]{1,4}:([0-9]{1,3}|0[xX][0-9A-Fa-f]{1,2})")

@@ -26,7 +26,7 @@ class JointDriverContract(PacedSuite):
     brake_s = 1.0
     """Time in which the arm must come to rest from ``speed``."""
     enforces_timeout = True
-    """Whether the device stops by itself when commands cease. Every device should; say False only with a
+    """Whether the device stops by itself when commands cease. Every device should; set False only with a
     reason.
     """
 

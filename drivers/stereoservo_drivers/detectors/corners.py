@@ -2,7 +2,7 @@
 every frame.
 
 Tracks that go from frame to frame only add up their errors (thesis 4.5: 0.3 px between consecutive images, "otherwise
-a noticeable drift"). Here optical flow only says where to look: what is reported is the alignment of the reference
+a noticeable drift"). Here optical flow only gives start values: what is reported is the alignment of the reference
 patch with this frame, whose error does not depend on how many frames there were before.
 """
 

@@ -41,7 +41,7 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     faces: tuple[FaceOptions, ...] | None = None
     """Default: the two faces of the default marker body."""
     beside: tuple[str | FaceOptions, ...] = ()
-    """Faces that stand beside the body, a workpiece's: names of printed ones or faces of one's own. No prior tells
+    """Faces beside the body, such as a workpiece's: names of printed ones or custom faces. No prior contains
     where they are, so that every image is searched for them.
     """
     image_size: tuple[int, int] | None = None
@@ -199,7 +199,7 @@ class DotDetector:
     ) -> _Found:
         """Find the ``faces`` (indices) among all spots of an image except those ``taken`` (k, 2) [px].
 
-        ``expected`` of all faces chooses among copies. ``origin`` (2,): where the image stands in a larger one.
+        ``expected`` of all faces chooses among copies. ``origin`` (2,): the image's offset in a larger one.
         """
         options = self.options
         least, tolerance = options.acquire_dots, options.consistency_px

@@ -13,7 +13,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntAr
 from stereoservo_drivers.detectors.patch_alignment import Alignment, ReferencePatches
 
 NEIGHBOURS = 6
-"""Landmarks about one that tell where it is, where they are found."""
+"""Number of neighbours that predict the place of a landmark."""
 LOOKED_AT = 24
 FEW = 4
 AGREEING = 3

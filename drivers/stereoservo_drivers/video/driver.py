@@ -54,9 +54,9 @@ class VideoCameraDriver:
     """One camera. Options: :class:`~stereoservo_drivers.video.options.VideoOptions`.
 
     It does not reconnect by itself: a source that fails raises DriverError from :meth:`poll`, and who holds the driver
-    closes it and configures it again, which opens the source anew (an old `cv2.VideoCapture` never recovers). Counts,
+    closes it and configures it again, which reopens the source (an old `cv2.VideoCapture` never recovers). Counts,
     numbers of frames and the last picture, by which a frozen camera is known, go on over that. A recording that is over
-    or damaged stays so: configured again, it says the same, rather than playing on from its beginning.
+    or damaged stays so: configured again, it raises the same error and does not restart.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:

@@ -1,7 +1,7 @@
 """MJPEG over HTTP: the parts of a ``multipart/x-mixed-replace`` stream, each with the time at which it began to arrive.
 
-A reader of our own, since it stamps a picture when its first byte arrives, knows the server's number of it, and sees
-a JPEG that was cut off: decoders behind `cv2.VideoCapture` tell neither and invent times.
+A reader of our own, since it stamps a picture when its first byte arrives, reads the server's number of it, and detects
+a JPEG that was cut off: decoders behind `cv2.VideoCapture` report neither and invent times.
 """
 
 from __future__ import annotations

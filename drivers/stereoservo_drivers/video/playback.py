@@ -16,7 +16,7 @@ MOST_A_POLL = 8
 class Playback:
     """Frames of a recording at their times; the first one is due when delivery begins.
 
-    With pace ``every`` each poll gives the next frame with the recording's own stamps, whatever the clock says.
+    With pace ``every`` each poll gives the next frame with the recording's own stamps, whatever the clock's time.
     """
 
     def __init__(self, place: Place, options: VideoOptions, camera: str, watch: Watch, clock: Clock) -> None:

@@ -38,8 +38,8 @@ class Watch:
     ) -> bool:
         """Count an image and set its :attr:`number`; False: it must be withheld.
 
-        ``seq``: the source's number, None where it gives none: then what is missing is told by the time since the
-        last. ``skipped``: pictures received before it that nobody looked at. ``look``: whether equal ones are frozen.
+        ``seq``: the source's number, None where it gives none: then what is missing is determined by the time since the
+        last. ``skipped``: pictures received before it that were not processed. ``look``: whether equal ones are frozen.
         """
         if seq is not None and seq == self._last_seq:
             self.frozen += 1

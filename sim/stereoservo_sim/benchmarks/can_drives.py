@@ -137,7 +137,7 @@ class _CpuMeter:
     """Measures CPU time per cycle: of the bus thread, and of the process with the caller's loop; medians of
     segments, and the whole.
 
-    A machine that others use slows some segments down; their median tells more of the code than the whole does.
+    A machine that others use slows some segments down; their median is a better measure of the code than the whole.
     """
 
     def __init__(self, driver: CanJointDriver) -> None:

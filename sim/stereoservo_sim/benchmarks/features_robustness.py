@@ -45,7 +45,7 @@ ROWS: dict[str, Conditions] = {
     "jpeg 75": Conditions(jpeg=75),
     "jpeg 50": Conditions(jpeg=50),
 }
-"""Dots of 10 px, tilts to 50 degrees, 2 grey levels of noise, 0.7 px of blur where nothing else is said."""
+"""Dots of 10 px, tilts to 50 degrees, 2 grey levels of noise, 0.7 px of blur where nothing else is stated."""
 REFERENCE_PX = {
     "n0": 0.011,
     "n2 b.7": 0.013,

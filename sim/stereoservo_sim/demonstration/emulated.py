@@ -12,9 +12,9 @@ SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)
 SOURCE = re.compile(r"^(\s*source\s*=\s*)\"http://127\.0\.0\.1:\d+/", re.MULTILINE)
 ANY_SERVER = "http://127.0.0.1:0"
-"""For emulated cameras: any free port of this host; the emulator tells which."""
+"""For emulated cameras: any free port of this host; the emulator reports which."""
 ANY_PORT = "socket://127.0.0.1:0"
-"""For an emulator: any free port of this host; it tells which."""
+"""For an emulator: any free port of this host, which it reports."""
 
 
 def has_emulated_drives(cell: CellFile) -> bool:

@@ -14,7 +14,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.demonstration.report_data import CalibrationPlots, GoalPlots
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#8b5a2b")
-"""One a joint, in this order everywhere; told apart by colour-blind readers too (Okabe and Ito)."""
+"""One a joint, in this order everywhere; distinguishable for colour-blind readers, too (Okabe and Ito)."""
 
 DPI = 110
 LEAST_ERROR_PX = 1e-4

@@ -30,8 +30,8 @@ class EmulatorProcess:
     """An emulator of a cell's drives or cameras as a child process; a context manager that ends it.
 
     ``cell``: a cell file, or the name of a shipped cell. ``what``: ``drives`` or ``cameras``. ``options``: further ones
-    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it told so far, oldest
-    first, times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
+    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it reported so far,
+    oldest first, times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ class ExperimentError(Exception):
 
     Attributes:
         code: short machine-readable cause, e.g. ``"data_missing"``, ``"csv"``, ``"tag_not_seen"``.
-        data: the values that the message speaks of; plain JSON types.
+        data: the values in the message; plain JSON types.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -53,7 +53,7 @@ class Option:
 
     ``parse`` gives the argument from the given value and raises ExperimentError; ``argument`` is its name in
     ``run_NAME`` (default: the option's). ``default``: the value where none is given; None: ``run_NAME``'s own.
-    ``required``: what the error says where it is missing.
+    ``required``: the error message where it is missing.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Simulated arms of the alignment tasks: the plate's true pose, and its motion by joint velocities.
 
 ``free`` is a virtual arm of six Cartesian generators that act at once; ``rx90`` a serial arm of six revolute joints
-with limits. The controller knows the readings of their joints and nothing else.
+with limits. The controller has the readings of their joints only.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """One task in closed loop: the controller sees noisy pixels only, and is evaluated against ground truth.
 
 Set-points are the exact projections of the goal (a goal is taught at rest, averaged over many frames); the target
-points are found from them with what the controller knows.
+points are computed from them with the controller's model.
 """
 
 from __future__ import annotations
@@ -83,8 +83,9 @@ class TaskResult(msgspec.Struct, frozen=True):
     ``success``: None where the arm cannot reach it. ``iterations``: until the error stayed below `SUCCESS_PX`, or all
     that were made. ``final_error_px``: mean over the last `REST_STEPS` of the largest error over markers and cameras
     used; ``floor_px``: what image noise leaves of it to this loop. ``line_deviation_mm``: the largest distance of
-    the plate's middle from the straight way. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
-    ``closest_view_px``: least distance of a marker from an image's border, on the whole way. ``reason``: why it failed.
+    the plate's middle from the straight path. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
+    ``closest_view_px``: least distance of a marker from an image's border, on the whole path. ``reason``: why it
+    failed.
     """
 
     id: int
@@ -169,7 +170,7 @@ class Controller:
     def step(self, pixels: FloatArray, seen: FloatArray, joints: FloatArray) -> FloatArray:
         """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,).
 
-        Raises RefusedError where a way has to be planned and there is none.
+        Raises RefusedError where a path must be planned and there is none.
         """
         knowledge = self._knowledge
         self._operators = knowledge.operators(joints)

@@ -29,7 +29,7 @@ NEAR_PX = 20.0
 STEPS = 41
 FIRST_ID = 5000
 KINDS = ("leaves the view", "near a border", "shows the back", "as it comes")
-"""In turn: of the way on which the middle goes straight and the plate turns about one axis, the shorter way round."""
+"""In turn: of the way on which the middle goes straight and the plate turns about one axis, by the shorter rotation."""
 
 
 def shipped_tasks_path() -> Path:

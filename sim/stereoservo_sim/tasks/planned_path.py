@@ -20,7 +20,7 @@ VIEW_MARGIN_PX = 2.0
 JOINT_MARGIN = 0.02
 """Planned distance from the joints' limits [rad], likewise."""
 LARGEST_LAG_PX = 20.0
-"""Distance behind its way at which the body is waited for."""
+"""Distance behind its path at which the plan waits for the body."""
 SPEED_M, SPEED_RAD = 0.1, 0.6
 """[m/s], [rad/s]; accelerations reach them in half a second."""
 ACCELERATION_S = 0.5
@@ -47,7 +47,7 @@ class PlannedPath:
         """Current set-points of the plan, with their velocities as a difference over ``dt_s``.
 
         The same of its joints, for an arm at ``joints`` (n,).
-        The plan's time goes on by ``dt_s``, or less where the body lags.
+        The plan's time advances by ``dt_s``, or less where the body lags.
         """
         set_points = self._set_points(scene)
         apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))

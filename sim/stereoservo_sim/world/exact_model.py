@@ -38,7 +38,7 @@ def exact_model(
     if None.
 
     ``plane`` must not pass between the markers as seen from the left camera; the default stays clear of them for
-    cameras of ordinary focal lengths. ``stratum`` says how much of it the model tells.
+    cameras of ordinary focal lengths. ``stratum`` of the model.
     """
     zero = cell.home if zero is None else zero
     normaliser = pixel_normaliser(cell.width, cell.height)

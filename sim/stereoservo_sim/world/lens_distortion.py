@@ -12,7 +12,7 @@ from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo_sim.world.camera_rig import PinholeCamera
 
 CIRCLE_POINTS = 40
-"""Corners of the polygon that stands for a dot: with its area, the centre of its image is right to 1e-4 px."""
+"""Corners of the polygon that represents a dot: with its area, the centre of its image is right to 1e-4 px."""
 PIECE_PX = 20.0
 """Length up to which a piece of an outline's edge stays straight."""
 MOST_PIECES = 64

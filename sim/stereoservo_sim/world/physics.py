@@ -19,7 +19,7 @@ POSITION_GAIN = 0.2
 
 
 class PhysicsError(Exception):
-    """pybullet cannot be used; the message says why."""
+    """pybullet cannot be used; the message holds the cause."""
 
 
 def import_pybullet() -> Any:

@@ -164,7 +164,7 @@ def demo_cell() -> SimulatedCell:
 
 @lru_cache(maxsize=1)
 def workpiece_cell() -> SimulatedCell:
-    """The same cell with a workpiece that stands nearer to the cameras, at the upper left of both images: on no way
+    """The same cell with a workpiece that stands nearer to the cameras, at the upper left of both images: on no path
     between the base and DEMO_GOALS, and at no calibration stop, does it hide the body.
     """
     cell = demo_cell()

@@ -1,7 +1,7 @@
 """Synthetic cells: an arm, cameras and markers, with pixels from exact projections and noise; no images.
 
-The common truth of experiments, benchmarks, campaigns and tests: Euclidean, known to the last digit, and told to
-nobody but the judge.
+The common truth of experiments, benchmarks, campaigns and tests: Euclidean, known to the last digit, and used
+for evaluation only.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def flat_plate() -> FloatArray:
 def stereo_pair(count: int = 2) -> tuple[FloatArray, FloatArray]:
     """Intrinsics (c, 3, 3) and poses (c, 4, 4): f = 800 px, 640x480, baseline 20 cm, vergence 20°, looking along z.
 
-    A third camera stands above.
+    Cell with a third camera above.
     """
     K = np.array([[800, 0, 322.0], [0, 795, 238.5], [0, 0, 1]])
     K2 = np.array([[812, 0, 315.0], [0, 806, 243.0], [0, 0, 1]])

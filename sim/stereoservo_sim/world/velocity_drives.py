@@ -12,7 +12,7 @@ from stereoservo.ports.devices import JointSpec
 STIFFNESS = 500.0
 """Of an ideal joint's drive at a wall [N m/rad or N/m]."""
 REST_VELOCITY = 1e-9
-"""Below this [rad/s or m/s] a physics engine's joint stands still."""
+"""Below this [rad/s or m/s] a physics engine's joint is at rest."""
 
 
 class Plant(Protocol):

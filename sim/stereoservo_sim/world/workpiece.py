@@ -1,6 +1,6 @@
 """The simulated workpiece: a plate of two small faces beside the marker body, static until it is moved on request.
 
-Where it stands now is told by a file in the cell's runtime directory, so that a shell, a test or a demonstration can
+Its present pose is in a file in the cell's runtime directory, so that a shell, a test or a demonstration can
 move it while the cell runs, whichever processes its cameras live in.
 """
 

@@ -33,7 +33,7 @@ STALL_NS = 2_000_000
 """A loop that wakes later than this was stalled."""
 LATE_FRAME_NS = 500_000
 ENDING_NS = 500_000_000
-"""How long after power off the arm is followed until it stands."""
+"""Time limit after power off until the arm must be at rest."""
 
 
 class Stalls(msgspec.Struct):

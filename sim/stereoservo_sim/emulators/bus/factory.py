@@ -37,7 +37,7 @@ class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     ``plant``: ``pybullet``, the simulated arm as rigid bodies (joints of its names), or ``ideal``, any joints, without
     mass. ``bit_time``: frames take their time on the wire. ``start``: positions by joint [rad or m] of an arm that was
-    never moved; ``resume``: an arm whose truth file exists stands where that ends. ``brake_ms``: what the brakes take
+    never moved; ``resume``: an arm whose truth file exists starts at its end. ``brake_ms``: what the brakes take
     to open and to close. ``rated_torques`` by joint [N m or N] where they are not the driver's. ``eds``: of the
     emulated drives where it is not the driver's, relative to the cell file. ``machine``: see PlantSettings.
     """

@@ -24,14 +24,14 @@ RECORD_STEPS = 4
 AWAKE_NS = 100_000_000
 """How long the plant is followed at rest after power or contact has changed, for its efforts."""
 RESTING = 1e-3
-"""Below this [rad/s or m/s] an axis is said to be at rest; rigid bodies tremble."""
+"""Below this [rad/s or m/s] an axis counts as at rest; simulated rigid bodies oscillate."""
 EFFORT_FILTER_S = 0.005
 
 
 class PlantSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of the machine [rad, s; m for prismatic joints; efforts in shares of the rated torque].
 
-    ``brake_s``: from closing until the axis stands. ``coast_deceleration``: of an axis without power and brake.
+    ``brake_s``: from closing until the axis is at rest. ``coast_deceleration``: of an axis without power and brake.
     ``end_stop_margin``: how far behind the position limits the mechanical stops are. ``contact_stiffness``: effort
     for each unit that a blocked axis lags; ``effort_max``: where the drive's current saturates. Of a plant without
     torques of its own: ``inertia`` (effort for each unit/s²), ``friction``, ``gravity`` (times the cosine of the
@@ -159,9 +159,9 @@ class _Body:
 class AxisPlant:
     """Axes and plant, step by step. A command acts from the first grid point after it came: never too early.
 
-    A position asked for between grid points goes on at the velocity of the last one. While everything rests, steps are
+    A position between grid points is extrapolated with the velocity of the last one. While everything rests, steps are
     skipped. ``history`` takes the truth. ``rated`` (n,) [N m or N]: what the plant's efforts are shares of; None: the
-    plant has no mass, and inertia, friction and gravity of the settings stand for it.
+    plant has no mass, and inertia, friction and gravity of the settings are used instead.
     Without power and brake an axis coasts down by friction; that an arm then sinks under gravity is not modelled.
     """
 

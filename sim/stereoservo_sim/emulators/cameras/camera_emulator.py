@@ -47,7 +47,7 @@ class CameraEmulator:
         self.stalled: set[str] = set()
         self.refused: set[str] = set()
         self.wanted: set[str] = {camera.stream for camera in cameras}
-        """Streams that somebody looks at; no picture is taken for others."""
+        """Streams with a client; no picture is taken for others."""
         self.on_hang_up: Callable[[str, bool], None] = lambda stream, within: None
         """Called to close a stream's connections, at once or within the next picture."""
         self._camera_lock = threading.Lock()

@@ -18,7 +18,7 @@ FOLLOWING_ERROR = 0x8611
 REACHED_SHARE = 0.01
 """Velocity window of "target reached" as a share of the largest velocity; the EDS has no 0x606D."""
 STANDING_UNITS = 1
-"""Up to this velocity [velocity units] bit 12 of profile velocity says that the speed is zero (0x606F)."""
+"""Up to this velocity [velocity units] bit 12 of profile velocity reports zero speed (0x606F)."""
 PARAMETERS = (HALT_OPTION, 0x6065, 0x6066, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085)
 LIMIT_FACTOR = 2.0
 """Braking at the current limit, as a multiple of the quick stop deceleration."""
@@ -240,7 +240,7 @@ class DriveMotion:
         """Enabled: follow the target velocity within the drive's limits, with ramps of 0x6083 and 0x6084.
 
         In cyclic synchronous velocity the standard leaves ramps to the master; this drive bounds the acceleration by
-        0x6083 there, both ways, as many do.
+        0x6083 there, in both directions, as many do.
         """
         axis, get = self.axis, self._dictionary.get
         mode = get(0x6061)

@@ -82,7 +82,7 @@ class PowerMachine:
 
     A command that changes the state is carried out before the next (IEC 61800-7-201): one that comes while the drive
     slows down for transition 5 or 8 waits, the newest counts; disable voltage and quick stop do not wait. Transition
-    16 needs a new command: a master that goes on sending "enable" does not undo a quick stop that the drive began.
+    16 needs a new command: a master that keeps sending "enable" does not undo a quick stop that the drive began.
     """
 
     def __init__(self, option: Callable[[int], int], clear_faults: Callable[[], bool]) -> None:

@@ -1,9 +1,10 @@
 """Experiment: success rate of self-calibration on random rigs, arms, bodies and noise, and whether reported
 accuracy holds.
 
-Each case is judged by the truth that only the judge knows. *Success*: a model whose predictions of held-out
-configurations are as far from the exact pixels as its own covariance says, and whose stated focal lengths and
-principal point are true within their deviations. *Failure*: a CalibrationError. *Wrong*: a model that fails the judge.
+Each case is evaluated against the ground truth, which the calibration does not use. *Success*: a model whose
+predictions of held-out configurations are as far from the exact pixels as its own covariance says, and whose stated
+focal lengths and principal point are true within their deviations. *Failure*: a CalibrationError. *Wrong*: a model
+that fails the judge.
 """
 
 from __future__ import annotations

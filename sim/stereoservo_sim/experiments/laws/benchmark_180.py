@@ -40,7 +40,7 @@ ASIDE_M = {"centred": 0.0, "aside": 0.15}
 LIMIT_MARGIN = np.radians(5.0)
 WAY_STEPS = 25
 LARGEST_JOINT_STEP = np.radians(25.0)
-"""Between two samples of the way: beyond it the arm would change its posture."""
+"""Between two samples of the path: beyond it the arm would change its posture."""
 TRIED_GAIN, TRIED_SEEDS = 1.0, 4
 
 

@@ -28,7 +28,7 @@ Commanded = Callable[[Scene, float], FloatArray]
 
 DT_S, GAIN, SECONDS = 0.04, 1.0, 8.0
 SIGMA_PX = 0.1
-"""What pixels are said to be known to."""
+"""Stated standard deviation of the pixels."""
 MARKERS = 4
 WORKPIECE = np.array(
     [

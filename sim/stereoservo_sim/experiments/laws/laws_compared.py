@@ -23,7 +23,7 @@ from stereoservo_sim.world.synthetic import rotation, translation
 
 NOISE_PX = 0.1
 LARGE_ID, BENT_ID = 5032, 5116
-"""Of the shipped hard tasks: one whose turn swings corners out of the image, one whose straight way leaves it."""
+"""Of the shipped hard tasks: one whose turn swings corners out of the image, one whose straight path leaves it."""
 ROLL_ID = 1
 CURRENT = "stereo, current"
 VARIANTS = ("stereo", CURRENT, *(law for law in LAWS if law != "stereo"))

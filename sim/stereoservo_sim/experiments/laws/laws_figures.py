@@ -31,7 +31,7 @@ ENDINGS = {
     "NOT_CONVERGED": "does not arrive",
 }
 AROUND_PX = 25.0
-"""Drawn around the markers' ways, so that what leaves the image shows beside its border."""
+"""Drawn around the markers' tracks, so that what leaves the image shows beside its border."""
 LONGEST_S, EVERY = 16.0, 5
 """Of the curves over time: their length, and every how many steps a point is drawn."""
 TASKS = {

@@ -37,7 +37,7 @@ TRIALS = 35
 """Fig. 4.10."""
 JOINTS = ("pan", "tilt")
 LIMITS = np.radians([[-90.0, 90.0], [-90.0, 90.0]])
-"""Of the head: all that the search is told."""
+"""Limits of the head, the only prior knowledge of the search."""
 TAIL = 0.005
 """Probability of each tail outside the interval of the normalised errors."""
 THESIS = {

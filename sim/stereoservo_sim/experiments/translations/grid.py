@@ -42,7 +42,7 @@ from stereoservo_sim.summaries import spread
 from stereoservo_sim.world.camera_rig import StereoRig
 
 DISTANCE = 1.1
-"""[m] of the grid's edge from the rig; not said in the thesis."""
+"""[m] of the grid's edge from the rig; not stated in the thesis."""
 SIGMA = 0.05
 """[px], as the thesis states it."""
 STEP = 0.02
