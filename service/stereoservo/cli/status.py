@@ -52,7 +52,7 @@ def progress_words(state: StateMessage) -> str:
     """Progress of the active goal as text; empty where it is unknown."""
     words = []
     if state.progress is not None:
-        words.append(f"{100.0 * state.progress:.0f} % of its way")
+        words.append(f"{100.0 * state.progress:.0f} % of its path")
     if state.seconds_left is not None:
         words.append(f"{state.seconds_left:.1f} s left")
     if state.error_px is not None:

@@ -273,10 +273,10 @@ def follow(handle: GoalHandle, as_json: bool) -> None:
 
 def plan_table(plan: PlanReport) -> str:
     """Path, duration, and the closest approach to every limit, as text."""
-    lines = [f"law {plan.law}, way {plan.way}, {plan.seconds:.2f} s"]
+    lines = [f"law {plan.law}, path {plan.way}, {plan.seconds:.2f} s"]
     if not plan.approaches:
         return lines[0]
-    rows: list[tuple[str, ...]] = [("limit", "of", "nearest", "limit at", "room", "on the way")]
+    rows: list[tuple[str, ...]] = [("limit", "of", "nearest", "limit at", "clearance", "at path")]
     rows += [_row(approach) for approach in plan.approaches]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines += [
