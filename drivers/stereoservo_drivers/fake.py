@@ -1,4 +1,4 @@
-"""Fakes: an arm of pure arithmetic and cameras that deliver marker positions; with faults to order."""
+"""Fake drivers: an arm computed without physics, and cameras that deliver marker positions; with fault injection."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Count = Annotated[int, Meta(ge=1)]
 
 
 class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """Faults of a fake arm; may be changed while it runs (``driver.faults``).
+    """Injected faults of a fake arm; may be changed while it runs (``driver.faults``).
 
     Each call counts from 1 over the driver's life. ``fail_write``, ``fail_read``: that call and later
     ones raise DriverError (``connection_lost``). ``fail_activate``: activate() raises.
-    ``freeze_encoder_after``: from that read on positions, velocities and stamp stand still (no feedback).
-    ``stuck_encoder_after``: positions stand still, the stamp goes on. ``drop_writes_after``: later
+    ``freeze_encoder_after``: from that read on positions, velocities and stamp are frozen (no feedback).
+    ``stuck_encoder_after``: positions are frozen, the stamp continues. ``drop_writes_after``: later
     commands do not reach the drives, though reported as sent. ``delay_s``: states are that old. ``gain``:
     the drives run at this multiple of the command. ``block_after``: from that write on something is in the way of
     the joint ``block_joint`` (empty: of the one that is then fastest), where it stands, in the direction it moves in.
@@ -73,7 +73,7 @@ class FakeJointOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class FakeJointDriver(SimulatedArm):
-    """An arm whose joints follow ideal drives; see :class:`Faults` for what can go wrong on demand."""
+    """An arm whose joints follow ideal drives; see :class:`Faults` for its injected faults."""
 
     driver = "fake"
     call_budget_us = 500.0
@@ -105,18 +105,18 @@ class FakeJointDriver(SimulatedArm):
             )
 
     def make_plant(self, positions: FloatArray) -> Plant:
-        """Ideal joints."""
+        """A plant of ideal joints."""
         self._plant = IdealPlant(positions)
         return self._plant
 
     def activate(self) -> None:
-        """Brakes off, at rest. Raises DriverError."""
+        """Release the brakes, at rest. Raises DriverError."""
         if self.faults.fail_activate:
             raise DriverError("fault", "fake arm: activate() fails as ordered (faults.fail_activate)")
         super().activate()
 
     def read_state(self) -> JointState:
-        """The encoders now, or what the faults leave of them. Raises DriverError."""
+        """Encoder readings, as altered by injected faults. Raises DriverError."""
         state = super().read_state()
         self._reads += 1
         faults = self.faults
@@ -142,7 +142,7 @@ class FakeJointDriver(SimulatedArm):
         )
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
-        """Command (n,) velocities. Raises DriverError."""
+        """Command velocities (n,). Raises DriverError."""
         self._writes += 1
         if _due(self.faults.fail_write, self._writes):
             raise DriverError(
@@ -151,7 +151,7 @@ class FakeJointDriver(SimulatedArm):
         return super().write_velocity(qd)
 
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """Hand a command to the drives, unless a fault swallows it."""
+        """Send a command to the drives, unless an injected fault drops it."""
         if _due(self.faults.block_after, self._writes) and not self._blocked:
             self._block(asked)
         if _due(self.faults.drop_writes_after, self._writes):
@@ -162,7 +162,7 @@ class FakeJointDriver(SimulatedArm):
         return super().send(bank, now_ns, asked)
 
     def _block(self, asked: FloatArray) -> None:
-        """Put a wall before a joint, once it moves."""
+        """Block a joint by a wall, once it moves."""
         assert self._plant is not None  # configured: the lifecycle was checked
         named = [k for k, joint in enumerate(self._joints) if joint.name == self.faults.block_joint]
         joint = named[0] if named else int(np.abs(asked).argmax())

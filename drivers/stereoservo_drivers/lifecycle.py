@@ -1,4 +1,4 @@
-"""The lifecycle of a driver: what is allowed in which state."""
+"""Lifecycle of a driver: the calls that each state allows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from stereoservo.ports.devices import DriverError
 
 
 class LifecycleState(StrEnum):
-    """Where a driver stands. From CLOSED a camera driver can be configured again, a joint driver cannot."""
+    """State of a driver. From CLOSED a camera driver can be configured again, a joint driver cannot."""
 
     CREATED = "created"
     CONFIGURED = "configured"

@@ -1,4 +1,4 @@
-"""Driver options from a cell file, decoded strictly; what is wrong is said with key, value and what would be valid."""
+"""Strict decoding of driver options from a cell file; errors state key, value and what would be valid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MISSING = re.compile(r"missing required field `(.*)`")
 
 
 def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
-    """``options`` as ``kind``, a struct that forbids unknown fields.
+    """Decode ``options`` as ``kind``, a struct that forbids unknown fields.
 
     Raises:
         DriverError: code ``option``; names the driver, the option, its value and what would have been valid.
@@ -37,9 +37,9 @@ def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
 
 
 def invalid(kind: type[msgspec.Struct], tree: Mapping[str, Any], error: msgspec.ValidationError) -> str:
-    """What ``error`` found in ``tree``: where, the value, and what would have been valid, in a cell file's words.
+    """Error text for ``error`` in ``tree``: key, value, and what would be valid, in a cell file's terms.
 
-    An element of a list that has a name is told by it: ``joint 'j3': gear_ratio = 0; valid: a number above 0``.
+    An element of a list that has a name is identified by it: ``joint 'j3': gear_ratio = 0; valid: a number above 0``.
     """
     text, _, path = str(error).partition(" - at `")
     value, wanted, where, key = _walk(tree, inspect.type_info(kind), path.rstrip("`"))
@@ -52,7 +52,7 @@ def invalid(kind: type[msgspec.Struct], tree: Mapping[str, Any], error: msgspec.
 
 
 def _walk(value: Any, wanted: Any, path: str) -> tuple[Any, Any, str, str]:
-    """Value and type at msgspec's ``path``, the named element that it lies in, and the key from there."""
+    """Value and type at msgspec's ``path``, the named element that contains it, and the key from there."""
     where = key = ""
     for name, number in _STEP.findall(path):
         if name:
@@ -94,7 +94,7 @@ def _either(wanted: Any) -> tuple[Any, ...]:
 
 
 def _failing(table: Mapping[str, Any], wanted: Any) -> tuple[str, Any]:
-    """The entry of a table that is not of its type: msgspec does not say which."""
+    """Entry of a table that is not of its type, which msgspec does not report."""
     for name, value in table.items():
         if not any(_fits(value, one) for one in _either(wanted)):
             return name, value
@@ -124,7 +124,7 @@ def _instead(name: str, wanted: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    """As a cell file writes it."""
+    """A value as a cell file writes it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     text = f'"{value}"' if isinstance(value, str) else f"{value!r}"
@@ -132,7 +132,7 @@ def _shown(value: Any) -> str:
 
 
 def _words(wanted: Any) -> str:
-    """What a type takes, for people."""
+    """Valid values of a type, as text."""
     words = [_word(one) for one in _either(wanted) if not isinstance(one, inspect.NoneType)]
     return " or ".join(dict.fromkeys(words))
 

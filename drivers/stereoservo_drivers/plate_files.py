@@ -52,7 +52,7 @@ def _colour(ink: float) -> str:
 
 
 def write_pdf(pages: Sequence[Page], path: Path) -> None:
-    """All pages into one PDF, vectors only. Raises OSError."""
+    """Write all pages into one PDF, vectors only. Raises OSError."""
     import matplotlib
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
@@ -117,7 +117,7 @@ def write_pages(pages: Sequence[Page], path: Path, *, force: bool = False) -> li
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write beside ``path`` and move it there, so that nobody finds half a file."""
+    """Write beside ``path`` and rename, such that the file is always complete."""
     part = path.with_name(f".{path.name}.part")
     try:
         write(part)

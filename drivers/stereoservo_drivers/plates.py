@@ -1,4 +1,5 @@
-"""Plates to print: faces of dots and tags on pages, in millimetres, with what cutting, folding and checking needs.
+"""Layout of marker plates for printing: faces of dots and tags on pages [mm], with cutting, folding and scale
+marks.
 
 Page coordinates: origin at the top left, x right, y down [mm]. :mod:`stereoservo_drivers.plate_files` writes pages.
 """
@@ -40,7 +41,9 @@ LEAST_GAP = 0.5
 
 
 class PlateError(Exception):
-    """A plate cannot be printed as asked. ``code`` is stable; the text says what, the value, what would be valid."""
+    """A plate cannot be printed as requested. ``code`` is stable; the text holds the cause, the value, what would
+    be valid.
+    """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
         super().__init__(message)
@@ -92,7 +95,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Page:
-    """What is drawn on one sheet, lowest first; ``title`` names what is on it."""
+    """Content of one sheet, lowest first; ``title`` names it."""
 
     width: float
     height: float
@@ -129,7 +132,7 @@ class DotPlates:
         object.__setattr__(self, "millimetres", tuple(self._scaled(face) for face in self.faces))
 
     def _scaled(self, face: DotFace) -> DotFace:
-        """Raises PlateError ``dot_size``, ``spacing``."""
+        """A face at the printed scale [mm]. Raises PlateError ``dot_size``, ``spacing``."""
         spacing = float(np.linalg.norm(face.positions[1] - face.positions[0]))
         nearest = _nearest(face)
         dot = self.dot_mm
@@ -163,12 +166,12 @@ class DotPlates:
 
     @property
     def dot_px_range(self) -> str:
-        """How far away the smallest of the dots can be."""
+        """Text: distance at which the smallest dots can still be detected."""
         return _range(2.0 * min(face.radius for face in self.millimetres))
 
     @property
     def in_proportion(self) -> bool:
-        """Whether dots and faces grew alike: to the detector, which knows no scale, the faces are what they were."""
+        """Whether dots and faces are scaled alike, so that the detector's patterns are unchanged."""
         return self.spacing_mm is None or all(
             abs(mm.radius / one.radius - mm.positions[1, 0] / one.positions[1, 0])
             < 1e-6 * mm.radius / one.radius
@@ -176,7 +179,7 @@ class DotPlates:
         )
 
     def plates(self) -> list[Plate]:
-        """Squares to cut out."""
+        """The plates to cut out."""
         ground, dot = (1.0, 0.0) if self.polarity == "light" else (0.0, 1.0)
         found = []
         for face in self.millimetres:
@@ -188,7 +191,7 @@ class DotPlates:
         return found
 
     def cell_lines(self) -> list[str]:
-        """Lines of a cell file, below ``[[camera]]``."""
+        """Lines of a cell file, below ``[[camera]]``, that describe the plates."""
         options = ['polarity = "dark"'] if self.polarity == "dark" else []
         names = [face.name for face in self.faces]
         tables: list[str] = []
@@ -218,7 +221,7 @@ class TagPlates:
     tag_mm: float = 50.0
 
     def plates(self) -> list[Plate]:
-        """Squares to cut out, a white cell about each tag. Raises PlateError ``tag_size``."""
+        """The plates to cut out, a white cell about each tag. Raises PlateError ``tag_size``."""
         if not LEAST_TAG_MM <= self.tag_mm < np.inf:
             raise PlateError(
                 "tag_size",
@@ -240,7 +243,7 @@ class TagPlates:
         return found
 
     def cell_lines(self) -> list[str]:
-        """Lines of a cell file, below ``[[camera]]``."""
+        """Lines of a cell file, below ``[[camera]]``, that describe the tags."""
         return [
             'detector = "aruco"',
             f'detector_options = {{ dictionary = "{self.dictionary}", tags = {list(self.tags)} }}',
@@ -248,7 +251,7 @@ class TagPlates:
 
 
 def faces_named(text: str) -> tuple[DotFace, ...]:
-    """Faces from ``a,b``. Raises PlateError ``face``."""
+    """Parse faces from ``a,b``. Raises PlateError ``face``."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in names if name not in FACES]
     if not names or unknown or len(set(names)) < len(names):
@@ -262,7 +265,7 @@ def faces_named(text: str) -> tuple[DotFace, ...]:
 
 
 def tags_named(text: str) -> tuple[str, tuple[int, ...]]:
-    """Dictionary and tags from ``36h11:0-3,7``. Raises PlateError ``tags``."""
+    """Parse dictionary and tags from ``36h11:0-3,7``. Raises PlateError ``tags``."""
     name, colon, numbers = text.partition(":")
     name = name.strip().lower()
     if name not in DICTIONARIES or not colon:
@@ -286,7 +289,7 @@ def tags_named(text: str) -> tuple[str, tuple[int, ...]]:
 
 
 def paper_named(text: str) -> tuple[float, float]:
-    """Width and height [mm] from ``a4`` or ``200x300``. Raises PlateError ``page``."""
+    """Parse width and height [mm] from ``a4`` or ``200x300``. Raises PlateError ``page``."""
     if text.lower() in PAPERS:
         return PAPERS[text.lower()]
     match = re.fullmatch(r"(\d{1,5}(?:\.\d+)?)x(\d{1,5}(?:\.\d+)?)(?:mm)?", text.lower())
@@ -309,7 +312,7 @@ def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence
     """
     width, height = paper
     footer = BAR + LINE * len(below)
-    room = (
+    space = (
         width - 2 * BORDER - 2 * (MARK + CLEARANCE),
         height - 2 * BORDER - HEADER - footer - MARK - CLEARANCE,
     )
@@ -317,14 +320,14 @@ def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence
     while rest:
         first = rest[0]
         gap = 0.0 if first.joins else 2 * (MARK + CLEARANCE)
-        across, down = (int((side + gap + 1e-6) // (first.side + gap)) for side in room)
+        across, down = (int((side + gap + 1e-6) // (first.side + gap)) for side in space)
         if across < 1 or down < 1:
             raise PlateError(
                 "too_large",
                 f"{first.name} is {first.side:.1f} mm wide; on {width:g} x {height:g} mm there is room for "
-                f"{max(min(room), 0.0):.1f} mm: a larger --page or smaller dots or tags",
+                f"{max(min(space), 0.0):.1f} mm: a larger --page or smaller dots or tags",
                 side_mm=first.side,
-                room_mm=min(room),
+                room_mm=min(space),
             )
         if first.joins:  # a strip, so that only neighbours share an edge
             across, down = (across, 1) if across > down else (1, down)

@@ -1,4 +1,4 @@
-"""The simulated cell: an arm whose joints pybullet moves, and cameras that render what they would see.
+"""Drivers of the simulated cell: an arm in the physics engine pybullet, and cameras that render images.
 
 pybullet itself is imported by the arm only, when it is configured: the servo process loads no image code,
 the camera process no physics.
@@ -27,7 +27,7 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class PybulletJointOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the pybullet arm: those of every simulated arm."""
+    """Options of the pybullet arm: the same as of every simulated arm."""
 
 
 class PybulletJointDriver(SimulatedArm):
@@ -76,15 +76,13 @@ class PybulletCameraDriver(SimulatedCamera):
         return self.describe_as("frames")
 
     def configure(self) -> None:
-        """Load the renderer and draw once, so that no later frame waits for a compiler. Raises
-        DriverError.
-        """
+        """Load the renderer and draw once, so that no later frame waits for compilation. Raises DriverError."""
         super().configure()
         if self._renderer is None:
-            self._renderer = self._draw_anew()
+            self._renderer = self._redraw()
             self._renderer.render(self.cell.base, np.random.default_rng(0))
 
-    def _draw_anew(self) -> Renderer:
+    def _redraw(self) -> Renderer:
         from stereoservo_sim.world.rendering import Renderer, RenderSettings
 
         options = self._render
@@ -99,7 +97,7 @@ class PybulletCameraDriver(SimulatedCamera):
         """The image with the arm at ``q`` (n,)."""
         assert self._renderer is not None  # active: the lifecycle was checked
         if self._renderer.camera is not self.camera:  # it was bumped
-            self._renderer = self._draw_anew()
+            self._renderer = self._redraw()
         return Frame(
             camera=self.name,
             seq=seq,

@@ -1,4 +1,4 @@
-"""What the simulated joint drivers share: lifecycle, time, encoder, and the record of the truth."""
+"""Base of the simulated joint drivers: lifecycle, time, encoder, and the history of true positions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Options of every simulated arm.
 
     ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the
-    simulated cell's base. ``resume``: an arm whose history exists stands where that ends. ``encoder``:
+    simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
     resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept.
     """
 
@@ -73,7 +73,7 @@ class SimulatedArm:
         self._last_ns = 0
 
     def make_plant(self, positions: FloatArray) -> Plant:
-        """The joints, standing at ``positions`` (n,). Raises DriverError."""
+        """Plant of the joints, at rest at ``positions`` (n,). Raises DriverError."""
         raise NotImplementedError
 
     def describe(self) -> JointDriverDescription:
@@ -89,7 +89,7 @@ class SimulatedArm:
         )
 
     def configure(self) -> None:
-        """Set the arm up where it was left. Raises DriverError."""
+        """Set up the arm at the positions where it was left. Raises DriverError."""
         self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
         if self._life.state is LifecycleState.CONFIGURED:
             return
@@ -108,12 +108,12 @@ class SimulatedArm:
         self._life.state = LifecycleState.CONFIGURED
 
     def activate(self) -> None:
-        """Brakes off, at rest. Raises DriverError."""
+        """Release the brakes, at rest. Raises DriverError."""
         self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         self._life.state = LifecycleState.ACTIVE
 
     def read_state(self) -> JointState:
-        """Encoders, motors' efforts and following errors now. Raises DriverError."""
+        """Encoder readings, motors' efforts and following errors now. Raises DriverError."""
         self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         bank = self._advance()
         self._seq += 1
@@ -124,7 +124,7 @@ class SimulatedArm:
         )  # fmt: skip
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
-        """Command (n,) velocities. Raises DriverError: not active, wrong shape, not finite."""
+        """Command velocities (n,). Raises DriverError: not active, wrong shape, not finite."""
         self._life.require("write_velocity()", LifecycleState.ACTIVE)
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (len(self._joints),):
@@ -165,12 +165,12 @@ class SimulatedArm:
         self._life.state = LifecycleState.CLOSED
 
     def encode(self, positions: FloatArray) -> FloatArray:
-        """What encoders of the given resolution say, (n,)."""
+        """Readings (n,) of encoders of the given resolution."""
         step = self._options.encoder
         return np.round(positions / step) * step if step > 0 else positions.copy()
 
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """Hand a command to the drives: what was sent (n,), and why it differs from what was asked."""
+        """Send a command to the drives: returns what was sent (n,), and why it differs from what was commanded."""
         return bank.command(now_ns, asked)
 
     def _advance(self) -> DriveBank:

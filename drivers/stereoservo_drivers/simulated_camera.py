@@ -1,6 +1,4 @@
-"""What the simulated camera drivers share: the shutter grid, latency, drop-outs, and where the arm was at
-the shutter.
-"""
+"""Base of the simulated camera drivers: shutter grid, latency, drop-outs, and the arm's pose at the shutter time."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ HOLD_NS = 100_000_000
 
 
 class Bump(Moved, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``at_s`` after activation the camera is where this takes it from its place in the rig, in its own frame."""
+    """Displacement of the camera, in its own frame, at ``at_s`` after activation."""
 
     at_s: NonNegative
 
@@ -34,8 +32,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     ``view``: which camera of the simulated rig it is (default: the one with the driver's own name). ``k1``: how its
     lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole. ``moved``: how far the
     camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
-    what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: one stands
-    beside the body; where, the file ``simulated-workpiece.json`` there tells for every frame
+    what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: there
+    is one beside the body; the file ``simulated-workpiece.json`` there has its pose for every frame
     (`stereoservo_sim.world.workpiece`).
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
     ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
@@ -59,9 +57,9 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class SimulatedCamera:
-    """A camera of the simulated cell. Shows the arm as it truly stood at the shutter time.
+    """A camera of the simulated cell. It sees the arm at its true pose at the shutter time.
 
-    It stands before the arm, or rides on it before the standing body, as the cell file's ``mount`` says.
+    It is static before the arm, or mounted on it before a static body, by the cell file's ``mount``.
     ``blackout`` may be set while it runs: no frame arrives until it is cleared. Before the simulated arm
     has ever moved the camera shows it at the cell's base; when the arm's process is silent, where it was
     last.
@@ -109,11 +107,11 @@ class SimulatedCamera:
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
     ) -> Frame | CameraObservation:
-        """What this camera gives for the arm at ``q`` (n,) and the workpiece where it stands."""
+        """Frame or observation of the arm at ``q`` (n,) and the workpiece at its pose."""
         raise NotImplementedError
 
     def bump(self, moved: Moved) -> None:
-        """From the next shutter on it stands where ``moved`` takes it from its place in the rig. Raises ValueError."""
+        """Displace the camera by ``moved`` from its pose in the rig, from the next shutter on. Raises ValueError."""
         self._given = moved
         self._put(moved)
 
@@ -123,7 +121,7 @@ class SimulatedCamera:
             self._place = moved
 
     def _stand(self, t_shutter_ns: int) -> None:
-        """Stand where it was moved to until then: by the file, else by the newest bump. Raises DriverError."""
+        """Apply the current displacement: by the file, else by the newest bump. Raises DriverError."""
         since = (t_shutter_ns - self._activated_ns) * 1e-9
         due = [bump for bump in self._options.bumps if bump.at_s <= since]
         given = self._given if not due else Moved(due[-1].shift_m, due[-1].turn_deg)
@@ -133,7 +131,7 @@ class SimulatedCamera:
             raise DriverError("moved", str(error), path=str(self._bumped.path)) from error
 
     def workpiece_pose(self) -> FloatArray | None:
-        """Where the workpiece stands in the world, (4, 4); None where the cell has none."""
+        """Pose (4, 4) of the workpiece in the world; None where the cell has none."""
         return self._workpiece_pose
 
     def describe_as(
@@ -152,14 +150,14 @@ class SimulatedCamera:
         )
 
     def configure(self) -> None:
-        """Nothing to connect to: the arm may start later; also after :meth:`close`. Raises DriverError."""
+        """Set up the camera, also after :meth:`close`; the arm may start later. Raises DriverError."""
         self._life.require(
             "configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED
         )
         self._life.state = LifecycleState.CONFIGURED
 
     def activate(self) -> None:
-        """Frames from the next shutter on. Raises DriverError."""
+        """Deliver frames from the next shutter on. Raises DriverError."""
         self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         if self._life.state is LifecycleState.CONFIGURED:
             self._activated_ns = self._context.clock.now_ns()
@@ -167,7 +165,7 @@ class SimulatedCamera:
         self._life.state = LifecycleState.ACTIVE
 
     def poll(self) -> list[Frame] | list[CameraObservation]:
-        """The newest frame that has arrived since the last poll, or nothing. Raises DriverError."""
+        """The newest frame that has arrived since the last poll, or none. Raises DriverError."""
         self._life.require("poll()", LifecycleState.ACTIVE)
         now_ns = self._context.clock.now_ns()
         k = self._grid(now_ns - round(self._options.latency_s * 1e9))
@@ -187,7 +185,7 @@ class SimulatedCamera:
         return [self.deliver(k, t_shutter_ns + self._stamped_late_ns, now_ns, q, rng)]  # type: ignore[return-value]
 
     def deactivate(self) -> None:
-        """No more frames. Idempotent."""
+        """Stop delivering frames. Idempotent."""
         if self._life.state is LifecycleState.ACTIVE:
             self._life.state = LifecycleState.CONFIGURED
 
@@ -212,7 +210,7 @@ class SimulatedCamera:
         return unlucky or self.blackout or any(start <= since < end for start, end in self._options.dropouts)
 
     def _arm_at(self, t_ns: int, now_ns: int) -> FloatArray | None:
-        """Joint positions at the shutter, or None while the arm's process has not got there yet."""
+        """Joint positions at the shutter, or None while the arm's process has not reached that time."""
         if self._stands_still(t_ns) and self._frozen is not None:
             return self._frozen
         history = self._open_history(now_ns)

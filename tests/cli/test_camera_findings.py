@@ -11,7 +11,7 @@ from stereoservo.cli.doctor.camera_findings import (
     contrast_and_blur,
     examine_record,
     examine_skew,
-    mean_sights,
+    mean_observations,
     near_border,
 )
 from stereoservo.cli.doctor.view_consistency import examine_views, reprojection_rms
@@ -152,7 +152,7 @@ def test_the_mean_keeps_markers_of_most_frames() -> None:
     pixels = project_many(LEFT[None], points())[0]
     left = record("left", pixels, frames=200)
     left.seen[0] = observation("left", 0, np.vstack([pixels, [[1.0, 1.0]]]))
-    ids, mean, sigma = mean_sights(left)
+    ids, mean, sigma = mean_observations(left)
     assert ids.tolist() == list(range(14))
     assert np.abs(mean - pixels).max() < 5 * 0.05 / np.sqrt(200)
     assert sigma == pytest.approx(0.05)

@@ -187,16 +187,16 @@ def test_a_plan_is_a_table_of_the_closest_approaches() -> None:
         {},
     )
     head, titles, first, second = plan_table(plan).splitlines()
-    assert head == "law cartesian3, way linear, 3.25 s"
-    assert titles.split() == ["limit", "of", "nearest", "limit", "at", "room", "on", "the", "way"]
+    assert head == "law cartesian3, path linear, 3.25 s"
+    assert titles.split() == ["limit", "of", "nearest", "limit", "at", "clearance", "at", "path"]
     assert first.split("  ")[-1].strip() == "41 %"
     assert "j3" in first
     assert "0.07 rad" in first
     assert "left, marker 3" in second
-    assert titles.index("room") == first.index("0.07 rad") == second.index("7 px")
+    assert titles.index("clearance") == first.index("0.07 rad") == second.index("7 px")
 
 
 def test_progress_is_told_as_far_as_it_is_known() -> None:
     state: Any = SimpleNamespace(progress=0.4, seconds_left=2.0, error_px=1.25)
-    assert progress_words(state) == "40 % of its way, 2.0 s left, error 1.250 px"
+    assert progress_words(state) == "40 % of its path, 2.0 s left, error 1.250 px"
     assert progress_words(SimpleNamespace(progress=None, seconds_left=None, error_px=None)) == ""  # type: ignore[arg-type]

@@ -17,8 +17,8 @@ from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.contracts import JointDriverContract
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 
 
 def can_joint(k: int, **changes: Any) -> dict[str, Any]:
@@ -54,22 +54,24 @@ ODRIVE: dict[str, Any] = PATIENT | {
 
 
 @pytest.fixture(scope="class")
-def rack(request: pytest.FixtureRequest) -> Iterator[None]:
-    """One rack for all tests of a suite: every driver finds the drives as the one before left them."""
+def emulator(request: pytest.FixtureRequest) -> Iterator[None]:
+    """One emulated bus for all tests of a suite: every driver finds the drives as the one before left them."""
     suite = request.cls
     name = uuid4().hex[:8]
     endpoint = open_endpoint(suite.bus.format(name=name), 1_000_000)
     channel = name if suite.interface == "virtual" else endpoint.channel
     suite.given = {"interface": suite.interface, "channel": channel} | suite.options
     options = decode_options(CanOptions, suite.given, "canopen")
-    drives = make_rack(options, DrivesSettings(plant="ideal", brake_ms=10.0), t_ns=time.monotonic_ns())
-    with RackServer(drives, endpoint):
+    drives = make_bus_emulator(
+        options, DrivesSettings(plant="ideal", brake_ms=10.0), t_ns=time.monotonic_ns()
+    )
+    with BusServer(drives, endpoint):
         yield
 
 
-@pytest.mark.usefixtures("rack")
+@pytest.mark.usefixtures("emulator")
 class CanContract(JointDriverContract):
-    """``bus``: what the drives are served on; ``given``: the driver's options, set by the rack."""
+    """``bus``: what the drives are served on; ``given``: the driver's options, set by the emulated bus."""
 
     real_time = True
     brake_s = 0.3

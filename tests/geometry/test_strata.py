@@ -23,7 +23,7 @@ from stereoservo.geometry.strata import (
     affine_to_projective,
     decompose_camera,
     euclidean_to_projective,
-    heights_of_one_side,
+    oriented_plane,
     projective_to_affine,
     projective_to_euclidean,
     upper_triangular,
@@ -173,10 +173,10 @@ def test_a_plane_between_the_points_is_refused_by_name(rig):
     M = rig.points(np.random.default_rng(2), 6)
     M = M / M[:, 2:3]
     plane = np.array([0, 0, 0, -1.0])
-    assert np.array_equal(heights_of_one_side(plane, M), [0, 0, 0, 1.0])
+    assert np.array_equal(oriented_plane(plane, M), [0, 0, 0, 1.0])
     cutting = np.array([0.0, 0.0, -1.0, 1.0]) * [1, 1, np.sort(M[:, 3])[1] * 1.001, 1]
     with pytest.raises(GeometryError, match="beyond the plane at infinity") as error:
-        heights_of_one_side(cutting, M)
+        oriented_plane(cutting, M)
     assert error.value.data["points"] == sorted(np.argsort(M[:, 3])[:2].tolist())
 
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 from stereoservo.kinematics.joint_angles import (
+    homing_displacement,
     homing_problem,
     joint_zeros,
     measured_joints,
     sensitivity,
-    way_home,
 )
 from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
@@ -140,7 +140,9 @@ def test_reported_covariance_is_the_bound_and_is_reached(perfect_calibration):
         )
         angles = measured_joints(joint_problem(seen, points[:2], pixels, 0.3), start=cell.home)[0]
         totals["exact points"] += (angles.q - q) @ np.linalg.solve(angles.covariance, angles.q - q)
-        way = way_home(homing_problem(seen, cell.home, home, pixels, 0.3), cell.home, start=cell.home)
+        way = homing_displacement(
+            homing_problem(seen, cell.home, home, pixels, 0.3), cell.home, start=cell.home
+        )
         error = way.displacement - (cell.home - q)
         totals["home image"] += error @ np.linalg.solve(way.covariance, error)
     low, high = chi2.ppf([0.005, 0.995], 2 * runs)
@@ -155,7 +157,7 @@ def test_uncertain_points_give_the_covariance_of_the_joint_fit(perfect_calibrati
     q = cell.home + np.array([0.1, -0.05])
     images = cell.pixels(np.array([cell.home, q]))
     home, now = images[:, 0, :1], images[:, 1, :1]
-    found = way_home(homing_problem(seen, cell.home, home, now, 0.3), cell.home, start=cell.home)
+    found = homing_displacement(homing_problem(seen, cell.home, home, now, 0.3), cell.home, start=cell.home)
 
     def both(x):
         point = points[:1] + np.array([[x[2], x[3], 0, x[4]]])
@@ -271,7 +273,7 @@ def test_what_another_calibration_does_to_the_angles_is_foreseen(perfect_calibra
         return homing_problem(replace(seen, cameras=seen.cameras + sign * change), cell.home, home, now, 0.3)
 
     foreseen = sensitivity(problem(0), problem(1), problem(-1), q)
-    ends = [way_home(problem(sign), cell.home, start=q).current.q for sign in (1, -1)]
+    ends = [homing_displacement(problem(sign), cell.home, start=q).current.q for sign in (1, -1)]
     assert np.allclose(0.5 * (ends[0] - ends[1]), foreseen, rtol=0.02, atol=1e-9)
 
 

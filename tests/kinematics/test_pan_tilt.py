@@ -13,7 +13,7 @@ from stereoservo.calibration.pan_tilt_head import (
     tracking_velocity,
 )
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.kinematics.joint_angles import homing_problem, joint_zeros, way_home
+from stereoservo.kinematics.joint_angles import homing_displacement, homing_problem, joint_zeros
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, points_seen
 from stereoservo_sim.world import synthetic
 
@@ -48,7 +48,7 @@ def test_a_calibrated_head_predicts_homes_and_resets_its_zeros():
     exact = cell.pixels(q)
     predicted = feed_forward(head, q[0], exact[:, 0], q[1:])
     assert np.abs(predicted.swapaxes(0, 1) - exact[:, 1:]).max() < 0.15
-    home = way_home(homing_problem(head, q[0], exact[:, 0, :1], exact[:, 1, :1], 0.1), q[0])
+    home = homing_displacement(homing_problem(head, q[0], exact[:, 0, :1], exact[:, 1, :1], 0.1), q[0])
     assert np.abs(home.displacement - (q[0] - q[1])).max() < np.radians(0.02)
     zeros = joint_zeros(head, result.model.marker_points, exact.swapaxes(0, 1)[:2], 0.1, q[:2] - [0.3, -0.2])
     assert np.abs(zeros.offset - [0.3, -0.2]).max() < np.radians(0.02)

@@ -1,4 +1,4 @@
-"""What a CAN controller says about its bus in an error frame, in words."""
+"""Decoding of a CAN controller's error frames into text."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _CONTROLLER_WORDS: tuple[tuple[int, str, str], ...] = (
 
 
 class BusError(msgspec.Struct, frozen=True):
-    """Something the controller or the line reported. ``code``: stable; ``message``: for people."""
+    """An error reported by the controller or the line. ``code``: stable; ``message``: for people."""
 
     code: str
     message: str
 
 
 def bus_error(message: can.Message) -> BusError:
-    """What an error frame says; the gravest where it says several things."""
+    """Decode an error frame; the most severe error where it reports several."""
     number, data = message.arbitration_id, bytes(message.data)
     for bit, code, words in _CLASSES[:1]:
         if number & bit:

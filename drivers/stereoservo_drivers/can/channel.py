@@ -1,4 +1,4 @@
-"""Any python-can interface as frames, its failures as typed errors that say what to check."""
+"""CAN channel over any python-can interface; its failures become typed errors with what to check."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FULL = (errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT)
 
 
 class ChannelOptions(Protocol):
-    """What a channel is opened by; ``CanOptions`` has these too."""
+    """Options to open a channel; ``CanOptions`` contains them, too."""
 
     @property
     def interface(self) -> str: ...
@@ -46,7 +46,7 @@ class ChannelOptions(Protocol):
 
 
 class ChannelSettings(msgspec.Struct, frozen=True):
-    """The options alone."""
+    """The channel options as a struct of their own."""
 
     interface: str
     channel: str | int
@@ -87,7 +87,7 @@ class Channel:
         self.frames_sent += len(frames)
 
     def receive(self, timeout_s: float) -> list[tuple[int, CanFrame]]:
-        """All frames that are there (at most ``BATCH``), stamped [ns, monotonic] as read; waits for the first one.
+        """All waiting frames (at most ``BATCH``), stamped [ns, monotonic] as read; blocks until the first one.
 
         What controller and line report beside frames is kept for ``take_errors``; bus-off raises.
         """
@@ -99,13 +99,13 @@ class Channel:
         return received
 
     def take_errors(self) -> list[tuple[int, BusError]]:
-        """What the bus reported since the last call, stamped [ns]; the newest 256."""
+        """Bus errors since the last call, stamped [ns]; the newest 256."""
         errors = list(self._errors)
         self._errors.clear()
         return errors
 
     def close(self) -> None:
-        """Release the interface. Idempotent; what fails now has no consequence any more."""
+        """Release the interface. Idempotent; errors are ignored."""
         try:
             self._bus.shutdown()
         except (can.CanError, OSError) as error:
@@ -187,39 +187,41 @@ class Channel:
         number, cause = _errno(error), str(error) or type(error).__name__
         socketcan_name = self._options.interface == "socketcan"
         if number in (errno.EACCES, errno.EPERM):
-            cure = "No permission: is this user in group dialout (`id`)? The udev rules in deploy/can set it"
+            remedy = (
+                "No permission: is this user in group dialout (`id`)? The udev rules in deploy/can set it"
+            )
         elif number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-            cure = f"Somebody else has it: `fuser -v {self._options.channel}`; another daemon on this cell?"
+            remedy = f"Somebody else has it: `fuser -v {self._options.channel}`; another daemon on this cell?"
         elif number == errno.ECONNREFUSED:
-            cure = (
+            remedy = (
                 "Nobody listens there: is `stereoservo emulate drives CELL` or the adapter's server running?"
             )
         elif socketcan_name and number == errno.EAFNOSUPPORT:
-            cure = "This kernel has no CAN: `modprobe can_raw`; in a container, on the host"
+            remedy = "This kernel has no CAN: `modprobe can_raw`; in a container, on the host"
         elif socketcan_name:
-            cure = f"Check `ip link show {self._options.channel}`; deploy/can sets interfaces up"
+            remedy = f"Check `ip link show {self._options.channel}`; deploy/can sets interfaces up"
         elif number in (errno.EISDIR, errno.ENOTTY):
-            cure = "That is no serial port; they are listed by `ls -l /dev/serial/by-id`"
+            remedy = "That is no serial port; they are listed by `ls -l /dev/serial/by-id`"
         elif isinstance(error.__cause__ or error, socket.gaierror):
-            cure = "No such host: check the name, or give its address"
+            remedy = "No such host: check the name, or give its address"
         elif isinstance(error, TypeError):
-            cure = (
+            remedy = (
                 f"Check `interface_options` ({', '.join(self._options.interface_options) or 'none given'}) against "
                 f"what python-can's manual lists for interface {self._options.interface!r}"
             )
         elif number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-            cure = "Is the adapter plugged in (`ls -l /dev/serial/by-id`, `dmesg | tail`)?"
+            remedy = "Is the adapter plugged in (`ls -l /dev/serial/by-id`, `dmesg | tail`)?"
         elif isinstance(error, ValueError):
-            cure = "Check `channel`, `bitrate` and `interface_options` of the cell file"
+            remedy = "Check `channel`, `bitrate` and `interface_options` of the cell file"
         elif isinstance(error, (ImportError, NameError, AttributeError)):
-            cure = f"What interface {self._options.interface!r} needs is not installed: its maker's library"
+            remedy = f"What interface {self._options.interface!r} needs is not installed: its maker's library"
         else:
-            cure = "Is the adapter plugged in and powered, its driver installed, and nobody else using it?"
-        return self._error("can_open", f"cannot be opened: {cause}. {cure}", retry=not _wrong(error))
+            remedy = "Is the adapter plugged in and powered, its driver installed, and nobody else using it?"
+        return self._error("can_open", f"cannot be opened: {cause}. {remedy}", retry=not _wrong(error))
 
     def _failure(self, error: Exception, doing: str) -> DriverError:
         if isinstance(error, SlcanRefusedError):
-            return self._error("send_refused", f"{error}{self._told()}")
+            return self._error("send_refused", f"{error}{self._status_text()}")
         if isinstance(error, SlcanGarbledError):
             return self._error(
                 "connection_lost",
@@ -235,8 +237,8 @@ class Channel:
             )
         return self._error("connection_lost", f"{doing}: {error}. {self._where_it_went()}", retry=True)
 
-    def _told(self) -> str:
-        """What the adapter answers when asked why it refused."""
+    def _status_text(self) -> str:
+        """The adapter's status as text, to explain a refusal."""
         assert self._fast is not None
         try:
             flags = self._fast.status_flags()
@@ -268,7 +270,7 @@ class Channel:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """The system's number of an error, looked for in its causes too."""
+    """The system's error number, searched in an error's causes, too."""
     while error is not None:
         number = getattr(error, "errno", None)
         if number is None:
@@ -280,5 +282,5 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def _wrong(error: BaseException) -> bool:
-    """Whether the configuration and not the world is at fault."""
+    """Whether the configuration is at fault, and not the hardware."""
     return isinstance(error, (TypeError, ValueError, ImportError, can.CanInterfaceNotImplementedError))

@@ -1,5 +1,5 @@
-"""Bits of frames on the wire, and how much of a bus a cycle takes. ISO 11898-1, classical frames; always with the
-intermission of 3 bits after a frame.
+"""Bus load: length of CAN frames in bits, and the share of a bus that a cycle takes (ISO 11898-1, classical frames,
+with the intermission of 3 bits after each).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def crc15(bits: int, count: int) -> int:
 
 
 def stuffable_bits(frame: CanFrame) -> tuple[int, int]:
-    """Everything of ``frame`` that is stuffed, from start of frame to CRC: (bits, count), the highest sent first."""
+    """The bits of ``frame`` that are stuffed, from start of frame to CRC: (bits, count), the highest sent first."""
     length = frame.length if frame.remote else len(frame.data)
     if frame.extended:
         head = frame.id >> 18 << 27 | 0b11 << 25 | (frame.id & 0x3FFFF) << 7 | frame.remote << 6 | length
@@ -59,7 +59,7 @@ def frame_bits(frame: CanFrame) -> int:
 
 
 def worst_bits(length: int, *, extended: bool = False) -> int:
-    """Longest that a frame with ``length`` data bytes can be [bits]: a stuff bit after the first five and then after
+    """Maximum length of a frame with ``length`` data bytes [bits]: a stuff bit after the first five and then after
     every four. A remote frame has no data bytes.
     """
     stuffable = (EXTENDED_HEAD if extended else STANDARD_HEAD) + 8 * length
@@ -67,7 +67,9 @@ def worst_bits(length: int, *, extended: bool = False) -> int:
 
 
 class BusLoad(msgspec.Struct, frozen=True):
-    """Worst case of a bus. ``cycle_bits``: of all frames of one cycle; ``background``: [bits/s] beside the cycle."""
+    """Worst-case load of a bus. ``cycle_bits``: of all frames of one cycle; ``background``: [bits/s] beside the
+    cycle.
+    """
 
     cycle_bits: int
     rate_hz: float
@@ -76,23 +78,23 @@ class BusLoad(msgspec.Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Of the bus's time; above 1 it cannot be."""
+        """Load as a share of the bus's capacity; above 1 it is impossible."""
         return (self.cycle_bits * self.rate_hz + self.background) / self.bitrate
 
     def rate_at(self, share: float) -> float:
-        """The cycle rate [Hz] that takes ``share`` of the bus; 0 where the background alone takes more."""
+        """Cycle rate [Hz] at a load of ``share``; 0 where the background alone takes more."""
         return max(share * self.bitrate - self.background, 0.0) / self.cycle_bits
 
     @property
     def max_rate_hz(self) -> float:
-        """What the bus can carry at all."""
+        """Highest possible cycle rate [Hz]."""
         return self.rate_at(1.0)
 
 
 def cycle_load(
     lengths: Sequence[int], rate_hz: float, bitrate: int, background: Sequence[tuple[int, float]] = ()
 ) -> BusLoad:
-    """Worst case of cycles of standard frames.
+    """Worst-case load of cycles of standard frames.
 
     ``lengths``: data bytes of every frame of a cycle, SYNC (0) included. ``background``: (data bytes, frames/s) of
     heartbeats and the like.
@@ -102,15 +104,15 @@ def cycle_load(
 
 
 def refusal(load: BusLoad, max_share: float) -> str | None:
-    """Why ``load`` is too much for ``max_share`` of the bus, and what would fit; None where it is not."""
+    """Text: why ``load`` exceeds ``max_share`` of the bus, and what would fit; None where it does not."""
     if load.share <= max_share:
         return None
     fitting = math.floor(load.rate_at(max_share))
-    cure = f"rate_hz up to {fitting} fits" if fitting >= 1 else "no cycle rate fits beside the heartbeats"
+    remedy = f"rate_hz up to {fitting} fits" if fitting >= 1 else "no cycle rate fits beside the heartbeats"
     return (
         f"worst-case bus load {load.share:.1%}, max_bus_load {max_share:.1%}: cycles of {load.cycle_bits} bits at "
         f"{load.rate_hz:g} Hz and {load.background:.0f} bit/s of heartbeats on {load.bitrate} bit/s (this bus carries "
-        f"{load.max_rate_hz:.0f} Hz at most). {cure}; less feedback per joint or a higher bitrate leave more room"
+        f"{load.max_rate_hz:.0f} Hz at most). {remedy}; less feedback per joint or a higher bitrate leave more room"
     )
 
 

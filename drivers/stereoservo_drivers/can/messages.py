@@ -1,4 +1,4 @@
-"""Frames as python-can's messages and back."""
+"""Conversion between frames and python-can's messages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from stereoservo_drivers.can.frames import CanFrame
 
 
 def to_message(frame: CanFrame) -> can.Message:
-    """``frame`` as python-can sends it."""
+    """Convert ``frame`` to a python-can message."""
     return can.Message(
         arbitration_id=frame.id,
         data=frame.data,
@@ -19,7 +19,7 @@ def to_message(frame: CanFrame) -> can.Message:
 
 
 def from_message(message: can.Message) -> CanFrame:
-    """A received ``message``.
+    """Convert a received ``message`` to a frame.
 
     Raises:
         ValueError: an error frame or a CAN FD frame, which are no ``CanFrame``.

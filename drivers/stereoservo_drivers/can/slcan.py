@@ -34,11 +34,11 @@ _SENT = frozenset((b"", b"z", b"Z"))
 
 
 class SlcanLostError(can.CanOperationError):
-    """The adapter is unplugged, or the peer has closed."""
+    """The adapter is unplugged, or the peer has closed the connection."""
 
 
 class SlcanRefusedError(can.CanOperationError):
-    """The adapter answered BEL: it did not take a frame or command."""
+    """The adapter answered BEL: it refused a frame or command."""
 
 
 class SlcanGarbledError(can.CanOperationError):
@@ -55,7 +55,7 @@ class SlcanBus(can.BusABC):
     in ``last_malformed``).
 
     Raises:
-        ValueError: channel or bitrate; says what is valid.
+        ValueError: channel or bitrate; states what is valid.
         can.CanInitializationError: device, peer or adapter refuse.
     """
 
@@ -100,7 +100,7 @@ class SlcanBus(can.BusABC):
         super().__init__(channel, can_filters)
 
     def _begin(self, commands: list[str]) -> None:
-        """Close whatever was open, empty the line, then ``commands``, none of which may be refused."""
+        """Close an open channel, flush the line, then send ``commands``, none of which may be refused."""
         self._write(b"\r\r\rC\r")
         deadline = time.monotonic() + self._reply_timeout_s
         self._await_answer(deadline)
@@ -116,7 +116,7 @@ class SlcanBus(can.BusABC):
                 raise SlcanRefusedError(f"the adapter refused command {command!r}")
 
     def _await_answer(self, deadline: float) -> bytes | None:
-        """The next answer that is no frame; None where there is none by ``deadline`` of the monotonic clock [s]."""
+        """The next answer other than a frame; None where there is none by ``deadline`` of the monotonic clock [s]."""
         while not self._answers:
             left = deadline - time.monotonic()
             if left <= 0 or not self._fill(left):
@@ -146,7 +146,7 @@ class SlcanBus(can.BusABC):
                 raise can.CanTimeoutError(message)
 
     def _fill(self, timeout_s: float | None) -> bool:
-        """Read once and sort what came; False on time-out."""
+        """Read once and sort the received lines; False on time-out."""
         try:
             chunk = self._port.read(timeout_s)
         except PortLostError as error:
@@ -182,7 +182,7 @@ class SlcanBus(can.BusABC):
         self.last_malformed = error
 
     def _check(self) -> None:
-        """Raises what the adapter has said since the last call."""
+        """Raise the errors that the adapter reported since the last call."""
         if self._refusals:
             refusals = self._forget_refusals()
             raise SlcanRefusedError(
@@ -196,7 +196,7 @@ class SlcanBus(can.BusABC):
             )
 
     def send_many(self, frames: Sequence[CanFrame], timeout: float | None = None) -> None:
-        """``frames`` in one write. ``timeout`` [s] instead of ``send_timeout_s``.
+        """Send ``frames`` in one write. ``timeout`` [s] replaces ``send_timeout_s``.
 
         Raises:
             can.CanTimeoutError: the line takes no more.
@@ -207,7 +207,7 @@ class SlcanBus(can.BusABC):
         self._check()
 
     def receive_many(self, timeout: float | None) -> list[CanFrame]:
-        """All frames that are there, unfiltered; waits up to ``timeout`` [s] for the first. Raises as ``recv``."""
+        """All waiting frames, unfiltered; waits up to ``timeout`` [s] for the first. Raises as ``recv``."""
         self._await_frame(timeout)
         frames = list(self._frames)
         self._frames.clear()
@@ -226,7 +226,7 @@ class SlcanBus(can.BusABC):
                 return
 
     def status_flags(self) -> int | None:
-        """The adapter's status by command ``F``, see ``flags_in_words``; None where it does not tell."""
+        """The adapter's status by command ``F``, see ``flags_in_words``; None where it does not report it."""
         self._answers.clear()
         self._write(b"F\r")
         deadline = time.monotonic() + self._reply_timeout_s
@@ -239,7 +239,7 @@ class SlcanBus(can.BusABC):
         return None
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """One message; see ``send_many``.
+        """Send one message; see ``send_many``.
 
         Raises:
             ValueError: an error frame or a CAN FD frame.
@@ -256,11 +256,11 @@ class SlcanBus(can.BusABC):
         return message, False
 
     def fileno(self) -> int:
-        """Of the port. Frames already read do not make it readable: receive until there is none."""
+        """Descriptor of the port. Frames already read do not make it readable: receive until there is none."""
         return self._port.fileno()
 
     def shutdown(self) -> None:
-        """Close the adapter's channel and the port; quiet where they are gone already."""
+        """Close the adapter's channel and the port; errors are ignored where they are already gone."""
         if self._is_shutdown:
             return
         super().shutdown()

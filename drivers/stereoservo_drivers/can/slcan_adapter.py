@@ -1,4 +1,4 @@
-"""The adapter's side of serial-line CAN, for emulated buses: commands in, answers out. No I/O, no clock."""
+"""Emulated serial-line CAN adapter, without I/O or clock: parses commands, produces answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SHORT, _LONG = b"z\r", b"Z\r"
 
 
 class SlcanAdapter:
-    """One adapter as its host sees it: closed, open or open for listening; refuses with BEL like the real ones.
+    """State of one adapter: closed, open, or open for listening; invalid commands are refused with BEL.
 
     ``bitrate``: what the host has set [bit/s]; None before that, or where it was set by registers (``registers``,
     BTR0 and BTR1). Whoever owns the bus compares it with the bus. ``flags``: the status that ``F`` answers and clears.
@@ -40,7 +40,7 @@ class SlcanAdapter:
         self._splitter = LineSplitter()
 
     def feed(self, chunk: bytes) -> tuple[list[CanFrame], bytes]:
-        """What the host wrote: the frames it wants on the bus, and the answer to write back."""
+        """Process bytes from the host; returns the frames to send on the bus, and the answer to write back."""
         frames: list[CanFrame] = []
         answers: list[bytes] = []
         for line in self._splitter.feed(chunk):
@@ -51,7 +51,7 @@ class SlcanAdapter:
         return frames, b"".join(answers)
 
     def deliver(self, frames: list[CanFrame], t_ns: int = 0) -> bytes:
-        """Lines for the host of ``frames`` that were on the bus at ``t_ns``; nothing while closed."""
+        """Lines for the host of ``frames`` that were on the bus at ``t_ns``; empty while closed."""
         if not self.is_open:
             return b""
         if not self._stamped:
@@ -71,7 +71,7 @@ class SlcanAdapter:
         return _LONG if frame.extended else _SHORT
 
     def _command(self, line: bytes) -> bytes:
-        """The answer to a line that is no frame. An empty one only ends what noise stood before it."""
+        """Answer to a command line. An empty line only ends preceding noise."""
         if line == b"":
             return CR
         if line in (b"O", b"L"):
@@ -94,7 +94,7 @@ class SlcanAdapter:
         return BEL
 
     def _set_up(self, line: bytes) -> bool:
-        """Commands that a closed channel takes: bit rate, registers, time stamps, automatic polling."""
+        """Handle a command that a closed channel accepts: bit rate, registers, time stamps, automatic polling."""
         if line in _BITRATE_OF:
             self.bitrate, self.registers = _BITRATE_OF[line], None
             return True

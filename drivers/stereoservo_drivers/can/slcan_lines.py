@@ -1,4 +1,5 @@
-"""Lawicel's serial-line CAN: frames as lines, lines out of a byte stream. Pure; for the host's and the adapter's side.
+"""Codec of Lawicel's serial-line CAN protocol: frames as text lines, lines from a byte stream. For host and
+adapter.
 
 A line ends with CR; BEL alone says that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
 (29 bits), ``rIIIL``, ``RIIIIIIIIL`` (remote); an adapter may append a time stamp of four digits.
@@ -48,7 +49,7 @@ _REMOTE = {ord("r"), ord("R")}
 
 
 class LineError(ValueError):
-    """A line that is none of Lawicel's. ``line``: as received, without its end; ``reason``: what is wrong with it."""
+    """Malformed line. ``line``: as received, without its end; ``reason``: what is wrong with it."""
 
     def __init__(self, line: bytes, reason: str) -> None:
         super().__init__(f"malformed serial-line CAN {line[:LONGEST_LINE]!r}: {reason}")
@@ -57,7 +58,7 @@ class LineError(ValueError):
 
 
 def encode_frame(frame: CanFrame) -> bytes:
-    """``frame`` as a line with its end.
+    """Encode ``frame`` as a line with its end.
 
     Raises:
         ValueError: id, data or length that no classical frame has.
@@ -79,7 +80,7 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 @cache
 def _head(can_id: int, length: int) -> bytes:
-    """Of a data frame with 11 bits, up to its data."""
+    """Line of a data frame with 11 bits up to its data."""
     if not 0 <= can_id <= 0x7FF:
         raise ValueError(f"id 0x{can_id:X} of a frame; valid here: 0 to 0x7FF")
     if length > 8:
@@ -88,7 +89,7 @@ def _head(can_id: int, length: int) -> bytes:
 
 
 def decode_frame(line: bytes) -> CanFrame:
-    """A frame from its ``line`` without the end, with or without a time stamp.
+    """Decode a frame from its ``line`` without the end, with or without a time stamp.
 
     Raises:
         LineError: it is not one.
@@ -97,7 +98,7 @@ def decode_frame(line: bytes) -> CanFrame:
 
 
 def _usual_frame(line: bytes) -> CanFrame | None:
-    """A data frame with 11 bits and without a stamp, the quick way; None where it is not one."""
+    """Fast decoder of a data frame with 11 bits and without a stamp; None for any other line."""
     if not line.startswith(b"t"):
         return None
     try:
@@ -137,7 +138,7 @@ def _any_frame(line: bytes) -> CanFrame:
 
 
 def bitrate_command(bitrate: int) -> str:
-    """``S0`` … ``S8``.
+    """Command ``S0`` … ``S8`` of a bit rate.
 
     Raises:
         ValueError: a bitrate that adapters of this kind cannot be asked for; lists the others.
@@ -149,13 +150,13 @@ def bitrate_command(bitrate: int) -> str:
 
 
 def flags_in_words(flags: int) -> str:
-    """The status that an adapter answers to ``F``."""
+    """The adapter's status answer to ``F`` as text."""
     words = [word for bit, word in enumerate(FLAG_WORDS) if word and flags >> bit & 1]
     return ", ".join(words) or "no error"
 
 
 class LineSplitter:
-    """Lines out of a byte stream that comes in pieces of any size.
+    """Splits a byte stream that arrives in chunks into lines.
 
     What is longer than any line is given as a line as far as it came, so that noise without ends does not pile up.
     """
@@ -164,7 +165,7 @@ class LineSplitter:
         self._rest = b""
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Lines that ``chunk`` completes, without CR. A BEL ends what stands before it and is a line of its own."""
+        """Lines that ``chunk`` completes, without CR. A BEL ends the preceding line and is a line of its own."""
         if BEL in chunk:
             chunk = chunk.replace(BEL, b"\r\a\r")
             lines = (self._rest + chunk).split(CR)

@@ -1,4 +1,4 @@
-"""What serial-line CAN runs over: a serial device, a pseudo terminal, a TCP connection. A file descriptor each."""
+"""Byte ports of serial-line CAN: a serial device, a pseudo terminal, or a TCP connection, each a file descriptor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _URL = re.compile(r"socket://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<po
 
 
 class PortLostError(OSError):
-    """The other side is gone: adapter unplugged, peer closed."""
+    """The connection is lost: adapter unplugged, or closed by the peer."""
 
 
 class _Descriptor(Protocol):
@@ -28,7 +28,7 @@ class _Descriptor(Protocol):
 
 
 class SlcanPort:
-    """Reads and writes of one open descriptor, non-blocking, with time limits."""
+    """Non-blocking reads and writes on one open descriptor, with time limits."""
 
     def __init__(self, descriptor: _Descriptor, name: str) -> None:
         self.name = name
@@ -38,11 +38,11 @@ class SlcanPort:
         self._tells_its_end = isinstance(descriptor, socket.socket)
 
     def fileno(self) -> int:
-        """For ``select``."""
+        """Descriptor for ``select``."""
         return self._fd[0]
 
     def read(self, timeout_s: float | None) -> bytes:
-        """What is there, at most ``CHUNK`` bytes; waits for it so long (None: for ever). Empty on time-out.
+        """Waiting bytes, at most ``CHUNK``; blocks up to the time limit (None: for ever). Empty on time-out.
 
         Raises:
             PortLostError: the other side is gone.
@@ -61,7 +61,7 @@ class SlcanPort:
         return chunk
 
     def write(self, content: bytes, timeout_s: float) -> bytes:
-        """Write ``content``; what could not be written within ``timeout_s`` is returned.
+        """Write ``content``; returns what could not be written within ``timeout_s``.
 
         Raises:
             PortLostError: the other side is gone.
@@ -83,17 +83,17 @@ class SlcanPort:
         return b""
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the descriptor."""
         self._descriptor.close()
 
 
 def open_port(channel: str, baud: int, *, rtscts: bool = False, connect_timeout_s: float = 2.0) -> SlcanPort:
-    """``channel``: ``socket://HOST:PORT`` or a serial device, its speed behind an ``@`` or else ``baud``.
+    """Open ``channel``: ``socket://HOST:PORT``, or a serial device with its speed after an ``@`` or else ``baud``.
 
-    A serial device is locked: nobody else opens it meanwhile.
+    A serial device is locked against other processes.
 
     Raises:
-        ValueError: the channel's text; says what would be valid.
+        ValueError: the channel's text; states what would be valid.
         OSError: the system refuses (``serial.SerialException`` is one).
     """
     if "://" in channel:

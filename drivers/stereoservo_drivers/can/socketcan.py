@@ -1,4 +1,4 @@
-"""What Linux tells about a CAN network interface."""
+"""State of a Linux CAN network interface (SocketCAN)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SO_RCVBUFFORCE = 33
 
 
 class SocketcanState(msgspec.Struct, frozen=True):
-    """As `ip -details link show` has it; None: not told (a virtual interface has no bit rate)."""
+    """State as `ip -details link show` reports it; None: not reported (a virtual interface has no bit rate)."""
 
     kind: str
     up: bool
@@ -28,7 +28,7 @@ class SocketcanState(msgspec.Struct, frozen=True):
 
 
 def read_state(channel: str) -> SocketcanState | None:
-    """The state of ``channel``; None where there is no `ip` to ask or it knows no such interface."""
+    """State of ``channel``; None where `ip` is missing or does not know the interface."""
     command = shutil.which("ip") or shutil.which("ip", path="/usr/sbin:/sbin")
     if command is None:
         return None
@@ -46,7 +46,7 @@ def read_state(channel: str) -> SocketcanState | None:
 
 
 def state_of(link: dict[str, Any]) -> SocketcanState:
-    """``link``: one element of what `ip -json -details link show` prints."""
+    """State from ``link``: one element of what `ip -json -details link show` prints."""
     about = link.get("linkinfo", {})
     facts = about.get("info_data", {})
     return SocketcanState(
@@ -60,21 +60,23 @@ def state_of(link: dict[str, Any]) -> SocketcanState:
 
 
 def objection(state: SocketcanState, channel: str, bitrate: int) -> str | None:
-    """Why ``channel`` cannot be used at ``bitrate`` [bit/s], with the cure; None where it can."""
+    """Text: why ``channel`` cannot be used at ``bitrate`` [bit/s], with the remedy; None where it can."""
     if state.kind not in ("can", "vcan", "vxcan", "slcan"):
         return f"it is a network interface of kind {state.kind or 'unknown'!r}, not of CAN"
-    cure = f"ip link set {channel} down; ip link set {channel} up type can bitrate {bitrate} restart-ms 0"
+    remedy = f"ip link set {channel} down; ip link set {channel} up type can bitrate {bitrate} restart-ms 0"
     if not state.up:
-        return f"the interface is down. Cure: {cure}, or the units in deploy/can"
+        return f"the interface is down. Cure: {remedy}, or the units in deploy/can"
     if state.bitrate is not None and state.bitrate != bitrate:
-        return f"it runs at {state.bitrate} bit/s, the cell says {bitrate}. Cure: {cure}"
+        return f"it runs at {state.bitrate} bit/s, the cell says {bitrate}. Cure: {remedy}"
     if state.state == "BUS-OFF":
-        return f"its controller is in bus-off. Find the cause (cable, terminators, bit rate), then: {cure}"
+        return f"its controller is in bus-off. Find the cause (cable, terminators, bit rate), then: {remedy}"
     return None
 
 
 def enlarge_receive_buffer(bus: can.BusABC) -> int:
-    """Room for bursts while the receiving thread is held up; gives the size that the kernel grants [bytes]."""
+    """Enlarge the receive buffer for bursts while the receiving thread is delayed; returns the size granted
+    [bytes].
+    """
     channel: socket.socket = bus.socket  # type: ignore[attr-defined]
     try:
         channel.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)

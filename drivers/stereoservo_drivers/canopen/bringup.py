@@ -1,6 +1,6 @@
-"""What a protocol does before and beside the cycle: find, check and configure the drives, clear their faults.
+"""Bring-up protocol of drives: find, check and configure them, clear their faults; routing of received frames.
 
-These calls block (tens of milliseconds). While they run, somebody pumps the bus: the driver's receive thread, or a
+These calls block (tens of milliseconds). While they run, the bus must be served: the driver's receive thread, or a
 simulation in virtual time.
 """
 
@@ -16,35 +16,35 @@ from stereoservo_drivers.canopen.codec import Codec
 
 
 class Link(Protocol):
-    """A pumped bus."""
+    """Protocol of a bus that is being served, for use outside of the cycle."""
 
     def send(self, frames: list[CanFrame]) -> None:
-        """Send in order. Raises DriverError (``connection_lost``)."""
+        """Send frames in order. Raises DriverError (``connection_lost``)."""
         ...
 
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+    def subscribe(self, can_id: int, received: list[CanFrame]) -> None:
         """Append every frame of ``can_id`` that arrives from now on to ``heard``, until ``unsubscribe``."""
         ...
 
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        """End it."""
+    def unsubscribe(self, can_id: int, received: list[CanFrame]) -> None:
+        """End a subscription."""
         ...
 
     def wait(self, seconds: float) -> None:
-        """Let the bus go on for so long."""
+        """Let the bus run for some time."""
         ...
 
     def now_ns(self) -> int:
-        """The link's time."""
+        """Time of the link."""
         ...
 
 
 class Bringup(Protocol):
-    """Bring-up of one protocol."""
+    """Protocol: bring-up of one type of drives."""
 
     @property
     def codec(self) -> Codec:
-        """The codec of the same drives."""
+        """Codec of the same drives."""
         ...
 
     def connect(self, link: Link) -> None:
@@ -56,7 +56,7 @@ class Bringup(Protocol):
         ...
 
     def release(self, link: Link) -> None:
-        """Leave the drives quiet. Raises DriverError."""
+        """Leave the drives passive. Raises DriverError."""
         ...
 
 
@@ -64,40 +64,40 @@ STEP_S = 0.001
 
 
 class Subscriptions:
-    """Who hears which identifier. One thread may deliver while another subscribes."""
+    """Subscriptions by CAN identifier. One thread may deliver while another subscribes."""
 
     def __init__(self) -> None:
         self._subscribers: defaultdict[int, list[list[CanFrame]]] = defaultdict(list)
 
-    def subscribe(self, can_id: int, heard: list[CanFrame]) -> None:
+    def subscribe(self, can_id: int, received: list[CanFrame]) -> None:
         """Append frames of ``can_id`` to ``heard`` from now on."""
-        self._subscribers[can_id] = [*self._subscribers[can_id], heard]
+        self._subscribers[can_id] = [*self._subscribers[can_id], received]
 
-    def unsubscribe(self, can_id: int, heard: list[CanFrame]) -> None:
-        """End it."""
-        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not heard]
+    def unsubscribe(self, can_id: int, received: list[CanFrame]) -> None:
+        """End a subscription."""
+        self._subscribers[can_id] = [other for other in self._subscribers[can_id] if other is not received]
 
     def tell(self, frame: CanFrame) -> None:
-        """A frame has arrived."""
-        for heard in self._subscribers.get(frame.id, ()):
-            heard.append(frame)
+        """Deliver a frame that has arrived."""
+        for received in self._subscribers.get(frame.id, ()):
+            received.append(frame)
 
 
 @contextmanager
 def listening(link: Link, ids: list[int]) -> Iterator[dict[int, list[CanFrame]]]:
-    """What arrives meanwhile, by identifier."""
-    heard: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
-    for can_id, frames in heard.items():
+    """Context manager: frames that arrive meanwhile, by identifier."""
+    received: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
+    for can_id, frames in received.items():
         link.subscribe(can_id, frames)
     try:
-        yield heard
+        yield received
     finally:
-        for can_id, frames in heard.items():
+        for can_id, frames in received.items():
             link.unsubscribe(can_id, frames)
 
 
 def until(link: Link, done: Callable[[], bool], limit_s: float, step_s: float = STEP_S) -> bool:
-    """Wait for ``done``; gives whether it came within ``limit_s``."""
+    """Wait for ``done``; returns whether it became true within ``limit_s``."""
     deadline_ns = link.now_ns() + round(limit_s * 1e9)
     while not done():
         if link.now_ns() >= deadline_ns:

@@ -1,4 +1,4 @@
-"""The one thread that owns the bus: receives, ticks the master on an absolute grid, sends.
+"""The thread that owns the CAN bus: receives, ticks the master on an absolute time grid, sends.
 
 Before the cycle begins, and while faults are reset, it pumps: it receives, hands frames to whoever has subscribed, and
 sends the master's heartbeat. In the cycle heartbeats come from the master's ticks alone: a hung thread is silent.
@@ -37,10 +37,10 @@ class ThreadStatistics:
 
 
 class BusThread(Subscriptions):
-    """A pumped bus (:class:`~stereoservo_drivers.canopen.bringup.Link`) that can also run the master's cycle.
+    """The bus thread, a :class:`~stereoservo_drivers.canopen.bringup.Link` that can also run the master's cycle.
 
     It ends by itself when the connection is lost or something unforeseen is raised in it: that fault is latched in the
-    master, the heartbeat ends, and the drives stop by their own watch on it. ``error`` tells why.
+    master, the heartbeat ends, and the drives stop by their own monitoring of it. ``error`` holds the cause.
     """
 
     def __init__(self, channel: Channel, master: Master) -> None:
@@ -52,7 +52,7 @@ class BusThread(Subscriptions):
         self._period_ns = round(1e9 / master.settings.rate_hz)
         self._read_every_ns = self._period_ns // READS_A_PERIOD
         self._send_lock = threading.Lock()
-        self._cycle_wanted = False
+        self._cycle_requested = False
         self._cycling = False
         self._ending = False
         self._next_ns = 0
@@ -65,13 +65,13 @@ class BusThread(Subscriptions):
     # -- link -----------------------------------------------------------------------------------------------
 
     def send(self, frames: list[CanFrame]) -> None:
-        """Send in order. Raises DriverError."""
+        """Send frames in order. Raises DriverError."""
         self._require()
         with self._send_lock:
             self._channel.send(frames)
 
     def wait(self, seconds: float) -> None:
-        """Let the bus go on. Raises DriverError once it is lost."""
+        """Let the bus run for some time. Raises DriverError once it is lost."""
         self._require()
         time.sleep(seconds)
         self._require()
@@ -88,11 +88,11 @@ class BusThread(Subscriptions):
         return self._thread.is_alive() and self.error is None
 
     def begin_cycle(self) -> None:
-        """From now on tick the master. Raises DriverError."""
+        """Start ticking the master. Raises DriverError."""
         self._hand_over(True)
 
     def end_cycle(self) -> None:
-        """From now on only pump. Raises DriverError."""
+        """Stop ticking the master; the bus is still served. Raises DriverError."""
         self._hand_over(False)
 
     def end(self) -> None:
@@ -106,7 +106,7 @@ class BusThread(Subscriptions):
             raise self.error
 
     def _hand_over(self, cycle: bool) -> None:
-        self._cycle_wanted = cycle
+        self._cycle_requested = cycle
         until = time.monotonic() + HAND_OVER_S
         while self._cycling is not cycle:
             self._require()
@@ -135,7 +135,7 @@ class BusThread(Subscriptions):
         self.error = error
 
     def _stop_blindly(self) -> None:
-        """Quick stop every cycle, without the heartbeat, which makes the drives stop by themselves."""
+        """Send quick stop every cycle, without the heartbeat, whose absence stops the drives, too."""
         try:
             while not self._ending:
                 with self._send_lock:
@@ -146,8 +146,8 @@ class BusThread(Subscriptions):
 
     def _step(self) -> None:
         now = time.monotonic_ns()
-        if self._cycle_wanted is not self._cycling:
-            self._cycling = self._cycle_wanted
+        if self._cycle_requested is not self._cycling:
+            self._cycling = self._cycle_requested
             self._next_ns = now
         if now >= self._follow_ns:
             self._follow_ns = now + FOLLOW_EVERY_NS
@@ -161,7 +161,7 @@ class BusThread(Subscriptions):
             self._sleep_and_read(now)
 
     def _sleep_and_read(self, now: int) -> None:
-        """Whatever has come when a slot begins belongs to the cycle that ends there."""
+        """Wait for the next slot; frames that have arrived when it begins belong to the cycle that ends there."""
         wake_ns = self._next_ns
         if self._master.awaits_answers:
             wake_ns = min(wake_ns, max(now + self._read_every_ns, self._first_read_ns))
@@ -193,7 +193,7 @@ class BusThread(Subscriptions):
 
 
 def next_slot(slot_ns: int, now_ns: int, period_ns: int) -> tuple[int, int]:
-    """The slot of the grid to wait for after the one of ``slot_ns`` was served at ``now_ns``; how many are left out.
+    """Next slot of the grid to wait for after that of ``slot_ns`` was served at ``now_ns``, and the number skipped.
 
     Slots are never made up for, and the drives get at least half a period to answer before the next poll.
     """
@@ -204,9 +204,11 @@ def next_slot(slot_ns: int, now_ns: int, period_ns: int) -> tuple[int, int]:
 
 
 def follow_scheduling() -> None:
-    """Run this thread just above the main thread where that runs in real time; else leave it as it is."""
+    """Give this thread a priority just above the main thread's where that runs in real time; else leave it as it
+    is.
+    """
     process = os.getpid()
-    # The servo process sets this flag beside the policy, and the kernel tells it with it.
+    # The servo process sets this flag beside the policy, and the kernel reports both together.
     if os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return
     above = os.sched_getparam(process).sched_priority + 1

@@ -1,4 +1,5 @@
-"""CiA 402 for the cyclic master: SYNC, process data, heartbeats and emergencies of velocity-controlled drives.
+"""CiA 402 codec for the cyclic master: SYNC, process data, heartbeats and emergencies of velocity-controlled
+drives.
 
 RPDO1: control word (0x6040) and target velocity (0x60FF), type 255, so that a stop needs no SYNC. TPDO1: status word
 (0x6041) and position (0x6064); TPDO2, TPDO3: the further feedback; all with every SYNC. COB-IDs of the predefined
@@ -57,7 +58,7 @@ _PERMILLE = 1e-3
 
 
 def tpdo_feedback(feedback: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-    """What TPDO2, TPDO3, … carry: ``feedback`` in its order, as many as fit into 8 bytes each."""
+    """Content of TPDO2, TPDO3, …: ``feedback`` in its order, as many as fit into 8 bytes each."""
     pdos: list[tuple[str, ...]] = []
     free = 0
     for what in feedback:
@@ -77,9 +78,9 @@ def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
 
 
 class DriveAxis:
-    """What is known of one drive. ``codes``: its emergencies since the last error reset, newest last.
+    """State of one drive. ``codes``: its emergencies since the last error reset, newest last.
 
-    ``enabled``, ``faulty``: what ``state`` says. ``heard_poll``: number of the poll before its last heartbeat.
+    ``enabled``, ``faulty``: by ``state``. ``heard_poll``: number of the poll before its last heartbeat.
     ``limit_side``: 1 or -1 where the drive's internal limit is known to lie on that side of the joint, else 0.
     """
 
@@ -107,7 +108,7 @@ class DriveAxis:
         return bool((self.status_word or 0) & INTERNAL_LIMIT_BIT)
 
     def take_status(self, status_word: int) -> None:
-        """The newest status word."""
+        """Store the newest status word."""
         self.status_word = status_word
         self.state = drive_state(status_word)
         self.enabled = self.state is DriveState.OPERATION_ENABLED
@@ -116,14 +117,14 @@ class DriveAxis:
             self.limit_side = 0
 
     def take_code(self, code: int) -> None:
-        """An emergency's error code; 0 is the drive's error reset."""
+        """Store an emergency's error code; 0 is the drive's error reset."""
         if code == 0:
             self.codes = []
         elif code not in self.codes:
             self.codes = [*self.codes, code][-_CODES_KEPT:]
 
     def words(self) -> str:
-        """For people."""
+        """The state as text."""
         if self.status_word is None:
             return "no status word yet"
         said = self.state.value if self.state is not DriveState.UNKNOWN else self._unknown()
@@ -235,7 +236,7 @@ class Cia402Codec:
         return take
 
     def receive(self, frame: CanFrame) -> int:
-        """Take a frame: a TPDO gives its bit, everything else NOT_CYCLIC."""
+        """Decode a frame: returns a TPDO's bit, NOT_CYCLIC for everything else."""
         take = self._takers.get(frame.id)
         if take is None or frame.remote or frame.extended:
             return NOT_CYCLIC
@@ -303,19 +304,21 @@ class Cia402Codec:
     # -- verdicts -------------------------------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Drives are configured and operational: from now on what they do unasked is a fault."""
+        """Start monitoring: the drives are configured and operational, and unrequested changes are faults."""
         self._events = []
         for axis in self.axes:
             axis.heard_poll = self._polls
         self._watching = True
 
     def ignore(self) -> None:
-        """Bring-up begins, or the drives are released."""
+        """Stop monitoring: bring-up begins, or the drives are released."""
         self._watching = False
         self._commanding = False
 
     def faults(self) -> tuple[AxisFault, ...]:
-        """Events since the last call; drives in fault, off unasked, silent, or commanded against a limit."""
+        """Faults since the last call: drives in fault, switched off unrequested, silent, or commanded against a
+        limit.
+        """
         events, self._events = self._events, []
         for axis in self.axes:
             if (
@@ -351,11 +354,11 @@ class Cia402Codec:
         return found
 
     def enabled(self) -> bool:
-        """Every axis in operation enabled."""
+        """Whether every axis is in operation enabled."""
         return all(axis.enabled for axis in self.axes)
 
     def at_rest_unpowered(self) -> bool:
-        """Every axis in a state without torque."""
+        """Whether every axis is in a state without torque."""
         return all(axis.state in POWER_OFF for axis in self.axes)
 
     def status_words(self) -> tuple[str, ...]:
@@ -365,7 +368,7 @@ class Cia402Codec:
     # -- sending --------------------------------------------------------------------------------------------
 
     def poll(self) -> list[CanFrame]:
-        """SYNC."""
+        """The SYNC frame."""
         self._polls += 1
         return self._sync
 
@@ -379,7 +382,7 @@ class Cia402Codec:
             axis.commanded = 0.0
 
     def idle(self) -> list[CanFrame]:
-        """Disable voltage, target zero.
+        """Frames: disable voltage, target zero.
 
         0x00 and not 0x06 (shutdown): it leads from every state to switch on disabled, from which only the whole
         enable sequence leads to power. No fault is reset by it. A moving axis would coast: stop it first.
@@ -388,7 +391,7 @@ class Cia402Codec:
         return self._idle
 
     def enable(self) -> list[CanFrame]:
-        """For every axis the next step from the state that its newest status word shows."""
+        """Frames: for every axis the next transition towards enabled from its newest status word."""
         self._stand()
         return [
             self._at_rest[ENABLE_STEPS.get(axis.state, ControlWord.DISABLE_VOLTAGE)][axis.index]
@@ -396,7 +399,7 @@ class Cia402Codec:
         ]
 
     def command(self, velocities: FloatArray) -> list[CanFrame]:
-        """Enable operation (halt bit clear) with target velocities (n,) [rad/s or m/s]."""
+        """Frames: enable operation (halt bit clear) with target velocities (n,) [rad/s or m/s]."""
         self._commanding = True
         return [
             self._velocity(axis, velocity)
@@ -410,12 +413,12 @@ class Cia402Codec:
         return CanFrame(axis.command_id, _COMMAND.pack(_ENABLE_OPERATION, units))
 
     def quick_stop(self) -> list[CanFrame]:
-        """Quick stop, target zero: it takes the place of the stored cyclic control word."""
+        """Frames: quick stop, target zero, in place of the stored cyclic control word."""
         self._stand()
         return self._quick_stop
 
     def sendable(self, velocities: FloatArray) -> FloatArray:
-        """Rounded to the drives' velocity units, within 32 bits."""
+        """Velocities rounded to the drives' units, within 32 bits."""
         pairs = zip(self.axes, velocities.tolist(), strict=True)
         return np.array(
             [axis.scale.velocity(axis.scale.velocity_units(velocity)) for axis, velocity in pairs]

@@ -1,4 +1,4 @@
-"""Bring-up of CiA 402 drives: who is there, is it the right drive, its configuration, faults cleared on demand.
+"""Bring-up of CiA 402 drives: presence, identity, configuration, and reset of faults on request.
 
 All of it in NMT state pre-operational, where no process data moves anything and none is awaited. What is written is
 read back. Nothing here enables a drive.
@@ -61,7 +61,7 @@ TAKEN_S = 0.01
 SETTLE_S = 0.03
 """A cause that is still there trips a drive again within this time."""
 STANDS_SHARE = 0.01
-"""Of the largest velocity: slower than this a drive stands."""
+"""Of the largest velocity: slower than this a drive is at rest."""
 
 
 class Cia402Bringup:
@@ -96,7 +96,8 @@ class Cia402Bringup:
                 self._start(link, drives)
 
     def reset(self, link: Link) -> None:
-        """Configure anew and clear the faults of all drives, by NMT reset communication where they were of the bus.
+        """Configure again and clear the faults of all drives, by NMT reset communication where they were bus
+        faults.
 
         Ends in switch on disabled. Raises DriverError: as ``connect``; ``fault_stays`` where one cannot be cleared.
         """
@@ -114,12 +115,12 @@ class Cia402Bringup:
                     self._settle(link, drives)
                 except DriverError as error:
                     stays = error
-                self._start(link, drives)  # with a fault too: the arm's positions are wanted
+                self._start(link, drives)  # with a fault, too: the arm's positions are needed
                 if stays is not None:
                     raise stays
 
     def release(self, link: Link) -> None:
-        """Process data off; the drives no longer wait for this master. Raises one DriverError for all.
+        """Stop process data and the drives' monitoring of this master. Raises one DriverError for all.
 
         A drive that is still enabled is stopped and switched off first; one that cannot be keeps its watch.
         """
@@ -163,7 +164,7 @@ class Cia402Bringup:
             drive.nmt("PRE-OPERATIONAL")
 
     def _prepare(self, link: Link, drives: list[RemoteDrive]) -> None:
-        for drive in drives:  # those first that somebody has left moving
+        for drive in drives:  # those first that were left moving
             status_word = drive.read_if_there(0x6041)
             if status_word is not None and drive_state(status_word) is DriveState.OPERATION_ENABLED:
                 drive.write(0x6040, 0, ControlWord.QUICK_STOP)
@@ -173,7 +174,7 @@ class Cia402Bringup:
             self._configure(link, drive)
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
-        """A drive that was left enabled is brought to rest and switched off. A fault stays as it is."""
+        """Bring a drive that was left enabled to rest and switch it off. A fault stays as it is."""
         state = _state(drive)
         if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
             drive.write(0x6040, 0, ControlWord.QUICK_STOP)
@@ -189,7 +190,7 @@ class Cia402Bringup:
             )
 
     def _configure(self, link: Link, drive: RemoteDrive) -> None:
-        """Write everything, then read everything back. Raises DriverError (``read_back``)."""
+        """Write the whole configuration, then read it back. Raises DriverError (``read_back``)."""
         options, joint = self._options, drive.axis.joint
         parameters = parameter_writes(options, joint, drive.dictionary)
         pdos = pdo_writes(options, drive.node_id)
@@ -205,7 +206,7 @@ class Cia402Bringup:
 
     @staticmethod
     def _differs(drive: RemoteDrive, write: Write) -> bool:
-        """Not where the drive lacks the object: what it would be is then fixed."""
+        """Whether a value read back differs; not where the drive lacks the object, whose value is then fixed."""
         found = drive.read_if_there(write.index, write.subindex)
         return found is not None and not write.agrees(found)
 
@@ -231,23 +232,23 @@ class Cia402Bringup:
             )
 
     def _start(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Arm the watch on this master's heartbeat, go operational, see that all say so."""
+        """Activate the drives' monitoring of this master's heartbeat, go operational, check that all report so."""
         value = self._options.master_id << 16 | self._options.heartbeat_timeout_ms
         for drive in drives:
             drive.write(*HEARTBEAT_CONSUMER, value)
             self._compare(drive, Write(*HEARTBEAT_CONSUMER, value))
-            _look(drive)
-        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+            _read_initial_state(drive)
+        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
             for drive in drives:
                 drive.nmt("OPERATIONAL")
             limit_s = max(STATE_S, 10e-3 * self._options.heartbeat_ms)
             for drive in drives:
-                said = heard[HEARTBEAT_ID + drive.node_id]
-                if not until(link, _says(said, NmtState.OPERATIONAL), limit_s):
+                heartbeats = received[HEARTBEAT_ID + drive.node_id]
+                if not until(link, _reports(heartbeats, NmtState.OPERATIONAL), limit_s):
                     raise DriverError(
                         "not_operational",
                         f"{drive.name}: no heartbeat says operational within {limit_s:g} s after NMT start; "
-                        f"{len(said)} heartbeats came",
+                        f"{len(heartbeats)} heartbeats came",
                         retry=True,
                         node_id=drive.node_id,
                     )
@@ -256,13 +257,13 @@ class Cia402Bringup:
     # -- faults ---------------------------------------------------------------------------------------------
 
     def _reset_communication(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Some drives refuse to forget a lost heartbeat or bus without it (EPOS4)."""
-        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+        """Reset communication by NMT, without which some drives (EPOS4) keep a lost heartbeat or bus as a fault."""
+        with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
             for drive in drives:
                 drive.nmt("RESET COMMUNICATION")
             for drive in drives:
-                said = heard[HEARTBEAT_ID + drive.node_id]
-                if not until(link, _says(said, NmtState.BOOT_UP), BOOT_S):
+                heartbeats = received[HEARTBEAT_ID + drive.node_id]
+                if not until(link, _reports(heartbeats, NmtState.BOOT_UP), BOOT_S):
                     raise DriverError(
                         "no_boot_up",
                         f"{drive.name}: no boot-up within {BOOT_S:g} s after NMT reset communication; switch its "
@@ -272,7 +273,7 @@ class Cia402Bringup:
                     )
 
     def _clear_fault(self, link: Link, drive: RemoteDrive) -> None:
-        """The fault reset's edge, and what came of it. Raises DriverError (``fault_stays``)."""
+        """Send the fault reset's edge and check its effect. Raises DriverError (``fault_stays``)."""
         until(link, lambda: _state(drive) is not DriveState.FAULT_REACTION_ACTIVE, REST_S)
         drive.axis.codes = []
         if _state(drive) in FAULTY:
@@ -284,11 +285,11 @@ class Cia402Bringup:
             raise self._stays(drive)
 
     def _settle(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """A cause that is still there shows itself. Raises DriverError (``fault_stays``)."""
-        with listening(link, [EMCY_ID + drive.node_id for drive in drives]) as heard:
+        """Wait for causes that are still present to appear again. Raises DriverError (``fault_stays``)."""
+        with listening(link, [EMCY_ID + drive.node_id for drive in drives]) as received:
             link.wait(SETTLE_S)
         for drive in drives:
-            codes = [int.from_bytes(frame.data[:2], "little") for frame in heard[EMCY_ID + drive.node_id]]
+            codes = [int.from_bytes(frame.data[:2], "little") for frame in received[EMCY_ID + drive.node_id]]
             tripping = [code for code in codes if code and code not in self._options.emcy_ignore]
             if tripping or _state(drive) is not DriveState.SWITCH_ON_DISABLED:
                 drive.axis.codes = [*drive.axis.codes, *tripping]
@@ -310,7 +311,7 @@ class Cia402Bringup:
 
 
 def _state(drive: RemoteDrive) -> DriveState:
-    """By SDO; the codec takes it as the newest."""
+    """Drive state read by SDO; the codec takes it as the newest."""
     drive.axis.take_status(drive.read(0x6041))
     return drive.axis.state
 
@@ -322,8 +323,8 @@ def _at_rest(drive: RemoteDrive) -> bool:
     return drive.axis.state is DriveState.QUICK_STOP_ACTIVE and abs(drive.read(0x606C)) <= slow
 
 
-def _look(drive: RemoteDrive) -> None:
-    """State, error code and limit switches before the first cycle."""
+def _read_initial_state(drive: RemoteDrive) -> None:
+    """Read state, error code and limit switches before the first cycle."""
     axis = drive.axis
     if _state(drive) in FAULTY:
         axis.take_code(drive.read_if_there(0x603F) or 0)
@@ -338,5 +339,5 @@ def _lost_the_bus(drive: RemoteDrive) -> bool:
     return any(is_communication_error(known) for known in (*axis.codes, code))
 
 
-def _says(said: list[CanFrame], state: NmtState) -> Callable[[], bool]:
-    return lambda: any(len(frame.data) == 1 and frame.data[0] & 0x7F == state for frame in said)
+def _reports(heartbeats: list[CanFrame], state: NmtState) -> Callable[[], bool]:
+    return lambda: any(len(frame.data) == 1 and frame.data[0] & 0x7F == state for frame in heartbeats)

@@ -1,4 +1,4 @@
-"""What is written into a CiA 402 drive, object by object, from the cell file's options."""
+"""Configuration of a CiA 402 drive as a list of object writes, from the cell file's options."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ _OBJECT = re.compile(r"\s*(0[xX][0-9a-fA-F]{1,4})\s*(?::\s*(\d{1,3}|0[xX][0-9a-f
 
 @dataclass(frozen=True)
 class Write:
-    """``value`` to an object; read back, it must agree in the bits of ``mask``. ``option``: where it comes from."""
+    """One write of ``value`` to an object; read back, it must agree in the bits of ``mask``. ``option``: its origin
+    in the cell file.
+    """
 
     index: int
     subindex: int
@@ -51,12 +53,12 @@ class Write:
         return self.index, self.subindex
 
     def agrees(self, read: int) -> bool:
-        """Whether a value read back is the one written."""
+        """Whether a value read back agrees with the one written."""
         return (read ^ self.value) & self.mask == 0
 
 
 def parse_object(name: str, joint: str) -> tuple[int, int]:
-    """``0x60C2:1`` as index and sub-index (0 where left out). Raises DriverError (``option``)."""
+    """Parse ``0x60C2:1`` as index and sub-index (0 where left out). Raises DriverError (``option``)."""
     match = _OBJECT.fullmatch(name)
     if match is None or int(match[2] or "0", 0) > 0xFF:
         raise DriverError(
@@ -69,7 +71,9 @@ def parse_object(name: str, joint: str) -> tuple[int, int]:
 
 
 def identifier_writes(node_id: int) -> list[Write]:
-    """COB-IDs of SYNC (which the drive must not produce: bit 30) and EMCY, for drives that have them otherwise."""
+    """Writes of the COB-IDs of SYNC (which the drive must not produce: bit 30) and EMCY, for drives with other
+    values.
+    """
     return [
         Write(0x1005, 0, SYNC_ID, 0x400007FF),
         Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF),
@@ -79,7 +83,8 @@ def identifier_writes(node_id: int) -> list[Write]:
 def parameter_writes(
     options: CanOptions, joint: CanJoint, dictionary: canopen.ObjectDictionary
 ) -> list[Write]:
-    """Everything but PDOs and the watch on this master's heartbeat (0x1016), which is armed last.
+    """Writes of everything but PDOs and the monitoring of this master's heartbeat (0x1016), which is activated
+    last.
 
     What the joint's ``sdo`` names takes the place of the driver's own value. 0x605E, 0x607F, 0x6080, 0x6083 and 0x6084
     only where the EDS has them.
@@ -114,7 +119,7 @@ def _pdo_writes(
     transmission: int,
     deadline_ms: int,
 ) -> list[Write]:
-    """Off, no mapping, mapping, type, deadline, on: the order that CiA 301 asks for."""
+    """Writes of one PDO in the order of CiA 301: off, no mapping, mapping, type, deadline, on."""
     communication, mapped = base[0] + number, base[1] + number
     writes = [Write(communication, 1, cob_id | PDO_OFF, _COB_ID_MASK), Write(mapped, 0, 0)]
     writes += [Write(mapped, place + 1, entry, option="feedback") for place, entry in enumerate(mapping)]
@@ -126,7 +131,7 @@ def _pdo_writes(
 
 
 def pdo_writes(options: CanOptions, node_id: int) -> list[Write]:
-    """Mapping of RPDO1 and the TPDOs in use, in the order of writing."""
+    """Writes of the mapping of RPDO1 and the TPDOs in use, in order."""
     rpdo = (RPDO_COMMUNICATION, RPDO_MAPPING)
     tpdo = (TPDO_COMMUNICATION, TPDO_MAPPING)
     writes = _pdo_writes(0, rpdo, RPDO_IDS[0] + node_id, COMMAND, AT_ONCE, options.rpdo_deadline_ms)
@@ -136,7 +141,7 @@ def pdo_writes(options: CanOptions, node_id: int) -> list[Write]:
 
 
 def unused_pdos(options: CanOptions, dictionary: canopen.ObjectDictionary) -> list[int]:
-    """Communication parameters of all other PDOs in the EDS: a drive may have them on by default."""
+    """Writes that disable all other PDOs of the EDS: a drive may have them on by default."""
     used = len(tpdo_mappings(options.feedback))
     rpdos = range(RPDO_COMMUNICATION + 1, RPDO_COMMUNICATION + PDO_RANGE)
     tpdos = range(TPDO_COMMUNICATION + used, TPDO_COMMUNICATION + PDO_RANGE)
@@ -144,7 +149,9 @@ def unused_pdos(options: CanOptions, dictionary: canopen.ObjectDictionary) -> li
 
 
 def eds_path(options: CanOptions, cell_dir: Path) -> Path:
-    """The EDS: beside the cell file, or the shipped one (``eds`` empty or its name). Raises DriverError (``eds``)."""
+    """Path of the EDS: beside the cell file, or the shipped one (``eds`` empty or its name). Raises DriverError
+    (``eds``).
+    """
     if not options.eds:
         return SHIPPED_EDS
     path = cell_dir / options.eds
@@ -161,7 +168,7 @@ def eds_path(options: CanOptions, cell_dir: Path) -> Path:
 
 
 def load_eds(path: Path) -> canopen.ObjectDictionary:
-    """Object dictionary of an EDS file. Raises DriverError (``eds``) where it is none."""
+    """Object dictionary of an EDS file. Raises DriverError (``eds``) where it is invalid."""
     from canopen import import_od  # heavy: only who talks to drives pays for it
 
     try:

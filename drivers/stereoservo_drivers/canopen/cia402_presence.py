@@ -1,4 +1,4 @@
-"""Who is on the bus, and is it the right drive: one answer a node id, device type, identity, EDS, mode."""
+"""Presence and identity of drives on the bus: one reply per node id, device type, identity, EDS, mode."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity object 0x1018."""
+    """Identity object 0x1018 of a drive."""
 
     vendor_id: int
     product_code: int
@@ -42,11 +42,13 @@ class Identity:
 
 
 def alone(link: Link, drives: list[RemoteDrive]) -> None:
-    """Listens before anything is sent. Raises DriverError (``second_master``) where somebody commands these drives."""
-    with listening(link, [RPDO_IDS[0] + drive.node_id for drive in drives]) as heard:
+    """Check, before anything is sent, that no other master commands these drives. Raises DriverError
+    (``second_master``).
+    """
+    with listening(link, [RPDO_IDS[0] + drive.node_id for drive in drives]) as received:
         link.wait(ALONE_S)
     for drive in drives:
-        count = len(heard[RPDO_IDS[0] + drive.node_id])
+        count = len(received[RPDO_IDS[0] + drive.node_id])
         if count:
             raise DriverError(
                 "second_master",
@@ -61,21 +63,23 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
 
 @contextmanager
 def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
-    """Raises DriverError (``rebooted``) at its end where a drive has booted meanwhile: its configuration is gone."""
-    with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as heard:
+    """Context manager that raises DriverError (``rebooted``) at its end where a drive has booted meanwhile and lost
+    its configuration.
+    """
+    with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
         try:
             yield
         except DriverError as error:
-            _check_boots(drives, heard, error)
+            _check_boots(drives, received, error)
             raise
-    _check_boots(drives, heard, None)
+    _check_boots(drives, received, None)
 
 
 def _check_boots(
-    drives: list[RemoteDrive], heard: dict[int, list[CanFrame]], consequence: DriverError | None
+    drives: list[RemoteDrive], received: dict[int, list[CanFrame]], consequence: DriverError | None
 ) -> None:
     for drive in drives:
-        if any(frame.data == BOOT_UP for frame in heard[HEARTBEAT_ID + drive.node_id]):
+        if any(frame.data == BOOT_UP for frame in received[HEARTBEAT_ID + drive.node_id]):
             raise DriverError(
                 "rebooted",
                 f"{drive.name}: booted while it was configured and has forgotten what was written; is its supply "
@@ -88,20 +92,20 @@ def _check_boots(
 def ask(
     link: Link, nodes: list[int], index: int, subindex: int, patience_s: float = PROBE_S
 ) -> dict[int, list[CanFrame]]:
-    """All answers of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
+    """All replies of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
     request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
-    with listening(link, [0x580 + node for node in nodes]) as heard:
+    with listening(link, [0x580 + node for node in nodes]) as received:
         for node in nodes:
             link.send([CanFrame(0x600 + node, request)])
         link.wait(PROBE_S)
-        if patience_s > PROBE_S and not all(heard.values()):
-            until(link, lambda: all(heard.values()), patience_s - PROBE_S)
+        if patience_s > PROBE_S and not all(received.values()):
+            until(link, lambda: all(received.values()), patience_s - PROBE_S)
             link.wait(PROBE_S)
-    return {node: heard[0x580 + node] for node in nodes}
+    return {node: received[0x580 + node] for node in nodes}
 
 
 def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
-    """One answer of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
+    """One reply of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
     answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
     missing = [drive for drive in drives if not answers[drive.node_id]]
     if missing:
@@ -146,7 +150,9 @@ def _missing(
 
 
 def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
-    """Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``, ``mode``)."""
+    """Check the drive's type and identity. Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``,
+    ``mode``).
+    """
     device_type = drive.read(0x1000)
     if device_type & 0xFFFF != CIA_402:
         raise DriverError(
@@ -158,16 +164,16 @@ def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
         )
     identity = Identity(*(drive.read(0x1018, subindex) for subindex in (1, 2, 3, 4)))
     for key in IDENTITY:
-        wanted, found = getattr(drive.axis.joint, key), getattr(identity, key)
-        if wanted is not None and wanted != found:
+        expected, found = getattr(drive.axis.joint, key), getattr(identity, key)
+        if expected is not None and expected != found:
             raise DriverError(
                 "identity",
-                f"{drive.name}: {key} is {found} (0x{found:X}), the cell file says {wanted} (0x{wanted:X}); was "
+                f"{drive.name}: {key} is {found} (0x{found:X}), the cell file says {expected} (0x{expected:X}); was "
                 "the drive exchanged, or are node ids swapped?",
                 node_id=drive.node_id,
                 key=key,
                 found=found,
-                wanted=wanted,
+                wanted=expected,
             )
     _check_eds(drive, identity, eds)
     mode = MODES[options.mode]
@@ -185,7 +191,7 @@ def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
 
 
 def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
-    """An EDS of the drive's own maker must be of this drive; the shipped one is of none."""
+    """Check that an EDS of the drive's own maker is of this drive; the shipped one is of no particular drive."""
     if eds == SHIPPED_EDS:
         return
     of = drive.dictionary.device_information

@@ -1,4 +1,4 @@
-"""A drive's object dictionary over the bus: SDO reads and writes with errors in words, and NMT commands.
+"""SDO access to a drive's object dictionary, with errors as text, and NMT commands.
 
 The protocol is the ``canopen`` package's; frames go and come by the ``Link``, so that no thread of its own receives
 and nothing is swallowed in its callbacks.
@@ -40,7 +40,7 @@ ABSENT = (ABORT_NO_OBJECT, ABORT_NO_SUBINDEX)
 
 
 class LinkNetwork(canopen.Network):
-    """The ``canopen`` package's network, sending by a link. It receives nothing."""
+    """The ``canopen`` package's network, which sends by a link. It does not receive."""
 
     def __init__(self, link: Link) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class LinkNetwork(canopen.Network):
 
 
 class _LinkSdoClient(SdoClient):
-    """An SDO client that waits by letting the link go on, and never repeats or logs."""
+    """SDO client that lets the link run while it waits, and neither repeats nor logs."""
 
     def __init__(self, node_id: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
         super().__init__(SDO_REQUEST_ID + node_id, SDO_RESPONSE_ID + node_id, dictionary)
@@ -80,7 +80,7 @@ class _LinkSdoClient(SdoClient):
 
 
 class RemoteDrive:
-    """The drive of ``axis`` over ``link``, its objects as ``dictionary`` (an EDS) has them. Use it as a context."""
+    """The drive of ``axis`` over ``link``, with the objects of ``dictionary`` (an EDS). A context manager."""
 
     def __init__(self, link: Link, axis: DriveAxis, dictionary: canopen.ObjectDictionary) -> None:
         self.axis = axis
@@ -102,15 +102,15 @@ class RemoteDrive:
         self._link.unsubscribe(self._client.tx_cobid, self._client.heard)
 
     def nmt(self, command: str) -> None:
-        """NMT command of CiA 301 by name: ``OPERATIONAL``, ``PRE-OPERATIONAL``, ``RESET COMMUNICATION``."""
+        """Send an NMT command of CiA 301 by name: ``OPERATIONAL``, ``PRE-OPERATIONAL``, ``RESET COMMUNICATION``."""
         self._nmt.send_command(NMT_COMMANDS[command])
 
     def variable(self, index: int, subindex: int = 0) -> ODVariable | None:
-        """The EDS's entry, None where it has none."""
+        """Entry of the EDS, None where there is none."""
         return self.dictionary.get_variable(index, subindex)
 
     def object_name(self, index: int, subindex: int = 0) -> str:
-        """For people: ``0x6085:0 (Quick stop deceleration)``."""
+        """Name of an object as text: ``0x6085:0 (Quick stop deceleration)``."""
         variable = self.variable(index, subindex)
         label = f"0x{index:04X}:{subindex}"
         if variable is None:
@@ -132,7 +132,7 @@ class RemoteDrive:
         return int.from_bytes(data, "little", signed=signed)
 
     def read_if_there(self, index: int, subindex: int = 0) -> int | None:
-        """As ``read``; None where EDS or drive lack the object."""
+        """Value as by ``read``; None where EDS or drive lack the object."""
         if self.variable(index, subindex) is None:
             return None
         try:

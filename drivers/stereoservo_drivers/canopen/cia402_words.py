@@ -1,4 +1,4 @@
-"""CiA 402 and CiA 301 in words: status word, control word, error codes, SDO abort codes, NMT states."""
+"""CiA 402 and CiA 301 codes and their texts: status word, control word, error codes, SDO abort codes, NMT states."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum, StrEnum
 
 
 class DriveState(StrEnum):
-    """State of the drive's finite state automaton, CiA 402-2. UNKNOWN: a status word of no state."""
+    """State of the drive's finite state automaton, CiA 402-2. UNKNOWN: the status word matches no state."""
 
     NOT_READY_TO_SWITCH_ON = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -57,12 +57,12 @@ INTERNAL_LIMIT_BIT = 0x0800
 
 
 def drive_state(status_word: int) -> DriveState:
-    """State that 0x6041 shows."""
+    """State in the status word 0x6041."""
     return _STATES[status_word & 0x7F]
 
 
 class ControlWord(IntEnum):
-    """Values of 0x6040."""
+    """Values of the control word 0x6040."""
 
     DISABLE_VOLTAGE = 0x0000
     QUICK_STOP = 0x0002
@@ -78,11 +78,11 @@ ENABLE_STEPS: dict[DriveState, ControlWord] = {
     DriveState.SWITCHED_ON: ControlWord.ENABLE_OPERATION,
     DriveState.OPERATION_ENABLED: ControlWord.ENABLE_OPERATION,
 }
-"""Next control word on the way to operation enabled; every other state gets DISABLE_VOLTAGE, never a fault reset."""
+"""Next control word towards operation enabled; every other state gets DISABLE_VOLTAGE, never a fault reset."""
 
 
 class NmtState(IntEnum):
-    """State that a heartbeat carries, CiA 301."""
+    """NMT state in a heartbeat, CiA 301."""
 
     BOOT_UP = 0
     STOPPED = 4
@@ -91,7 +91,7 @@ class NmtState(IntEnum):
 
 
 def nmt_words(state: int) -> str:
-    """NMT state in words."""
+    """NMT state as text."""
     try:
         return NmtState(state).name.lower().replace("_", "-")
     except ValueError:
@@ -232,7 +232,7 @@ def error_words(code: int) -> str:
 
 
 def error_hint(code: int) -> str:
-    """What to do about an error code."""
+    """Remedy of an error code, as text."""
     for group in (code, code & 0xFF00, code & 0xF000):
         if group and group in ERROR_CODES:
             return ERROR_CODES[group][1]
@@ -296,5 +296,5 @@ def abort_words(code: int) -> str:
 
 
 def abort_hint(code: int) -> str:
-    """What to do about an SDO abort."""
+    """Remedy of an SDO abort, as text."""
     return ABORT_CODES[code][1] if code in ABORT_CODES else "look the abort code up in the drive's manual"

@@ -1,4 +1,4 @@
-"""What a protocol of drives must offer the cyclic master. Pure: frames in, frames out, no clock, no I/O.
+"""Protocol of a drive codec for the cyclic master: frames in, frames out, without clock or I/O.
 
 Fixed in the master and not in a codec: the rate, freshness of frames, which fault latches, the explicit reset, that a
 stop is repeated every cycle.
@@ -18,7 +18,7 @@ NOT_CYCLIC = -1
 
 
 class AxisFault(msgspec.Struct, frozen=True):
-    """Something an axis said or showed that must end motion.
+    """A fault reported or shown by an axis, which must end motion.
 
     ``axis``: index of the joint, -1 for the bus. ``code``: stable, e.g. ``drive_fault``, ``emergency``, ``rebooted``,
     ``mapping``, ``limit_switch``. ``value``: the number on the wire, where there is one. ``hint``: what to do.
@@ -32,7 +32,7 @@ class AxisFault(msgspec.Struct, frozen=True):
 
 
 class Feedback(msgspec.Struct, eq=False):
-    """Newest of every joint, in joint units, written in place by the codec. NaN before the first frame.
+    """Newest feedback of every joint, in joint units, written in place by the codec. NaN before the first frame.
 
     ``positions`` [rad or m] are unwrapped; ``efforts`` [N m or N where the rated torque is configured, else shares
     of it]; ``following_errors`` [rad or m]; the last two None where the drives do not send them.
@@ -45,7 +45,7 @@ class Feedback(msgspec.Struct, eq=False):
 
 
 class Codec(Protocol):
-    """One bus of drives, one axis a joint, in joint order.
+    """Protocol: codec of one bus of drives, one axis a joint, in joint order.
 
     ``expected``: bit mask of the cyclic frames that every poll must bring; bit ``b`` belongs to axis ``bit_axis[b]``
     and is called ``bit_name[b]`` ("TPDO1 of node 3").
@@ -57,49 +57,49 @@ class Codec(Protocol):
     bit_name: tuple[str, ...]
 
     def poll(self) -> list[CanFrame]:
-        """What asks all drives for their state: SYNC, or remote frames."""
+        """Frames that request the drives' state: SYNC, or remote frames."""
         ...
 
     def heartbeat(self) -> list[CanFrame]:
-        """What tells the drives that the master lives; empty where the protocol has none."""
+        """Heartbeat frame of the master; empty where the protocol has none."""
         ...
 
     def receive(self, frame: CanFrame) -> int:
-        """Take a frame: decoded into ``feedback``; the bit it sets, or NOT_CYCLIC. Faults are kept for ``faults``."""
+        """Decode a frame into ``feedback``; returns the bit it sets, or NOT_CYCLIC. Faults are kept for ``faults``."""
         ...
 
     def faults(self) -> tuple[AxisFault, ...]:
-        """What is wrong by the frames received since the last call (events) and by the newest states (levels)."""
+        """Faults by the frames received since the last call (events) and by the newest states (levels)."""
         ...
 
     def enabled(self) -> bool:
-        """Whether every axis says that it follows velocity commands."""
+        """Whether every axis reports that it follows velocity commands."""
         ...
 
     def at_rest_unpowered(self) -> bool:
-        """Whether every axis says that its power stage is off."""
+        """Whether every axis reports that its power stage is off."""
         ...
 
     def idle(self) -> list[CanFrame]:
-        """What a cycle sends while the arm is off: power off, target zero. Does not clear any fault."""
+        """Frames of a cycle while the arm is off: power off, target zero. Does not clear any fault."""
         ...
 
     def enable(self) -> list[CanFrame]:
-        """One step towards enabled for every axis from the state that it is in, target zero. Never clears a fault."""
+        """Frames: the next transition of every axis towards enabled, target zero. Never clears a fault."""
         ...
 
     def command(self, velocities: FloatArray) -> list[CanFrame]:
-        """Velocities (n,) [rad/s or m/s] to enabled drives."""
+        """Frames: velocities (n,) [rad/s or m/s] to enabled drives."""
         ...
 
     def quick_stop(self) -> list[CanFrame]:
-        """Target zero and quick stop, to every axis."""
+        """Frames: target zero and quick stop, to every axis."""
         ...
 
     def sendable(self, velocities: FloatArray) -> FloatArray:
-        """``velocities`` (n,) as the wire's resolution and range let them arrive."""
+        """``velocities`` (n,) after rounding and clipping by the wire format."""
         ...
 
     def status_words(self) -> tuple[str, ...]:
-        """The state of every axis in words, for people."""
+        """State of every axis as text."""
         ...

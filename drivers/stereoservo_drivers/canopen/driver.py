@@ -44,7 +44,7 @@ CALL_BUDGET_US = 500.0
 FIRST_SAMPLE_S = 1.0
 OFF_MARGIN_S = 1.0
 SWITCH_INTERVAL_S = 0.0005
-"""How long Python lets another thread of the process compute before the bus thread may go on."""
+"""How long Python lets another thread of the process compute before the bus thread may continue."""
 _POLL_S = 0.001
 _LOADS: dict[Literal["efforts", "following_errors"], str] = {
     "efforts": "effort",
@@ -65,7 +65,7 @@ class CanJointDriver:
         self._bringup = make_bringup(self.options, self._codec, context.cell_dir)
         self.master = Master(self._codec, MasterSettings.of(self.options))
         self.bus: BusThread | None = None
-        self._told: MasterFault | None = None
+        self._reported_fault: MasterFault | None = None
         self._write_seq = 0
 
     def describe(self) -> JointDriverDescription:
@@ -107,22 +107,22 @@ class CanJointDriver:
             self._clear()
 
     def _connect(self) -> None:
-        """Open, bring up, begin the cycle, wait for a complete set. Raises DriverError; nothing stays open then."""
+        """Open, bring up, begin the cycle, wait for a complete set. Raises DriverError, with everything closed."""
         self._release()
         self.bus = BusThread(Channel(self.options), self.master)
         try:
             self._bringup.connect(self.bus)
             self._begin_cycle(self.bus)
-        except BaseException as error:  # nobody would stop a pump that goes on with its heartbeats
+        except BaseException as error:  # nothing else would stop a thread that keeps sending heartbeats
             self._release()
             code = error.code if isinstance(error, DriverError) else "internal"
             self.master.latch(MasterFault(code, str(error), hint="reset connects again"))
             raise
 
     def _begin_cycle(self, bus: BusThread) -> None:
-        """Raises DriverError where no complete set comes."""
+        """Begin the cycle and wait for a complete set. Raises DriverError where none comes."""
         self.master.clear()
-        self._told = None
+        self._reported_fault = None
         bus.begin_cycle()
         cycles = self.master.statistics.cycles + 2
 
@@ -139,7 +139,7 @@ class CanJointDriver:
             )
 
     def _clear(self) -> None:
-        """The reset. Raises DriverError where a fault stays; it stays latched then."""
+        """Reset the drives' faults. Raises DriverError where a fault stays; it is latched then."""
         assert self.bus is not None
         if self.master.fault is None:
             return
@@ -155,7 +155,7 @@ class CanJointDriver:
         self._require_no_fault()
 
     def _await_rest(self) -> None:
-        """Let the quick stop end before its cycle does. Raises DriverError where the arm goes on moving."""
+        """Wait for the end of the quick stop before the cycle ends. Raises DriverError where the arm keeps moving."""
         limit_s = self.master.stop_limit_s
         if self._wait(lambda: self.master.stands() is True, limit_s) or self.master.stands() is None:
             return
@@ -188,7 +188,9 @@ class CanJointDriver:
         self._life.state = LifecycleState.ACTIVE
 
     def deactivate(self) -> None:
-        """Bring to rest, then switch off. Idempotent. Raises DriverError where a drive does not say that it is off."""
+        """Bring to rest, then switch off. Idempotent. Raises DriverError where a drive does not report that it is
+        off.
+        """
         if self._life.state is not LifecycleState.ACTIVE:
             return
         self._life.state = LifecycleState.CONFIGURED
@@ -202,16 +204,16 @@ class CanJointDriver:
             )
 
     def _is_off(self) -> bool:
-        """Whether all is off, or a latched fault's quick stop is at work, which nothing here may weaken."""
+        """Whether all axes are off, or a latched fault's quick stop is active, which must not be interrupted."""
         mode = self.master.mode
         return mode is Mode.LATCHED or (mode is Mode.OFF and self._codec.at_rest_unpowered())
 
     def stop(self) -> None:
-        """Velocity zero from the next cycle on; the drives stay enabled. Any state, never raises."""
+        """Command velocity zero from the next cycle on; the drives stay enabled. Any state, never raises."""
         self.master.set_command(np.zeros(len(self.options.joint)), time.monotonic_ns())
 
     def close(self) -> None:
-        """Stop, switch off, leave the drives quiet, release the bus. Idempotent; never raises."""
+        """Stop, switch off, release drives and bus. Idempotent; never raises."""
         try:
             self.deactivate()
         except DriverError as error:
@@ -233,7 +235,7 @@ class CanJointDriver:
             self.bus = None
 
     def examine(self, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
-        """What `stereoservo doctor` wants to know of bus and drives; closes the driver."""
+        """Findings on bus and drives for `stereoservo doctor`; closes the driver."""
         from stereoservo_drivers.canopen.examination import examine  # for this one command
 
         self._life.require("examine()", LifecycleState.CREATED)
@@ -242,10 +244,10 @@ class CanJointDriver:
     # -- the cycle of the caller ----------------------------------------------------------------------------
 
     def read_state(self) -> JointState:
-        """The newest complete set, stamped with its poll. Raises DriverError, a latched fault's once."""
+        """The newest complete set, stamped with its poll. Raises DriverError, for a latched fault once."""
         self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         self.master.port_called(time.monotonic_ns())
-        if self.master.fault is not self._told:
+        if self.master.fault is not self._reported_fault:
             self._require_no_fault()
         sample = self.master.sample()
         if sample is None:
@@ -253,7 +255,7 @@ class CanJointDriver:
         return sample
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
-        """The newest command, (n,). Raises DriverError: not active, a latched fault, wrong shape, not finite."""
+        """Command velocities (n,). Raises DriverError: not active, a latched fault, wrong shape, not finite."""
         self._life.require("write_velocity()", LifecycleState.ACTIVE)
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (len(self.options.joint),):
@@ -275,7 +277,7 @@ class CanJointDriver:
     def _require_no_fault(self) -> None:
         fault = self.master.fault
         if fault is not None:
-            self._told = fault
+            self._reported_fault = fault
             raise DriverError(
                 fault.code,
                 f"{fault.text()} [all axes are stopped until a reset]",
@@ -285,7 +287,7 @@ class CanJointDriver:
             )
 
     def _wait(self, until: Callable[[], bool], limit_s: float) -> bool:
-        """Wait for ``until``, at most ``limit_s``; gives whether it came."""
+        """Wait for ``until``, at most ``limit_s``; returns whether it became true."""
         end = time.monotonic() + limit_s
         while not until():
             if time.monotonic() > end:
@@ -297,21 +299,23 @@ class CanJointDriver:
 
 
 def _effort_unit(joint: CanJoint, protocol: str) -> str:
-    """CiA 402 tells torques in permille of a rated torque (0x6077) that only the cell file may know; ODrive in N m."""
+    """Unit of efforts: CiA 402 reports torque in permille of a rated torque (0x6077) that only the cell file may
+    know; ODrive in N m.
+    """
     if protocol == "cia402" and joint.rated_torque is None:
         return "of rated"
     return "N m" if joint.kind == "revolute" else "N"
 
 
 def make_codec(options: CanOptions) -> Codec:
-    """The cyclic part. Raises DriverError (``option``) where the options do not fit the protocol."""
+    """The cyclic codec. Raises DriverError (``option``) where the options do not fit the protocol."""
     if options.protocol == "odrive":
         return OdriveCodec(options)
     return Cia402Codec(options)
 
 
 def make_bringup(options: CanOptions, codec: Codec, cell_dir: Path) -> Bringup:
-    """What goes before the cycle of ``codec``, which ``make_codec`` gave for the same ``options``."""
+    """The bring-up that belongs to ``codec``, which ``make_codec`` returned for the same ``options``."""
     if isinstance(codec, OdriveCodec):
         return OdriveBringup(options, codec, cell_dir)
     assert isinstance(codec, Cia402Codec)

@@ -1,4 +1,4 @@
-"""What ``stereoservo doctor`` learns from a CAN arm: the bus, the drives, their cycle, their units."""
+"""Examination of a CAN arm for ``stereoservo doctor``: the bus, the drives, their cycle, their units."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MayMove = Callable[[str], bool]
 
 
 def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterator[ExaminationFinding]:
-    """Findings, in the order in which an integrator would ask; ends early where nothing further can be known."""
+    """Findings, in the order in which an integrator would check; ends early where no more can be determined."""
     options = driver.options
     yield load_finding(options)
     try:
@@ -53,7 +53,7 @@ def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterat
             yield ExaminationFinding("bus", False, str(error))
             return
         yield ExaminationFinding("bus", True, f"{channel.name} is open at {options.bitrate} bit/s")
-        yield from _look(driver, channel, cell_dir)
+        yield from _examine_bus(driver, channel, cell_dir)
         yield from _run(driver, may_move)
     except DriverError as error:
         yield ExaminationFinding("drives", False, str(error))
@@ -62,7 +62,7 @@ def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterat
 
 
 def load_finding(options: CanOptions) -> ExaminationFinding:
-    """The bus load of the cell file's cycle, which the driver has found to be allowed."""
+    """Finding on the bus load of the cell file's cycle, which the driver has accepted."""
     load = bus_load(options)
     return ExaminationFinding(
         "bus load",
@@ -72,18 +72,18 @@ def load_finding(options: CanOptions) -> ExaminationFinding:
     )
 
 
-def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[ExaminationFinding]:
-    """Listen, then ask the drives. Ends the channel."""
+def _examine_bus(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[ExaminationFinding]:
+    """Listen, then query the drives. Closes the channel."""
     try:
-        heard = _listen(channel)
+        received = _listen(channel)
         errors = [error.message for _, error in channel.take_errors()]
     except DriverError:
         channel.close()
         raise
-    yield traffic_finding(driver.options, heard)
+    yield traffic_finding(driver.options, received)
     if errors:
-        cure = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
-        yield ExaminationFinding("bus errors", False, "; ".join(dict.fromkeys(errors)), cure)
+        remedy = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
+        yield ExaminationFinding("bus errors", False, "; ".join(dict.fromkeys(errors)), remedy)
     bus = BusThread(channel, driver.master)
     try:
         if isinstance(driver.master.codec, Cia402Codec):
@@ -93,18 +93,18 @@ def _look(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> Iterator[
 
 
 def _listen(channel: Channel) -> list[CanFrame]:
-    heard: list[CanFrame] = []
+    received: list[CanFrame] = []
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end:
-        heard += [frame for _, frame in channel.receive(0.01)]
-    return heard
+        received += [frame for _, frame in channel.receive(0.01)]
+    return received
 
 
-def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> ExaminationFinding:
-    """Whether somebody else commands this bus: frames (heard in ``LISTEN_S``) that only a master sends."""
+def traffic_finding(options: CanOptions, received: list[CanFrame]) -> ExaminationFinding:
+    """Finding on other masters on this bus, by frames (received in ``LISTEN_S``) that only a master sends."""
     commands = {RPDO_IDS[0] + joint.node_id for joint in options.joint}
     of_a_master = {0, SYNC_ID, HEARTBEAT_ID + options.master_id, *commands}
-    found = {frame.id for frame in heard if not frame.extended} & of_a_master
+    found = {frame.id for frame in received if not frame.extended} & of_a_master
     if options.protocol == "cia402" and found:
         foreign = ", ".join(f"0x{can_id:X}" for can_id in sorted(found))
         return ExaminationFinding(
@@ -112,7 +112,7 @@ def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> ExaminationFi
             "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
         )  # fmt: skip
     return ExaminationFinding(
-        "traffic", True, f"{len(heard)} frames in {LISTEN_S:g} s, none of another master"
+        "traffic", True, f"{len(received)} frames in {LISTEN_S:g} s, none of another master"
     )
 
 
@@ -120,7 +120,7 @@ def traffic_finding(options: CanOptions, heard: list[CanFrame]) -> ExaminationFi
 
 
 def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[ExaminationFinding]:
-    """Configure, watch the cycle, jog. Raises DriverError."""
+    """Configure, observe the cycle, jog. Raises DriverError."""
     driver.configure()
     yield ExaminationFinding(
         "configuration", True, "every drive took its settings, and gave them back as written"
@@ -141,7 +141,7 @@ def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[ExaminationFindi
 
 
 def _watch(driver: CanJointDriver) -> Iterator[ExaminationFinding]:
-    """A second of cycles with the arm off; returns positions (k, n)."""
+    """Run a second of cycles with the arm off; returns positions (k, n)."""
     period_s = 1.0 / driver.options.rate_hz
     before, skipped = driver.master.statistics, driver.bus.statistics.skipped if driver.bus else 0
     first = (before.cycles, before.incomplete)
@@ -149,7 +149,7 @@ def _watch(driver: CanJointDriver) -> Iterator[ExaminationFinding]:
     ids = [HEARTBEAT_ID + joint.node_id for joint in driver.options.joint] if cia402 else []
     positions, answered = [], []
     assert driver.bus is not None  # configured
-    with listening(driver.bus, ids) as heard:
+    with listening(driver.bus, ids) as received:
         for _ in range(round(WATCH_S / period_s)):
             positions.append(_sample(driver))
             answered.append(driver.master.statistics.answered_ns)
@@ -160,13 +160,13 @@ def _watch(driver: CanJointDriver) -> Iterator[ExaminationFinding]:
     yield latency_finding(np.array(answered) * 1e-9, period_s)
     if cia402:
         yield from heartbeat_findings(
-            driver.options, [frame for frames in heard.values() for frame in frames]
+            driver.options, [frame for frames in received.values() for frame in frames]
         )
     return np.array(positions)
 
 
 def _sample(driver: CanJointDriver) -> FloatArray:
-    """Positions now; of a latched fault, which is told once, the sample behind it."""
+    """Current positions; with a latched fault, which is raised once, the sample after it."""
     try:
         return driver.read_state().positions
     except DriverError:
@@ -174,7 +174,7 @@ def _sample(driver: CanJointDriver) -> FloatArray:
 
 
 def cycles_finding(cycles: int, missed: int, skipped: int) -> ExaminationFinding:
-    """Cycles that lacked an answer, and slots that this computer missed itself."""
+    """Finding on cycles that lacked a reply, and slots that this computer missed itself."""
     message = f"{cycles} cycles, {missed} without all answers, {skipped} skipped by this computer"
     if missed == 0 and skipped <= MISSED_SHARE * cycles:
         return ExaminationFinding("cycle", True, message)
@@ -185,12 +185,12 @@ def cycles_finding(cycles: int, missed: int, skipped: int) -> ExaminationFinding
             message,
             "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz",
         )
-    cure = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
-    return ExaminationFinding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, cure)
+    remedy = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
+    return ExaminationFinding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, remedy)
 
 
 def latency_finding(answered_s: FloatArray, period_s: float) -> ExaminationFinding:
-    """From a poll to its last answer [s], (k,)."""
+    """Finding on the time from a poll to its last reply [s], (k,)."""
     median, largest = float(np.median(answered_s)), float(np.max(answered_s))
     message = (
         f"SYNC to last answer {median * 1e3:.2f} ms median, {largest * 1e3:.2f} ms largest, of a cycle of "
@@ -203,10 +203,10 @@ def latency_finding(answered_s: FloatArray, period_s: float) -> ExaminationFindi
     )
 
 
-def heartbeat_findings(options: CanOptions, heard: list[CanFrame]) -> Iterator[ExaminationFinding]:
-    """Those heard in ``WATCH_S``, against what was asked of the drives."""
+def heartbeat_findings(options: CanOptions, received: list[CanFrame]) -> Iterator[ExaminationFinding]:
+    """Findings on the heartbeats received in ``WATCH_S``, against the configured ones."""
     expected = WATCH_S * 1e3 / options.heartbeat_ms
-    counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in heard) for joint in options.joint]
+    counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in received) for joint in options.joint]
     rare = [
         (joint, count)
         for joint, count in zip(options.joint, counts, strict=True)
@@ -242,25 +242,25 @@ def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> I
         if error is None:
             yield jog_finding(trace)
             continue
-        cure = jog_finding(trace).remedy if trace.asked else ""
-        yield ExaminationFinding(name, False, str(error), cure)
+        remedy = jog_finding(trace).remedy if trace.asked else ""
+        yield ExaminationFinding(name, False, str(error), remedy)
         return
 
 
 def _question(joint: CanJoint, sign: float) -> str:
-    way = (
+    travel = (
         f"{math.degrees(sign * JOG['revolute']):+.0f}°"
         if joint.kind == "revolute"
         else f"{sign * JOG['prismatic'] * 1e3:+.0f} mm"
     )
     return (
-        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {way}, slowly. Is its "
+        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {travel}, slowly. Is its "
         "surrounding clear and a hand on the emergency stop?"
     )
 
 
 def _jog(driver: CanJointDriver, k: int, sign: float) -> tuple[JogTrace, DriverError | None]:
-    """Enable, move joint ``k``, wait until it stands, switch off; what ended it early, if anything did."""
+    """Enable, move joint ``k``, wait for rest, switch off; returns what ended it early, if anything."""
     joint = driver.options.joint[k]
     trace = JogTrace(joint, float(driver.read_state().positions[k]))
     try:
@@ -293,7 +293,7 @@ def _hold(driver: CanJointDriver, trace: JogTrace, k: int, seconds: float) -> No
 
 
 def _step(driver: CanJointDriver, trace: JogTrace, k: int, velocity: float) -> None:
-    """Command for one period, then look."""
+    """Command for one period, then read."""
     begun = time.monotonic()
     command = np.zeros(len(driver.options.joint))
     command[k] = velocity

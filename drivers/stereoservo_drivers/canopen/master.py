@@ -1,4 +1,4 @@
-"""The cycle of the CAN master, without I/O: time and frames in, frames out.
+"""The cyclic CAN master, without I/O: time and frames in, frames out.
 
 A tick closes the books on the cycle that ends, judges it, and gives the frames of the next: poll, axes, heartbeat.
 The first fault latches; from then on every tick sends target zero and quick stop to all axes, until ``clear``. Nothing
@@ -37,7 +37,7 @@ __all__ = ["ENABLE_LIMIT_S", "Master", "MasterFault", "MasterSettings", "MasterS
 ENABLE_LIMIT_S = 1.5
 STOP_MARGIN_S = 0.1
 REST_SHARE = 0.01
-"""Of the largest velocity: slower than this a joint that is told to stand counts as at rest."""
+"""Of the largest velocity: slower than this a joint that is commanded to zero counts as at rest."""
 REST_CYCLES = 3
 FRESH_CYCLES = 2
 RESOLUTION_SAID = 1e-3
@@ -55,7 +55,7 @@ class _Monitors:
 
 @dataclass
 class _Cycle:
-    """The cycle that is under way."""
+    """The cycle in progress."""
 
     poll_ns: int = 0
     received: int = 0
@@ -64,7 +64,9 @@ class _Cycle:
 
 
 class Master:
-    """The cycle over a ``codec``. ``fault`` is the first one, None while there is none; ``also`` those after it."""
+    """Cyclic master over a ``codec``. ``fault`` is the first one, None while there is none; ``also`` the later
+    ones.
+    """
 
     def __init__(self, codec: Codec, settings: MasterSettings) -> None:
         self.codec = codec
@@ -111,30 +113,30 @@ class Master:
 
     @property
     def mode(self) -> Mode:
-        """LATCHED as long as there is a fault."""
+        """Current mode; LATCHED as long as there is a fault."""
         return self._mode if self.fault is None else Mode.LATCHED
 
     def set_command(self, velocities: FloatArray, now_ns: int) -> None:
-        """The newest command (n,), sent from the next tick on while running. Counts as a call of the port."""
+        """Set the command (n,), sent from the next tick on while running. Counts as a call of the port."""
         self._command = (velocities.copy(), now_ns)
         self._called_ns = now_ns
 
     def port_called(self, now_ns: int) -> None:
-        """Whoever uses the port lives."""
+        """Note that the port's user is alive."""
         self._called_ns = now_ns
 
     def request_enable(self, now_ns: int) -> None:
-        """From the next tick on enable all axes at velocity zero, unless a fault is latched."""
+        """Enable all axes at velocity zero from the next tick on, unless a fault is latched."""
         self._command = (self._zero, 0)
         self._called_ns = now_ns
         self._request = "enable"
 
     def request_disable(self) -> None:
-        """From the next tick on bring to rest, then switch off."""
+        """Bring to rest from the next tick on, then switch off."""
         self._request = "disable"
 
     def latch(self, fault: MasterFault) -> None:
-        """Take ``fault``: the first one latches, later ones are kept in ``also`` (each code and axis once)."""
+        """Latch ``fault``: the first one; later ones are kept in ``also`` (each code and axis once)."""
         if self.fault is None:
             self.fault = fault
             return
@@ -143,11 +145,11 @@ class Master:
             self.also.append(fault)
 
     def clear(self) -> None:
-        """Forget the latched fault and all that was observed. The axes are off, and stay off until enabled.
+        """Clear the latched fault and all observations. The axes are off, and stay off until enabled.
 
-        Call it while nobody ticks. A drive that is still in fault latches again with the next answers.
+        Call it while the cycle is not running. A drive that is still in fault latches again with the next answers.
         """
-        self.codec.faults()  # events of the reset itself: a node that was told to boot has booted
+        self.codec.faults()  # events of the reset itself: a node that was commanded to boot has booted
         self._restart()
         self.also = []
         self.fault = None
@@ -157,14 +159,14 @@ class Master:
         return self._sample
 
     def stands(self) -> bool | None:
-        """Whether all axes stand by the newest complete set; None where that is too old to tell."""
+        """Whether all axes are at rest by the newest complete set; None where that is too old."""
         sample, poll_ns = self._sample, self._cycle.poll_ns
         if sample is None or poll_ns - sample.t_ns > FRESH_CYCLES * self._period_ns:
             return None
         return bool(np.all(np.abs(sample.velocities) <= REST_SHARE * self._max_velocity))
 
     def limited(self, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """What the master would send now of a command (n,), and why it differs. Before the first sample: nothing."""
+        """The velocities that would be sent for a command (n,), and why they differ. Before the first sample: zero."""
         sample = self._sample
         if sample is None:
             return self._zero.copy(), ("no_position",)
@@ -178,11 +180,11 @@ class Master:
 
     @property
     def awaits_answers(self) -> bool:
-        """Whether answers to the newest poll are still missing."""
+        """Whether replies to the newest poll are still missing."""
         return self._cycle.received != self.codec.expected
 
     def receive(self, frame: CanFrame, now_ns: int) -> bool:
-        """Take a frame that arrived at ``now_ns``; gives whether it belongs to the cycle."""
+        """Process a frame that arrived at ``now_ns``; returns whether it belongs to the cycle."""
         bit = self.codec.receive(frame)
         if bit < 0:
             self.statistics.foreign += 1
@@ -226,7 +228,7 @@ class Master:
         self.statistics.answered_max_ns = max(self.statistics.answered_max_ns, now_ns - poll_ns)
 
     def tick(self, now_ns: int) -> list[CanFrame]:
-        """End the cycle under way, begin the next: the frames to send now, in order."""
+        """End the cycle in progress and begin the next; returns the frames to send now, in order."""
         complete = self._cycle.received == self.codec.expected
         if self._cycle.open:
             self._close(now_ns, complete)
@@ -383,7 +385,7 @@ class Master:
 
 
 class Mode(StrEnum):
-    """What the master does with the axes."""
+    """What the master commands the axes to do."""
 
     OFF = "off"
     ENABLING = "enabling"
@@ -393,7 +395,9 @@ class Mode(StrEnum):
 
 
 class MasterFault(msgspec.Struct, frozen=True):
-    """What ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: where there are some."""
+    """The fault that ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: where there
+    are some.
+    """
 
     code: str
     message: str
@@ -404,12 +408,12 @@ class MasterFault(msgspec.Struct, frozen=True):
     t_ns: int = 0
 
     def text(self) -> str:
-        """All of it as one sentence for people."""
+        """The fault as one sentence."""
         return self.message + (f": {self.hint}" if self.hint else "")
 
 
 class MasterSettings(msgspec.Struct, frozen=True):
-    """What the master needs of the cell file's options. ``resolution_counts``: smallest step of a position."""
+    """Settings of the master. ``resolution_counts``: smallest step of a position."""
 
     joints: tuple[CanJoint, ...]
     rate_hz: float
@@ -437,7 +441,8 @@ class MasterSettings(msgspec.Struct, frozen=True):
 
 @dataclass
 class MasterStatistics:
-    """Since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two ticks.
+    """Statistics since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two
+    ticks.
 
     ``answered_ns``: from the newest complete cycle's poll to its last frame; ``answered_max_ns``: the largest.
     """
@@ -461,10 +466,11 @@ def limit_command(
     position_min: FloatArray,
     position_max: FloatArray,
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Velocities (n,) that may be sent, and why they differ (``drive_velocity_limit``, ``position_limit``).
+    """Velocities (n,) within the drives' limits, and why they differ (``drive_velocity_limit``,
+    ``position_limit``).
 
     Beyond a velocity limit all joints are scaled alike, so that the direction of motion is kept. A joint at or
-    beyond a position limit may only move inward; the others go on. Joints whose position is not known
+    beyond a position limit may only move inward; the others continue. Joints whose position is not known
     (NaN) do not move.
     """
     reasons: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""What the master watches on the bus and on the axes: missed, doubled, late and foreign frames; encoders.
+"""Monitors of the CAN master: missed, doubled, late and foreign frames; encoder jumps; motion against the command.
 
 Every monitor takes what a cycle brought and gives a :class:`Trip` or None. No clock, no I/O.
 """
@@ -25,7 +25,7 @@ LATE_EVERY = 5
 """Cycles; divides the window."""
 LATE_SHARE = 0.35
 """Of the period: later than its own baseline by so much, compared with the other drives, a drive is late. A quarter,
-and a tenth because arrivals are only told apart as finely as the bus is read (an eighth of the period)."""
+and a tenth because the resolution of arrival times is that of reading the bus (an eighth of the period)."""
 LATE_SHARE_SINGLE = 0.5
 """The same of an only drive, which nothing can be compared with."""
 FLOOD_WINDOW = 5
@@ -42,7 +42,7 @@ REVERSED_COUNTS = 8.0
 
 
 class Trip(msgspec.Struct, frozen=True):
-    """Why a monitor ends motion. ``bit`` or ``axis`` say whose fault it is, -1: nobody's in particular."""
+    """Reason of a monitor to end motion. ``bit`` or ``axis``: the one at fault, -1: none in particular."""
 
     code: str
     message: str
@@ -54,13 +54,13 @@ class Trip(msgspec.Struct, frozen=True):
 
 
 class FrameCounter:
-    """Frames of every cycle, by bit: consecutive misses, doubles in a row."""
+    """Counts the frames of every cycle, by bit: consecutive misses, consecutive duplicates."""
 
     def __init__(self, names: tuple[str, ...], max_missed: int) -> None:
         self._names = names
         self._max_missed = max_missed
         self.counts = [0] * len(names)
-        """Frames of the cycle under way, by bit, written by who receives."""
+        """Frames of the cycle under way, by bit, written by the receiver."""
         self._once = [1] * len(names)
         self._clean = False
         self._misses = [0] * len(names)
@@ -74,11 +74,11 @@ class FrameCounter:
 
     @property
     def within_allowed_misses(self) -> bool:
-        """Whether no bit misses more than is tolerated."""
+        """Whether no bit exceeds the tolerated number of misses."""
         return max(self._misses) <= self._max_missed
 
     def end_cycle(self) -> None:
-        """Close the books on a poll's cycle."""
+        """Evaluate a poll's cycle."""
         every_one_once = self.counts == self._once
         if every_one_once and self._clean:
             self.counts[:] = [0] * len(self.counts)
@@ -107,7 +107,7 @@ class FrameCounter:
         self.owing = any(self._owed)
 
     def verdict(self, period_s: float) -> Trip | None:
-        """After ``end_cycle``."""
+        """Trip of the last cycle, after ``end_cycle``."""
         if self._clean:
             return None
         return self._missing(period_s) or self._duplicate()
@@ -152,13 +152,13 @@ class FrameCounter:
 
 
 class LatenessMonitor:
-    """When frames come after their poll, against when they used to come.
+    """Monitors the delay of frames after their poll against its baseline.
 
-    A drive that is late by more than a cycle answers as often as one in time: only its phase tells. Of the arrivals in
-    ``LATE_WINDOW`` cycles the one counts that a fifth of them undercut: a drive that is late is so in nearly all
-    cycles, a busy host in some. The baseline is the smallest such value of the first windows in which no frame was
-    owed: after a miss an early frame may be the late one of the cycle before. What all axes have in common is the
-    host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
+    A drive that is late by more than a cycle answers as often as one in time; only its phase shows it. Of the
+    arrivals in ``LATE_WINDOW`` cycles the one counts that a fifth of them undercut: a drive that is late is so in
+    nearly all cycles, a busy host in some. The baseline is the smallest such value of the first windows in which no
+    frame was owed: after a miss an early frame may be the late one of the cycle before. What all axes have in
+    common is the host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
     """
 
     def __init__(self, names: tuple[str, ...], bit_axis: tuple[int, ...], period_ns: int) -> None:
@@ -168,7 +168,7 @@ class LatenessMonitor:
         self._limit_ns = period_ns * (LATE_SHARE if len(set(bit_axis)) > 1 else LATE_SHARE_SINGLE)
         self._arrivals = np.zeros((LATE_WINDOW, len(names)))
         self.arrivals = [0] * len(names)
-        """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one stands."""
+        """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one is kept."""
         self._newest: list[list[int]] = []
         self._cycles = 0
         self._baseline = np.full(len(names), math.inf)
@@ -176,7 +176,7 @@ class LatenessMonitor:
         self._looks = 0
 
     def end_cycle(self, owing: bool) -> Trip | None:
-        """Judges every ``LATE_EVERY`` cycles, once there is a baseline. ``owing``: a frame was missed and may come."""
+        """Evaluate every ``LATE_EVERY`` cycles, once there is a baseline. ``owing``: a missed frame may still come."""
         self._settled = 0 if owing else self._settled + 1
         self._newest.append(self.arrivals.copy())
         self._cycles += 1
@@ -213,7 +213,7 @@ class LatenessMonitor:
 
 
 class FloodMonitor:
-    """Frames that belong to no part of the cycle: one id's share of the bus over the last ``FLOOD_WINDOW`` cycles.
+    """Monitors frames outside of the cycle: one id's share of the bus over the last ``FLOOD_WINDOW`` cycles.
 
     By id, since after a stall of the host or the adapter the heartbeats and emergencies of all nodes come at once.
     """
@@ -227,13 +227,13 @@ class FloodMonitor:
         """Frames of all ids within the window."""
 
     def note(self, can_id: int) -> None:
-        """A frame that is nobody's."""
+        """Count a frame that does not belong to the cycle."""
         if can_id in self._by_id or len(self._by_id) < 256:
             self._by_id[can_id] = self._by_id.get(can_id, 0) + 1
             self._heard += 1
 
     def end_cycle(self, cycle_ns: int) -> Trip | None:
-        """Judges every cycle: a flood that starves the drives' own frames is to be named before they are missed."""
+        """Evaluate every cycle, so that a flood is named before the drives' own frames are missed."""
         forgotten = self._cycles[0][1]
         if forgotten:
             self._heard -= sum(forgotten.values())
@@ -260,7 +260,7 @@ class FloodMonitor:
 
 
 class JumpMonitor:
-    """Positions that change by more than the axis can move."""
+    """Monitors position changes larger than the axis can move."""
 
     def __init__(self, max_velocities: FloatArray, resolutions: FloatArray) -> None:
         fastest = (JUMP_FACTOR * max_velocities).tolist()
@@ -269,7 +269,7 @@ class JumpMonitor:
         self._t_ns = 0
 
     def check(self, t_ns: int, positions: list[float]) -> Trip | None:
-        """A complete set (n,) with its stamp. Of several axes that jump, the first is told."""
+        """Check a complete set (n,) with its stamp. Of several axes that jump, the first is reported."""
         last, elapsed_s = self._positions, (t_ns - self._t_ns) * 1e-9
         self._positions, self._t_ns = positions, t_ns
         if last is None:
@@ -293,7 +293,7 @@ class JumpMonitor:
 
 
 class ReversalMonitor:
-    """Axes that move against their command.
+    """Monitors axes that move against their command.
 
     Compares over ``REVERSED_WINDOW_S`` the travel that the commands ask for, ramped at the joint's acceleration, with
     the measured one. Opposite signs for ``REVERSED_FOR_S`` trip: longer than any drive lags behind its ramp.
@@ -308,7 +308,7 @@ class ReversalMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """At rest."""
+        """Restart, at rest."""
         n = self._accelerations.size
         self._velocities = np.zeros(n)
         self._asked = np.zeros(n)
@@ -318,7 +318,7 @@ class ReversalMonitor:
         self._dt_s = 0.0
 
     def check(self, dt_s: float, command: FloatArray, positions: FloatArray) -> Trip | None:
-        """One cycle of ``dt_s``: what was sent (n,), where the axes are (n,). Judges every ``REVERSED_EVERY_S``."""
+        """Check one cycle of ``dt_s``: sent velocities (n,), positions (n,). Evaluates every ``REVERSED_EVERY_S``."""
         self._cycles += 1
         self._dt_s += dt_s
         if self._cycles % self._every:

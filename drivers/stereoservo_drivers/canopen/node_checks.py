@@ -1,4 +1,4 @@
-"""What ``doctor`` asks of CiA 402 drives before anything is configured: who answers, what they are, how they are."""
+"""Checks of CiA 402 drives for ``doctor``, before anything is configured: presence, identity, state."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def examine_nodes(
 ) -> Iterator[ExaminationFinding]:
     """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
     answers = scan(link)
-    strangers = [node for node in answers if node not in {axis.node_id for axis in codec.axes}]
+    unknown_nodes = [node for node in answers if node not in {axis.node_id for axis in codec.axes}]
     dictionary = load_eds(eds_path(options, cell_dir))
     for axis in codec.axes:
         count = answers.get(axis.node_id, 0)
         if count != 1:
-            yield _not_one(axis, count, strangers)
+            yield _not_one(axis, count, unknown_nodes)
             continue
         with RemoteDrive(link, axis, dictionary) as drive:
             try:
@@ -38,39 +38,41 @@ def examine_nodes(
                 yield _modes(drive, options)
             except DriverError as error:
                 yield ExaminationFinding(axis.name, False, str(error))
-    if strangers:
-        words = ", ".join(str(node) for node in strangers)
+    if unknown_nodes:
+        words = ", ".join(str(node) for node in unknown_nodes)
         yield ExaminationFinding(
             "other nodes", None, f"{words} answer too, and no joint of the cell file has them"
         )
 
 
 def scan(link: Link) -> dict[int, int]:
-    """Ask every node id for its device type; how many answers came from each that answered."""
+    """Query every node id for its device type; returns the number of replies from each that replied."""
     answers = ask(link, list(ALL_NODES), 0x1000, 0)
     return {node: len(frames) for node, frames in answers.items() if frames}
 
 
-def _not_one(axis: DriveAxis, count: int, strangers: list[int]) -> ExaminationFinding:
+def _not_one(axis: DriveAxis, count: int, unknown_nodes: list[int]) -> ExaminationFinding:
     if count > 1:
         return ExaminationFinding(
             axis.name, False, f"{count} drives answer as node {axis.node_id}",
             "give each drive a node id of its own (switches on the drive, or its vendor's tool, one drive at a time)",
         )  # fmt: skip
-    cure = _WIRING
-    if strangers:
-        cure += f" Nodes {', '.join(map(str, strangers))} answer, which no joint has: is it one of them?"
-    return ExaminationFinding(axis.name, False, "no answer", cure)
+    remedy = _WIRING
+    if unknown_nodes:
+        remedy += (
+            f" Nodes {', '.join(map(str, unknown_nodes))} answer, which no joint has: is it one of them?"
+        )
+    return ExaminationFinding(axis.name, False, "no answer", remedy)
 
 
 def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
     name = drive.axis.name
     device = drive.read(0x1000)
     values = {what: drive.read_if_there(0x1018, k + 1) for k, what in enumerate(IDENTITY)}
-    told = ", ".join(
+    reported = ", ".join(
         f"{what} {value:#x}" if value is not None else f"no {what}" for what, value in values.items()
     )
-    message = f"answers once; device type {device:#010x}, {told}"
+    message = f"answers once; device type {device:#010x}, {reported}"
     if device & 0xFFFF != CIA_402:
         return ExaminationFinding(
             name, False, f"{message}: device profile {device & 0xFFFF} is not CiA 402",
@@ -95,32 +97,32 @@ def _state(drive: RemoteDrive) -> ExaminationFinding:
     state = drive_state(drive.read(0x6041))
     register = drive.read(0x1001)
     past = _past_errors(drive)
-    said = [state.value]
+    texts = [state.value]
     volts = drive.read_if_there(0x6079)
     if volts is not None:
-        said.append(f"supply {volts * 1e-3:.1f} V")
+        texts.append(f"supply {volts * 1e-3:.1f} V")
     switches = drive.read_if_there(0x60FD) or 0
-    said += [
+    texts += [
         f"{what} limit switch active"
         for bit, what in enumerate(("negative", "positive"))
         if switches >> bit & 1
     ]
-    said.append(f"error register {register:#04x}" if register else "no error")
+    texts.append(f"error register {register:#04x}" if register else "no error")
     if past:
-        said.append(f"history {', '.join(error_words(code) for code in past)}")
-    message = "; ".join(said)
+        texts.append(f"history {', '.join(error_words(code) for code in past)}")
+    message = "; ".join(texts)
     if state in FAULTY or register:
         code = drive.read_if_there(0x603F) or (past[0] if past else 0)
         words = f" ({error_words(code)})" if code else ""
-        cure = error_hint(code) if code else "look its error up in the drive's manual"
+        remedy = error_hint(code) if code else "look its error up in the drive's manual"
         return ExaminationFinding(
-            name, False, f"{message}{words}", f"{cure}; then `stereoservo reset` clears it"
+            name, False, f"{message}{words}", f"{remedy}; then `stereoservo reset` clears it"
         )
     return ExaminationFinding(name, None if switches & 3 else True, message)
 
 
 def _past_errors(drive: RemoteDrive) -> list[int]:
-    """0x1003, newest first."""
+    """Error history 0x1003, newest first."""
     count = drive.read_if_there(0x1003, 0) or 0
     read = (drive.read_if_there(0x1003, k) for k in range(1, min(count, 4) + 1))
     return [value & 0xFFFF for value in read if value]
@@ -129,17 +131,17 @@ def _past_errors(drive: RemoteDrive) -> list[int]:
 def _modes(drive: RemoteDrive, options: CanOptions) -> ExaminationFinding:
     name = f"{drive.axis.name} modes"
     supported = drive.read_if_there(0x6502)
-    wanted = MODES[options.mode]
+    expected = MODES[options.mode]
     if supported is None:
         return ExaminationFinding(
-            name, None, f"0x6502 is not there: whether it has mode {wanted} shows when it is configured"
+            name, None, f"0x6502 is not there: whether it has mode {expected} shows when it is configured"
         )
     modes = [mode for mode in range(1, 33) if supported >> (mode - 1) & 1]
     message = ", ".join(f"{mode} {MODE_NAMES.get(mode, '')}".strip() for mode in modes)
-    if wanted in modes:
+    if expected in modes:
         return ExaminationFinding(name, True, message)
     other = [mode for mode, number in MODES.items() if number in modes]
-    cure = f'mode = "{other[0]}"' if other else "this drive has no velocity mode that this driver knows"
+    remedy = f'mode = "{other[0]}"' if other else "this drive has no velocity mode that this driver knows"
     return ExaminationFinding(
-        name, False, f"mode {wanted} ({options.mode}) is not among {message or 'none'}", cure
+        name, False, f"mode {expected} ({options.mode}) is not among {message or 'none'}", remedy
     )

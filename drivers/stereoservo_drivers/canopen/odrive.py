@@ -1,4 +1,5 @@
-"""ODrive's CANSimple (firmware 0.6): identifier = node id << 5 | command, little-endian float32 in turns and turns/s.
+"""Codec of ODrive's CANSimple (firmware 0.6): identifier = node id << 5 | command, little-endian float32 in turns
+and turns/s.
 
 Encoder estimates of all axes are asked for by remote frames every cycle; errors and torques in turn, ``SHARE`` axes a
 cycle, since six axes at 250 Hz on 1 Mbit/s leave no room for more. Axis states come with the drives' own heartbeats.
@@ -80,12 +81,12 @@ _ERRORS = {
 
 
 def frame_id(node_id: int, command: int) -> int:
-    """Identifier of a command to, or an answer of, a node."""
+    """CAN identifier of a command to, or a reply of, a node."""
     return node_id << 5 | command
 
 
 def error_words(errors: int) -> str:
-    """``errors`` (ODrive.Error bits) in words."""
+    """Text of ``errors`` (ODrive.Error bits)."""
     names = [name for bit, name in _ERRORS.items() if errors & bit]
     rest = errors & ~sum(_ERRORS)
     return ", ".join([*names, *([f"0x{rest:X}"] if rest else [])]) or "none"
@@ -102,7 +103,7 @@ def _refuse(joint: CanJoint, option: str, value: object, valid: str) -> None:
 
 
 def check_options(options: CanOptions) -> None:
-    """Raises DriverError (``option``) on what CANSimple cannot do."""
+    """Check options that CANSimple does not support. Raises DriverError (``option``)."""
     if "following_error" in options.feedback:
         raise DriverError(
             "option",
@@ -124,7 +125,7 @@ def check_options(options: CanOptions) -> None:
 
 
 class _Axis:
-    """What is known and last said of one axis, in turns."""
+    """Last known state of one axis, in turns."""
 
     def __init__(self, index: int, joint: CanJoint, rate_hz: float) -> None:
         scale = JointScale.of(joint)
@@ -191,11 +192,11 @@ class OdriveCodec:
         return self._estimates + [asked[k] for asked in self._rounds for k in turns]
 
     def heartbeat(self) -> list[CanFrame]:
-        """None: the drives' watchdogs are fed by the velocities of every cycle."""
+        """No frame: the drives' watchdogs are fed by the velocities of every cycle."""
         return []
 
     def receive(self, frame: CanFrame) -> int:
-        """Take a frame; NOT_CYCLIC for all but encoder estimates that are numbers."""
+        """Decode a frame; NOT_CYCLIC for all but finite encoder estimates."""
         if frame.remote or frame.extended or frame.id not in self._takers:
             return NOT_CYCLIC
         take, axis = self._takers[frame.id]
@@ -228,7 +229,9 @@ class OdriveCodec:
         return NOT_CYCLIC
 
     def _take_torques(self, axis: _Axis, data: bytes) -> int:
-        """[N m] at the motor; at the joint [N m], or [N] of a prismatic one, by the gear without its losses."""
+        """Torques [N m] at the motor, converted to the joint [N m], or [N] of a prismatic one, by the gear without
+        losses.
+        """
         _, torque = _F32X2.unpack(data)
         if not math.isfinite(torque):
             self._event(axis, "feedback", f"torque estimate {torque} N m")
@@ -251,20 +254,22 @@ class OdriveCodec:
         )
 
     def enabled(self) -> bool:
-        """By the newest heartbeats since enabling was asked for."""
+        """Whether all axes are in closed loop, by their newest heartbeats since enabling was requested."""
         return all(axis.state == CLOSED_LOOP_CONTROL and not axis.errors for axis in self.axes)
 
     def at_rest_unpowered(self) -> bool:
-        """All idle, by their newest heartbeats."""
+        """Whether all axes are idle, by their newest heartbeats."""
         return all(axis.state == IDLE for axis in self.axes)
 
     def idle(self) -> list[CanFrame]:
-        """Velocity zero; the idle state to whoever is not known to be in it."""
+        """Frames: velocity zero; the idle state for axes not known to be in it."""
         still = [axis.velocity(0.0) for axis in self.axes]
         return still + [axis.request(IDLE) for axis in self.axes if axis.state != IDLE]
 
     def enable(self) -> list[CanFrame]:
-        """Velocity zero; closed loop to those idle without errors, whose state is then unknown until they tell."""
+        """Frames: velocity zero; closed loop for idle axes without errors, whose state is unknown until the next
+        heartbeat.
+        """
         frames = [axis.velocity(0.0) for axis in self.axes]
         for axis in self.axes:
             if axis.state == IDLE and not axis.errors:
@@ -273,7 +278,7 @@ class OdriveCodec:
         return frames
 
     def command(self, velocities: FloatArray) -> list[CanFrame]:
-        """The next step of every axis's ramp towards ``velocities`` (n,)."""
+        """Frames: the next step of every axis's ramp towards ``velocities`` (n,)."""
         turns_s = (
             min(max(float(qd) * axis.turns_per_unit, -axis.velocity_max), axis.velocity_max)
             for axis, qd in zip(self.axes, velocities, strict=True)
@@ -281,11 +286,11 @@ class OdriveCodec:
         return [axis.towards(goal, axis.step) for axis, goal in zip(self.axes, turns_s, strict=True)]
 
     def quick_stop(self) -> list[CanFrame]:
-        """The next step of every axis's ramp to zero; torque stays on."""
+        """Frames: the next step of every axis's ramp to zero; torque stays on."""
         return [axis.towards(0.0, axis.stop_step) for axis in self.axes]
 
     def sendable(self, velocities: FloatArray) -> FloatArray:
-        """Within the joints' limits, as float32 turns/s."""
+        """Velocities within the joints' limits, as float32 turns/s."""
         turns = np.array([axis.turns_per_unit for axis in self.axes])
         limits = np.array([axis.velocity_max for axis in self.axes])
         wire = np.clip(velocities * turns, -limits, limits).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Bring-up of ODrives over CANSimple: who is there, one drive a node id, velocity control, errors cleared on demand.
+"""Bring-up of ODrives over CANSimple: presence, unique node ids, velocity control, and reset of errors on request.
 
 What CANSimple cannot do: the axis watchdog (``axis0.config.enable_watchdog``, ``watchdog_timeout``), which disarms an
 axis when velocities cease, and the rates of cyclic messages are configured over USB. The watchdog is all that stops
@@ -25,7 +25,7 @@ HEARTBEAT_WAIT_S = 0.5
 """Heartbeats come every 100 ms unless configured otherwise."""
 ANSWER_WAIT_S = 0.05
 QUIET_S = 0.05
-"""Time in which no encoder estimates may come unasked, and nobody else may command."""
+"""Time in which no unrequested encoder estimates and no commands of another master may come."""
 PROTOCOL_VERSION = 2
 ALL_NODES = tuple(range(63))
 
@@ -35,8 +35,8 @@ Heard = dict[int, list[CanFrame]]
 
 @contextmanager
 def _listening(link: Link, nodes: tuple[int, ...], command: int) -> Iterator[Heard]:
-    with listening(link, [frame_id(node, command) for node in nodes]) as heard:
-        yield {node: heard[frame_id(node, command)] for node in nodes}
+    with listening(link, [frame_id(node, command) for node in nodes]) as received:
+        yield {node: received[frame_id(node, command)] for node in nodes}
 
 
 class OdriveBringup:
@@ -58,7 +58,7 @@ class OdriveBringup:
         self._check_alone(link)
         # Whom a master that died has left moving: before anything that can fail, and long before the idle state.
         link.send([axis.velocity(0.0) for axis in self.codec.axes])
-        self._hear_all(link)
+        self._await_heartbeats(link)
         self._check_identities(link)
         self._check_versions(link)
         self._check_estimates(link)
@@ -66,11 +66,11 @@ class OdriveBringup:
         self._await_idle(link)
 
     def reset(self, link: Link) -> None:
-        """Set up anew (a drive may have rebooted), clear errors, read them. Enables nothing.
+        """Configure again (a drive may have rebooted), clear errors, read them. Enables nothing.
 
         Raises DriverError (``node_missing``, ``reset_refused``, ``no_answer``, ``not_idle``).
         """
-        self._hear_all(link)
+        self._await_heartbeats(link)
         self._set_up(link)
         link.send([CanFrame(frame_id(node, odrive.CLEAR_ERRORS), bytes(8)) for node in self._nodes])
         link.wait(STEP_S)
@@ -92,16 +92,16 @@ class OdriveBringup:
                 raise DriverError("reset_refused", fault.message, retry=True, errors=fault.value)
 
     def release(self, link: Link) -> None:
-        """Velocity zero, power off."""
+        """Command velocity zero and power off."""
         link.send([axis.velocity(0.0) for axis in self.codec.axes])
         link.send([axis.request(odrive.IDLE) for axis in self.codec.axes])
 
     def _ask(self, link: Link, command: int) -> Heard:
-        """All answers of all nodes to a remote frame within ``ANSWER_WAIT_S``; raises where one has none."""
-        with _listening(link, self._nodes, command) as heard:
+        """All replies of all nodes to a remote frame within ``ANSWER_WAIT_S``; raises where one has none."""
+        with _listening(link, self._nodes, command) as received:
             link.send([axis.remote(command) for axis in self.codec.axes])
             link.wait(ANSWER_WAIT_S)
-        answers = {node: [f for f in frames if not f.remote] for node, frames in heard.items()}
+        answers = {node: [f for f in frames if not f.remote] for node, frames in received.items()}
         for node, frames in answers.items():
             if not frames:
                 raise DriverError(
@@ -113,10 +113,10 @@ class OdriveBringup:
         return answers
 
     def _check_alone(self, link: Link) -> None:
-        """Nobody else sends velocities to these axes."""
-        with _listening(link, self._nodes, odrive.SET_INPUT_VEL) as heard:
+        """Check that no other master sends velocities to these axes."""
+        with _listening(link, self._nodes, odrive.SET_INPUT_VEL) as received:
             link.wait(QUIET_S)
-        for node, frames in heard.items():
+        for node, frames in received.items():
             if frames:
                 raise DriverError(
                     "second_master",
@@ -127,12 +127,12 @@ class OdriveBringup:
                     frames=len(frames),
                 )
 
-    def _hear_all(self, link: Link) -> None:
+    def _await_heartbeats(self, link: Link) -> None:
         """Wait for every node's heartbeat, at most ``HEARTBEAT_WAIT_S``."""
-        with _listening(link, ALL_NODES, odrive.HEARTBEAT) as heard:
-            until(link, lambda: all(heard[node] for node in self._nodes), HEARTBEAT_WAIT_S, STEP_S)
-        present = [node for node, frames in heard.items() if frames]
-        missing = [node for node in self._nodes if not heard[node]]
+        with _listening(link, ALL_NODES, odrive.HEARTBEAT) as received:
+            until(link, lambda: all(received[node] for node in self._nodes), HEARTBEAT_WAIT_S, STEP_S)
+        present = [node for node, frames in received.items() if frames]
+        missing = [node for node in self._nodes if not received[node]]
         if missing:
             raise DriverError(
                 "node_missing",
@@ -173,7 +173,7 @@ class OdriveBringup:
             self.firmware[node] = ".".join(str(number) for number in data[4:7])
 
     def _check_estimates(self, link: Link) -> None:
-        """None comes unasked (in the cycle it would be taken for a second drive's); one when asked for."""
+        """Check that an estimate comes only on request (in the cycle others would look like a second drive's)."""
         with _listening(link, self._nodes, odrive.GET_ENCODER_ESTIMATES) as unasked:
             link.wait(QUIET_S)
         for node, frames in unasked.items():
@@ -205,19 +205,21 @@ class OdriveBringup:
                 link.send([CanFrame(frame_id(node, odrive.SET_LIMITS), limits)])
 
     def _await_idle(self, link: Link) -> None:
-        """A heartbeat of every axis, from now on, says idle."""
+        """Wait for a new heartbeat of every axis that reports idle."""
 
         def all_idle() -> bool:
-            return all(frames and frames[-1].data[4:5] == bytes([odrive.IDLE]) for frames in heard.values())
+            return all(
+                frames and frames[-1].data[4:5] == bytes([odrive.IDLE]) for frames in received.values()
+            )
 
-        with _listening(link, self._nodes, odrive.HEARTBEAT) as heard:
+        with _listening(link, self._nodes, odrive.HEARTBEAT) as received:
             idle = until(link, all_idle, HEARTBEAT_WAIT_S, STEP_S)
-        for frames in heard.values():
+        for frames in received.values():
             for frame in frames[-1:]:
                 self.codec.receive(frame)
         if not idle:
             words = "; ".join(
-                f"{axis.name}: {said if heard[axis.node_id] else 'silent'}"
+                f"{axis.name}: {said if received[axis.node_id] else 'silent'}"
                 for axis, said in zip(self.codec.axes, self.codec.status_words(), strict=True)
             )
             raise DriverError(

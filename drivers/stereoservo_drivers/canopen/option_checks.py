@@ -1,4 +1,4 @@
-"""What the types of the options cannot say: whether they fit each other, the wire and the bus."""
+"""Checks of the CAN options beyond their types: consistency with each other, the wire format and the bus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import INT32_MAX, UINT32_MAX, JointScale
 
 LONGEST_TURN = 2.0 * math.pi
-"""[rad] A joint that goes further from zero turns more than once: ``multi_turn`` has to say so."""
+"""[rad] A joint that goes further from zero turns more than once, which needs ``multi_turn``."""
 FASTEST_TURN = 4.0 * math.pi
 """[rad/s] No joint of an arm is meant to be faster; the number is in degrees."""
 SDO_KEY = re.compile(r"0[xX][0-9A-Fa-f]{1,4}:([0-9]{1,3}|0[xX][0-9A-Fa-f]{1,2})")
@@ -24,7 +24,7 @@ ODRIVE_HEARTBEATS_S = 10.0
 
 
 def parse_sdo_key(key: str) -> tuple[int, int]:
-    """``"0x60C2:1"`` as (index, sub-index). Raises ValueError, which says what is valid."""
+    """Parse ``"0x60C2:1"`` as (index, sub-index). Raises ValueError, which states what is valid."""
     if SDO_KEY.fullmatch(key):
         index, subindex = (int(part, 0) for part in key.split(":"))
         if index and subindex <= 0xFF:
@@ -33,7 +33,7 @@ def parse_sdo_key(key: str) -> tuple[int, int]:
 
 
 def check_options(options: CanOptions) -> None:
-    """Raises DriverError (``option``): names the joint, the value, and what would be valid."""
+    """Check the options. Raises DriverError (``option``): names the joint, the value, and what would be valid."""
     if not options.joint:
         raise _refusal("joint", "[]", "at least one [[joints.options.joint]] with its name and node_id")
     _check_bus(options)
@@ -79,7 +79,7 @@ def _check_bus(options: CanOptions) -> None:
 
 
 def bus_load(options: CanOptions) -> BusLoad:
-    """Worst case of the cycle and of the heartbeats beside it."""
+    """Worst-case load of the cycle and of the heartbeats beside it."""
     n = len(options.joint)
     if options.protocol == "odrive":
         asked_in_turn = (2 if "effort" in options.feedback else 1) * min(SHARE, n)
@@ -115,7 +115,7 @@ def _check_identity(options: CanOptions, joint: CanJoint) -> None:
 
 
 def _largest_identity(options: CanOptions) -> int:
-    """0x1018 has 32 bits (CiA 301, 7.5.2.19); serial numbers of ODrives have 48."""
+    """Largest identity number: 32 bits in 0x1018 (CiA 301, 7.5.2.19), 48 in ODrive's serial numbers."""
     return UINT32_MAX if options.protocol == "cia402" else 2**48 - 1
 
 
@@ -151,10 +151,10 @@ def _in_radians(degrees: float) -> str:
 
 
 def _check_range(joint: CanJoint) -> None:
-    """Whether what goes to the drive fits its objects: 0x60FF is INTEGER32, 0x6083 to 0x6085 are UNSIGNED32."""
+    """Check the range of the drive's objects: 0x60FF is INTEGER32, 0x6083 to 0x6085 are UNSIGNED32."""
     scale = JointScale.of(joint)
     units = abs(scale.velocity_units_per_unit)
-    cure = "check counts_per_rev, gear_ratio and velocity_units_per_rev_s"
+    remedy = "check counts_per_rev, gear_ratio and velocity_units_per_rev_s"
     for option, largest in (
         ("max_velocity", INT32_MAX),
         ("max_acceleration", UINT32_MAX),
@@ -162,13 +162,13 @@ def _check_range(joint: CanJoint) -> None:
     ):
         value = getattr(joint, option)
         if not value * units <= largest:
-            what = f"{value * units:.4g} drive units; valid: up to {largest / units:.4g}, which is {largest}; {cure}"
+            what = f"{value * units:.4g} drive units; valid: up to {largest / units:.4g}, which is {largest}; {remedy}"
             raise _refusal(option, f"{value:g} is {what}", "", joint)
         if value * units < 0.5:
-            what = f"{value * units:.3g} drive units, which is nothing; valid: at least {0.5 / units:.4g}; {cure}"
+            what = f"{value * units:.3g} drive units, which is nothing; valid: at least {0.5 / units:.4g}; {remedy}"
             raise _refusal(option, f"{value:g} is {what}", "", joint)
     if joint.multi_turn:
-        return  # the counter may wrap on its way
+        return  # the counter may wrap within its range
     farthest = max(abs(joint.position_min + joint.offset_rad), abs(joint.position_max + joint.offset_rad))
     if farthest * abs(scale.counts_per_unit) > INT32_MAX:
         valid = (

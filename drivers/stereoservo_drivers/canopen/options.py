@@ -15,7 +15,7 @@ Feedback = Literal["velocity", "effort", "following_error"]
 
 
 class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One ``[[joints.options.joint]]``: a drive and what hangs on it [rad, s; m for prismatic joints].
+    """One ``[[joints.options.joint]]``: a drive and its joint [rad, s; m for prismatic joints].
 
     ``counts_per_rev``, ``velocity_units_per_rev_s``: of the motor (60: the drive speaks rpm; default: counts/s).
     ``gear_ratio``: motor turns per joint turn; of a prismatic joint, motor turns per metre. ``offset_rad``:
@@ -49,7 +49,7 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     sdo: dict[str, int] = {}
 
     def spec(self) -> JointSpec:
-        """The joint as the service knows it."""
+        """The joint in the form of the joint driver port."""
         return JointSpec(
             name=self.name,
             kind=self.kind,

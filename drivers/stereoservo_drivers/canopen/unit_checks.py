@@ -1,4 +1,4 @@
-"""Whether units, limits and signs of a joint in the cell file fit what its drive does. Numbers in, findings out."""
+"""Checks whether a joint's units, limits and signs in the cell file agree with the drive's behaviour."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NAMED_UNITS = {1.0: "rev/s", 60.0: "rpm", 600.0: "rpm/10", 6000.0: "rpm/100", 60
 
 
 def position_finding(joint: CanJoint, position: float) -> ExaminationFinding:
-    """A joint's position [rad or m] against the machine's limits."""
+    """Finding on a joint's position [rad or m] against the machine's limits."""
     name, unit = f"{joint.name} position", _unit(joint)
     limits = f"{joint.position_min:g} to {joint.position_max:g} {unit}"
     if joint.position_min <= position <= joint.position_max:
@@ -43,25 +43,25 @@ def position_finding(joint: CanJoint, position: float) -> ExaminationFinding:
     outside = max(joint.position_min - position, position - joint.position_max)
     message = f"{position:+.4f} {unit} is {outside:.3g} {unit} outside {limits}"
     zero = joint.offset_rad + position
-    cure = f"if the joint stands at its zero now, offset_rad = {zero:.4f}"
+    remedy = f"if the joint stands at its zero now, offset_rad = {zero:.4f}"
     if joint.kind == "revolute" and abs(zero) > math.pi:
-        cure = (
+        remedy = (
             "so far outside, counts_per_rev (of the motor, after quadrature) or gear_ratio is wrong, limits are in "
             "degrees, or the encoder has lost its zero: home the drive"
         )
-    return ExaminationFinding(name, False, message, cure)
+    return ExaminationFinding(name, False, message, remedy)
 
 
 def noise_finding(joint: CanJoint, positions: FloatArray) -> ExaminationFinding:
-    """Positions (k,) of a joint that should stand still."""
+    """Finding on positions (k,) of a joint that should be at rest."""
     name, unit = f"{joint.name} at rest", _unit(joint)
     counts = abs(JointScale.of(joint).counts_per_unit)
-    spread = float(np.ptp(positions))
+    range_seen = float(np.ptp(positions))
     drift = float(positions[-1] - positions[0])
-    message = f"wavers by {spread:.2g} {unit} ({spread * counts:.0f} counts)"
-    if spread <= max(NOISE, NOISE_COUNTS / counts):
+    message = f"wavers by {range_seen:.2g} {unit} ({range_seen * counts:.0f} counts)"
+    if range_seen <= max(NOISE, NOISE_COUNTS / counts):
         return ExaminationFinding(name, True, message)
-    if abs(drift) > 0.8 * spread:
+    if abs(drift) > 0.8 * range_seen:
         return ExaminationFinding(
             name, False, f"moves by {drift:+.2g} {unit} while nobody drives it",
             "it sinks: see to its brake; or it was pushed: leave it alone and repeat",
@@ -72,7 +72,7 @@ def noise_finding(joint: CanJoint, positions: FloatArray) -> ExaminationFinding:
 
 
 def resolution_finding(joint: CanJoint) -> ExaminationFinding:
-    """What one unit of velocity is at the joint."""
+    """Finding on the joint velocity of one velocity unit."""
     unit = _unit(joint)
     step = 1.0 / abs(JointScale.of(joint).velocity_units_per_unit)
     message = (
@@ -89,7 +89,7 @@ def resolution_finding(joint: CanJoint) -> ExaminationFinding:
 
 
 def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
-    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: creeping, doubling, constant; None: it is over."""
+    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: slow, doubling, constant; None: finished."""
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
     slowest = max(SLOWEST_SHARE * fastest, 1.0 / abs(JointScale.of(joint).velocity_units_per_unit))
     slowest = min(slowest, fastest)
@@ -105,7 +105,7 @@ def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
 
 @dataclass
 class JogTrace:
-    """A jog as it went. ``add`` every cycle; ``asked``: travel that the commands sent so far mean [rad or m]."""
+    """Record of a jog. ``add`` every cycle; ``asked``: commanded travel so far [rad or m]."""
 
     joint: CanJoint
     start: float
@@ -116,36 +116,36 @@ class JogTrace:
 
     @property
     def travel(self) -> float:
-        """By the joint's encoder."""
+        """Travel by the joint's encoder."""
         return self.positions[-1] - self.start if self.positions else 0.0
 
     def add(self, asked: float, position: float, velocity: float, dt_s: float) -> None:
-        """One cycle: the travel asked for in it, position and velocity as reported."""
+        """Add one cycle: its commanded travel, position and velocity as reported."""
         self.asked += asked
         self.positions.append(position)
         self.reported += velocity * dt_s
         self.longest_lag = max(self.longest_lag, abs(self.asked - self.travel))
 
     def runs_away(self) -> bool:
-        """Whether the joint moves far more than it was asked to: stop it."""
+        """Whether the joint moves far more than commanded, and must be stopped."""
         margin = max(NOISE, NOISE_COUNTS / abs(JointScale.of(self.joint).counts_per_unit))
         return abs(self.travel) > RUNAWAY * abs(self.asked) + 3.0 * margin
 
 
 def jog_finding(trace: JogTrace) -> ExaminationFinding:
-    """A jog that is over: the way it went, how far, by which factor the units are wrong."""
+    """Finding on a finished jog: direction, travel, and the factor by which the units are wrong."""
     joint = trace.joint
     name = f"{joint.name} jog"
-    asked, travel = _told(joint, trace.asked), _told(joint, trace.travel)
+    asked, travel = _travel_text(joint, trace.asked), _travel_text(joint, trace.travel)
     ratio = trace.travel / trace.asked if trace.asked else math.inf
     if trace.runs_away():
-        cure = _units_cure(joint, ratio, at_least=True)
+        remedy = _units_remedy(joint, ratio, at_least=True)
         return ExaminationFinding(
-            name, False, f"asked for {asked}, moved {travel} before it was stopped", cure
+            name, False, f"asked for {asked}, moved {travel} before it was stopped", remedy
         )
     if ratio > 1.0 + TOLERANCE:
         return ExaminationFinding(
-            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
+            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_remedy(joint, ratio)
         )
     if ratio < -0.05:
         return ExaminationFinding(
@@ -155,19 +155,19 @@ def jog_finding(trace: JogTrace) -> ExaminationFinding:
     if ratio < 0.05:
         return ExaminationFinding(
             name, False, f"asked for {asked}, moved {travel}: it stands",
-            f"brake, safe torque off, the drive's mode; or {_units_cure(joint, ratio)}"
+            f"brake, safe torque off, the drive's mode; or {_units_remedy(joint, ratio)}"
             if ratio > 1e-5 else "brake, safe torque off, the drive's mode, its velocity limit",
         )  # fmt: skip
     if ratio < 1.0 - TOLERANCE:
         return ExaminationFinding(
-            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_cure(joint, ratio)
+            name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_remedy(joint, ratio)
         )
     share = trace.reported / trace.travel
     if not 1.0 - 2 * TOLERANCE < share < 1.0 + 2 * TOLERANCE:
         return ExaminationFinding(
             name, False,
             f"moved {travel}, but the velocity that the drive reports (0x606C) adds up to "
-            f"{_told(joint, trace.reported)}: {share:.3g} times",
+            f"{_travel_text(joint, trace.reported)}: {share:.3g} times",
             "actual and target velocity differ in units: see the drive's manual; or leave velocity out of feedback",
         )  # fmt: skip
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
@@ -183,8 +183,8 @@ def jog_finding(trace: JogTrace) -> ExaminationFinding:
     )  # fmt: skip
 
 
-def _units_cure(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:
-    """``at_least``: the joint was stopped while it was still gaining speed; the true ratio is larger."""
+def _units_remedy(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:
+    """Remedy for wrong units. ``at_least``: the joint was stopped while accelerating; the true ratio is larger."""
     configured = joint.velocity_units_per_rev_s or joint.counts_per_rev
     if not 0.0 < abs(ratio) < math.inf:
         return f"velocity_units_per_rev_s is {configured:g}, counts_per_rev {joint.counts_per_rev:g}: both right?"
@@ -209,5 +209,5 @@ def _unit(joint: CanJoint) -> str:
     return "rad" if joint.kind == "revolute" else "m"
 
 
-def _told(joint: CanJoint, travel: float) -> str:
+def _travel_text(joint: CanJoint, travel: float) -> str:
     return f"{math.degrees(travel):+.3f}°" if joint.kind == "revolute" else f"{travel * 1e3:+.3f} mm"

@@ -1,4 +1,4 @@
-"""Drive units and joint units: counts, velocity units, and counts that wrap at 32 bits."""
+"""Conversion between drive units and joint units: counts, velocity units, and counts that wrap at 32 bits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ def clamp_int32(value: float) -> int:
 
 @dataclass(frozen=True)
 class JointScale:
-    """``counts = counts_per_unit * (q + offset)``; ``velocity units = velocity_units_per_unit * qd``.
+    """Scales of one joint: ``counts = counts_per_unit * (q + offset)``; ``velocity units = velocity_units_per_unit
+    * qd``.
 
     ``counts_per_unit`` [counts per rad or m at the joint] and ``velocity_units_per_unit`` carry the direction's sign;
     ``offset`` [rad or m]. Accelerations are in velocity units per second (CiA 402-2, 0x6083 with the same
@@ -34,7 +35,7 @@ class JointScale:
 
     @classmethod
     def of(cls, joint: CanJoint) -> JointScale:
-        """Of a joint of the cell file."""
+        """Scales of a joint of the cell file."""
         motor_revolutions = joint.direction * joint.gear_ratio
         if joint.kind == "revolute":
             motor_revolutions /= 2.0 * math.pi
@@ -47,7 +48,7 @@ class JointScale:
 
     @property
     def resolution(self) -> float:
-        """One count [rad or m]."""
+        """Joint displacement of one count [rad or m]."""
         return 1.0 / abs(self.counts_per_unit)
 
     def position(self, counts: int) -> float:
@@ -67,7 +68,7 @@ class JointScale:
         return units / self.velocity_units_per_unit
 
     def velocity_units(self, velocity: float) -> int:
-        """Drive's velocity units of a joint velocity, clamped to 32 bits. Raises ValueError on NaN."""
+        """Velocity in the drive's units, clamped to 32 bits. Raises ValueError on NaN."""
         return clamp_int32(velocity * self.velocity_units_per_unit)
 
     def rate_units(self, rate: float) -> int:
@@ -76,7 +77,7 @@ class JointScale:
 
 
 class Unwrapper:
-    """Signed 32-bit counts of an encoder that goes on across the wrap. The first sample fixes the turn."""
+    """Unwraps signed 32-bit counts of an encoder. The first sample defines the turn."""
 
     def __init__(self) -> None:
         self._counts: int | None = None
@@ -90,5 +91,5 @@ class Unwrapper:
         return self._counts
 
     def reset(self) -> None:
-        """Forget the turn: the next sample fixes it."""
+        """Reset: the next sample defines the turn."""
         self._counts = None

@@ -33,7 +33,7 @@ Sights = dict[str, list[ImageArray]]
 
 
 class LearnError(Exception):
-    """The command cannot do what was asked; ``code`` is stable."""
+    """The command cannot be carried out; ``code`` is stable."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -74,7 +74,7 @@ def learn_corners(
     force: Annotated[bool, typer.Option("--force", help="Write over a file that exists.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Learn landmarks from images of one moment, or of a scene at rest; a second set sorts tool from scene."""
+    """Learn landmarks from images of one moment, or of a scene at rest; a second set separates tool from scene."""
     if images is not None and pair is not None:
         raise LearnError("argument", "--images and --pair are two ways to give the images; give one of them")
     if moved is not None and moved_images is not None:
@@ -93,7 +93,7 @@ def learn_corners(
     if picture is not None and picture.suffix.lower() not in SUFFIXES:
         raise LearnError("argument", f"--picture {picture}: one of {', '.join(SUFFIXES)} is valid")
     section = load_cell_file(cell)
-    before, after = _sights(section, cell, images, pair, frames, ask_to_move)
+    before, after = _observations(section, cell, images, pair, frames, ask_to_move)
     if moved is not None:
         after = _pair(section, moved, "--moved")
     elif moved_images is not None:
@@ -139,10 +139,10 @@ def _text(answer: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _sights(
+def _observations(
     cell: CellFile, path: Path, images: Path | None, pair: tuple[Path, Path] | None, frames: int, ask: bool
 ) -> tuple[Sights, Sights | None]:
-    """Images before, and, of live cameras where it was ``ask``ed for, after a motion."""
+    """Images before a motion and, of live cameras where ``ask`` is set, after it."""
     if images is not None:
         return _folder(cell, images, frames), None
     if pair is not None:
@@ -153,13 +153,13 @@ def _sights(
             "running",
             f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images",
         )
-    before = _look(cell, path, frames)
+    before = _take_frames(cell, path, frames)
     if not ask:
         return before, None
     print("Move the last joint alone by 10° or more, keep all else still, then press Enter.", file=sys.stderr)
     if not sys.stdin.readline():
         raise LearnError("input", "nobody pressed Enter: the input is closed")
-    return before, _look(cell, path, frames)
+    return before, _take_frames(cell, path, frames)
 
 
 def _pair(cell: CellFile, files: tuple[Path, Path], option: str) -> Sights:
@@ -171,7 +171,7 @@ def _pair(cell: CellFile, files: tuple[Path, Path], option: str) -> Sights:
 def _folder(cell: CellFile, folder: Path, frames: int) -> Sights:
     if not folder.is_dir():
         raise LearnError("images", f"{folder} is no folder")
-    sights: Sights = {}
+    views: Sights = {}
     for camera in cell.camera:
         stills = sorted(
             file
@@ -181,16 +181,16 @@ def _folder(cell: CellFile, folder: Path, frames: int) -> Sights:
         )
         video = folder / f"{camera.name}.avi"
         if stills:
-            sights[camera.name] = [_read(file) for file in stills[:frames]]
+            views[camera.name] = [_read(file) for file in stills[:frames]]
         elif video.exists():
             with ImageReader(video, camera.name) as reader:
-                sights[camera.name] = [frame.image for frame, _ in zip(reader, range(frames), strict=False)]
+                views[camera.name] = [frame.image for frame, _ in zip(reader, range(frames), strict=False)]
         else:
             raise LearnError(
                 "images",
                 f"{folder}: no {camera.name}.png, {camera.name}_*.png or {camera.name}.avi of camera {camera.name!r}",
             )
-    return sights
+    return views
 
 
 def _read(file: Path) -> ImageArray:
@@ -206,10 +206,10 @@ def _read(file: Path) -> ImageArray:
     return np.asarray(image, dtype=np.uint8)
 
 
-def _look(cell: CellFile, path: Path, frames: int) -> Sights:
+def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
     """Frames of the cell's own cameras, through their drivers. Raises DriverError, PluginError."""
     opened: dict[str, CameraDriver] = {}
-    sights: Sights = {camera.name: [] for camera in cell.camera}
+    views: Sights = {camera.name: [] for camera in cell.camera}
     try:
         for camera in cell.camera:
             context = DriverContext(
@@ -223,19 +223,19 @@ def _look(cell: CellFile, path: Path, frames: int) -> Sights:
             driver.configure()
             driver.activate()
         until = time.monotonic() + PATIENCE_S
-        while short := [name for name, seen in sights.items() if len(seen) < frames]:
+        while short := [name for name, seen in views.items() if len(seen) < frames]:
             if time.monotonic() > until:
                 raise DriverError(
                     "silent",
-                    f"camera {short[0]!r} gave {len(sights[short[0]])} of {frames} frames in {PATIENCE_S:g} s",
+                    f"camera {short[0]!r} gave {len(views[short[0]])} of {frames} frames in {PATIENCE_S:g} s",
                 )
             for name in short:
-                _take(name, opened[name].poll(), sights[name], frames)
+                _take(name, opened[name].poll(), views[name], frames)
             time.sleep(0.005)
     finally:
         for driver in opened.values():
             driver.close()
-    return sights
+    return views
 
 
 def _take(name: str, arrived: Sequence[Any], seen: list[ImageArray], frames: int) -> None:
@@ -256,7 +256,7 @@ def _write_picture(path: Path, drawn: ImageArray) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Whole or not at all. Raises OSError."""
+    """Write a file atomically. Raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         beside.write_bytes(data)

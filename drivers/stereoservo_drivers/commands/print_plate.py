@@ -82,7 +82,7 @@ def print_plate(
 
 
 def _polarity(text: str) -> Polarity:
-    """Raises PlateError ``polarity``."""
+    """Parse the polarity. Raises PlateError ``polarity``."""
     match text:
         case "light" | "dark":
             return text
@@ -90,7 +90,7 @@ def _polarity(text: str) -> Polarity:
 
 
 def _short(lines: list[str]) -> list[str]:
-    """What fits below a plate: long tables are on the screen only."""
+    """Cell file lines short enough to be printed below a plate; long ones are shown on the terminal only."""
     if len(lines) > 4:
         return [lines[0], "detector_options: as `stereoservo print-plate` wrote them"]
     return lines

@@ -1,6 +1,6 @@
-"""Contract suites: what every joint driver, camera driver and detector has to keep, as pytest classes.
+"""Contract tests, as pytest classes: what every joint driver, camera driver and detector must fulfil.
 
-Subclass one in your own tests, say how to make your driver, and run pytest::
+Subclass one in your own tests, override the factory of your driver, and run pytest::
 
     from stereoservo_drivers.contracts import JointDriverContract
 

@@ -1,4 +1,4 @@
-"""The contract of camera drivers."""
+"""Contract tests of camera drivers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_bud
 
 
 class CameraDriverContract(PacedSuite):
-    """Subclass under pytest and override :meth:`make_driver`; the camera is called :attr:`camera_name`."""
+    """Base class of the tests: subclass under pytest and override :meth:`make_driver`; the camera is called
+    :attr:`camera_name`.
+    """
 
     camera_name = "left"
     frames = 5

@@ -1,4 +1,4 @@
-"""The contract of detectors."""
+"""Contract tests of detectors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_bud
 
 
 class DetectorContract(PacedSuite):
-    """Subclass under pytest; override :meth:`make_detector` and :meth:`make_scene`.
+    """Base class of the tests: subclass under pytest; override :meth:`make_detector` and :meth:`make_scene`.
 
     What a detector must keep whatever it is shown: well-formed answers, no exception, no memory of the
     caller's arrays, the same answer to the same question.
@@ -67,7 +67,7 @@ class DetectorContract(PacedSuite):
         )
 
     def check(self, observation: CameraObservation, frame: Frame, detector: Detector) -> None:
-        """Assert that an answer belongs to its frame and is well formed."""
+        """Assert that an observation belongs to its frame and is well formed."""
         assert observation.camera == frame.camera
         assert observation.seq == frame.seq
         assert observation.t_shutter_ns == frame.t_shutter_ns
@@ -76,7 +76,7 @@ class DetectorContract(PacedSuite):
         check_observation(observation, detector.describe().marker_ids, width, height)
 
     def check_accuracy(self, observation: CameraObservation, truth: dict[int, tuple[float, float]]) -> None:
-        """Assert that each reported marker is in the scene and where it is said to be."""
+        """Assert that each reported marker is in the scene, at the reported pixel."""
         for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
             assert marker in truth
             assert np.linalg.norm(pixel - np.array(truth[marker])) <= self.accuracy_px, marker

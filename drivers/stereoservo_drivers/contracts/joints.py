@@ -1,4 +1,4 @@
-"""The contract of joint drivers."""
+"""Contract tests of joint drivers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_bud
 
 
 class JointDriverContract(PacedSuite):
-    """Subclass under pytest and override :meth:`make_driver`.
+    """Base class of the tests: subclass under pytest and override :meth:`make_driver`.
 
     The suite moves the arm: slowly (``speed`` of each joint's largest velocity) and for fractions of a
     second. Clear the machine's surroundings before you run it on hardware.
@@ -26,7 +26,7 @@ class JointDriverContract(PacedSuite):
     brake_s = 1.0
     """Time in which the arm must come to rest from ``speed``."""
     enforces_timeout = True
-    """Whether the device stops by itself when commands cease. Every device should; say False only with a
+    """Whether the device stops by itself when commands cease. Every device should; set False only with a
     reason.
     """
 

@@ -1,6 +1,4 @@
-"""Time in contract suites: virtual where the device simulates, real where it does not; and measured call
-budgets.
-"""
+"""Time in contract tests: virtual where the device simulates, real where it does not; measured call budgets."""
 
 from __future__ import annotations
 
@@ -17,7 +15,9 @@ from stereoservo.ports.devices import DriverContext
 
 
 class PacedSuite:
-    """What the suites share. Override :attr:`real_time` and :meth:`make_context` where a device needs it."""
+    """Common base of the contract tests. Override :attr:`real_time` and :meth:`make_context` where a device needs
+    it.
+    """
 
     real_time = False
     """True: the device lives in real time (hardware, another process). False: it follows the context's
@@ -59,8 +59,8 @@ def measure(
 def report_budget(
     record: Callable[[str, object], None], name: str, budget_us: float, **calls: dict[str, float]
 ) -> None:
-    """Print what calls took beside the declared budget, and put it into the JUnit report. Machines stall:
-    no verdict.
+    """Print call times beside the declared budget, and add them to the JUnit report; without an assertion, since
+    machines stall.
     """
     for call, figures in calls.items():
         text = ", ".join(f"{key[:-3]} {value:.0f}" for key, value in figures.items())

@@ -1,4 +1,4 @@
-"""Acquisition: every dot-like spot of a whole image, before anything is known about it."""
+"""Acquisition: search of a whole image for dot-like spots, and their assignment to faces."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ WORTH = 0.5
 
 @dataclass(frozen=True)
 class Expectation:
-    """Where the dots of a face may be: ``rows`` (k,) of its pattern, ``pixels`` (k, 2), ``covariances`` (k, 2, 2)."""
+    """Expected dots of a face: ``rows`` (k,) of its pattern, ``pixels`` (k, 2), ``covariances`` (k, 2, 2)."""
 
     rows: IntArray
     pixels: FloatArray
@@ -133,7 +133,8 @@ class Expectation:
 
 
 def expectations(prior: Prior, t_ns: int, max_age_s: float, every_id: IntArray) -> list[Expectation | None]:
-    """What a prior of any age says of each face of ``every_id`` (f, 7) at ``t_ns``; None where it says nothing usable.
+    """Expectation of each face of ``every_id`` (f, 7) at ``t_ns`` from a prior of any age; None where it is
+    unusable.
 
     It is moved by its velocities for no longer than ``max_age_s``, and loosened by its whole age.
     """
@@ -151,7 +152,7 @@ def expectations(prior: Prior, t_ns: int, max_age_s: float, every_id: IntArray) 
 
 
 def region_of(expected: Sequence[Expectation | None], shape: tuple[int, ...]) -> Region | None:
-    """The part of a picture (height, width) where all of these must be; None where that is no smaller, or unknown."""
+    """Region of an image (height, width) that must contain all of these; None where that is no smaller, or unknown."""
     known = [one for one in expected if one is not None]
     if len(known) < len(expected) or not known:
         return None
@@ -166,13 +167,13 @@ def region_of(expected: Sequence[Expectation | None], shape: tuple[int, ...]) ->
 
 
 def crop(image: ImageArray, region: Region) -> ImageArray:
-    """The part of an image, C order."""
+    """Region of an image, C order."""
     u0, v0, u1, v1 = region
     return np.ascontiguousarray(image[v0:v1, u0:u1])
 
 
 def copies_of(pattern: Pattern, spots: FloatArray, least: int, tolerance: float) -> list[IntArray]:
-    """Every place of a face among ``spots`` (m, FIELDS): rows of the spots (7,), -1 for missing dots."""
+    """All occurrences of a face among ``spots`` (m, FIELDS): rows of the spots (7,), -1 for missing dots."""
     left = np.arange(len(spots))
     found: list[IntArray] = []
     while len(left) >= least and len(found) < MOST_COPIES:
@@ -194,7 +195,7 @@ def copies_of(pattern: Pattern, spots: FloatArray, least: int, tolerance: float)
 
 
 def choose(copies: Sequence[IntArray], spots: FloatArray, expected: Expectation | None) -> IntArray | None:
-    """Of several copies of a face the one that was expected; None where nothing or nothing clear was.
+    """Of several occurrences of a face the expected one; None where there is none, or it is ambiguous.
 
     A single one is taken wherever it is: a prior does not decide against the picture.
     """
@@ -209,7 +210,7 @@ def choose(copies: Sequence[IntArray], spots: FloatArray, expected: Expectation 
 
 
 def without_conflicts(owners: IntArray) -> IntArray:
-    """Faces (f, 7) that share a spot: the one with more dots stays; of equals, none."""
+    """Faces (f, 7) without those that share a spot: the one with more dots stays; of equals, none."""
     kept = owners.copy()
     for f, owner in enumerate(owners):
         mine = owner[owner >= 0]

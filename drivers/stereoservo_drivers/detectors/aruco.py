@@ -1,4 +1,4 @@
-"""The tag detector: corners of ArUco tags and of AprilTags, identified by their code.
+"""Detector of ArUco tags and AprilTags: their corners, identified by the tag's code.
 
 The marker of corner ``c`` (0 top left as drawn, clockwise) of tag ``t`` has the id ``first_marker + 4 t + c``, unless
 ``markers`` names others.
@@ -60,7 +60,7 @@ Id = Annotated[int, Meta(ge=0, le=1_000_000_000)]
 
 
 class TagMarkers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Marker ids of one's own for the four corners of a tag."""
+    """Explicit marker ids of the four corners of a tag."""
 
     tag: Id
     ids: tuple[Id, Id, Id, Id]
@@ -89,14 +89,14 @@ class TagOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class _Found:
-    """Corners (4, 2) [px] of a tag and their covariances (4, 2, 2) [px²]."""
+    """A detected tag: corners (4, 2) [px] and their covariances (4, 2, 2) [px²]."""
 
     corners: FloatArray
     covariances: FloatArray
 
 
 class TagDetector:
-    """Corners of square tags with ids and covariances. One thread at a time.
+    """Detects corners of square tags with ids and covariances. One thread at a time.
 
     A tag's identity is read from its cells in every image. With a fresh prior a tag is looked for in a window about
     it; tags without one, and all when none is found, in the whole image. Of a tag that is seen twice nothing is
@@ -126,7 +126,9 @@ class TagDetector:
         return DetectorDescription("aruco", tuple(sorted(self._tag_of)), self._floor_px)
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
-        """Tags of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
+        """Corners of the tags in ``frame``. Raises DriverError (``image_format``, ``image_size``); never on
+        content.
+        """
         image = sized_image(frame, self.camera, self._size)
         self._size = (image.shape[1], image.shape[0])
         expected = self._expected(frame, prior)
@@ -141,7 +143,7 @@ class TagDetector:
         return self._observation(frame, found)
 
     def _expected(self, frame: Frame, prior: Prior | None) -> dict[int, tuple[FloatArray, FloatArray]]:
-        """Where a fresh prior puts all four corners of a tag: places (4, 2) and standard deviations (4,) [px]."""
+        """Expected corners of a tag by a fresh prior: pixels (4, 2) and standard deviations (4,) [px]."""
         if prior is None or abs(frame.t_shutter_ns - prior.t_ns) * 1e-9 > self.options.max_prior_age_s:
             return {}
         dt_s = (frame.t_shutter_ns - prior.t_ns) * 1e-9
@@ -166,11 +168,11 @@ class TagDetector:
     ) -> _Found | None:
         corners, sigmas = places
         low, high = corners.min(axis=0), corners.max(axis=0)
-        room = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
+        margin = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
         height, width = image.shape
-        left, top = np.maximum(np.floor(low - room), 0).astype(int).tolist()
-        right = int(min(high[0] + room + 1, width))
-        bottom = int(min(high[1] + room + 1, height))
+        left, top = np.maximum(np.floor(low - margin), 0).astype(int).tolist()
+        right = int(min(high[0] + margin + 1, width))
+        bottom = int(min(high[1] + margin + 1, height))
         if right - left < SMALLEST_IMAGE or bottom - top < SMALLEST_IMAGE:
             return None
         quads = self._quads(image[top:bottom, left:right], {tag}).get(tag, [])
@@ -183,7 +185,7 @@ class TagDetector:
         tags: Iterable[int],
         expected: Mapping[int, tuple[FloatArray, FloatArray]],
     ) -> dict[int, _Found]:
-        """The ``tags`` in the whole image."""
+        """Search for ``tags`` in the whole image."""
         chosen = {
             tag: self._chosen(image, tag, quads, expected.get(tag))
             for tag, quads in self._quads(image, set(tags)).items()
@@ -191,7 +193,7 @@ class TagDetector:
         return {tag: found for tag, found in chosen.items() if found is not None}
 
     def _quads(self, image: ImageArray, tags: set[int]) -> dict[int, list[FloatArray]]:
-        """Corners (4, 2) [px] that OpenCV reads as one of ``tags``."""
+        """Quadrilaterals (4, 2) [px] that OpenCV decodes as one of ``tags``."""
         level = noise_level(image)
         searched = cv2.GaussianBlur(image, (5, 5), 1.0) if level > NOISY else np.ascontiguousarray(image)
         corners, ids, _ = self._detector.detectMarkers(searched)
@@ -208,7 +210,7 @@ class TagDetector:
         quads: Iterable[FloatArray],
         places: tuple[FloatArray, FloatArray] | None,
     ) -> _Found | None:
-        """The one tag that ``quads`` show, or of several the one that the prior's ``places`` tell of; else None."""
+        """The tag among ``quads``: the only one, or the one at the prior's ``places``; else None."""
         finds: list[_Found] = []
         for quad in quads:
             one = self._measured(image, tag, quad)

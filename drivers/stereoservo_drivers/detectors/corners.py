@@ -1,8 +1,8 @@
-"""The detector of natural features: landmarks learnt once, found by keypoints, followed, and anchored in every frame
-to their reference.
+"""Detector of natural features: learnt landmarks, found by keypoints, tracked, and registered to their reference in
+every frame.
 
 Tracks that go from frame to frame only add up their errors (thesis 4.5: 0.3 px between consecutive images, "otherwise
-a noticeable drift"). Here optical flow only says where to look: what is reported is the alignment of the reference
+a noticeable drift"). Here optical flow only gives start values: what is reported is the alignment of the reference
 patch with this frame, whose error does not depend on how many frames there were before.
 """
 
@@ -84,7 +84,7 @@ class CornerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """The frame before: its image, its stamp, and where the landmarks were in it."""
+    """The previous frame: its image, its stamp, and the landmarks' pixels."""
 
     seq: int
     t_ns: int
@@ -93,7 +93,7 @@ class _Track:
 
 
 class CornerDetector:
-    """Landmarks of one camera. One thread at a time.
+    """Detects the landmarks of one camera. One thread at a time.
 
     It remembers the last frame, and forgets it where the sequence goes back or time has passed: the same *series* of
     frames and priors gives the same observations. A landmark is reported where its reference patch is found, looks
@@ -157,7 +157,7 @@ class CornerDetector:
         return self._observation(frame, found)
 
     def _reference_keypoints(self, picture: ImageArray) -> Keypoints:
-        """Keypoints of the reference within reach of a landmark, seen from several sides."""
+        """Keypoints of the reference near landmarks, from several simulated views."""
         keypoints = find_keypoints(picture, KEYPOINTS, REFERENCE_TILTS)
         near = np.zeros(len(keypoints.pixels), np.bool_)
         for pixel in self._patches.pixels:
@@ -184,7 +184,7 @@ class CornerDetector:
         return track if 0.0 <= gap_s <= self.options.max_gap_s and track.found.found.any() else None
 
     def _expected(self, frame: Frame, prior: Prior) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Rows of the landmarks that a fresh prior knows, where it has them in this frame (k, 2) [px], sigmas (k,)."""
+        """Rows of the landmarks in a fresh prior, their expected pixels in this frame (k, 2), sigmas (k,)."""
         dt_s = (frame.t_shutter_ns - prior.t_ns) * 1e-9
         known = np.array([marker in self._place for marker in prior.ids.tolist()], dtype=np.bool_)
         if abs(dt_s) > self.options.max_prior_age_s or not known.any():
@@ -204,7 +204,7 @@ class CornerDetector:
         prior: Prior | None,
         frame: Frame,
     ) -> None:
-        """Tracked landmarks by flow there and back, then their reference patch from where the flow leads."""
+        """Track landmarks by optical flow (checked backwards), then register their reference patches from there."""
         rows = np.flatnonzero(track.found.found)
         before = np.ascontiguousarray(track.found.pixels[rows], np.float32).reshape(-1, 1, 2)
         guess = before.copy()
@@ -237,7 +237,7 @@ class CornerDetector:
     def _anchor(
         self, pyramid: list[ImageArray], track: _Track, rows: IntArray, where: FloatArray, found: Alignment
     ) -> None:
-        """The reference patches of ``rows`` (k,) from where flow has them (k, 2) [px]."""
+        """Register the reference patches of ``rows`` (k,), starting at the flow's pixels (k, 2)."""
         flowed, used = np.zeros((len(self._ids), 2)), np.zeros(len(self._ids), np.bool_)
         flowed[rows], used[rows] = where, True
         around, _, known = self._around.local_maps(flowed, used)
@@ -246,7 +246,7 @@ class CornerDetector:
         take_better(found, rows, *seek(self._patches, pyramid, rows, warps, where, self._least, 0))
 
     def _by_prior(self, pyramid: list[ImageArray], frame: Frame, prior: Prior, found: Alignment) -> None:
-        """Landmarks not found yet that the prior knows, through the warp that it gives their neighbourhood."""
+        """Find missing landmarks by the prior, with the warp that it implies for their neighbourhood."""
         rows, where, sigmas = self._expected(frame, prior)
         pixels, used = np.zeros((len(self._ids), 2)), np.zeros(len(self._ids), np.bool_)
         pixels[rows], used[rows] = where, True
@@ -255,7 +255,7 @@ class CornerDetector:
         self._seek_near(pyramid, rows[lost], warps[rows[lost]], where[lost], sigmas[lost], found)
 
     def _by_neighbours(self, pyramid: list[ImageArray], found: Alignment) -> None:
-        """Landmarks not found yet, where those that are have them: what was hidden comes back so."""
+        """Find missing landmarks at positions predicted from their neighbours, e.g. after an occlusion."""
         warps, where, known = self._around.local_maps(found.pixels, found.found)
         rows = np.flatnonzero(known & ~found.found)
         self._seek_near(pyramid, rows, warps[rows], where[rows], np.zeros(len(rows)), found)
@@ -283,7 +283,7 @@ class CornerDetector:
         found.found[:] = rigid | free
 
     def _search(self, image: ImageArray, pyramid: list[ImageArray], found: Alignment) -> None:
-        """Kinds of which nothing is found: where they were in the reference, then anywhere, by keypoints."""
+        """Search for kinds of which nothing is found: at their reference positions, then anywhere by keypoints."""
         kinds = [kind for kind in np.unique(self._kinds) if not found.found[self._kinds == kind].any()]
         self._since_search += 1
         if not kinds:
@@ -311,7 +311,9 @@ class CornerDetector:
         return result
 
     def _merge(self, found: Alignment, other: Alignment, missing: BoolArray) -> None:
-        """Take from ``other`` what of the ``missing`` hangs together, and what its neighbourhood shows besides."""
+        """Take from ``other`` those ``missing`` landmarks that are mutually consistent, and further ones of their
+        neighbourhood.
+        """
         other.found[:] &= missing
         self._keep_coherent(other)
         if other.found.any():

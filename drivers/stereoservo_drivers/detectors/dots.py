@@ -1,4 +1,4 @@
-"""The dot detector: faces of seven dots, found anywhere, then tracked in windows placed by the core's
+"""Detector of dot faces (seven dots each): acquisition in the whole image, then tracking in windows at the core's
 priors.
 """
 
@@ -41,7 +41,7 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     faces: tuple[FaceOptions, ...] | None = None
     """Default: the two faces of the default marker body."""
     beside: tuple[str | FaceOptions, ...] = ()
-    """Faces that stand beside the body, a workpiece's: names of printed ones or faces of one's own. No prior tells
+    """Faces beside the body, such as a workpiece's: names of printed ones or custom faces. No prior contains
     where they are, so that every image is searched for them.
     """
     image_size: tuple[int, int] | None = None
@@ -76,7 +76,7 @@ _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
 
 
 class DotDetector:
-    """Dots of self-identifying faces with ids, centres and calibrated covariances. One thread at a time.
+    """Detects dots of self-identifying faces: ids, centres and calibrated covariances. One thread at a time.
 
     With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are
     found, the whole image is searched and every face identified on its own. Faces ``beside`` the body, which the prior
@@ -129,7 +129,7 @@ class DotDetector:
         return self._observation(frame, self._search(frame, image, prior))
 
     def _search(self, frame: Frame, image: ImageArray, prior: Prior | None) -> _Found:
-        """All faces: where the prior, of whatever age, expects them; in the whole image if that is not enough."""
+        """Search for all faces: near the prior, of any age; in the whole image if that is not enough."""
         every = range(len(self._patterns))
         if prior is None or not len(prior.ids):
             return self._acquire(image, every, [None] * len(every))
@@ -164,20 +164,20 @@ class DotDetector:
             image, self._dark, windows, predicted, options.min_contrast, least, self._labels, self._stack,
             dots, status
         )  # fmt: skip
-        spread, limit = np.zeros((m, 3)), np.inf
+        covariance, limit = np.zeros((m, 3)), np.inf
         if options.gate_probability:
             limit = -2.0 * np.log1p(-options.gate_probability)
             for k, marker in enumerate(ids.tolist()):
                 if marker in self._place:
-                    spread[self._place[marker]] = uncertain[k].ravel()[[0, 1, 3]]
+                    covariance[self._place[marker]] = uncertain[k].ravel()[[0, 1, 3]]
         judge(
-            self._positions, self._radii, predicted, present, shapes, status, spread, limit, options.lopsided,
+            self._positions, self._radii, predicted, present, shapes, status, covariance, limit, options.lopsided,
             options.consistency_px, dots, used,
         )  # fmt: skip
         return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
 
     def _with_others(self, image: ImageArray, tracked: _Found, prior: Prior) -> _Found:
-        """What was tracked, and the faces beside the body that the prior does not know, wherever they are."""
+        """Tracked dots together with faces outside of the body, which the prior does not contain, found by search."""
         if not self.options.beside:
             return tracked
         unknown = ~np.isin(self._every_id, prior.ids).any(axis=1)
@@ -185,8 +185,8 @@ class DotDetector:
         if not unknown.any():
             return tracked
         dots, used = tracked
-        wanted = np.flatnonzero(unknown).tolist()
-        found, seen = self._acquire(image, wanted, [None] * len(unknown), taken=dots[used, :2])
+        missing_faces = np.flatnonzero(unknown).tolist()
+        found, seen = self._acquire(image, missing_faces, [None] * len(unknown), taken=dots[used, :2])
         return np.where(unknown[:, None, None], found, dots), np.where(unknown[:, None], seen, used)
 
     def _acquire(
@@ -197,9 +197,9 @@ class DotDetector:
         origin: npt.NDArray[np.int64] | None = None,
         taken: FloatArray | None = None,
     ) -> _Found:
-        """The ``faces`` by index, among all spots of an image but those ``taken`` (k, 2) [px].
+        """Find the ``faces`` (indices) among all spots of an image except those ``taken`` (k, 2) [px].
 
-        ``expected`` of all faces chooses among copies. ``origin`` (2,): where the image stands in a larger one.
+        ``expected`` of all faces chooses among copies. ``origin`` (2,): the image's offset in a larger one.
         """
         options = self.options
         least, tolerance = options.acquire_dots, options.consistency_px
@@ -236,8 +236,8 @@ class DotDetector:
         dots, used = found
         rows = self._order[used.ravel()[self._order]]
         ids, chosen = self._every_id.ravel()[rows], dots.reshape(-1, FIELDS)[rows]
-        spread = np.empty((len(ids), 2, 2))
-        levels.covariances(chosen, self.options.floor_px, spread)
+        covariance = np.empty((len(ids), 2, 2))
+        levels.covariances(chosen, self.options.floor_px, covariance)
         return CameraObservation(
             camera=frame.camera,
             seq=frame.seq,
@@ -245,5 +245,5 @@ class DotDetector:
             t_received_ns=frame.t_received_ns,
             ids=ids,
             pixels=np.ascontiguousarray(chosen[:, :2]),
-            covariances=spread,
+            covariances=covariance,
         )

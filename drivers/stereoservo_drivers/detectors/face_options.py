@@ -1,4 +1,4 @@
-"""Faces that the dot detector looks for, as its kernels want them."""
+"""Options of the faces that the dot detector searches, and their patterns for the kernels."""
 
 from __future__ import annotations
 
@@ -21,9 +21,7 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class FaceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A face of one's own: ids and positions of its dots [any unit], four corners clockwise first; radius
-    in that unit.
-    """
+    """A custom face: ids and positions of its dots [any unit], four corners clockwise first; radius in that unit."""
 
     name: str
     ids: tuple[int, ...]
@@ -33,7 +31,7 @@ class FaceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Pattern:
-    """A face as the kernels want it, in units of half the distance of its corners."""
+    """A face in the kernels' form, in units of half the distance of its corners."""
 
     ids: npt.NDArray[np.int64]
     positions: FloatArray
@@ -97,9 +95,7 @@ def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float
 
 
 def _spare_basis(positions: FloatArray, missing: int) -> tuple[int, int, int, int]:
-    """Four dots without ``missing``, convex and clockwise where possible, whose smallest triangle is
-    largest.
-    """
+    """Four dots without ``missing``, convex and clockwise where possible, with the largest smallest triangle."""
     points = [complex(x, y) for x, y in positions]
 
     def quality(rows: tuple[int, ...]) -> float:

@@ -1,4 +1,4 @@
-"""Tracking: faces of dots in windows placed by a prior. Numba kernels; no state.
+"""Tracking of dot faces in windows placed by a prior. Numba kernels; no state.
 
 Three steps: :func:`expect` turns a prior into windows and expected shapes, :func:`measure_windows`
 measures, :func:`judge` accepts. Arrays of dots are flat over the faces: dot ``i`` of face ``f`` is row ``f
@@ -56,7 +56,7 @@ them.
 
 @kernel
 def whole(dot, lopsided):
-    """Whether a measurement (FIELDS,) is of a whole dot: not cut, not merged with something else."""
+    """Whether a measurement (FIELDS,) is of a complete dot: not cut off, not merged with something else."""
     thin = smaller_half_axis(dot[QXX], dot[QXY], dot[QYY])
     # thin dots suffer from sampling: measured 0.04 at 2 px, 0.13 at 1.4 px
     limit = lopsided + np.exp(-1.4 * thin) + 2.5 * dot[LOPSIDED_NOISE] * np.sqrt(max(dot[NOISE], 0.08))
@@ -140,7 +140,7 @@ def expect(
 
 @kernel
 def _gates(predicted, present, shapes, status, spread, limit, lopsided, dots, used):
-    """What each dot of a face must keep by itself and beside its neighbours, into ``used`` (n,)."""
+    """Gates of each dot of a face, by itself and relative to its neighbours, into ``used`` (n,)."""
     n = used.size
     contrasts = np.zeros(n)
     scales = np.zeros(n)
@@ -172,8 +172,8 @@ def _gates(predicted, present, shapes, status, spread, limit, lopsided, dots, us
 def judge(
     patterns, radii, predicted, present, shapes, status, spread, limit, lopsided, tolerance, dots, used
 ):
-    """Accept what was measured: whole, of the expected size, alike, nearest to its own prediction, fitting
-    its face.
+    """Accept measured dots: complete, of the expected size, similar, nearest to their own prediction, consistent
+    with the face.
 
     ``spread`` (m, 3): covariances (xx, xy, yy) of the prior [px²], and ``limit`` the largest squared distance from it
     with the measurement's covariance added, infinite for none;
@@ -255,7 +255,7 @@ def agree_with_prior(predicted, dots, used, tolerance):
 
 @kernel
 def _remove_shift(pattern, radius, raw, used, H, dots):
-    """``dots`` = ``raw`` minus the way from a dot's image to the centre of its ellipse."""
+    """``dots`` = ``raw`` minus the offset of the ellipse's centre from the image of the dot's centre."""
     circle = np.zeros(7)
     for i in range(used.size):
         if used[i]:
@@ -296,9 +296,9 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
                 return 0
             areas[i] = circle[4]
     dark = max(_median(dots[:, NOISE], used), 0.08)
-    misfit = UNEVEN_INSIDE * _median(dots[:, CONTRAST], used)
+    tolerance_inside = UNEVEN_INSIDE * _median(dots[:, CONTRAST], used)
     inside = max(_median(dots[:, BRIGHT], used), dark)
-    bright = max(inside - misfit * misfit, dark)
+    bright = max(inside - tolerance_inside * tolerance_inside, dark)
     # slopes inside have that misfit, too
     flat_field(areas, used, dark, inside, dots, raw)
     variance = 0.0

@@ -1,4 +1,4 @@
-"""What a detector asks of a frame before it looks into it."""
+"""Validation of a frame's image before detection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planar dot patterns under homographies: fit, picture of a dot, check. Numba kernels; no state.
+"""Homographies of planar dot patterns: fit, image of a circle, outlier test. Numba kernels; no state.
 
 Pattern coordinates are those of :class:`~stereoservo.ports.dot_plates.DotFace` in units of half its
 corner distance. A face seen from in front has a homography of positive determinant and positive depths; a
@@ -62,8 +62,8 @@ def _lower_root(A):
 
 @kernel
 def _normal_matrix(pattern, pixels, used, frame, h, A, b):
-    """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = middle and scale
-    of the pixels.
+    """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = centroid and scale of the
+    pixels.
     """
     A[:] = 0.0
     b[:] = 0.0
@@ -161,9 +161,8 @@ def fit_homography(pattern, pixels, used, H):
 
 @kernel
 def image_of_circle(H, x, y, radius, out):
-    """The picture of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's
-    centre, ellipse area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen
-    from in front.
+    """Image of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's centre,
+    ellipse area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen from the front.
     """
     w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
     if w <= 0.0:
@@ -213,9 +212,9 @@ def misfits(pattern, pixels, used, H, out):
 
 
 @kernel
-def _left_out(pattern, pixels, used, frame, h, A, b, out):
-    """Each dot against the homography of the others: ``out`` (n, 3) = its distance from it [px], the smallest root of
-    I - L, its squared studentised residual [px²].
+def _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
+    """Leave-one-out residual of each dot: ``out`` (n, 3) = its distance from the homography of the others [px], the
+    smallest root of I - L, its squared studentised residual [px²].
 
     A dot's distance, to first order, is |(I - L)⁻¹ e|, e its residual and L (2, 2) its leverage; a homography bends to
     a single bad dot, so that e alone may hide most of its error. Rows of 0 where the others say nothing of a dot (five
@@ -262,7 +261,7 @@ def _left_out(pattern, pixels, used, frame, h, A, b, out):
 
 @kernel
 def outlier_dot(pattern, pixels, used, sigma, out):
-    """The dot that fits its face worse than noise and the others' misfit allow, -1 if none does; of six or more.
+    """The dot whose residual exceeds noise and the others' misfit, -1 if there is none; of six or more.
 
     ``sigma`` [px] of a dot; ``out`` (n, 3) as :func:`_left_out` writes it. Beyond ODD_NOISE variances of noise and
     ODD_REST of what the others misfit beyond noise (F of 2 and 4 degrees of freedom, 0.9998).
@@ -276,7 +275,7 @@ def outlier_dot(pattern, pixels, used, sigma, out):
         n += 1 if used[i] else 0
     if n < 6 or not _fit(pattern, pixels, used, frame, h, A, b):
         return -1
-    if not _left_out(pattern, pixels, used, frame, h, A, b, out):
+    if not _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
         return -1
     total = 0.0
     for i in range(used.size):
@@ -297,14 +296,14 @@ def outlier_dot(pattern, pixels, used, sigma, out):
 
 
 @kernel
-def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
-    """The dot that fits the others least, -1 where each lies where the others put it.
+def _worst_outlier(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
+    """The dot with the largest leave-one-out residual, -1 where all are within tolerance.
 
     It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root of
     (I - L)⁻¹. Of the dots beyond, the one with the largest studentised residual goes. -2 where the fit is degenerate.
     """
     out = np.zeros((used.size, 3))
-    if not _left_out(pattern, pixels, used, frame, h, A, b, out):
+    if not _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
         return -2
     worst = -1
     largest = 0.0
@@ -318,8 +317,8 @@ def _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
 
 @kernel
 def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
-    """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of where the others
-    put it.
+    """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of its prediction by the
+    others.
 
     ``sigma`` [px]: standard deviation of a dot, allowed for on top. False where fewer than ``least`` dots
     would remain; with five dots left nothing tells which one is wrong, so that ``least`` must be at least
@@ -335,7 +334,7 @@ def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
     while count >= least:
         if not _fit(pattern, pixels, used, frame, h, A, b):
             return False
-        worst = _worst_stranger(pattern, pixels, used, frame, h, A, b, tolerance, sigma)
+        worst = _worst_outlier(pattern, pixels, used, frame, h, A, b, tolerance, sigma)
         if worst == -1:
             _in_pixels(frame, h, H)
             return True

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from numba import types
 
-# Read-only arrays: a kernel compiled for them takes writable ones too. Anything else would be compiled anew
+# Read-only arrays: a kernel compiled for them takes writable ones too. Anything else would be compiled again
 # in the middle of the work.
 IMAGE = types.Array(types.uint8, 2, "C", readonly=True)
 BOOL = types.boolean

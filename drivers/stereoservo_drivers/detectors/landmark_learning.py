@@ -1,4 +1,5 @@
-"""Landmarks learnt from simultaneous images of several cameras, and sorted by images after a motion of the arm.
+"""Learning of landmarks from simultaneous images of several cameras; their separation into tool and scene by a
+motion.
 
 Corners (Shi and Tomasi 1994) of the first camera are found in the others: keypoints say roughly where, patches are
 aligned there to a hundredth of a pixel, and back again; the epipolar constraint, with what the alignments say of their
@@ -54,10 +55,10 @@ BAND_PX = 3.0
 
 
 class LearningSettings(msgspec.Struct, frozen=True):
-    """``half``: of the patches' side [px]; ``most`` landmarks; ``spacing_px`` of corners; ``tilts``: simulated views
-    from aside, for cameras far apart; ``epipolar_px``: what lenses do to the epipolar constraint, beside the noise
-    [px]; ``least_correlation`` of patches of two cameras; ``margin``: by which a second place must be less alike;
-    ``first_id``.
+    """Settings. ``half``: of the patches' side [px]; ``most`` landmarks; ``spacing_px`` of corners; ``tilts``:
+    simulated oblique views, for cameras far apart; ``epipolar_px``: error of the epipolar constraint by lenses,
+    beside the noise [px]; ``least_correlation`` of patches of two cameras; ``margin``: by which a second match
+    must correlate less; ``first_id``.
     """
 
     half: int = 10
@@ -74,8 +75,8 @@ class LearningSettings(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class PairReport:
-    """What became of the corners of a pair of cameras. ``epipolar_rms_px`` of those that were kept (of their common
-    plane, where ``planar``: one plane leaves the epipolar geometry open).
+    """Counts of a pair of cameras' corners by the result of each test. ``epipolar_rms_px`` of the accepted ones (of
+    their common plane, where ``planar``: one plane leaves the epipolar geometry undetermined).
     """
 
     first: str
@@ -91,25 +92,25 @@ class PairReport:
 
 @dataclass(frozen=True)
 class LearningReport:
-    """``pairs`` of the first camera with each other; ``left_out``: matched, but their kind is in doubt."""
+    """Report on ``pairs`` of the first camera with each other; ``left_out``: matched, but of uncertain kind."""
 
     pairs: tuple[PairReport, ...]
     left_out: int
 
 
 def learn_landmarks(
-    sights: Mapping[str, Sequence[ImageArray]],
+    views: Mapping[str, Sequence[ImageArray]],
     moved: Mapping[str, Sequence[ImageArray]] | None = None,
     settings: LearningSettings | None = None,
 ) -> tuple[Landmarks, LearningReport]:
-    """Landmarks from ``sights``: by name of camera, one or more images (h, w), of one moment or of a scene at rest.
+    """Landmarks from ``sights``: camera name to one or more images (h, w), of one moment or of a scene at rest.
 
     ``moved``: the same after the arm alone has moved; without it every landmark is unsorted.
 
     Raises DriverError: ``images`` (cameras or sizes do not fit, no texture), ``too_few_matches``, ``no_landmarks``.
     """
     options = settings or LearningSettings()
-    pictures = _means(sights, "images")
+    pictures = _means(views, "images")
     if len(pictures) < 2:
         raise DriverError(
             "images",
@@ -123,7 +124,7 @@ def learn_landmarks(
     reports, seen = [], np.zeros(m, np.bool_)
     for name in names[1:]:
         found, kept, report = _match_pair(
-            (base, name), pictures[base], pictures[name], corners, len(sights[base]), options
+            (base, name), pictures[base], pictures[name], corners, len(views[base]), options
         )
         reports.append(report)
         pixels[name] = np.where(kept[:, None], found.pixels, np.nan)
@@ -146,7 +147,7 @@ def learn_landmarks(
         CameraReference(
             name,
             pictures[name],
-            len(sights[name]),
+            len(views[name]),
             np.ascontiguousarray(pixels[name][rows]),
             np.ascontiguousarray(sigmas[name][rows]),
         )
@@ -159,7 +160,7 @@ def learn_landmarks(
 
 
 def _chosen(seen: BoolArray, kinds: IntArray, most: int) -> IntArray:
-    """Rows of up to ``most`` landmarks, the strongest (first) of each kind, so that no kind crowds out another."""
+    """Rows of up to ``most`` landmarks, the strongest (first) of each kind, such that no kind displaces another."""
     rank = np.zeros(len(seen), np.int64)
     for kind in range(len(KINDS)):
         mine = seen & (kinds == kind)
@@ -170,7 +171,7 @@ def _chosen(seen: BoolArray, kinds: IntArray, most: int) -> IntArray:
 
 
 def find_corners(picture: ImageArray, settings: LearningSettings) -> FloatArray:
-    """Corners (n, 2) [px] of a picture, the strongest first. Raises DriverError (``images``) for fewer than eight."""
+    """Corners (n, 2) [px] of an image, the strongest first. Raises DriverError (``images``) for fewer than eight."""
     found = cv2.goodFeaturesToTrack(picture, 4 * settings.most, 0.005, settings.spacing_px, blockSize=5)
     corners = np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
     margin = settings.half + 3
@@ -186,9 +187,9 @@ def find_corners(picture: ImageArray, settings: LearningSettings) -> FloatArray:
     return corners
 
 
-def _means(sights: Mapping[str, Sequence[ImageArray]], what: str) -> dict[str, ImageArray]:
+def _means(views: Mapping[str, Sequence[ImageArray]], what: str) -> dict[str, ImageArray]:
     pictures = {}
-    for name, images in sights.items():
+    for name, images in views.items():
         shapes = {np.shape(image) for image in images}
         if len(shapes) != 1 or len(next(iter(shapes))) != 2 or min(next(iter(shapes))) < SMALLEST_PICTURE:
             raise DriverError(
@@ -230,7 +231,7 @@ def _match_pair(
     averaged: int,
     settings: LearningSettings,
 ) -> tuple[Alignment, BoolArray, PairReport]:
-    """The corners (m, 2) of ``left`` in ``right``, and which of them are kept."""
+    """Matches (m, 2) of the corners of ``left`` in ``right``, and which of them are accepted."""
     first = find_keypoints(left, settings.keypoints, settings.tilts)
     second = find_keypoints(right, settings.keypoints, settings.tilts)
     matches = match_keypoints(first, second)
@@ -241,7 +242,7 @@ def _match_pair(
     for rows, warps, where in starts_from_planes(planes, corners, settings.radius_px):
         if len(rows):
             take_better(found, rows, *seek(patches, pyramid, rows, warps, where, settings.least_correlation))
-    aligned = _that_come_back(found, left, right, corners, settings)
+    aligned = _passes_backward_check(found, left, right, corners, settings)
     count = int(aligned.sum())
     if count < MIN_MATCHES:
         raise _too_few(names, len(corners), len(matches), count)
@@ -272,10 +273,10 @@ def _too_few(names: tuple[str, str], corners: int, matches: int, agreeing: int) 
     )
 
 
-def _that_come_back(
+def _passes_backward_check(
     found: Alignment, left: ImageArray, right: ImageArray, corners: FloatArray, settings: LearningSettings
 ) -> BoolArray:
-    """Which matches lead back to where they came from: aligned the other way, by patches of the right picture."""
+    """Mask of matches that pass the backward check: aligned in reverse, by patches of the right image."""
     rows = np.flatnonzero(found.found)
     back = ReferencePatches(right, found.pixels[rows], settings.half)
     inverse: FloatArray = np.linalg.inv(found.A[rows])
@@ -296,7 +297,9 @@ def _epipolar(
     names: tuple[str, str],
     matches: int,
 ) -> tuple[BoolArray, FloatArray | None, float, bool]:
-    """Which matches (m,) keep one epipolar geometry by chi-square; F (3, 3) or None for a plane; rms [px]; planar."""
+    """Mask (m,) of matches consistent with one epipolar geometry by chi-square; F (3, 3) or None for a plane; rms
+    [px]; planar.
+    """
     rows = np.flatnonzero(aligned)
     left, right = corners[rows], found.pixels[rows]
     try:
@@ -326,7 +329,7 @@ def _unique(
     F: FloatArray | None,
     settings: LearningSettings,
 ) -> BoolArray:
-    """Which matches (m,) have no second place near their epipolar lines, in either picture, that looks as alike."""
+    """Mask (m,) of matches without a similar second match near their epipolar lines, in either image."""
     unique, half = np.zeros(len(corners), np.bool_), settings.half
     y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float32)
     for k in np.flatnonzero(chosen):
@@ -347,7 +350,9 @@ def _unique(
 def _rival(
     picture: ImageArray, patch: ImageArray, at: FloatArray, line: FloatArray | None, half: int
 ) -> float:
-    """Best correlation of ``patch`` elsewhere than ``at`` [px], within ``BAND_PX`` of ``line`` (3,); None: anywhere."""
+    """Best correlation of ``patch`` elsewhere than ``at`` [px], within ``BAND_PX`` of ``line`` (3,); None:
+    anywhere.
+    """
     scores = cv2.matchTemplate(picture, patch, cv2.TM_CCOEFF_NORMED)
     v, u = np.mgrid[: scores.shape[0], : scores.shape[1]] + half
     elsewhere = np.maximum(np.abs(u - at[0]), np.abs(v - at[1])) > half
@@ -363,7 +368,7 @@ def sort_landmarks(
     after: Mapping[str, ImageArray],
     settings: LearningSettings,
 ) -> tuple[IntArray, BoolArray]:
-    """Kinds (m,) of landmarks at ``pixels`` (m, 2) of the pictures ``before`` a motion; which are beyond doubt (m,).
+    """Kinds (m,) of landmarks at ``pixels`` (m, 2) of the images ``before`` a motion, and which are certain (m,).
 
     Tool: moved in some camera, stayed in none. Static: stayed in some, moved in none. What a motion along the line of
     sight leaves in its place in one camera is in doubt.
@@ -381,7 +386,7 @@ def sort_landmarks(
 def _motion(
     before: ImageArray, pixels: FloatArray, after: ImageArray, settings: LearningSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Which landmarks (m,) of one camera stayed, and which moved; those not found again did neither."""
+    """Masks (m,) of one camera's landmarks that stayed, and that moved; those not found again are in neither."""
     m = len(pixels)
     patches = ReferencePatches(before, pixels, settings.half)
     pyramid = build_pyramid(after, TEMPLATE_LEVELS)
@@ -410,8 +415,8 @@ SHIFT = 4
 
 
 def draw_landmarks(landmarks: Landmarks) -> ImageArray:
-    """The cameras' pictures side by side (h, w, 3) BGR: orange tool, green scene, blue unsorted; lines join a landmark
-    in the first camera and in the others.
+    """Image (h, w, 3) BGR of the cameras side by side: orange tool, green scene, blue unsorted; lines join a
+    landmark in the first camera and in the others.
     """
     height = max(camera.picture.shape[0] for camera in landmarks.cameras)
     parts, left = [], []

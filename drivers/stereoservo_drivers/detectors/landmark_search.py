@@ -1,4 +1,4 @@
-"""Landmarks of one camera's reference found again in a picture, and whether what was found hangs together."""
+"""Search for the landmarks of one camera's reference in an image, and consistency of what was found."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntAr
 from stereoservo_drivers.detectors.patch_alignment import Alignment, ReferencePatches
 
 NEIGHBOURS = 6
-"""Landmarks about one that tell where it is, where they are found."""
+"""Number of neighbours that predict the place of a landmark."""
 LOOKED_AT = 24
 FEW = 4
 AGREEING = 3
@@ -26,7 +26,7 @@ START_COARSE = 2
 
 
 class Surroundings:
-    """Which landmarks of one reference, at ``pixels`` (m, 2) [px], of ``kinds`` (m,), are near which of their kind."""
+    """Neighbourhoods of one reference's landmarks at ``pixels`` (m, 2) [px], each of its kind among ``kinds`` (m,)."""
 
     def __init__(self, pixels: FloatArray, kinds: IntArray) -> None:
         self.pixels = pixels
@@ -38,7 +38,9 @@ class Surroundings:
         self._there: BoolArray = np.isfinite(np.take_along_axis(distances, self.near, axis=1))
 
     def local_maps(self, found: FloatArray, use: BoolArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where each landmark is by its neighbours in ``use`` (m,), at ``found`` (m, 2) [px]: warps, pixels, known."""
+        """Each landmark as predicted by its neighbours in ``use`` (m,), at ``found`` (m, 2) [px]: warps, pixels,
+        known.
+        """
         m = len(self.pixels)
         counted = use[self.near] & self._there
         counted &= np.cumsum(counted, axis=1) <= NEIGHBOURS
@@ -58,20 +60,20 @@ class Surroundings:
         return warps, np.where(known[:, None], B[:, 2], np.zeros((m, 2))), known
 
     def agreeing(self, A: FloatArray, found: FloatArray, use: BoolArray) -> BoolArray:
-        """Pairs (m, LOOKED_AT) of a landmark and its neighbours, both in ``use``, that its warp puts where they are."""
+        """Pairs (m, LOOKED_AT) of a landmark and its neighbours, both in ``use``, that its warp predicts correctly."""
         counted = use[self.near] & self._there & use[:, None]
         counted &= np.cumsum(counted, axis=1) <= 2 * NEIGHBOURS
         x = np.nan_to_num(self.pixels[self.near] - self.pixels[:, None])
-        told = found[:, None] + np.einsum("mij,mkj->mki", A, x)
-        misses = np.linalg.norm(told - found[self.near], axis=2)
-        allowed = LOOSE_PX + BENT * np.linalg.norm(told - found[:, None], axis=2)
+        predicted = found[:, None] + np.einsum("mij,mkj->mki", A, x)
+        misses = np.linalg.norm(predicted - found[self.near], axis=2)
+        allowed = LOOSE_PX + BENT * np.linalg.norm(predicted - found[:, None], axis=2)
         agreed: BoolArray = counted & (misses <= allowed)
         return agreed
 
     def coherent(
         self, A: FloatArray, found: FloatArray, use: BoolArray, least: int, *, one: bool
     ) -> BoolArray:
-        """Landmarks (m,) of ``use`` that ``AGREEING`` neighbours confirm, in groups of ``least`` that hang together.
+        """Mask (m,) of landmarks of ``use`` that ``AGREEING`` neighbours confirm, in connected groups of ``least``.
 
         ``one``: of each kind the largest group only: a rigid body is in one place.
         """
@@ -102,7 +104,7 @@ class Surroundings:
 
 
 def nothing(m: int) -> Alignment:
-    """No landmark of m found."""
+    """An empty result for m landmarks."""
     return Alignment(
         np.tile(np.eye(2), (m, 1, 1)),
         np.zeros((m, 2)),
@@ -113,7 +115,7 @@ def nothing(m: int) -> Alignment:
 
 
 def take_better(into: Alignment, rows: IntArray, other: Alignment, good: BoolArray) -> None:
-    """Write what ``other`` found of ``rows`` and is ``good`` into ``into``, where it correlates better."""
+    """Copy results of ``other`` for ``rows`` that are ``good`` into ``into``, where they correlate better."""
     better = good & (other.correlations > np.where(into.found[rows], into.correlations[rows], -1.0))
     at = rows[better]
     into.A[at], into.pixels[at] = other.A[better], other.pixels[better]
@@ -130,7 +132,9 @@ def seek(
     least_correlation: float,
     coarse: int = START_COARSE,
 ) -> tuple[Alignment, BoolArray]:
-    """Align ``rows`` (k,) from starts; which of them are found, alike enough and through a plausible warp."""
+    """Align ``rows`` (k,) from start values; returns which are found, with sufficient correlation and a plausible
+    warp.
+    """
     result = patches.align(pyramid, rows, warps, pixels, coarse)
     good = result.found & (result.correlations >= least_correlation) & plausible(result.A)
     return result, good
@@ -146,7 +150,7 @@ def search_by_keypoints(
     *,
     shifted_px: float = 0.0,
 ) -> Alignment:
-    """All landmarks of a reference in a picture, wherever they are: from planes of matched keypoints.
+    """Search for all landmarks of a reference anywhere in an image, by planes of matched keypoints.
 
     ``shifted_px``: only by keypoints that are so far from where they were. ``radius`` [px] about a landmark in which
     keypoints speak for it.
@@ -183,14 +187,14 @@ FEW_NEAR = 4
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """``pixels`` (n, 2) [px] and ``descriptors`` (n, 128)."""
+    """Keypoints: ``pixels`` (n, 2) [px] and ``descriptors`` (n, 128)."""
 
     pixels: FloatArray
     descriptors: npt.NDArray[np.float32]
 
 
 def find_keypoints(picture: ImageArray, most: int, tilts: int = 0) -> Keypoints:
-    """SIFT keypoints of a picture (h, w), of up to ``most`` a view; ``tilts``: simulated views from aside as well."""
+    """SIFT keypoints of an image (h, w), of up to ``most`` a view; ``tilts``: also of simulated oblique views."""
     finder: Any = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST)
     if tilts:
         finder = cv2.AffineFeature_create(finder, tilts)
@@ -202,7 +206,7 @@ def find_keypoints(picture: ImageArray, most: int, tilts: int = 0) -> Keypoints:
 
 
 def match_keypoints(first: Keypoints, second: Keypoints, ratio: float = RATIO) -> IntArray:
-    """Matches (n, 2) by index: nearest in descriptors, mutually, and well before the second best elsewhere."""
+    """Matches (n, 2) by index: mutual nearest neighbours in descriptors that pass the ratio test."""
     if len(first.pixels) < 2 or len(second.pixels) < 2:
         return np.empty((0, 2), np.int64)
     best, distance, other, back = _nearest(first.descriptors, second)
@@ -216,8 +220,8 @@ def match_keypoints(first: Keypoints, second: Keypoints, ratio: float = RATIO) -
 def _nearest(
     descriptors: npt.NDArray[np.float32], among: Keypoints
 ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
-    """Index of the nearest ``among``, its distance, that of the nearest not within ``NEAR_PX`` of it, (n,) each; and
-    which of ``descriptors`` is nearest to each ``among`` (k,).
+    """Nearest neighbours: index of the nearest ``among``, its distance, that of the nearest not within ``NEAR_PX``
+    of it, (n,) each; and which of ``descriptors`` is nearest to each ``among`` (k,).
     """
     n, k = len(descriptors), len(among.pixels)
     best, distance, other = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
@@ -239,15 +243,17 @@ def _nearest(
         for _ in range(TWINS):
             d2[rows, last] = np.inf
             last = d2.argmin(axis=1)
-            apart = np.linalg.norm(among.pixels[last] - among.pixels[nearest], axis=1) > NEAR_PX
-            rival = np.where(np.isnan(rival) & apart, d2[rows, last], rival)
+            distinct = np.linalg.norm(among.pixels[last] - among.pixels[nearest], axis=1) > NEAR_PX
+            rival = np.where(np.isnan(rival) & distinct, d2[rows, last], rival)
         other[at] = np.where(np.isnan(rival), d2[rows, last], rival)
     return best, np.sqrt(np.maximum(distance, 0.0)), np.sqrt(np.maximum(other, 0.0)), back
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Matches that a homography ``H`` (3, 3), first to second picture, explains: ``first``, ``second`` (n, 2) [px]."""
+    """A plane of matches: homography ``H`` (3, 3), first to second image, and its inliers ``first``, ``second`` (n,
+    2) [px].
+    """
 
     H: FloatArray
     first: FloatArray
@@ -255,7 +261,7 @@ class Plane:
 
 
 def find_planes(first: FloatArray, second: FloatArray) -> list[Plane]:
-    """Planes, or parts of the scene that look like one, among matches (n, 2) [px], the largest first.
+    """Planes, or approximately planar parts of the scene, among matches (n, 2) [px], the largest first.
 
     A fixed seed: the same matches give the same planes.
     """
@@ -292,12 +298,12 @@ def _homography(first: FloatArray, second: FloatArray) -> tuple[FloatArray, Bool
 
 
 def _distinct(pixels: FloatArray) -> int:
-    """How many different features there are among keypoints (n, 2): those of one cell of 3 px count once."""
+    """Number of distinct features among keypoints (n, 2): those of one cell of 3 px count once."""
     return len(np.unique(np.floor(pixels / NEAR_PX).astype(np.int64), axis=0))
 
 
 def map_pixels(H: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Pixels (n, 2) through ``H`` (3, 3); infinite where they go there."""
+    """Pixels (n, 2) mapped by ``H`` (3, 3); infinite where they are mapped to infinity."""
     mapped = pixels @ H[:, :2].T + H[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         result: FloatArray = mapped[:, :2] / mapped[:, 2:]
@@ -305,7 +311,7 @@ def map_pixels(H: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def local_warps(H: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Linear parts (n, 2, 2) of ``H`` (3, 3) about ``pixels`` (n, 2)."""
+    """Local linear parts (n, 2, 2) of ``H`` (3, 3) at ``pixels`` (n, 2)."""
     depth = pixels @ H[2, :2] + H[2, 2]
     mapped = map_pixels(H, pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -318,7 +324,9 @@ def local_warps(H: FloatArray, pixels: FloatArray) -> FloatArray:
 def starts_from_planes(
     planes: list[Plane], pixels: FloatArray, radius: float
 ) -> list[tuple[IntArray, FloatArray, FloatArray]]:
-    """For each plane the ``pixels`` (n, 2) that it has matches about, within ``radius`` [px]: rows, warps, where to."""
+    """Start values from each plane for the ``pixels`` (n, 2) that have matches within ``radius`` [px]: rows, warps,
+    targets.
+    """
     starts = []
     for plane in planes:
         with np.errstate(invalid="ignore"):
@@ -331,7 +339,7 @@ def starts_from_planes(
 
 
 def plausible(warps: FloatArray, *, least: float = 0.25, stretch: float = 4.0) -> BoolArray:
-    """Which warps (n, 2, 2) a patch may be seen through: no mirror, no size beyond 4, no stretch beyond 4."""
+    """Mask of warps (n, 2, 2) that a patch may be seen through: not mirrored, scale and stretch at most 4."""
     good: BoolArray = np.isfinite(warps).all(axis=(1, 2))
     safe = np.where(good[:, None, None], warps, np.eye(2))
     singular = np.linalg.svd(safe, compute_uv=False)

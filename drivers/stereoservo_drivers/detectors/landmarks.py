@@ -1,4 +1,4 @@
-"""Landmarks: natural features with ids that all cameras of a cell share, and the file that keeps them.
+"""Landmarks: natural features with ids common to all cameras of a cell, and their file.
 
 A file is written once, by `stereoservo learn-corners`; each camera's detector reads it and works alone. It holds one
 reference picture a camera, where each landmark is in it, and whether it belongs to the tool or to the scene.
@@ -31,8 +31,8 @@ KINDS: tuple[Kind, ...] = ("tool", "static", "unsorted")
 
 
 class CameraReference(msgspec.Struct, frozen=True, eq=False):
-    """``name`` of a camera, its reference ``picture`` (h, w), the mean of ``averaged`` images; ``pixels`` (m, 2) of the
-    landmarks in it [px], NaN for those that it does not see, and their ``sigmas`` (m,) [px].
+    """Reference of one camera: ``name``, ``picture`` (h, w), the mean of ``averaged`` images; ``pixels`` (m, 2) of
+    the landmarks in it [px], NaN for those that it does not see, and their ``sigmas`` (m,) [px].
     """
 
     name: str
@@ -43,7 +43,9 @@ class CameraReference(msgspec.Struct, frozen=True, eq=False):
 
 
 class Landmarks(msgspec.Struct, frozen=True, eq=False):
-    """``ids`` (m,), ascending, and ``kinds`` (m,), positions in ``KINDS``; one reference a camera."""
+    """Landmarks of a cell: ``ids`` (m,), ascending, and ``kinds`` (m,), positions in ``KINDS``; one reference a
+    camera.
+    """
 
     ids: IntArray
     kinds: IntArray
@@ -158,7 +160,7 @@ def load_landmarks(path: Path) -> Landmarks:
 
 
 def check_landmarks(landmarks: Landmarks, path: Path | str) -> None:
-    """Raises DriverError (``landmarks``) where shapes, ids or pixels contradict each other."""
+    """Check shapes, ids and pixels. Raises DriverError (``landmarks``) where they are inconsistent."""
     m = len(landmarks.ids)
     if landmarks.ids.shape != (m,) or landmarks.kinds.shape != (m,):
         raise _bad(path, f"ids {landmarks.ids.shape} and kinds {landmarks.kinds.shape}; both must be (m,)")
@@ -192,7 +194,7 @@ def check_landmarks(landmarks: Landmarks, path: Path | str) -> None:
 
 def _picture(encoded: npt.NDArray[Any]) -> ImageArray:
     data = _typed(encoded, np.uint8)
-    # PNG says its size in bytes 16 to 24: looked at first, so that a small file cannot ask for a huge picture.
+    # PNG has its size in bytes 16 to 24: checked first, so that a small file cannot request a huge picture.
     if len(data) < 33 or data[:8].tobytes() != b"\x89PNG\r\n\x1a\n":
         raise ValueError("a reference picture is no PNG")
     width, height = (int.from_bytes(data[k : k + 4].tobytes(), "big") for k in (16, 20))

@@ -1,4 +1,4 @@
-"""What uneven light does to the dots of a face, and what is taken back of it. Numba kernels; no state.
+"""Correction of the dots' centres for uneven light (shading). Numba kernels; no state.
 
 Light falls on a dot as background b(x) and contrast g(x); to first order a slope of either moves the centroid, by the
 columns DARK and LIT of its measurement. Both slopes are those of planes through the face's dots, whose predicted areas
@@ -98,7 +98,7 @@ def _residual(dot, value, plane):
 
 
 @kernel
-def _odd_one(dots, values, used, variance, plane):
+def _outlier(dots, values, used, variance, plane):
     """The dot whose value the plane of the others contradicts, -1 for none; ``plane`` becomes that of the others."""
     n = 0
     for i in range(used.size):
@@ -129,14 +129,15 @@ def _odd_one(dots, values, used, variance, plane):
 
 @kernel
 def _known(dots, values, used, variance, typical, plane, slope):
-    """Slope (2) of ``values`` and its covariance (3) at any of the dots into ``slope``; the odd dot, -1 for none.
+    """Slope (2) of ``values`` and its covariance (3) at any of the dots into ``slope``; the outlier dot, -1 for
+    none.
 
     ``variance`` of a value by noise; ``typical`` standard deviation beside it. -2 where there is no plane.
     """
     mine = used.copy()
     if not _plane(dots, values, mine, plane):
         return -2
-    odd = _odd_one(dots, values, mine, variance + typical * typical, plane)
+    outlier = _outlier(dots, values, mine, variance + typical * typical, plane)
     n = 0
     for i in range(mine.size):
         n += 1 if mine[i] else 0
@@ -147,12 +148,14 @@ def _known(dots, values, used, variance, typical, plane, slope):
     slope[2] = local + (bend + variance) * plane[5]
     slope[3] = (bend + variance) * plane[6]
     slope[4] = local + (bend + variance) * plane[7]
-    return odd
+    return outlier
 
 
 @kernel
 def _as_bright_as_its_light(dots, areas, used, i, away):
-    """Whether dot ``i``, whose flux is ``away`` from the others' (relative), is so for its light, not for its shape."""
+    """Whether the flux of dot ``i``, which differs by ``away`` (relative) from the others', is explained by its
+    light and not its shape.
+    """
     others = 0.0
     count = 0
     for k in range(used.size):
@@ -181,7 +184,7 @@ def _bend_inside(dots, used, slope, noise):
 
 
 @kernel
-def _add_spread(dot, a, b, c, d, p, q, r):
+def _add_covariance(dot, a, b, c, d, p, q, r):
     """Add M P Mᵀ to a dot's covariance, M = [[a, b], [c, d]] and P = [[p, q], [q, r]]."""
     dot[EXX] += a * a * p + 2.0 * a * b * q + b * b * r
     dot[EXY] += a * c * p + (a * d + b * c) * q + b * d * r
@@ -190,8 +193,8 @@ def _add_spread(dot, a, b, c, d, p, q, r):
 
 @kernel
 def _follow(dot, slope, noise, ground, moved):
-    """Undo the slope of the light at one dot; ``slope`` (5,) is that of its face, ``noise`` inside the dot, ``ground``
-    the part of the background that slopes with it.
+    """Remove the slope of the light at one dot; ``slope`` (5,) is that of its face, ``noise`` inside the dot,
+    ``ground`` the part of the background that slopes with it.
     """
     p, q, r = slope[2], slope[3], slope[4]
     sampled = SAMPLED_SLOPE * SAMPLED_SLOPE / dot[AREA]
@@ -212,9 +215,9 @@ def _follow(dot, slope, noise, ground, moved):
     g10, g11 = dot[LIT + 2] + ground * dot[DARK + 2], dot[LIT + 3] + ground * dot[DARK + 3]
     if ground > 0.0:
         t0, t1 = BLURRED_SLOPE * s0, BLURRED_SLOPE * s1
-        _add_spread(dot, g00, g01, g10, g11, t0 * t0, t0 * t1, t1 * t1)
+        _add_covariance(dot, g00, g01, g10, g11, t0 * t0, t0 * t1, t1 * t1)
     # (1 - K) P
-    _add_spread(
+    _add_covariance(
         dot, g00, g01, g10, g11, p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r
     )  # fmt: skip
     # the dot's own slope has noise in common with its centre: -(X Kᵀ Gᵀ + G K Xᵀ)
@@ -231,7 +234,7 @@ def _follow(dot, slope, noise, ground, moved):
 
 @kernel
 def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
-    """Move the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) to where they were under even light.
+    """Correct the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) for uneven light.
 
     ``areas`` (n,) [px²] as the face's homography predicts them. Adds to EXX .. EYY what remains uncertain: the slopes,
     and for a dot whose light does not fit the others' as much as the missing part of its rim would move it.
@@ -252,20 +255,22 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
         return
     for i in range(n):
         values[i] *= count / total
-    odd = _known(dots, values, used, dark_noise * flux_noise / count, PRINT_CONTRAST, plane, slope)
-    if odd >= 0 and _as_bright_as_its_light(dots, areas, used, odd, _residual(dots[odd], values[odd], plane)):
-        odd = -1
-    if odd >= -1:
+    outlier = _known(dots, values, used, dark_noise * flux_noise / count, PRINT_CONTRAST, plane, slope)
+    if outlier >= 0 and _as_bright_as_its_light(
+        dots, areas, used, outlier, _residual(dots[outlier], values[outlier], plane)
+    ):
+        outlier = -1
+    if outlier >= -1:
         bend = _bend_inside(dots, used, slope, bright_noise)
         slope[2] += bend
         slope[4] += bend
         for i in range(n):
             if used[i]:
                 _follow(dots[i], slope, bright_noise, 1.0 if bend > 0.0 else 0.0, moved[i])
-        if odd >= 0:
-            away = _residual(dots[odd], values[odd], plane) ** 2 * dots[odd, AREA] / np.pi
-            dots[odd, EXX] += away
-            dots[odd, EYY] += away
+        if outlier >= 0:
+            away = _residual(dots[outlier], values[outlier], plane) ** 2 * dots[outlier, AREA] / np.pi
+            dots[outlier, EXX] += away
+            dots[outlier, EYY] += away
         if bend > 0.0:
             # light that bends within a dot's size does so on black as on white
             return
@@ -278,6 +283,6 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
                 dot = dots[i]
                 moved[i, 0] -= dot[DARK] * slope[0] + dot[DARK + 1] * slope[1]
                 moved[i, 1] -= dot[DARK + 2] * slope[0] + dot[DARK + 3] * slope[1]
-                _add_spread(
+                _add_covariance(
                     dot, dot[DARK], dot[DARK + 1], dot[DARK + 2], dot[DARK + 3], slope[2], slope[3], slope[4]
                 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Driver ``video``: pictures of a real camera, or of a recorded one, as frames with their stamps."""
+"""Camera driver ``video``: images of a real camera, or of a recording, as stamped frames."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ RECORDED_BUDGET_US = 50_000.0
 
 
 class Feed(Protocol):
-    """Where frames come from: a :class:`Reader` or a :class:`Playback`, used from ``open`` to ``close`` once."""
+    """Protocol of a source of frames: a :class:`Reader` or a :class:`Playback`, opened and closed once."""
 
     @property
     def settings(self) -> Settings:
-        """What was asked for and what the source says."""
+        """Requested and reported settings of the source."""
         ...
 
     def open(self) -> None:
@@ -38,7 +38,7 @@ class Feed(Protocol):
         ...
 
     def begin(self) -> None:
-        """Deliver from now on."""
+        """Start delivery."""
         ...
 
     def take(self) -> Frame | None:
@@ -54,9 +54,9 @@ class VideoCameraDriver:
     """One camera. Options: :class:`~stereoservo_drivers.video.options.VideoOptions`.
 
     It does not reconnect by itself: a source that fails raises DriverError from :meth:`poll`, and who holds the driver
-    closes it and configures it again, which opens the source anew (an old `cv2.VideoCapture` never recovers). Counts,
+    closes it and configures it again, which reopens the source (an old `cv2.VideoCapture` never recovers). Counts,
     numbers of frames and the last picture, by which a frozen camera is known, go on over that. A recording that is over
-    or damaged stays so: configured again, it says the same, rather than playing on from its beginning.
+    or damaged stays so: configured again, it raises the same error and does not restart.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
@@ -70,7 +70,7 @@ class VideoCameraDriver:
         self._settings: Settings = {}
 
     def describe(self) -> CameraDescription:
-        """What the options ask for; works unconnected."""
+        """Description by the options; works unconnected."""
         return CameraDescription(
             driver=DRIVER,
             name=self._context.camera,
@@ -82,7 +82,7 @@ class VideoCameraDriver:
         )
 
     def configure(self) -> None:
-        """Open the source and see a first picture, within ``open_timeout_s``; also after :meth:`close`.
+        """Open the source and receive a first image, within ``open_timeout_s``; also after :meth:`close`.
 
         Raises DriverError: what is wrong with the source, ``image_size``, ``open_timeout``, ``end_of_file``.
         """
@@ -115,14 +115,14 @@ class VideoCameraDriver:
         return Reader(source, place, options, context.camera, self._watch)
 
     def activate(self) -> None:
-        """Frames from now on. Raises DriverError."""
+        """Start delivery. Raises DriverError."""
         self._life.require("activate()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         if self._life.state is LifecycleState.CONFIGURED and self._feed is not None:
             self._feed.begin()
         self._life.state = LifecycleState.ACTIVE
 
     def poll(self) -> list[Frame]:
-        """The newest frame since the last poll, or none. Raises DriverError: the source failed or is over."""
+        """The newest frame since the last poll, or none. Raises DriverError: the source failed or has ended."""
         self._life.require("poll()", LifecycleState.ACTIVE)
         assert self._feed is not None
         try:
@@ -134,12 +134,12 @@ class VideoCameraDriver:
         return [] if frame is None else [frame]
 
     def deactivate(self) -> None:
-        """No more frames; the source stays open. Idempotent."""
+        """Stop delivery; the source stays open. Idempotent."""
         if self._life.state is LifecycleState.ACTIVE:
             self._life.state = LifecycleState.CONFIGURED
 
     def close(self) -> None:
-        """Release the source, waiting half a second at most. Idempotent; never raises."""
+        """Release the source, within half a second. Idempotent; never raises."""
         if self._feed is not None:
             self._settings = self._feed.settings
             self._feed.close()

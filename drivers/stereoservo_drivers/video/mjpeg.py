@@ -1,7 +1,7 @@
 """MJPEG over HTTP: the parts of a ``multipart/x-mixed-replace`` stream, each with the time at which it began to arrive.
 
-A reader of our own, since it stamps a picture when its first byte arrives, knows the server's number of it, and sees
-a JPEG that was cut off: decoders behind `cv2.VideoCapture` tell neither and invent times.
+A reader of our own, since it stamps a picture when its first byte arrives, reads the server's number of it, and detects
+a JPEG that was cut off: decoders behind `cv2.VideoCapture` report neither and invent times.
 """
 
 from __future__ import annotations
@@ -102,14 +102,14 @@ class MjpegSource:
 
     def _boundary(self, response: http.client.HTTPResponse) -> str:
         if response.status != 200:
-            cure = {
+            remedy = {
                 401: "Put user and password into the URL: http://user:password@host/...",
                 403: "Look at the rights of the camera's user",
                 404: "Look up the path of its MJPEG stream",
             }.get(response.status, "Look at the camera's own page")
             raise self._place.error(
                 "http_status",
-                f"answered {response.status} {response.reason}. {cure}",
+                f"answered {response.status} {response.reason}. {remedy}",
                 retry=response.status >= 500,
                 status=response.status,
             )
@@ -125,7 +125,7 @@ class MjpegSource:
         return boundary
 
     def read(self) -> SourcePicture | None:
-        """The newest whole picture, waiting for one; None: it was spoiled. Raises DriverError."""
+        """The newest whole image, waiting for one; None: it was damaged. Raises DriverError."""
         parts: list[MultipartPart] = []
         assert self._response is not None
         assert self._parser is not None
@@ -207,7 +207,9 @@ def _target(url: SplitResult) -> str:
 
 
 def authorization(url: SplitResult, challenge: str = "") -> str:
-    """Header of the user in ``url``: Basic, or Digest where the server's ``challenge`` asks for it (RFC 7617, 7616)."""
+    """Authorization header for the user in ``url``: Basic, or Digest where the server's ``challenge`` requires it
+    (RFC 7617, 7616).
+    """
     user, password = unquote(url.username or ""), unquote(url.password or "")
     if not challenge:
         return "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()

@@ -1,4 +1,4 @@
-"""The parts of a ``multipart/x-mixed-replace`` stream (RFC 2046), as their bytes come in."""
+"""Incremental parser of a ``multipart/x-mixed-replace`` stream (RFC 2046)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HEADERS_END = re.compile(rb"\A\r?\n|\r?\n\r?\n")
 
 
 class MultipartError(Exception):
-    """The stream is not what it says: ``code`` as of DriverError."""
+    """The stream is malformed: ``code`` as of DriverError."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -21,7 +21,7 @@ class MultipartError(Exception):
 
 @dataclass
 class MultipartPart:
-    """One part: when its first byte was there, its headers by name in lower case, its body; ``cut``: not all of it."""
+    """One part: when its first byte arrived, its headers by name in lower case, its body; ``cut``: incomplete."""
 
     t_ns: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -30,7 +30,7 @@ class MultipartPart:
 
 
 class MultipartParser:
-    """Bytes in as they come, whole parts out. Finds its way again after a part that is not as long as it says."""
+    """Parses bytes as they arrive into whole parts. Resynchronises after a part of wrong length."""
 
     def __init__(self, boundary: str, largest: int = LARGEST_PART) -> None:
         # Half of the servers write the boundary's leading "--" into the header already: both end in this.
@@ -43,7 +43,7 @@ class MultipartParser:
         self._scanned = 0
 
     def feed(self, data: bytes, t_ns: int) -> list[MultipartPart]:
-        """Take ``data`` received at ``t_ns``; the parts that it completes.
+        """Parse ``data`` received at ``t_ns``; returns the parts that it completes.
 
         Raises MultipartError: ``frame_too_large``, ``not_mjpeg``.
         """
@@ -62,7 +62,7 @@ class MultipartParser:
             self._part = None
 
     def _find_part(self) -> bool:
-        """Pass over everything to after the next boundary's line, and see that something follows."""
+        """Skip to after the next boundary's line, and check that something follows."""
         at = self._buffer.find(self._delimiter, self._scanned)
         if at < 0:
             keep = len(self._delimiter) - 1
@@ -132,5 +132,5 @@ class MultipartParser:
 
 
 def number_in(text: str | None) -> int | None:
-    """The number that a header states; None where it states none."""
+    """The number in a header; None where there is none."""
     return int(text) if text is not None and text.isascii() and text.isdigit() and len(text) < 19 else None

@@ -1,4 +1,4 @@
-"""Options of the driver ``video``, and what its ``source`` names."""
+"""Options of the driver ``video``, and the parsing of its ``source``."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True)
 class Place:
-    """What ``source`` names. ``shown``: for messages, without a password."""
+    """A parsed ``source``. ``shown``: for messages, without a password."""
 
     kind: SourceKind
     shown: str
@@ -85,7 +85,7 @@ class Place:
 
     @property
     def live(self) -> bool:
-        """Whether pictures come by themselves."""
+        """Whether the source delivers images by itself."""
         return self.kind in ("device", "http", "rtsp")
 
     def error(self, code: str, what: str, *, retry: bool = False, **data: Any) -> DriverError:
@@ -117,14 +117,14 @@ def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[Vi
 
 
 def frozen_frames(options: VideoOptions, place: Place) -> int:
-    """So many equal pictures in a row are a frozen camera; 0: none."""
+    """Number of equal images in a row that mean a frozen camera; 0: disabled."""
     if options.frozen_frames is not None:
         return options.frozen_frames
     return LIVE_FROZEN_FRAMES if place.live else 0
 
 
 def place_of(source: int | str, cell_dir: Path) -> Place:
-    """What ``source`` names. Raises DriverError (``option``)."""
+    """Parse ``source``. Raises DriverError (``option``)."""
     if isinstance(source, int):
         if source < 0:
             raise _wrong("source", source, f"valid: {VALID_SOURCES}")

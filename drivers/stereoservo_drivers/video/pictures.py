@@ -1,4 +1,4 @@
-"""One picture: its size, one channel of it, turned; and whether JPEG data are whole."""
+"""Image operations: size check, extraction of one channel, rotation; check that JPEG data are whole."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ PICTURE_FLAG = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def jpeg_flag(channel: Channel) -> int:
-    """How JPEG data are decoded: their luma is coded by itself, and quicker to have alone."""
-    wanted = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
-    return wanted | cv2.IMREAD_IGNORE_ORIENTATION
+    """Decoder flag for JPEG data: luma is coded separately, and faster to decode alone."""
+    expected = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
+    return expected | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def one_channel(image: ImageArray, channel: Channel, flip: Flip) -> ImageArray:
-    """``(height, width)`` of ``image`` ``(height, width[, 3])``, blue first; contiguous. A gray one is any channel."""
+    """One channel ``(height, width)`` of ``image`` ``(height, width[, 3])``, blue first; contiguous. Of a gray
+    image any channel.
+    """
     if image.ndim == 3:
         if channel == "gray":
             image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -38,13 +40,13 @@ def one_channel(image: ImageArray, channel: Channel, flip: Flip) -> ImageArray:
 
 
 def check_size(place: Place, options: VideoOptions, width: int, height: int) -> None:
-    """Raises DriverError (``image_size``) unless it is what the cell file says."""
+    """Check the image size against the cell file. Raises DriverError (``image_size``)."""
     if (width, height) != (options.width, options.height):
         raise size_error(place, options, width, height)
 
 
 def size_error(place: Place, options: VideoOptions, width: int, height: int) -> DriverError:
-    """The error of pictures that have another size than the cell file says."""
+    """Error for images of another size than in the cell file."""
     return place.error(
         "image_size",
         f"its pictures are {width}x{height} px; the cell file says {options.width}x{options.height}. Set width = "

@@ -1,4 +1,4 @@
-"""A recording on the clock: which of its frames are due, under which stamps. Read in the caller's own thread."""
+"""Playback of a recording on the clock, in the caller's thread: due frames with their stamps."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ MOST_A_POLL = 8
 
 
 class Playback:
-    """Frames of a recording at their times: its first one is due when delivery begins.
+    """Frames of a recording at their times; the first one is due when delivery begins.
 
-    With pace ``every`` each poll gives the next frame with the recording's own stamps, whatever the clock says.
+    With pace ``every`` each poll gives the next frame with the recording's own stamps, whatever the clock's time.
     """
 
     def __init__(self, place: Place, options: VideoOptions, camera: str, watch: Watch, clock: Clock) -> None:
@@ -47,7 +47,7 @@ class Playback:
         return first
 
     def begin(self) -> None:
-        """The next frame is due now."""
+        """Start delivery: the next frame is due now."""
         if self._coming is not None and self._options.pace == "recorded":
             self._offset_ns = self._clock.now_ns() - self._coming.t_received_ns
 
@@ -67,7 +67,7 @@ class Playback:
         return found
 
     def _seen(self, coming: Frame) -> Frame | None:
-        """The frame as it is delivered; None where it repeats the last picture."""
+        """The frame to deliver; None where it repeats the last image."""
         image = one_channel(coming.image, self._options.channel, self._options.flip)
         watch = self._watch
         if not watch.see(image, coming.t_received_ns, coming.seq, 0, look=self._look > 0):

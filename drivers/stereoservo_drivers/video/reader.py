@@ -1,4 +1,4 @@
-"""The thread of one live camera: it waits for pictures and keeps the newest."""
+"""Thread of one live camera, which waits for images and keeps the newest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ daemon, and nothing that it still receives gets out.
 
 
 class Reader:
-    """Reads ``source``, never used before, in a thread of its own. Every wait of its callers is bounded."""
+    """Reads ``source``, which must be unused, in a thread of its own. Every wait of its callers is bounded."""
 
     def __init__(
         self, source: LiveSource, place: Place, options: VideoOptions, camera: str, watch: Watch
@@ -43,11 +43,11 @@ class Reader:
 
     @property
     def settings(self) -> Settings:
-        """What the source was asked for, and what it says."""
+        """Requested and reported settings of the source."""
         return dict(self._source.settings)
 
     def open(self) -> None:
-        """Start, and wait for the first picture. Raises DriverError: the source's, or ``open_timeout``."""
+        """Start, and wait for the first image. Raises DriverError: the source's, or ``open_timeout``."""
         self._watch.begin()
         self._thread.start()
         limit = self._options.open_timeout_s
@@ -61,7 +61,7 @@ class Reader:
                 )
 
     def begin(self) -> None:
-        """Deliver what comes from now on."""
+        """Start delivery of images that arrive from now on."""
         with self._changed:
             self._newest = None
 
@@ -83,7 +83,7 @@ class Reader:
         return None
 
     def close(self) -> None:
-        """End the thread, or leave it alone where it hangs. Idempotent; never raises."""
+        """End the thread, or abandon it where it hangs. Idempotent; never raises."""
         with self._changed:
             self._ending = True
             self._newest = None

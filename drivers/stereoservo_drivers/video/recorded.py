@@ -1,4 +1,4 @@
-"""Recorded pictures: video files and numbered pictures, one at a time; memory does not grow with the file."""
+"""Readers of recorded images: video files and numbered image files, one image at a time in constant memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LARGEST_PICTURE = 50_000_000
 
 
 class Recording(Protocol):
-    """A recording that is read forwards."""
+    """Protocol of a recording that is read forwards."""
 
     def read(self) -> Frame | None:
         """The next frame with the recording's own stamps and numbers; None at the end. Raises DriverError."""
@@ -45,7 +45,7 @@ def open_recording(place: Place, options: VideoOptions, camera: str) -> Recordin
 
 
 def check_file(place: Place, path: Path) -> None:
-    """Raises DriverError: ``missing``, ``permission``, ``not_a_file``, ``empty``."""
+    """Check that a file can be read. Raises DriverError: ``missing``, ``permission``, ``not_a_file``, ``empty``."""
     try:
         found = path.stat()
         if stat.S_ISREG(found.st_mode):
@@ -62,7 +62,7 @@ def check_file(place: Place, path: Path) -> None:
 
 
 class PlainVideo:
-    """A video without a sidecar: numbers are those of its frames, stamps those of a grid of ``rate_hz`` from 0."""
+    """A video without a sidecar: frames are numbered from 0, stamps are on a grid of ``rate_hz`` from 0."""
 
     def __init__(self, place: Place, options: VideoOptions, camera: str) -> None:
         self._place = place
@@ -93,7 +93,9 @@ class PlainVideo:
             raise
 
     def read(self) -> Frame | None:
-        """The next frame. Raises DriverError (``truncated``: it says that it has more; ``silent``: it does not end)."""
+        """The next frame. Raises DriverError (``truncated``: it states more frames; ``silent``: reading does not
+        end).
+        """
         begun_s = time.monotonic()
         if not self._capture.grab():
             if time.monotonic() - begun_s >= self._options.read_timeout_s:
@@ -126,7 +128,7 @@ class PlainVideo:
 
 
 class StampedVideo:
-    """A recorded camera with its sidecar: numbers and stamps of its own, every frame checked by its CRC."""
+    """A recorded camera with its sidecar: recorded numbers and stamps, every frame checked by its CRC."""
 
     def __init__(self, place: Place, options: VideoOptions, camera: str) -> None:
         self._place = place
@@ -169,7 +171,7 @@ class StampedVideo:
 
 
 class NumberedPictures:
-    """Pictures of their own files, numbered without a gap; stamps as those of :class:`PlainVideo`."""
+    """Image files numbered without a gap; stamps as those of :class:`PlainVideo`."""
 
     def __init__(self, place: Place, options: VideoOptions, camera: str) -> None:
         self._place = place
@@ -197,7 +199,7 @@ class NumberedPictures:
             )
 
     def read(self) -> Frame | None:
-        """The next picture. Raises DriverError (``missing``, ``corrupt``, ``image_size``)."""
+        """The next image. Raises DriverError (``missing``, ``corrupt``, ``image_size``)."""
         number = self._next
         if number > self._last:
             return None
@@ -230,7 +232,7 @@ class NumberedPictures:
         return image
 
     def close(self) -> None:
-        """Nothing is open between pictures."""
+        """No effect: no file is open between images."""
 
 
 def _numbers(place: Place) -> Iterator[int]:

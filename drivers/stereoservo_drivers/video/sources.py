@@ -1,4 +1,4 @@
-"""Opened live sources: a video device, an RTSP stream; an MJPEG stream is in ``mjpeg.py``. Used by one thread each."""
+"""Live sources: a video device or an RTSP stream (an MJPEG stream is in ``mjpeg.py``). Used by one thread each."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ MANUAL_EXPOSURE = 1.0
 
 @dataclass(frozen=True)
 class SourcePicture:
-    """What a source gives: ``image`` ``(height, width[, 3])``, when it was received, the source's number of it, and how
-    many pictures received before it were passed over.
+    """An image of a source: ``image`` ``(height, width[, 3])``, when it was received, the source's number of it,
+    and how many images received before it were skipped.
     """
 
     image: ImageArray
@@ -31,16 +31,18 @@ class SourcePicture:
 
 
 class LiveSource(Protocol):
-    """A source that gives pictures by itself. ``settings``: what it was asked for and what it says."""
+    """Protocol of a source that delivers images by itself. ``settings``: requested and reported ones."""
 
     settings: Settings
 
     def open(self) -> None:
-        """Connect. Blocks for the time-out of opening at most, as far as the libraries hold it. Raises DriverError."""
+        """Connect. Blocks at most for the time-out of opening, as far as the libraries respect it. Raises
+        DriverError.
+        """
         ...
 
     def read(self) -> SourcePicture | None:
-        """Wait for the next picture; None: one came that is not whole. Raises DriverError."""
+        """Wait for the next image; None: a damaged one was received. Raises DriverError."""
         ...
 
     def interrupt(self) -> None:
@@ -48,12 +50,12 @@ class LiveSource(Protocol):
         ...
 
     def release(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
         ...
 
 
 class CaptureSource:
-    """A device (V4L2) or an RTSP stream (FFmpeg), by `cv2.VideoCapture`. One that failed is never used again."""
+    """A device (V4L2) or an RTSP stream (FFmpeg), by `cv2.VideoCapture`. Not reused after a failure."""
 
     def __init__(self, place: Place, options: VideoOptions, clock: Clock) -> None:
         self.settings: Settings = {}
@@ -63,7 +65,7 @@ class CaptureSource:
         self._capture: cv2.VideoCapture | None = None
 
     def open(self) -> None:
-        """Open and set what is asked. Raises DriverError."""
+        """Open and apply the settings. Raises DriverError."""
         device = self._place.kind == "device"
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # ours say more
         if device:
@@ -95,12 +97,12 @@ class CaptureSource:
         try:
             os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError as error:
-            code, cure = {
+            code, remedy = {
                 errno.ENOENT: ("missing", "no such device; `ls /dev/video*` shows those there are"),
                 errno.EACCES: ("permission", "no right to use it; the user must be in the group 'video'"),
                 errno.EBUSY: ("busy", "another program uses it"),
             }.get(error.errno or 0, ("not_opened", f"cannot be opened ({error.strerror})"))
-            raise self._place.error(code, cure, retry=True) from error
+            raise self._place.error(code, remedy, retry=True) from error
 
     def _set(self) -> None:
         options = self._options
@@ -117,14 +119,14 @@ class CaptureSource:
             self._ask("gain", cv2.CAP_PROP_GAIN, options.gain)
 
     def _ask(self, name: str, what: int, value: float) -> None:
-        """Set and read back. A device that does not know it, or knows better, is no error: the settings tell."""
+        """Set a property and read it back. An unsupported or adjusted one is no error: the settings report it."""
         capture = self._capture
         assert capture is not None
         known = capture.set(what, value)
         self.settings[name] = value, capture.get(what) if known else None
 
     def read(self) -> SourcePicture | None:
-        """The next picture. Raises DriverError."""
+        """The next image. Raises DriverError."""
         capture = self._capture
         assert capture is not None
         if not capture.grab():
@@ -136,9 +138,9 @@ class CaptureSource:
         return SourcePicture(image, received_ns) if whole else None
 
     def interrupt(self) -> None:
-        """Nothing wakes `cv2.VideoCapture.grab`: it ends by its own time-out."""
+        """No effect: `cv2.VideoCapture.grab` ends by its own time-out."""
 
     def release(self) -> None:
-        """Give the device or the stream free."""
+        """Release the device or the stream."""
         if self._capture is not None:
             self._capture.release()

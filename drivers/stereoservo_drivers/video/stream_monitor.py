@@ -1,4 +1,4 @@
-"""What a camera's pictures tell about the camera: missing ones, and ones that repeat the last."""
+"""Monitor of a camera's image stream: numbers frames, counts missing and repeated ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from stereoservo.numerics.arrays import ImageArray
 
 
 class Watch:
-    """Numbers the frames of one camera, counts the missing, withholds repeated pictures. Lives over reconnections.
+    """Numbers the frames of one camera, counts missing ones, withholds repeated images. Persists over
+    reconnections.
 
     ``row``: how many pictures in a row have been equal to the last one delivered.
     """
@@ -26,7 +27,7 @@ class Watch:
         self._late = 0
 
     def begin(self) -> None:
-        """The source was opened anew: its numbers and its grid begin again, the last picture stays known."""
+        """The source was reopened: numbering and grid restart, the last image stays known."""
         self.row = 0
         self._last_seq = None
         self._last_ns = None
@@ -35,10 +36,10 @@ class Watch:
     def see(
         self, image: ImageArray, t_received_ns: int, seq: int | None, skipped: int, *, look: bool
     ) -> bool:
-        """Count a picture and give it its :attr:`number`; False: it must be withheld.
+        """Count an image and set its :attr:`number`; False: it must be withheld.
 
-        ``seq``: the source's number, None where it gives none: then what is missing is told by the time since the
-        last. ``skipped``: pictures received before it that nobody looked at. ``look``: whether equal ones are frozen.
+        ``seq``: the source's number, None where it gives none: then what is missing is determined by the time since the
+        last. ``skipped``: pictures received before it that were not processed. ``look``: whether equal ones are frozen.
         """
         if seq is not None and seq == self._last_seq:
             self.frozen += 1
@@ -60,7 +61,7 @@ class Watch:
         return True
 
     def _missing(self, t_received_ns: int, seq: int | None, skipped: int) -> int:
-        """Frames that never came just before this one; -1: one that was counted as missing was but late."""
+        """Number of frames missing just before this one; -1: one that was counted as missing was only late."""
         if seq is not None and self._last_seq is not None:
             return max(0, seq - self._last_seq - 1 - skipped)  # a lower one: the source began again
         if seq is not None or self._last_ns is None:

@@ -1,4 +1,4 @@
-"""Alternative joint axes for a metric bundle that a flat target may have led into a local minimum.
+"""Alternative joint axes as new start values, for a metric bundle in a local minimum (which planar targets cause).
 
 A plate that rotates nearly in its own plane determines its axis by small perspective effects only, and two axes may
 explain it almost alike. With cameras and markers known, each joint's trial is searched over all directions.
@@ -22,7 +22,8 @@ GAIN = 8.0
 
 
 def with_other_axes(solution: Solution) -> list[RigModel]:
-    """Metric rigs in which revolute joints turn about axes that explain their own trials better, most joints first.
+    """Metric rigs to start from again: revolute joints get the axes that fit their own trials better, most joints
+    first.
 
     Empty where no joint has a better one.
     """
@@ -43,14 +44,16 @@ def with_other_axes(solution: Solution) -> list[RigModel]:
 
 
 def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
-    """A generator (4, 4) that explains a joint's trial better, cameras and markers as they are; or None."""
+    """Generator (4, 4) that fits a joint's own trial better, with cameras and markers fixed; None where there is
+    none.
+    """
     rig, data = solution.rig, solution.data
     used = np.unique(data.stop)
     base = np.median(data.offsets[used], axis=0)
     still = np.asarray((np.delete(np.abs(data.offsets - base), joint, axis=1) <= STILL).all(axis=1))
     own = data.select(still[data.stop])
-    way = data.offsets[:, joint]
-    span = float(np.ptp(way[still])) if still.any() else 0.0
+    displacement = data.offsets[:, joint]
+    span = float(np.ptp(displacement[still])) if still.any() else 0.0
     if span == 0.0:
         return None
     base[joint] = 0.0
@@ -64,10 +67,12 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
     )
     own = replace(own, offsets=data.offsets[:, joint : joint + 1], lens_priors=None)
     now = _solved(single, own)
-    middles = [_middle(single, float(end)) for end in (way[still].min(), way[still].max())]
+    centroids = [
+        _centroid(single, float(end)) for end in (displacement[still].min(), displacement[still].max())
+    ]
     best: Solution | None = None
     for direction in DIRECTIONS:
-        start = replace(single, generators=twist_about(direction, middles, span)[None])
+        start = replace(single, generators=twist_about(direction, centroids, span)[None])
         try:
             fit = _solved(start, own)
         except np.linalg.LinAlgError:
@@ -81,8 +86,8 @@ def _solved(rig: RigModel, data: Measurements) -> Solution:
     return solve(rig, data, "metric", cameras=False, points=False, max_evaluations=40, tolerance=1e-4)
 
 
-def _middle(rig: RigModel, angle: float) -> FloatArray:
-    """Middle (3,) of a single joint's markers at ``angle``."""
+def _centroid(rig: RigModel, angle: float) -> FloatArray:
+    """Centroid (3,) of a single joint's markers at ``angle``."""
     _, after = partial_products(rig, np.array([[angle]]))
     points = rig.points @ after[0, 0].T
     return np.asarray((points[:, :3] / points[:, 3:]).mean(axis=0))

@@ -44,7 +44,7 @@ FREE_DAMPING = 1e-2
 
 @dataclass(frozen=True)
 class Solution:
-    """A solved bundle of ``data``, and the minimal ``charts`` at its ``rig``.
+    """Result of a bundle adjustment of ``data``, with the minimal ``charts`` at its ``rig``.
 
     ``cost``: sum of squared weighted residuals, those of lens priors included; ``residuals`` (2 k,) without them.
     """
@@ -99,7 +99,8 @@ def solve(
     max_evaluations: int = 100,
     tolerance: float = 1e-10,
 ) -> Solution:
-    """Least squares over the minimal charts of ``stratum`` by Levenberg and Marquardt, re-centred at every step.
+    """Least-squares bundle over the minimal charts of ``stratum`` by Levenberg-Marquardt, re-linearised at every
+    step.
 
     Columns are scaled to unit length. ``loss_scale`` [sigmas] for the robust losses, which are re-weighted
     iteratively. ``tolerance``: decrease, relative to the cost, below which nothing is left to gain. Raises
@@ -175,7 +176,7 @@ def _loss(error: FloatArray, loss: Loss, scale: float) -> float:
 
 
 def _weights(loss: Loss, scale: float) -> Weights | None:
-    """``ρ'(e²/s²)`` of squared residuals; None for plain least squares."""
+    """IRLS weights ``ρ'(e²/s²)`` of squared residuals; None for plain least squares."""
     if loss == "linear":
         return None
     if loss == "soft_l1":

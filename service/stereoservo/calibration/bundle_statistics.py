@@ -26,7 +26,7 @@ def degrees_of_freedom(solution: Solution) -> int:
 
 
 def variance_factor(solution: Solution) -> float:
-    """Estimated over stated variance of the pixels."""
+    """Variance factor of the fit: estimated over stated variance of the pixels."""
     return solution.cost / max(1, degrees_of_freedom(solution))
 
 
@@ -86,8 +86,8 @@ class GroupRms(NamedTuple):
 
 
 def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) -> GroupRms:
-    """Of pixels (k,): mean squared residuals of the two coordinates [px²], sigmas [px], and the variance of their
-    prediction [px², both coordinates].
+    """Residual statistics of a group of pixels (k,), from squared residuals of the two coordinates [px²], sigmas
+    [px], and the variance of their prediction [px², both coordinates].
     """
     n = 2 * len(squares)
     if not n:
@@ -95,8 +95,8 @@ def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) ->
     left = np.maximum(2.0 - variances / sigmas**2, 0.0)
     expected = float((sigmas**2 * left).sum()) / n
     # Of Gaussian residuals r = (I - H) e: var(rᵀr) <= 2 σ⁴ trace(I - H_g).
-    spread = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
-    error = 0.5 * spread / np.sqrt(expected) if expected > 0.0 else 0.0
+    deviation = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
+    error = 0.5 * deviation / np.sqrt(expected) if expected > 0.0 else 0.0
     return GroupRms(float(np.sqrt(squares.mean())), float(np.sqrt(expected)), float(error))
 
 

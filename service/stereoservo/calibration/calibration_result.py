@@ -215,9 +215,7 @@ def build_model(
     epoch: int,
     created: str,
 ) -> CellModel:
-    """The model in the canonical projective frame: ``P_left = [N⁻¹ | 0]``, heights 1 by the plane at
-    infinity.
-    """
+    """Model in the canonical projective frame: ``P_left = [N⁻¹ | 0]``, points scaled to 1 by the plane at infinity."""
     rig, stratum = solution.rig, solution.stratum
     if stratum == "projective":
         frame: FloatArray = np.eye(4)

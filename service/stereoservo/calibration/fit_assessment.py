@@ -1,4 +1,4 @@
-"""Assessment of a calibration in words: grade, reasons, and what to do."""
+"""Assessment of a calibration for people: grade, reasons, and advice."""
 
 from __future__ import annotations
 
@@ -104,11 +104,11 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
     _left_out(model, report, reasons, advice)
     _identified(model, report, depth_spread, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
-    said = f"residual {statistics.rms_px:.3g} px rms" + (
+    summary = f"residual {statistics.rms_px:.3g} px rms" + (
         ", as the measurement noise explains" if statistics.chi2_ok else ""
     )
     stratum = STRATA[model.stratum]
-    text = f"{grade}: {'; '.join(reasons)}" if reasons else f"good: {said}"
+    text = f"{grade}: {'; '.join(reasons)}" if reasons else f"good: {summary}"
     text += f". Stratum {stratum}."
     if advice:
         text += " " + " ".join(f"{line[0].upper()}{line[1:]}." for line in advice)
@@ -117,9 +117,9 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
 
 def assess_failure(code: str, message: str) -> Acceptance:
     """Assessment of a calibration that gave no model."""
-    cure = REMEDIES.get(code, "look at the tracks in the report")
-    said = message if message.endswith((".", "?")) else f"{message}."
-    return Acceptance("not usable", f"not usable: {said} What to do: {cure}.", (message,), (cure,))
+    remedy = REMEDIES.get(code, "look at the tracks in the report")
+    summary = message if message.endswith((".", "?")) else f"{message}."
+    return Acceptance("not usable", f"not usable: {summary} What to do: {remedy}.", (message,), (remedy,))
 
 
 def _residuals(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:

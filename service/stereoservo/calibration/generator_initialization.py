@@ -1,4 +1,4 @@
-"""Start values for a single joint's generator: linear, rigid by nominal cameras, and rotations about all directions."""
+"""Start values of a single joint's generator: linear, rigid by nominal cameras, or rotations about all directions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DIRECTIONS = np.array(
 """Start directions (26, 3): faces, edges and corners of a cube."""
 
 
-def spread_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
+def distant_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
     """First and second stops of the pairs where ``apart`` (k, k) holds, at most ``MAX_PAIRS``, evenly spread."""
     first, second = np.nonzero(apart)
     if len(first) <= MAX_PAIRS:
@@ -54,7 +54,7 @@ def linear_generator(
     ``angles`` (k,). None where the solution is no rotation.
     """
     span = float(np.ptp(angles))
-    first, second = spread_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
+    first, second = distant_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
     valid = finite_rows(points)
     pair, marker = np.nonzero(valid[first] & valid[second])
     here, there = first[pair], second[pair]
@@ -107,7 +107,7 @@ def nominal_generator(
     with np.errstate(divide="ignore", invalid="ignore"):
         euclidean = points @ upgrade.T / points[..., 3:]
     valid = finite_rows(euclidean)
-    first, second = spread_pairs(angles[None, :] - angles[:, None] > 0.5 * np.ptp(angles))
+    first, second = distant_pairs(angles[None, :] - angles[:, None] > 0.5 * np.ptp(angles))
     best, least = None, np.inf
     for k, n in zip(first, second, strict=True):
         both = valid[k] & valid[n]
@@ -131,8 +131,8 @@ def nominal_generator(
 
 
 def turned_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray]:
-    """Generators (4, 4) of rotations about ``DIRECTIONS``, as if the cameras were nominal ones: each takes the middle
-    of the markers along the trial's chord.
+    """Generators (4, 4) of rotations about ``DIRECTIONS``, as if the cameras were nominal ones: each moves the
+    markers' centroid along the trial's chord.
 
     ``points`` (k, m, 4), ``angles`` (k,). Noise excludes none of them, however little the markers turn.
     Empty where no two stops far apart have three markers in common.
@@ -153,7 +153,7 @@ def turned_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray
 
 
 def twist_about(direction: FloatArray, middles: Sequence[FloatArray], span: float) -> FloatArray:
-    """Unit twist (4, 4) about a ``direction`` (3,) that takes the markers' middle over the trial as seen.
+    """Unit twist (4, 4) about a ``direction`` (3,) that moves the markers' centroid as observed in the trial.
 
     The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
     """
@@ -169,7 +169,7 @@ def twist_about(direction: FloatArray, middles: Sequence[FloatArray], span: floa
 
 
 def _robust_least_squares(system: FloatArray, right: FloatArray, rounds: int = 8) -> FloatArray:
-    """Iteratively re-weighted least squares with Cauchy weights at the median residual."""
+    """Least squares by iterative re-weighting with Cauchy weights at the median residual."""
     scale = np.linalg.norm(system, axis=0)
     scale[scale == 0] = 1.0
     weights = np.ones(len(right))
@@ -190,8 +190,8 @@ def _robust_least_squares(system: FloatArray, right: FloatArray, rounds: int = 8
 
 
 def common_points(generator: FloatArray, kind: str, points: FloatArray, angles: FloatArray) -> FloatArray:
-    """Markers (m, 4) at angle 0: the median over stops of the points (k, m, 4) brought there, depth 1; NaN
-    if never seen.
+    """Markers (m, 4) at angle 0: median over stops of the points (k, m, 4) moved back there, depth 1; NaN if never
+    seen.
     """
     back = exp_generator(kind, generator, -angles)
     moved = np.einsum("kij,kmj->kmi", back, points)

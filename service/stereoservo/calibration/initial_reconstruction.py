@@ -34,7 +34,8 @@ margin.
 
 
 def initial_reconstruction(trials: TrialData) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Cameras (c, 3, 4) in the canonical frame, points (s, m, 4) of each stop, and usable pixels (c, s, m).
+    """Projective reconstruction of all stops: cameras (c, 3, 4) in the canonical frame, points (s, m, 4), usable
+    pixels (c, s, m).
 
     Points have depth 1 in the left camera, NaN where they are not usable in two cameras. Raises
     CalibrationError (``too_few_markers``, ``views_degenerate``).
@@ -79,7 +80,7 @@ def initial_reconstruction(trials: TrialData) -> tuple[FloatArray, FloatArray, B
 def _epipolar(
     trials: TrialData, flat: FloatArray, sigmas: FloatArray, k: int
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """F of cameras 0 and k, inliers among the common matches, and which (s m,) are common."""
+    """F of cameras 0 and k, the inliers among the common matches, and the mask (s m,) of these matches."""
     seen = np.isfinite(flat[0]).all(axis=1) & np.isfinite(flat[k]).all(axis=1)
     names = f"{trials.cameras[0].name!r} and {trials.cameras[k].name!r}"
     if int(seen.sum()) < MIN_MATCHES:
@@ -129,11 +130,11 @@ def _epipolar(
 
 
 def _weak_parallax(left: FloatArray, right: FloatArray, sigma: float) -> FloatArray | None:
-    """F (3, 3) of matches (n, 2) whose parallax is below the noise of each but not of all together; else None."""
+    """F (3, 3) of matches (n, 2) whose parallax is below the noise of each but significant over all; else None."""
     try:
         F, inliers = fundamental_robust(left, right, sigma, refuse_plane=False)
     except GeometryError:
-        return None  # no geometry at all is left to be said by the other tries
+        return None  # no geometry at all is reported by the other attempts
     enough = PARALLAX_RATIO + PARALLAX_SCATTER / np.sqrt(float(inliers.sum()))
     return F if parallax_ratio(F, left[inliers], right[inliers]) > enough else None
 

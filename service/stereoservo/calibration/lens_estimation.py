@@ -1,4 +1,4 @@
-"""Lens models of the cameras: start values, and a test whether the data need radial distortion.
+"""Lens models of the cameras: start values, and a significance test of radial distortion.
 
 The models are nested: none, or a radial parameter with its centre for each camera. The centre is held by a weak prior:
 a small distortion does not determine it, but fixing it would underestimate the uncertainty.
@@ -37,7 +37,7 @@ LENS_TAIL = 1e-4
 @dataclass(frozen=True)
 class LensTest:
     """Test of the radial parameters: ``chi2`` of ``freedom`` parameters against zero, and the ``limit`` that
-    pinholes stay below but for ``LENS_TAIL`` of cases.
+    pinhole cameras exceed with probability ``LENS_TAIL``.
     """
 
     chi2: float
@@ -53,7 +53,7 @@ class LensTest:
 def starting_lenses(
     trials: TrialData, asked: Literal["auto"] | LensModel, priors: Mapping[str, LensEstimate]
 ) -> tuple[FloatArray, LensModel]:
-    """Lenses (c, 4) to start from and what of them is free in the first bundle.
+    """Lenses (c, 4) to start from, and which of their parameters are free in the first bundle.
 
     Where ``asked`` leaves it to the data, lenses are free at once if priors are given or the epipolar geometry
     needs them. Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
@@ -97,7 +97,7 @@ def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> Le
 
 
 def straightened(rig: RigModel, data: Measurements) -> RigModel:
-    """The rig with pinholes, centres where the priors of ``data`` have them."""
+    """The rig with pinhole cameras, distortion centres from the priors of ``data``."""
     lenses = rig.lenses.copy()
     lenses[:, 0] = 0.0
     if data.lens_priors is not None:
@@ -137,7 +137,7 @@ PINHOLE_AGREEMENT = 0.95
 COARSE_PX = 1.5
 """Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
 MOST_BEND = 0.6
-"""Largest radial parameter of a lens to start from, either way."""
+"""Largest magnitude of the radial parameter of a lens to start from."""
 WORTH_SHARE = 0.03
 """By how much a lens must raise the share of matches that fit: misfit that it does not cure is not the lens's."""
 CENTRE_SHARE = 0.1
@@ -156,7 +156,7 @@ def straight_lenses(trials: TrialData) -> FloatArray:
 
 
 def undistorted(trials: TrialData, lenses: FloatArray) -> TrialData:
-    """The trials as pinholes would have seen them; sigmas scale with the area that a pixel covers.
+    """The trials with lens distortion removed; sigmas scale with the area that a pixel covers.
 
     Pixels that no ideal pixel is imaged to are NaN.
     """
@@ -167,7 +167,7 @@ def undistorted(trials: TrialData, lenses: FloatArray) -> TrialData:
 
 
 def _stretches(lenses: FloatArray, pixels: FloatArray) -> FloatArray:
-    """How much larger than raw pixels ideal ones (c, ..., 2) are: (c, ...); 1 where a pixel is missing."""
+    """Local magnification (c, ...) from raw to ideal pixels (c, ..., 2); 1 where a pixel is missing."""
     out = np.empty(pixels.shape[:-1])
     for lens, ideal, stretch in zip(lenses, pixels, out, strict=True):
         square = lens[0] * ((ideal - lens[1:3]) ** 2).sum(axis=-1) / lens[3] ** 2
@@ -177,7 +177,8 @@ def _stretches(lenses: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def epipolar_lenses(trials: TrialData) -> FloatArray:
-    """Lenses (c, 4) that the matches of the first camera with each other one need; straight where none is needed.
+    """Lenses (c, 4) from the epipolar geometry of the first camera with each other one; without distortion where
+    none is needed.
 
     A lens is believed where it lowers the robust epipolar cost by far more than chance does (``START_GAIN``).
     """
@@ -204,8 +205,8 @@ def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float:
-    """Share of matches that one epipolar geometry fits behind ``lenses``; 1 where they lie on one plane, which
-    determines nothing.
+    """Share of matches that one epipolar geometry fits after undistortion by ``lenses``; 1 for coplanar points,
+    which determine nothing.
     """
     ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
     known = np.asarray(finite_rows(ideal).all(axis=0))

@@ -1,4 +1,4 @@
-"""Normal equations of the bundle by blocks, for its steps, and its triangular factor by QR, for its statistics.
+"""Normal equations of the bundle in blocks, for its steps, and their triangular factor by QR, for its statistics.
 
 A pixel depends on the generators, one camera, one lens and one marker. Rows of the Jacobian are made chunk by chunk, so
 that memory stays bounded and cost grows linearly with the images; markers, which no pixel shares, are eliminated from
@@ -83,8 +83,8 @@ def _point_derivative(
 
 @kernel
 def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: FloatArray) -> None:
-    """Derivative ``own`` (2, q) of a pixel by the coordinates of its marker along ``basis`` (q, 4); ``outer`` (2, 4) is
-    that by the displaced point.
+    """Derivative (2, q) of a pixel by the coordinates of its marker along ``basis`` (q, 4), into ``own``; ``outer``
+    (2, 4) is that by the displaced point.
     """
     for a in range(own.shape[1]):
         D4 = basis[a]
@@ -106,7 +106,8 @@ def _rows_into(
     camera: IntArray, stop: IntArray, marker: IntArray, pixels: FloatArray, sigmas: FloatArray,
     core: FloatArray, own: FloatArray,
 ) -> None:  # fmt: skip
-    """Weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's first.
+    """Fill weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's
+    first.
 
     ``core`` (2 k, p + 1), zero on entry: derivatives by generators, cameras and lenses, then the residual. ``own``
     (2 k, 3 or 0): by the coordinates of the measurement's own marker. ``generator_basis`` (4, 4, p), the
@@ -176,7 +177,7 @@ def _rows_into(
 def _markers_into(
     core: FloatArray, own: FloatArray, marker: IntArray, cross: FloatArray, square: FloatArray
 ) -> None:
-    """Add the markers' blocks: ``cross`` (m, q, p + 1) by ``core`` (2 k, p + 1), ``square`` (m, q, q)."""
+    """Accumulate the markers' blocks: ``cross`` (m, q, p + 1) by ``core`` (2 k, p + 1), ``square`` (m, q, q)."""
     q, width = own.shape[1], core.shape[1]
     for row in range(len(core)):
         i = marker[row // 2]
@@ -210,13 +211,13 @@ class Rows:
 
 
 def by_stop(data: Measurements) -> tuple[Measurements, IntArray]:
-    """The measurements sorted by stop, marker and camera, as rows need them, and their order (k,)."""
+    """Measurements sorted by stop, marker and camera, the order that `Rows` needs, and the permutation (k,)."""
     order: IntArray = np.lexsort((data.camera, data.marker, data.stop))
     return data.select(order), order
 
 
 def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[slice, Rows]]:
-    """Rows of ``data``, sorted as by :func:`by_stop`, a chunk at a time, and their slice of ``data``."""
+    """Rows of ``data`` (sorted by :func:`by_stop`) in chunks, each with its slice of ``data``."""
     generator_basis = np.concatenate([np.zeros((0, 4, 4)), *charts.generators])
     camera_basis = np.concatenate([np.zeros((0, 3, 4)), *charts.cameras])
     lens_basis = np.concatenate([np.zeros((0, 4)), *charts.lenses])
@@ -365,7 +366,7 @@ def _triangle(rows: FloatArray) -> FloatArray:
 
 
 def leverages(rig: RigModel, charts: Charts, data: Measurements, root: FloatArray) -> FloatArray:
-    """``trace(J_i C J_iᵀ)`` (k,) of each measurement, in its sigmas: its share of the hat matrix's trace.
+    """Leverage (k,) of each measurement, ``trace(J_i C J_iᵀ)`` in its sigmas: its share of the hat matrix's trace.
 
     ``root`` (p, p): ``C = root rootᵀ`` is the parameters' covariance.
     """

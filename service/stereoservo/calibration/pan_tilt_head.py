@@ -1,4 +1,5 @@
-"""Pan-tilt head: cameras on two joints before a static scene or a moving target (thesis 4.5).
+"""Calibration and tracking control of a pan-tilt head: cameras on two joints before a static scene or a moving
+target (thesis 4.5).
 
 Calibration is the ordinary fit with cameras mounted eye-in-hand. From it follow the predicted image after a motion of
 the joints (4.44), homing and angles (`kinematics.joint_angles`), and the joint velocity that keeps a moving target at
@@ -54,8 +55,9 @@ def _check_pan_tilt(kinds: tuple[str, ...], mounts: tuple[str, ...]) -> None:
 def feed_forward(
     seen: SeenChain, q_from: FloatArray, pixels: FloatArray, q_to: FloatArray, sigma: FloatArray | float = 1.0
 ) -> FloatArray:
-    """Raw pixels (s, c, m, 2) at configurations ``q_to`` (s, n) of what was seen at ``pixels`` (c, m, 2) in ``q_from``
-    (n,): reconstructed, moved by the joints (4.44), projected. NaN where two cameras do not see a point.
+    """Predicted raw pixels (s, c, m, 2) at configurations ``q_to`` (s, n) of points seen at ``pixels`` (c, m, 2) in
+    ``q_from`` (n,): reconstructed, displaced by the joints (4.44), projected. NaN where two cameras do not see a
+    point.
     """
     points, _ = points_seen(seen, q_from, pixels, sigma)
     return predicted_pixels(seen, np.atleast_2d(q_to), points)
@@ -146,7 +148,7 @@ def tracking_velocity(
             "too_few", "no set-point belongs to a point with a track; at least one is needed"
         )
     n = seen.chain.joints
-    rows, wanted = J[required].reshape(-1, n), -(gain * error + own)[required].ravel()
-    velocity, _, _, singular = np.linalg.lstsq(rows, wanted, rcond=CONDITIONING)
+    rows, target_velocity = J[required].reshape(-1, n), -(gain * error + own)[required].ravel()
+    velocity, _, _, singular = np.linalg.lstsq(rows, target_velocity, rcond=CONDITIONING)
     conditioning = float(singular[-1] / singular[0]) if len(singular) == n and singular[0] > 0 else 0.0
     return TrackingStep(velocity, float(np.linalg.norm(error[required], axis=1).max()), conditioning)

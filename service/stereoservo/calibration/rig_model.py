@@ -245,10 +245,10 @@ def common_mount(trials: TrialData) -> Mount:
     """The mount that all cameras of the trials share. Raises CalibrationError (``mixed_mounts``)."""
     mounts = {camera.name: camera.mount for camera in trials.cameras}
     if len(set(mounts.values())) > 1:
-        told = ", ".join(f"{name!r} {mount}" for name, mount in mounts.items())
+        listed = ", ".join(f"{name!r} {mount}" for name, mount in mounts.items())
         raise CalibrationError(
             "mixed_mounts",
-            f"the cameras are mounted differently: {told}. One model needs cameras that see one motion: "
+            f"the cameras are mounted differently: {listed}. One model needs cameras that see one motion: "
             "calibrate those that stand and those on the tip each on their own",
             mounts=mounts,
         )
@@ -270,7 +270,7 @@ def reversed_trials(trials: TrialData) -> TrialData:
 
 
 def with_joints_reversed(model: CellModel) -> CellModel:
-    """The model of reversed trials with its joints in base-first order again, mounted eye-in-hand."""
+    """Model of reversed trials with its joints base first again, mounted eye-in-hand."""
     statistics = model.statistics
     if statistics is not None:
         statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])

@@ -68,11 +68,11 @@ def fit_model(
     """Model of a cell fitted to its trial motions, with a report of the fit.
 
     Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
-    joints from the base either way. Static markers become the model's static points. ``lens_priors``: by
+    joints from the base in both cases. Static markers become the model's static points. ``lens_priors``: by
     camera name, an estimate of its lens from straight lines
     (`geometry.distortion_lines`).
 
-    ``progress(stage, fraction)`` is called as the work goes on. Raises CalibrationError with the cause where
+    ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
     Between that and the noise floor the model's ``chi2_ok`` is false and the report's notes contain what is
     known.
@@ -135,7 +135,7 @@ def _fit(
     report_progress("rigid bundle", 0.6)
     decided = options.lens != "auto" or bool(priors)
     solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
-    _refuse_misfit(trials, solution, every, inliers, options)
+    _refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
     raised = select_stratum(solution, every.select(inliers), options)
     final, inliers = refine_to_convergence(
@@ -148,8 +148,8 @@ def _fit(
         final, inliers = refine_to_convergence(
             raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS
         )
-    _refuse_misfit(trials, final, every, inliers, options)
-    _refuse_open(final, raised.notes)
+    _refuse_poor_fit(trials, final, every, inliers, options)
+    _refuse_undetermined(final, raised.notes)
     report_progress("report", 0.95)
     result = build_fit(
         trials,
@@ -177,7 +177,7 @@ def _projective(
     options: FitOptions,
     decided: bool,
 ) -> tuple[Solution, BoolArray]:
-    """The projective bundle on its inliers; unless ``decided``, with the lenses that the data ask for."""
+    """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
     robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     if not decided and lenses == "none":
         # Before anything is called an outlier: distortion makes many of them.
@@ -231,7 +231,7 @@ def _without_rare_markers(
 def link_joints(
     trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
 ) -> RigModel:
-    """Rig of all joints, base to tip: operators transformed from their trials' bases to one zero (5.21), with one
+    """Rig of all joints, base to tip: generators transformed from their trials' bases to one zero (5.21), one
     marker structure (5.53).
 
     Raises CalibrationError (``too_few_markers``) for a marker that no trial shows.
@@ -272,7 +272,7 @@ def refine_to_convergence(
     lenses: LensModel,
     tolerance: float = 1e-10,
 ) -> tuple[Solution, BoolArray]:
-    """Least-squares bundle and its inliers (k,): gate and solve are repeated until the set of inliers is constant.
+    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same.
 
     Whether the last solution has converged is for the caller to judge. Raises CalibrationError
     (``no_convergence``).
@@ -287,8 +287,8 @@ def refine_to_convergence(
         inliers = again
     else:
         if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
-            # A projective bundle on its way along an open valley: a higher stratum may close it. Whether the last
-            # solution has converged is asked at the end.
+            # A projective bundle that still moves along an undetermined direction: a higher stratum may close it.
+            # Whether the last solution has converged is asked at the end.
             return solution, inliers
         raise CalibrationError(
             "no_convergence",
@@ -311,7 +311,7 @@ def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> Bool
     return inside
 
 
-def _refuse_misfit(
+def _refuse_poor_fit(
     trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
 ) -> None:
     share = float((~inliers).mean())
@@ -365,8 +365,8 @@ def _refuse_misfit(
         )
 
 
-def _refuse_open(solution: Solution, notes: tuple[str, ...]) -> None:
-    """Refuse a final bundle with directions that the data leave open, or that has not converged."""
+def _refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
+    """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
     rank = rank_of(solution)
     because = f" ({'; '.join(notes)})" if notes else ""
     if rank < solution.charts.size:

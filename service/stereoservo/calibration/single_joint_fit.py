@@ -167,10 +167,10 @@ def fit_single_joint(
     """
     name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
     stops, groups, base = trial_stops(trials, points, joint)
-    sights = virtual_markers(trials, points, usable, stops, groups)
+    observations = virtual_markers(trials, points, usable, stops, groups)
     angles = trials.positions[stops, joint] - base[joint]
     m = len(trials.marker_ids)
-    seen = np.asarray(sights.usable.any(axis=(0, 1)).reshape(-1, m).any(axis=0), dtype=bool)
+    seen = np.asarray(observations.usable.any(axis=(0, 1)).reshape(-1, m).any(axis=0), dtype=bool)
     if int(seen.sum()) < MIN_MARKERS:
         raise CalibrationError(
             "too_few_markers",
@@ -180,8 +180,8 @@ def fit_single_joint(
             markers=int(seen.sum()),
             minimum=MIN_MARKERS,
         )
-    best, least = best_single_joint(kind, cameras, sights, angles, thorough=True)
-    if best is None and (common := _common_markers(sights, angles)) < MIN_MARKERS:
+    best, least = best_single_joint(kind, cameras, observations, angles, thorough=True)
+    if best is None and (common := _common_markers(observations, angles)) < MIN_MARKERS:
         raise CalibrationError(
             "too_few_markers",
             f"joint {name!r}: any two stops of its trial far apart show {common} markers in common to two cameras; at "
@@ -201,17 +201,17 @@ def fit_single_joint(
             residual_sigmas=least,
             maximum=MISFIT,
         )
-    shown = np.asarray(sights.usable[:, :, :m].any(axis=(0, 1)))
+    shown = np.asarray(observations.usable[:, :, :m].any(axis=(0, 1)))
     return JointTrial(
         joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan)
     )
 
 
-def _common_markers(sights: VirtualObservations, angles: FloatArray) -> int:
-    """Most virtual markers that two stops half of the trial's range apart have in common."""
-    shown = finite_rows(sights.points).astype(np.int64)
-    apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
-    return int((shown @ shown.T)[apart].max(initial=0))
+def _common_markers(observations: VirtualObservations, angles: FloatArray) -> int:
+    """Largest number of virtual markers that two stops half of the trial's range apart have in common."""
+    shown = finite_rows(observations.points).astype(np.int64)
+    far_apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
+    return int((shown @ shown.T)[far_apart].max(initial=0))
 
 
 @dataclass(frozen=True)
@@ -231,10 +231,10 @@ class VirtualObservations:
 def virtual_markers(
     trials: TrialData, points: FloatArray, usable: BoolArray, stops: IntArray, groups: IntArray
 ) -> VirtualObservations:
-    """The markers (m) of G distal ``groups`` (k,) at ``stops`` (k,) as G m rigid virtual ones."""
+    """The markers (m) of G distal ``groups`` (k,) at ``stops`` (k,) as G m virtual markers of one rigid body."""
     c, m, k = len(trials.cameras), len(trials.marker_ids), len(stops)
     count = int(groups.max()) + 1
-    spread = VirtualObservations(
+    virtual = VirtualObservations(
         np.full((k, count * m, 4), np.nan),
         np.zeros((c, k, count * m), dtype=bool),
         np.full((c, k, count * m, 2), np.nan),
@@ -243,11 +243,11 @@ def virtual_markers(
     here: BoolArray = usable[:, stops] & finite_rows(points[stops])
     for g in range(count):
         at, rows = slice(g * m, (g + 1) * m), np.flatnonzero(groups == g)
-        spread.points[rows, at] = points[stops[rows]]
-        spread.usable[:, rows, at] = here[:, rows]
-        spread.pixels[:, rows, at] = trials.pixels[:, stops[rows]]
-        spread.sigmas[:, rows, at] = trials.sigmas[:, stops[rows]]
-    return spread
+        virtual.points[rows, at] = points[stops[rows]]
+        virtual.usable[:, rows, at] = here[:, rows]
+        virtual.pixels[:, rows, at] = trials.pixels[:, stops[rows]]
+        virtual.sigmas[:, rows, at] = trials.sigmas[:, stops[rows]]
+    return virtual
 
 
 def own_trials(
@@ -268,38 +268,46 @@ def own_trials(
 def best_single_joint(
     kind: Kind,
     cameras: FloatArray,
-    sights: VirtualObservations,
+    observations: VirtualObservations,
     angles: FloatArray,
     *,
     thorough: bool = False,
 ) -> tuple[RigModel | None, float]:
-    """The single joint of ``kind`` that explains the ``sights`` at ``angles`` (k,) best, with its median residual
-    [sigmas]; starts are tried until one fits. ``thorough``: unless one does, or two end alike, rotations about axes
-    all around are tried, too.
+    """Single joint of ``kind`` that fits the ``sights`` at ``angles`` (k,) best, with its median residual [sigmas];
+    start values are tried until one fits. ``thorough``: unless one does, or two converge to the same result,
+    rotations about axes in all directions are tried, too.
     """
-    camera, stop, marker = np.nonzero(sights.usable)
+    camera, stop, marker = np.nonzero(observations.usable)
     data = Measurements(
         angles[:, None],
         camera,
         stop,
         marker,
-        sights.pixels[sights.usable].reshape(-1, 2),
-        sights.sigmas[sights.usable].ravel(),
+        observations.pixels[observations.usable].reshape(-1, 2),
+        observations.sigmas[observations.usable].ravel(),
     )
     found: list[_StartResult] = []
     for start in (linear_generator, nominal_generator):
-        generator = start(kind, cameras, sights.points, sights.usable, sights.pixels, sights.sigmas, angles)
+        generator = start(
+            kind,
+            cameras,
+            observations.points,
+            observations.usable,
+            observations.pixels,
+            observations.sigmas,
+            angles,
+        )
         if generator is not None:
-            found += _solve_from(kind, generator, cameras, sights, data, FULL)
+            found += _solve_from(kind, generator, cameras, observations, data, FULL)
             if found and found[-1].fits:
                 break
     if thorough and kind == "revolute" and not _is_certain(found):
         turned: list[_StartResult] = []
-        for generator in turned_generators(sights.points, angles):
-            turned += _solve_from(kind, generator, cameras, sights, data, SHORT)
+        for generator in turned_generators(observations.points, angles):
+            turned += _solve_from(kind, generator, cameras, observations, data, SHORT)
         if turned:
             rig = min(turned, key=lambda one: one.score).rig
-            found += _solve_from(kind, rig.generators[0], cameras, sights, data, FULL)
+            found += _solve_from(kind, rig.generators[0], cameras, observations, data, FULL)
     best = min(found, key=lambda one: one.score, default=None)
     return (best.rig, best.typical) if best is not None else (None, np.inf)
 
@@ -319,7 +327,7 @@ class _StartResult:
 
 
 def _is_certain(found: list[_StartResult]) -> bool:
-    """Whether the best result is a minimum that fits, or one that two starts have reached."""
+    """Whether the best result fits, or was reached from two start values."""
     if not found:
         return False
     best = min(found, key=lambda one: one.score)
@@ -331,13 +339,13 @@ def _solve_from(
     kind: Kind,
     generator: FloatArray,
     cameras: FloatArray,
-    sights: VirtualObservations,
+    observations: VirtualObservations,
     data: Measurements,
     evaluations: int,
 ) -> list[_StartResult]:
-    """Result of a start with ``generator`` (4, 4) after at most ``evaluations``; empty where it breaks down."""
-    structure = common_points(generator, kind, sights.points, data.offsets[:, 0])
-    structure[~sights.usable.any(axis=(0, 1))] = [0.0, 0.0, 1.0, 1.0]
+    """Result from start value ``generator`` (4, 4) after at most ``evaluations``; empty where the fit fails."""
+    structure = common_points(generator, kind, observations.points, data.offsets[:, 0])
+    structure[~observations.usable.any(axis=(0, 1))] = [0.0, 0.0, 1.0, 1.0]
     try:
         fit = solve(
             RigModel((kind,), generator[None], cameras, structure),

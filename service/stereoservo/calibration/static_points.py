@@ -59,8 +59,8 @@ def with_static_points(
 def _scene_point(
     model: CellModel, pixels: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray] | str:
-    """A point (4,) of height 1 and its covariance (4, 4), given the cameras, from raw pixels (c, 2), NaN where missing;
-    or why not.
+    """Point (4,) of scale 1 and its covariance (4, 4), given the cameras, from raw pixels (c, 2), NaN where
+    missing; or the reason why there is none.
     """
     seen = np.flatnonzero(np.isfinite(pixels).all(axis=1))
     if len(seen) < 2:
@@ -137,7 +137,7 @@ def _covariance(
     pixels: FloatArray,
     sigmas: FloatArray,
 ) -> FloatArray:
-    """Covariance (2 c, 2 c) of the pixels of a point, with that of the cameras which see it."""
+    """Covariance (2 c, 2 c) of the pixels of a point, with that of the cameras that see it."""
     covariance = np.diag(np.repeat(sigmas[seen] ** 2, 2))
     if model.covariance is None:
         return covariance
@@ -162,10 +162,10 @@ NOISE = 5.0
 LEAST_PX = 0.3
 """... or than this [px], which a shaking table makes ..."""
 SHARE = 0.1
-"""... and by no more than this share of the way of the marker that moves most."""
+"""... and by no more than this share of the displacement of the marker that moves most."""
 
 STRAYING = 0.25
-"""Share of a camera's stops at which a static marker may be off: behind the arm, say."""
+"""Share of a camera's stops at which a static marker may be off, for example behind the arm."""
 
 STOPS = 4
 """Stops at which one camera must have seen a marker to call it static."""
@@ -179,8 +179,8 @@ def static_markers(pixels: FloatArray, sigmas: FloatArray) -> npt.NDArray[np.boo
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     count = seen.sum(axis=1)
     known = np.where(seen[..., None], pixels, 0.0)
-    middle = known.sum(axis=1) / np.maximum(count, 1)[..., None]
-    squares = np.where(seen, ((known - middle[:, None]) ** 2).sum(axis=-1), 0.0).sum(axis=(0, 1))
+    mean = known.sum(axis=1) / np.maximum(count, 1)[..., None]
+    squares = np.where(seen, ((known - mean[:, None]) ** 2).sum(axis=-1), 0.0).sum(axis=(0, 1))
     total = np.maximum(seen.sum(axis=(0, 1)), 1)
     strayed = np.sqrt(squares / total)
     noise = np.sqrt(2.0 * np.where(seen, sigmas**2, 0.0).sum(axis=(0, 1)) / total)
@@ -201,9 +201,9 @@ def static_observations(
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of a marker that a camera never sees: NaN it stays
-        middle = np.nanmedian(pixels, axis=1)
+        mean = np.nanmedian(pixels, axis=1)
         sigma = np.nanmedian(np.where(seen, sigmas, np.nan), axis=1)
-    away = np.linalg.norm(pixels - middle[:, None], axis=-1)
+    away = np.linalg.norm(pixels - mean[:, None], axis=-1)
     strays = seen & (away > np.maximum(NOISE * np.sqrt(2.0) * sigma, LEAST_PX)[:, None])
     moved = (strays.sum(axis=1) > STRAYING * np.maximum(seen.sum(axis=1), 1)).any(axis=0)
     kept = ~moved & seen.any(axis=(0, 1))
@@ -211,4 +211,4 @@ def static_observations(
     if not kept.any():
         return None, named
     left = tuple(marker for marker, one in zip(ids, kept, strict=True) if one)
-    return StaticObservations(left, middle[:, kept], sigma[:, kept]), named
+    return StaticObservations(left, mean[:, kept], sigma[:, kept]), named

@@ -64,7 +64,8 @@ wrong one."""
 
 @dataclass
 class StratumSelector:
-    """Accepts or rejects bundles of higher strata against the ``projective`` one; keeps rejected ones by reason.
+    """Accepts or rejects bundles of higher strata against the ``projective`` one; keeps the rejected ones by
+    reason.
 
     A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
     is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
@@ -84,7 +85,7 @@ class StratumSelector:
     bent: bool = False
 
     def passes(self, solution: Solution, plane: FloatArray) -> bool:
-        """Whether ``solution`` may be taken as it is. Sets ``hopeless`` where another start will not help."""
+        """Whether ``solution`` is acceptable. Sets ``hopeless`` where another start will not help."""
         problem = self._unidentified(solution)
         if problem:
             self._note(solution, problem)
@@ -114,7 +115,7 @@ class StratumSelector:
         return False
 
     def finished(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
-        """The first of the unfinished bundles, solved to their ends, that passes."""
+        """First of the unconverged bundles that is acceptable once it is solved to convergence."""
         candidates, self.unfinished = sorted(self.unfinished, key=lambda entry: entry[0].cost)[:FINISHED], []
         for solution, plane in candidates:
             if self.hopeless:
@@ -125,12 +126,12 @@ class StratumSelector:
         return None
 
     def best_tolerable(self) -> tuple[Solution, FloatArray] | None:
-        """The best of those whose constraints cost much, but not too much."""
+        """Best of the bundles whose constraints raise chi-square significantly, but tolerably."""
         tolerable, self.tolerable = self.tolerable, []
         return min(tolerable, key=lambda entry: entry[0].cost) if tolerable else None
 
     def turned(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
-        """The best bundle so far with other axes for single joints, if one passes then."""
+        """Best bundle so far, with other axes for single joints, if one is acceptable then."""
         reached = [entry for entry in (*self.reserve, *self.loose, *self.tolerable) if entry[0].converged]
         if not reached:
             return None
@@ -156,12 +157,12 @@ class StratumSelector:
             return None
         for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _solve_to_convergence(solution, data)
-            spread = (
+            deviation = (
                 max(_relative_deviations(final).values()) if rank_of(final) == final.charts.size else np.inf
             )
             if (
                 final.converged
-                and spread <= LOOSE_SPREAD
+                and deviation <= LOOSE_SPREAD
                 and not self._worse(final, PLAUSIBLE_TAIL, projective)
             ):
                 self.notes.append(
@@ -172,7 +173,8 @@ class StratumSelector:
         return None
 
     def second_best(self, certain: bool) -> tuple[Solution, FloatArray] | None:
-        """The best of the reserve, with a note of what it costs; None where it must not be taken.
+        """Best of the rejected but tolerable bundles, with a note of its extra residuals; None where none may be
+        taken.
 
         ``certain``: the data identify the stratum beyond doubt, so that what does not fit it is wrong, not
         the stratum.
@@ -189,7 +191,7 @@ class StratumSelector:
         return (solution, plane) if certain or self._close(solution) else None
 
     def _worse(self, solution: Solution, tail: float, projective: Solution | None = None) -> bool:
-        """Whether the constraints cost more chi-square than true ones do but for ``tail`` of cases."""
+        """Whether the constraints raise chi-square by more than true ones do with probability ``tail``."""
         beside = projective or self.projective
         fewer = max(1, beside.charts.size - solution.charts.size)
         allowed = float(chi2_distribution.isf(tail, fewer)) * max(1.0, variance_factor(beside))
@@ -205,9 +207,9 @@ class StratumSelector:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
         limit = self.options.max_spread
         return "; ".join(
-            f"{what} known to {spread:.0%} only, {limit:.0%} needed"
-            for what, spread in _relative_deviations(solution).items()
-            if spread > limit
+            f"{what} known to {deviation:.0%} only, {limit:.0%} needed"
+            for what, deviation in _relative_deviations(solution).items()
+            if deviation > limit
         )
 
     def _note(self, solution: Solution, text: str) -> None:
@@ -217,14 +219,14 @@ class StratumSelector:
 
 
 def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:
-    """The bundle solved again with many more evaluations."""
+    """The bundle solved again with a much larger limit of evaluations."""
     return solve(
         solution.rig, data, solution.stratum, lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS
     )
 
 
 def _relative_deviations(solution: Solution) -> dict[str, float]:
-    """Relative standard deviations of depths and, in the metric stratum, of focal lengths: the largest each."""
+    """Largest relative standard deviation of depths and, in the metric stratum, of focal lengths."""
     factor = max(1.0, variance_factor(solution))
     deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
     m = len(solution.rig.points)
@@ -320,7 +322,7 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
 
 
 def _several_directions(rig: RigModel, plane: FloatArray, noise: FloatArray) -> bool:
-    """Whether rotations about axes of different directions determine the intrinsics beyond doubt."""
+    """Whether rotation axes of different directions determine the intrinsics reliably."""
     revolute = np.array([kind == "revolute" for kind in rig.kinds])
     try:
         return stratum_upgrade.intrinsics_linear(

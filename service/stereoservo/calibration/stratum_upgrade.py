@@ -101,16 +101,16 @@ def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
     """Unit twist (4, 4), without pitch, of the rigid motion that best takes points (m, 3) to others
     (Kabsch).
     """
-    middle, middle_after = before.mean(axis=0), after.mean(axis=0)
-    u, _, vt = np.linalg.svd((after - middle_after).T @ (before - middle))
+    centroid, centroid_after = before.mean(axis=0), after.mean(axis=0)
+    u, _, vt = np.linalg.svd((after - centroid_after).T @ (before - centroid))
     u[:, 2] *= np.linalg.det(u @ vt)
     turn = Rotation.from_matrix(u @ vt).as_rotvec()
     angle = float(np.linalg.norm(turn))
     axis = turn / angle
     # The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
-    chord = middle_after - middle
+    chord = centroid_after - centroid
     chord = chord - axis * (axis @ chord)
-    centre = middle + 0.5 * chord + 0.5 * np.cross(axis, chord) / np.tan(0.5 * angle)
+    centre = centroid + 0.5 * chord + 0.5 * np.cross(axis, chord) / np.tan(0.5 * angle)
     return screw_twist(axis, centre)
 
 

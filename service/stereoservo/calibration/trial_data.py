@@ -27,7 +27,7 @@ MAX_OUTSIDE = 0.5
 
 
 class CalibrationError(Exception):
-    """Raised where a calibration gives no model; the text holds the reason, the value and the valid range.
+    """A calibration gives no model; the text holds the reason, the value and the valid range.
 
     Attributes:
         code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
@@ -38,7 +38,7 @@ class CalibrationError(Exception):
             ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
             ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``;
             of relocalization ``too_few_points``, ``points_coplanar``, ``not_explained``, ``too_uncertain``.
-        data: the values the message speaks of.
+        data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -56,7 +56,7 @@ def finite_rows(array: FloatArray) -> npt.NDArray[np.bool_]:
 class TrialCamera(msgspec.Struct, frozen=True):
     """A camera of the trials and its image size [px].
 
-    ``mount``: ``eye_to_hand`` where it is static and the arm carries the markers, ``eye_in_hand`` the other way round.
+    ``mount``: ``eye_to_hand`` where it is static and the arm carries the markers, ``eye_in_hand`` the reverse.
     """
 
     name: str
@@ -81,8 +81,8 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     Joints are in base-first order. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1
     for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
     seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
-    one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: what the drives said
-    of their loads on the way, where they did; copied into the model. ``static``: markers that do not move.
+    one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: the loads
+    that the drives reported meanwhile, if any; copied into the model. ``static``: markers that do not move.
     """
 
     joint_names: tuple[str, ...]
@@ -230,7 +230,7 @@ def _check_sizes(trials: TrialData) -> None:
 
 
 def _check_pixels(trials: TrialData) -> None:
-    """Refuse sigmas that are none, and measured pixels that no detector finds in an image of that size."""
+    """Check that sigmas are positive and that pixels lie within their images. Raises CalibrationError."""
     for c, camera in enumerate(trials.cameras):
         size = max(camera.width, camera.height)
         seen = trials.visible[c]
@@ -296,7 +296,7 @@ def encode_trials(trials: TrialData) -> bytes:
 
 
 def _load_arrays(loads: JointLoads | None) -> dict[str, FloatArray]:
-    """Loads as arrays of their own: a program that does not know them reads the rest."""
+    """Joint loads as arrays of their own, which programs that do not know them ignore."""
     if loads is None:
         return {}
     given = {field: getattr(loads, field) for field in JointLoads.__struct_fields__}
@@ -371,7 +371,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
 
 
 def save_trials(trials: TrialData, path: Path) -> None:
-    """Write trial data, whole or not at all. Raises CalibrationError, OSError."""
+    """Write trial data atomically. Raises CalibrationError, OSError."""
     write_atomically(path, encode_trials(trials))
 
 

@@ -54,9 +54,9 @@ def init(
             MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0]
         ),
     ).describe()
-    wanted = detector if described.delivers == "frames" else ""
+    detector_name = detector if described.delivers == "frames" else ""
     try:
-        file.write_text(_text(cell, joint_driver, joints, camera_driver, wanted, cameras))
+        file.write_text(_text(cell, joint_driver, joints, camera_driver, detector_name, cameras))
     except OSError as error:
         raise CommandError("file", f"{file}: {error.strerror}") from error
     check_joints(load_cell_file(file), tuple(joint.name for joint in joints.joints), file)

@@ -1,4 +1,4 @@
-"""Ctrl-C as exception and as flag: an exception raised in a destructor or a library's callback is lost."""
+"""Ctrl-C as an exception and as a flag, since an exception raised in a destructor or a library's callback is lost."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ _asked = False
 
 
 def install() -> None:
-    """From now on an interrupt raises KeyboardInterrupt and is remembered."""
+    """Install the handler: an interrupt raises KeyboardInterrupt and sets the flag."""
     signal.signal(signal.SIGINT, _interrupt)
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt where one was asked for. For loops that wait while the arm moves."""
+    """Raise KeyboardInterrupt where an interrupt is pending. For loops that wait while the arm moves."""
     if _asked:
         raise KeyboardInterrupt
 

@@ -26,16 +26,16 @@ def jog(
     json: JsonOption = False,
 ) -> None:
     """Move joints at given velocities for some time."""
-    wanted = pairs(velocities, "velocity")
+    requested = pairs(velocities, "velocity")
     with Client(cell, endpoint=endpoint, operator=operator) as client:
-        client.jog(wanted, LEASE_S)
+        client.jog(requested, LEASE_S)
         try:
             until = time.monotonic() + seconds
             while (left := until - time.monotonic()) > 0:
                 time.sleep(min(EVERY_S, left))
-                client.jog(wanted, LEASE_S)
+                client.jog(requested, LEASE_S)
         finally:
             with suppress(ClientError):  # the lease ends it anyhow, a little later
-                client.jog(dict.fromkeys(wanted, 0.0), 0.05)
+                client.jog(dict.fromkeys(requested, 0.0), 0.05)
         state = client.wait_state(lambda s: s.source != "jog", "at rest", 3.0)
     emit(state, "  ".join(f"{name} {value:+.4f}" for name, value in state.joints.items()), json)

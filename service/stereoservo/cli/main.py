@@ -1,4 +1,4 @@
-"""Entry point ``stereoservo``: finds the command, imports its module, reports failures and the exit code."""
+"""Entry point ``stereoservo``: imports the command's module on demand, runs it, reports failures and the exit code."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class LazyGroup(TyperGroup):
-    """The commands, each imported when it is called; a broken plug-in is listed with its error and breaks no other."""
+    """The group of commands, each imported when it is called; a broken plug-in is listed with its error and does
+    not affect the others.
+    """
 
     def list_commands(self, ctx: Any) -> list[str]:
         extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
@@ -89,7 +91,7 @@ class LazyGroup(TyperGroup):
 
 
 def _described(name: str, where: str) -> Any:
-    """A command that has only its help, read from the source of ``module:function`` without an import of it."""
+    """A command that has only its help text, read from the source of ``module:function`` without an import."""
     module, _, function = where.partition(":")
     spec = importlib.util.find_spec(module)
     assert spec is not None
@@ -120,7 +122,7 @@ def _broken(error: plugins.PluginError) -> Any:
 
 
 def _command(name: str, function: Any, context_settings: dict[Any, Any] | None = None) -> Any:
-    """A typer command of one function."""
+    """Typer command of one function."""
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
     single.registered_commands.append(
         CommandInfo(name=name, callback=function, context_settings=context_settings)

@@ -1,4 +1,4 @@
-"""What all commands share: options, arguments, exit codes, and output as text or as exactly one JSON object."""
+"""Common parts of the commands: options, arguments, exit codes, and output as text or as exactly one JSON object."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def emit(result: Any, text: str, as_json: bool) -> None:
 
 
 def note(message: str) -> None:
-    """Progress and remarks, on stderr."""
+    """Print progress and remarks on stderr."""
     print(message, file=sys.stderr, flush=True)
 
 
@@ -69,14 +69,14 @@ def fail(error: BaseException, as_json: bool) -> None:
 
 
 def known(error: BaseException) -> bool:
-    """Whether an exception is one that this project raises on purpose: its text is the message, no
-    traceback needed.
+    """Whether an exception is one that this project raises on purpose, so that its text suffices without a
+    traceback.
     """
     return type(error).__module__.split(".")[0].startswith("stereoservo") or isinstance(error, OSError)
 
 
 def pairs(items: list[str], what: str) -> dict[str, float]:
-    """``["a=0.1", "b=-2"]`` as a mapping. Raises CommandError for anything else."""
+    """Parse ``["a=0.1", "b=-2"]`` as a mapping. Raises CommandError for anything else."""
     found: dict[str, float] = {}
     for item in items:
         name, equals, value = item.partition("=")
@@ -91,7 +91,7 @@ def pairs(items: list[str], what: str) -> dict[str, float]:
 
 
 def marker_ids(text: str, what: str) -> list[int]:
-    """``"10,11,12"`` as marker ids. Raises CommandError."""
+    """Parse ``"10,11,12"`` as marker ids. Raises CommandError."""
     try:
         return [int(part) for part in text.split(",")]
     except ValueError as error:
@@ -101,7 +101,7 @@ def marker_ids(text: str, what: str) -> list[int]:
 
 
 def read_file(path: Path) -> bytes:
-    """A file's bytes. Raises CommandError."""
+    """Content of a file. Raises CommandError."""
     try:
         return path.read_bytes()
     except OSError as error:

@@ -1,4 +1,4 @@
-"""``stereoservo record``: records the flight of a running cell."""
+"""``stereoservo record``: starts or stops a flight recording of a running cell."""
 
 from __future__ import annotations
 

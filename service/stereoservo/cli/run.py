@@ -1,4 +1,4 @@
-"""``stereoservo run``: the daemon of a cell."""
+"""``stereoservo run``: runs the daemon of a cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``stereoservo status``: the state of a cell in words."""
+"""``stereoservo status``: prints the state of a cell."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
 
 
 def describe(state: StateMessage) -> str:
-    """A state in some lines of text."""
+    """A state as some lines of text."""
     joints = "  ".join(
         f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items()
     )
@@ -33,8 +33,11 @@ def describe(state: StateMessage) -> str:
     if state.efforts or state.following_errors:
         lines.append("  loads   " + _loads(state))
     if state.goal:
-        said = progress_words(state)
-        lines.append(f"  goal    {state.goal} ({state.law or 'joints'})" + (f": {said}" if said else ""))
+        progress_text = progress_words(state)
+        lines.append(
+            f"  goal    {state.goal} ({state.law or 'joints'})"
+            + (f": {progress_text}" if progress_text else "")
+        )
     lines += [
         f"  {reason.level:7} {' '.join(filter(None, (reason.code, reason.subject)))}: {reason.hint}"
         for reason in state.reasons
@@ -46,10 +49,10 @@ def describe(state: StateMessage) -> str:
 
 
 def progress_words(state: StateMessage) -> str:
-    """Progress of the active goal; empty where it is unknown."""
+    """Progress of the active goal as text; empty where it is unknown."""
     words = []
     if state.progress is not None:
-        words.append(f"{100.0 * state.progress:.0f} % of its way")
+        words.append(f"{100.0 * state.progress:.0f} % of its path")
     if state.seconds_left is not None:
         words.append(f"{state.seconds_left:.1f} s left")
     if state.error_px is not None:
@@ -58,7 +61,7 @@ def progress_words(state: StateMessage) -> str:
 
 
 def _health(state: StateMessage) -> list[str]:
-    """Agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
+    """Text: agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
     health = state.health
     if health.verdict == "unknown":
         return []
@@ -73,7 +76,7 @@ def _health(state: StateMessage) -> list[str]:
 
 
 def _loads(state: StateMessage) -> str:
-    """Efforts, the following error that is nearest to its limit, and whether a contact would stop the arm."""
+    """Text: efforts, the following error nearest to its limit, and whether a contact would stop the arm."""
     words = [f"{name} {value:+.3g}" for name, value in state.efforts.items()]
     used = {
         name: abs(error) / state.following_limits[name]

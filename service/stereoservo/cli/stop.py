@@ -1,4 +1,4 @@
-"""``stereoservo stop``: over zenoh, or by the stop slot where the gateway does not answer."""
+"""``stereoservo stop``: stops the arm over zenoh, or by the stop slot where the gateway does not reply."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``stereoservo teach``: stores the current view, or a drawing, as a goal."""
+"""``stereoservo teach``: stores the current view, or a goal made from CAD drawings, as a goal."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def teach(
             raise CommandError(
                 "usage", "--tool goes with what the cameras see; in a drawing, its tool is named"
             )
-        wanted = read_drawing(drawing, name)
+        request = read_drawing(drawing, name)
         with Client(cell, endpoint=endpoint, operator=operator) as client:
-            reply = client.synthesise(wanted)
+            reply = client.synthesise(request)
         emit(reply, reply.message, json)
         return
     markers = () if tool is None else tuple(marker_ids(tool, "--tool"))
@@ -65,7 +65,7 @@ def teach(
 
 
 def read_drawing(path: Path, name: str) -> Synthesise:
-    """A drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
+    """Parse a drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
     try:
         tree: Any = msgspec.json.decode(read_file(path))
     except msgspec.DecodeError as error:

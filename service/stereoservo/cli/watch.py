@@ -45,10 +45,10 @@ def _line(message: StateMessage | EventMessage | FeaturesMessage) -> str:
         return f"{message.seq:5} {message.kind:22} {message.id[:8]:8} {message.message}"
     if isinstance(message, FeaturesMessage):
         return f"      {message.camera} frame {message.seq}: {len(message.ids)} markers"
-    said = [message.lifecycle, message.source, progress_words(message)]
-    said.append(" ".join(f"{q:+.3f}" for q in message.joints.values()))
+    parts = [message.lifecycle, message.source, progress_words(message)]
+    parts.append(" ".join(f"{q:+.3f}" for q in message.joints.values()))
     return (
-        "      " + ", ".join(filter(None, said)) + "".join(f"; {_why(reason)}" for reason in message.reasons)
+        "      " + ", ".join(filter(None, parts)) + "".join(f"; {_why(reason)}" for reason in message.reasons)
     )
 
 

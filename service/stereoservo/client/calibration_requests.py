@@ -1,4 +1,4 @@
-"""How a client has a cell calibrated or checked: the motion under a lease, then what came of it."""
+"""Requests of a client to calibrate or check a cell: runs the motion under a lease and waits for the result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def calibrate(
     report: bool,
     lease_s: float | None,
 ) -> CalibrationResult:
-    """See `Client.calibrate`."""
+    """Implementation of `Client.calibrate`."""
     command = Calibrate(str(uuid.uuid4()), lease_s=lease_s)
     event = _run(connection, command, "calibrated", progress, timeout_s, report)
     if event.calibration is None:
@@ -37,7 +37,7 @@ def calibrate(
 def check_model(
     connection: Connection, progress: Progress | None, timeout_s: float, lease_s: float | None
 ) -> CheckReport:
-    """See `Client.check_model`."""
+    """Implementation of `Client.check_model`."""
     command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s)
     event = _run(connection, command, "checked", progress, timeout_s, False)
     if event.check is None:
@@ -48,7 +48,7 @@ def check_model(
 def reset_zeros(
     connection: Connection, progress: Progress | None, timeout_s: float, lease_s: float | None
 ) -> ZeroReset:
-    """See `Client.reset_zeros`."""
+    """Implementation of `Client.reset_zeros`."""
     command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s, reset_zeros=True)
     event = _run(connection, command, "zeros_reset", progress, timeout_s, False)
     if event.reset is None:
@@ -67,7 +67,7 @@ def _run(
     lease: Lease | None = None
 
     def until(*ends: str) -> Callable[[EventMessage], bool]:
-        def wanted(event: EventMessage) -> bool:
+        def matches(event: EventMessage) -> bool:
             if event.id != command.id:
                 return False
             if lease is not None and event.kind in ("calibration_finished", "check_finished"):
@@ -76,7 +76,7 @@ def _run(
                 progress(event)
             return event.kind in ends
 
-        return wanted
+        return matches
 
     with EventWatch(connection) as watch:
         connection.command("calibrate", command)
@@ -88,6 +88,6 @@ def _run(
         finally:
             lease.end()
         if report and end.kind != "calibration_aborted":
-            with suppress(TimedOutError):  # the model is there; its report is told by an event, if it comes
+            with suppress(TimedOutError):  # the model exists; an event announces its report, if it comes
                 watch.wait(until("calibration_report"), "the report", REPORT_TIMEOUT_S)
     return end

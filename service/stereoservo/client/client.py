@@ -54,7 +54,7 @@ RESET_TIMEOUT_S = 12.0
 
 
 class Client(Connection):
-    """A goal client of one cell: what an operator or a program may ask of its daemon.
+    """Goal client of one cell: goals, commands, calibration, and messages of its daemon.
 
     ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
     host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
@@ -115,19 +115,19 @@ class Client(Connection):
         raise TimedOutError(f"the cell is {self.status().lifecycle} {timeout_s:g} s after the reset")
 
     def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
-        """Joint velocities for ``lease_s``; call again within it to go on (a dead man's switch)."""
+        """Jog: joint velocities for ``lease_s``; call again within it to continue (a dead man's switch)."""
         return self.command("jog", Jog(dict(velocities), lease_s))
 
     def record(self, on: bool = True, images: bool = False) -> Reply:
-        """Begin or end a flight recording; the reply's message is its file on the daemon's host.
+        """Start or stop a flight recording; the reply's message is its file on the daemon's host.
 
-        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is told by the event
+        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is reported by the event
         ``images_recorded``. Raises RefusedError.
         """
         return self.request("record", self.keys.command("record", self.operator), encode(Record(on, images)))
 
     def wait_state(self, wanted: Callable[[StateMessage], bool], what: str, timeout_s: float) -> StateMessage:
-        """Ask for the state until it is as ``wanted``. Raises TimedOutError."""
+        """Poll the state until it is as ``wanted``. Raises TimedOutError."""
         until = time.monotonic() + timeout_s
         while True:
             state = self.status()
@@ -147,7 +147,7 @@ class Client(Connection):
         """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
 
         ``lease_s`` is 5 unless given. The lease is renewed by a thread of this client until the goal has ended or the
-        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal goes on without the client.
+        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal continues without the client.
         Raises RefusedError with every problem, NoReplyError, MessageError.
         """
         options.setdefault("lease_s", 5.0)
@@ -159,7 +159,7 @@ class Client(Connection):
         return decode(encode({"id": str(uuid.uuid4()), "target": as_target(target), **options}), Goal)
 
     def check(self, goal: Goal) -> Reply:
-        """Plan a goal without a motion: the reply's ``plan`` has path, time and approaches to limits.
+        """Plan a goal without motion: the reply's ``plan`` has path, duration and closest approaches to limits.
 
         Raises RefusedError.
         """
@@ -168,7 +168,7 @@ class Client(Connection):
         )
 
     def send(self, goal: Goal) -> GoalHandle:
-        """Send a goal made by the caller; returns when it was planned and accepted."""
+        """Send a goal made by the caller; returns once it was planned and accepted."""
         watch = EventWatch(self)
         try:
             reply = self.request("goal", self.goal_key, encode(goal), GOAL_TIMEOUT_S)
@@ -191,7 +191,7 @@ class Client(Connection):
     def teach(
         self, name: str, frames: int = 20, timeout_s: float = 30.0, *, tool: tuple[int, ...] = ()
     ) -> EventMessage:
-        """Store what the cameras see now as goal ``name``; ``tool``: the markers by which it is meant.
+        """Store the current observations as goal ``name``; ``tool``: the markers that define it.
 
         Raises RefusedError, FailedError.
         """
@@ -207,7 +207,7 @@ class Client(Connection):
         return event
 
     def synthesise(self, wanted: Synthesise) -> Reply:
-        """Make a goal from drawings; the workpiece's markers are seen now. Raises RefusedError."""
+        """Make a goal from CAD drawings; the workpiece's markers must be in view. Raises RefusedError."""
         return self.request("synthesise", self.keys.command("synthesise", self.operator), encode(wanted))
 
     def calibrate(
@@ -232,7 +232,7 @@ class Client(Connection):
         *,
         lease_s: float | None = 5.0,
     ) -> CheckReport:
-        """A short check motion, and whether the model in use still holds. Raises RefusedError, FailedError."""
+        """Run a short check motion and test whether the model in use still holds. Raises RefusedError, FailedError."""
         return calibration_requests.check_model(self, progress, timeout_s, lease_s)
 
     def reset_zeros(
@@ -242,7 +242,8 @@ class Client(Connection):
         *,
         lease_s: float | None = 5.0,
     ) -> ZeroReset:
-        """A check motion; where joint zeros have drifted, and nothing else, a new model with moved zeros.
+        """Run a check motion; where joint zeros have drifted, and nothing else has, install a model with corrected
+        zeros.
 
         ``progress`` is called with the ``checked`` event, too. Raises RefusedError, FailedError (its event's ``name``:
         ``check_holds``, ``other_cause``, ``not_observable`` or the code of a check that failed).
@@ -252,7 +253,9 @@ class Client(Connection):
     # -- watching -------------------------------------------------------------------------------------------
 
     def watch(self, *, features: bool = False) -> Iterator[StateMessage | EventMessage | FeaturesMessage]:
-        """Everything the cell publishes, without end; raises DaemonLostError when it goes away, InvalidReplyError."""
+        """Iterate over all messages of the cell, without end; raises DaemonLostError when the daemon goes away,
+        InvalidReplyError.
+        """
         kinds: list[tuple[str, type[Any], int]] = [
             (self.keys.event, EventMessage, 1024),
             (self.keys.state, StateMessage, 16),
@@ -262,7 +265,7 @@ class Client(Connection):
         subscribers = [
             (self._session.declare_subscriber(key, RingChannel(size)), kind) for key, kind, size in kinds
         ]
-        heard = time.monotonic()
+        last_heard_s = time.monotonic()
         try:
             while True:
                 idle = True
@@ -272,10 +275,10 @@ class Client(Connection):
                         if sample is None:
                             break
                         idle = False
-                        heard = time.monotonic()
+                        last_heard_s = time.monotonic()
                         yield read_message(str(sample.key_expr), sample.payload.to_bytes(), kind)
                 if idle:
-                    if time.monotonic() - heard > 2.0:
+                    if time.monotonic() - last_heard_s > 2.0:
                         raise DaemonLostError(f"cell {self.cell!r} has been silent for 2 s")
                     time.sleep(POLL_S)
         finally:

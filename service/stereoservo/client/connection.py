@@ -1,4 +1,4 @@
-"""One session with the daemon of a cell: queries with decoded replies, and the puts that keep a goal alive."""
+"""Zenoh connection to the daemon of a cell: queries with decoded replies, and the puts that renew a goal's lease."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Connection:
 
     @property
     def session(self) -> Any:
-        """The zenoh session, for what this class does not do."""
+        """The underlying zenoh session."""
         return self._session
 
     def query(self, key: str, payload: bytes = b"", timeout_s: float | None = None) -> bytes:
@@ -85,14 +85,16 @@ class Connection:
         raise NoReplyError(key, timeout)
 
     def request(self, what: str, key: str, payload: bytes, timeout_s: float | None = None) -> Reply:
-        """The reply that accepts a goal or command, ``what`` in messages. Raises RefusedError, NoReplyError."""
+        """The accepting reply to a goal or command; ``what`` names it in messages. Raises RefusedError,
+        NoReplyError.
+        """
         reply = read_message(key, self.query(key, payload, timeout_s), Reply)
         if not reply.accepted:
             raise RefusedError(what, reply)
         return reply
 
     def fetch(self, key: str, kind: type[_T]) -> _T:
-        """A message of type ``kind`` queried on ``key``. Raises RefusedError, NoReplyError, InvalidReplyError."""
+        """Query a message of type ``kind`` on ``key``. Raises RefusedError, NoReplyError, InvalidReplyError."""
         data = self.query(key)
         try:
             return read_message(key, data, kind)
@@ -103,7 +105,7 @@ class Connection:
             raise RefusedError(key.rpartition("/")[2], reply) from error
 
     def command(self, verb: str, command: Command) -> Reply:
-        """The reply that accepts a command. Raises RefusedError, NoReplyError."""
+        """Send a command and return the accepting reply. Raises RefusedError, NoReplyError."""
         return self.request(verb, self.keys.command(verb, self.operator), encode(command))
 
     def status(self) -> StateMessage:
@@ -111,7 +113,7 @@ class Connection:
         return self.fetch(self.keys.state, StateMessage)
 
     def events(self, first: int = 1) -> EventList:
-        """Events from number ``first`` on (a page of them)."""
+        """Events from number ``first`` on, one page."""
         return self.fetch(f"{self.keys.event}?from={first}", EventList)
 
     def cancel(self, goal_id: str) -> Reply:
@@ -121,7 +123,8 @@ class Connection:
     def update(
         self, goal_id: str, target: StreamedTarget, stamp_s: float | None = None, *, answered: bool = False
     ) -> None:
-        """Move the set-points of the active goal, which renews its lease, too. ``stamp_s``: this client's time of them.
+        """Move the set-points of the active goal, which also renews its lease. ``stamp_s``: their time on this
+        client's clock.
 
         A put, for streams of 30 to 200 Hz: what is refused is reported by ``goal_refused`` events, at most one a
         second. ``answered``: a query instead; raises RefusedError.
@@ -133,7 +136,7 @@ class Connection:
             self._session.put(self.goal_key, encode(command), encoding=ENCODING)
 
     def acknowledge(self, goal_id: str) -> Reply:
-        """A reached goal with ``acknowledge_s`` may be left. Raises RefusedError."""
+        """Release a reached goal with ``acknowledge_s``, so that the queue continues. Raises RefusedError."""
         return self.command("acknowledge", AcknowledgeGoal(goal_id))
 
     def renew(self, goal_id: str) -> None:
@@ -156,7 +159,7 @@ class Connection:
 
 
 def read_message(key: str, data: bytes, kind: type[_T]) -> _T:
-    """A message that came on ``key``. Raises InvalidReplyError where it is none of ``kind``."""
+    """Decode a message received on ``key``. Raises InvalidReplyError where it is not a ``kind``."""
     try:
         return read(data, kind)
     except MessageError as error:
@@ -164,7 +167,7 @@ def read_message(key: str, data: bytes, kind: type[_T]) -> _T:
 
 
 def _refusal(data: bytes) -> Reply | None:
-    """The reply that refuses to answer, None where ``data`` is none."""
+    """The reply if ``data`` is a refusal, else None."""
     try:
         reply = read(data, Reply)
     except MessageError:

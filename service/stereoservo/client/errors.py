@@ -10,7 +10,7 @@ class ClientError(Exception):
 
 
 class NoReplyError(ClientError):
-    """Nobody answered: the daemon is gone, hangs, or does not let this client ask. Means refused."""
+    """No reply: the daemon is gone, hangs, or does not authorise this client."""
 
     def __init__(self, key: str, timeout_s: float) -> None:
         super().__init__(
@@ -21,7 +21,7 @@ class NoReplyError(ClientError):
 
 
 class InvalidReplyError(ClientError):
-    """A message on ``key`` does not decode: another version, or somebody else."""
+    """A message on ``key`` does not decode: it is of another version or sender."""
 
     def __init__(self, key: str, error: MessageError) -> None:
         super().__init__(
@@ -51,7 +51,7 @@ class FailedError(ClientError):
 
     @property
     def code(self) -> str:
-        """Its cause's own: the event's ``name`` (a fit's code), else that of its first reason, else ``failed``."""
+        """Code of the cause: the event's ``name`` (a fit's code), else that of its first reason, else ``failed``."""
         return self.event.name or next((reason.code for reason in self.event.reasons), "failed")
 
 
@@ -60,4 +60,4 @@ class TimedOutError(ClientError):
 
 
 class DaemonLostError(ClientError):
-    """The daemon went away, or another one took its place, while this client waited."""
+    """The daemon went away, or was replaced by another one, while this client waited."""

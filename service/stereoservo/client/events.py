@@ -1,4 +1,4 @@
-"""A cell's events as a client receives them: in order and without gaps."""
+"""Event subscription of a client: a cell's events in order and without gaps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALIVE_EVERY_S = 1.0
 
 
 class EventWatch:
-    """Events from now on, in order and without gaps: what a subscription lost is asked for."""
+    """Events from now on, in order and without gaps: those that a subscription lost are queried."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

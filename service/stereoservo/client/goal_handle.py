@@ -1,4 +1,4 @@
-"""A goal that was accepted: its lease, its progress, its end."""
+"""Handle of an accepted goal: renews its lease, reports progress, waits for its end."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class GoalResult(msgspec.Struct, frozen=True):
 
     @property
     def why(self) -> str:
-        """The message, and the fault where one ended the goal."""
+        """The message, with the fault where one ended the goal."""
         faults = [reason.hint for reason in self.reasons if reason.level == "fault"]
         return ": ".join([self.message, *faults])
 
@@ -57,7 +57,7 @@ class GoalProgress(msgspec.Struct, frozen=True):
 
 
 class Lease:
-    """Renews the lease of something that moves the arm, from a thread of this client, until it is ended."""
+    """Renews the lease of a motion from a thread, until it is ended."""
 
     def __init__(self, connection: Connection, goal_id: str, lease_s: float | None) -> None:
         self._connection = connection
@@ -76,7 +76,7 @@ class Lease:
                 return
 
     def end(self) -> None:
-        """Renew no more. Idempotent."""
+        """Stop renewing. Idempotent."""
         self._ended.set()
 
 
@@ -95,7 +95,7 @@ class GoalHandle:
         self._lease = Lease(connection, goal.id, goal.lease_s)
 
     def wait(self, timeout_s: float = 600.0) -> GoalResult:
-        """Wait for its terminal event. Raises TimedOutError (the goal goes on), DaemonLostError."""
+        """Wait for its terminal event. Raises TimedOutError (the goal continues), DaemonLostError."""
         if self._result is None:
             event = self._watch.wait(
                 lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
@@ -128,7 +128,7 @@ class GoalHandle:
         self._connection.update(self.id, target, stamp_s)
 
     def stream(self, set_points: Iterable[tuple[float | None, StreamedTarget]]) -> int:
-        """Put (stamp [s], target) as they come, until they, or the goal, end; gives how many were put.
+        """Send (stamp [s], target) as they come, until they, or the goal, end; returns how many were sent.
 
         The iterable sets the pace. Raises DaemonLostError.
         """
@@ -142,7 +142,7 @@ class GoalHandle:
         return count
 
     def acknowledge(self) -> None:
-        """Reached, it may be left: the queue goes on. Raises RefusedError."""
+        """Release the reached goal, so that the queue continues. Raises RefusedError."""
         self._connection.acknowledge(self.id)
 
     def _poll_end(self) -> None:
@@ -158,11 +158,11 @@ class GoalHandle:
         self._result = GoalResult(self.id, outcome, event.message, event.error_px, event.reasons, seconds)
 
     def cancel(self) -> None:
-        """Cancel it."""
+        """Cancel the goal."""
         self._connection.cancel(self.id)
 
     def abandon(self) -> None:
-        """Stop renewing and watching; the goal goes on until its lease or time limit ends."""
+        """Stop renewing and watching; the goal continues until its lease or time limit ends."""
         self._end()
 
     def _end(self) -> None:

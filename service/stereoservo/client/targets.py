@@ -1,4 +1,4 @@
-"""What clients write for a target and for the options of a goal."""
+"""Short forms of targets and options of a goal, converted to messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stereoservo.messages.goals import (
 
 
 class GoalOptions(TypedDict, total=False):
-    """The fields of `Goal` beside id and target; what is left out takes the cell's default."""
+    """Fields of `Goal` beside id and target; the cell's default applies to those left out."""
 
     law: LawName | None
     points: PointSource | None

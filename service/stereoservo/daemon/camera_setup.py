@@ -83,7 +83,7 @@ class RecordedCamera:
     def observations(
         self, log: Callable[[str], None], wanted: Callable[[int], bool] = lambda t_shutter_ns: True
     ) -> Iterator[CameraObservation]:
-        """Observations of one frame after the other, detected without priors; stamps are those of the recording.
+        """Observations of the frames in order, detected without priors; stamps are those of the recording.
 
         Only frames whose shutter time is ``wanted`` are detected; ``log`` is called where a file is cut off.
         Raises DriverError: a damaged file, a picture of another size.
@@ -115,7 +115,7 @@ def video_of(directory: Path, camera: str) -> Path:
 
 
 def recorded_camera(cell: CellFile, cell_path: Path, name: str, file: Path, start: int = 0) -> RecordedCamera:
-    """Driver and detector of camera ``name`` of a cell, on a file recorded of it, from frame ``start`` on.
+    """Driver and detector of camera ``name`` of a cell, for a file recorded from it, from frame ``start`` on.
 
     The detector is the cell file's, the options of the camera's own driver have had their effect when it was recorded.
     Raises ImageFileError, PluginError, DriverError, CellFileError.

@@ -1,4 +1,4 @@
-"""Preparation of a cell's run: checks cell file and drivers, writes the run plan, compiles the kernels.
+"""Preparation of a run: checks cell file and drivers, writes the run plan, compiles the kernels.
 
 It is a process of its own: a driver that crashes when it is asked for its description ends nothing else.
 ``python -m stereoservo.daemon.cell_preparation CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID JSON_OPTIONS``.
@@ -33,7 +33,7 @@ EXIT_INVALID = 2
 
 
 class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a run that are not the cell file's."""
+    """Options of a run that are not in the cell file."""
 
     boot: str
     seed: int = 0
@@ -44,7 +44,7 @@ class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @contextmanager
 def _named(cell_path: Path, section: str) -> Iterator[None]:
-    """Prefix a driver's error with the file and the section of its options."""
+    """A driver's error prefixed with the file and the section of its options."""
     try:
         yield
     except DriverError as error:

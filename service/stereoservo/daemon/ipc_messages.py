@@ -82,11 +82,11 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
 
 
 class Heartbeat(msgspec.Struct, frozen=True, tag="heartbeat"):
-    """Sign of life of the gateway; without it a moving arm is held."""
+    """Heartbeat of the gateway; without it a moving arm is held."""
 
 
 class Ask(msgspec.Struct, frozen=True, tag="ask"):
-    """A request for the core."""
+    """A request forwarded to the core."""
 
     request: Request
 
@@ -145,7 +145,7 @@ _plan_decoder = msgspec.msgpack.Decoder(RunPlan)
 
 
 def encode(message: Any) -> bytes:
-    """Any of these structs as msgpack, arrays bit for bit."""
+    """Encode any of these structs as msgpack, arrays bit for bit."""
     return _any_encoder.encode(message)
 
 

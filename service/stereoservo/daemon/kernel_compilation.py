@@ -51,7 +51,7 @@ LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
 
 def warm_up() -> None:
-    """Run each law, the planner and fault isolation on the example cell; compiles what is not compiled."""
+    """Run each law, the planner and fault isolation on the example cell, which compiles their kernels."""
     warm_up_incidences()
     warm_up_laws()
     warm_up_planner()
@@ -102,8 +102,8 @@ def warm_up() -> None:
 def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
     """Run the core on frames of a camera that was moved: fault isolation runs at no other time."""
     settings = example_settings()
-    standing = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
-    core = ServoCore(msgspec.structs.replace(settings, cameras=standing))
+    static_cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
+    core = ServoCore(msgspec.structs.replace(settings, cameras=static_cameras))
     moved = pixels + np.array([30.0, 0.0]) * np.array([1.0, 0.0])[:, None, None]
     for step in range(1, 12):
         now_ns = 1_000_000_000 + step * PERIOD_NS
@@ -213,7 +213,7 @@ WARM_UPS: Mapping[str, Callable[[], None]] = {
 
 
 def compile_in_parallel() -> None:
-    """Compile the kernels of ``WARM_UPS`` in parallel processes, unless the largest is compiled."""
+    """Compile the kernels of ``WARM_UPS`` in parallel processes, unless those of the largest are already compiled."""
     if _compiled() or len(os.sched_getaffinity(0)) < 2:
         return
     command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]

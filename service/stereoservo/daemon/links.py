@@ -1,4 +1,4 @@
-"""Interfaces of the servo loop and the vision loop to the other processes and to time.
+"""Interfaces of the servo loop and the vision loop: links to the other processes, and pacing.
 
 The loops' code exists once. Between processes the links are slots and sockets (`servo_links`, `vision`) and time is the
 host's; in lockstep (`lockstep`) the links are objects in memory and time is virtual.
@@ -17,7 +17,7 @@ from stereoservo.recording.step_records import StepSink
 
 
 class GatewayMessages(NamedTuple):
-    """What the gateway has sent since the last cycle. ``heard``: whether it sent anything, a heartbeat included."""
+    """Messages from the gateway since the last cycle. ``heard``: whether there were any, heartbeats included."""
 
     heard: bool = False
     requests: tuple[Request, ...] = ()
@@ -25,10 +25,10 @@ class GatewayMessages(NamedTuple):
 
 
 class ServoLinks(Protocol):
-    """What the servo loop reads from and writes to the other processes. No call blocks."""
+    """Links of the servo loop to the other processes. No call blocks."""
 
     def receive(self) -> GatewayMessages:
-        """What the gateway has sent since the last call."""
+        """Messages from the gateway since the last call."""
         ...
 
     def observations(self) -> tuple[CameraObservation, ...]:
@@ -44,7 +44,7 @@ class ServoLinks(Protocol):
         ...
 
     def publish_prior(self, prior: Prior) -> None:
-        """Hand the expected marker positions to a camera's vision loop."""
+        """Send the expected marker positions to a camera's vision loop."""
         ...
 
     def publish_state(self, state: ServoState) -> None:
@@ -52,12 +52,12 @@ class ServoLinks(Protocol):
         ...
 
     def publish_events(self, events: tuple[Event, ...]) -> None:
-        """Queue events, whose numbers ascend, and send what waits; none is lost while the gateway restarts."""
+        """Queue events, whose numbers ascend, and send those that wait; none is lost while the gateway restarts."""
         ...
 
 
 class VisionLinks(Protocol):
-    """What the vision loop of one camera reads from and writes to the servo loop. No call blocks."""
+    """Links of one camera's vision loop to the servo loop. No call blocks."""
 
     def newest_prior(self) -> Prior | None:
         """The newest prior of this camera, of any age; None before the first."""
@@ -69,10 +69,10 @@ class VisionLinks(Protocol):
 
 
 class Pacing(Protocol):
-    """What starts the servo loop's cycles: a clock's grid (`pacing.ClockPacing`), or an arm that sets the beat."""
+    """Source of the servo loop's cycles: a clock's grid (`pacing.ClockPacing`), or an arm that sets the cycle."""
 
     def wait(self) -> int:
-        """Block until the next cycle is due; returns the time then [ns]."""
+        """Block until the next cycle is due; returns the time [ns] of waking."""
         ...
 
     def statistics(self) -> LoopStatistics:

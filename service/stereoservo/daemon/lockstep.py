@@ -1,4 +1,4 @@
-"""A cell in one process on a virtual clock: the servo and vision loops of the daemon on links in memory.
+"""A cell in one process on a virtual clock: the servo and vision loops of the daemon on in-memory links.
 
 Used by tests, experiments and ``demo --lockstep``: deterministic given the seed, and as fast as the machine.
 """
@@ -41,7 +41,7 @@ REPLY_TIMEOUT_S = 60.0
 
 
 class LockstepTimeoutError(Exception):
-    """What was waited for did not happen in the given virtual time; carries the last status."""
+    """An expected condition did not occur within the given virtual time; carries the last status."""
 
     def __init__(self, message: str, status: Status | None) -> None:
         super().__init__(message)
@@ -49,7 +49,7 @@ class LockstepTimeoutError(Exception):
 
 
 class LockstepLinks(ServoLinks, Protocol):
-    """The servo loop's links together with their other ends, which a `LockstepCell` holds.
+    """The servo loop's links together with their other ends, for a `LockstepCell`.
 
     ``run_cameras`` is called before observations are returned: the vision loops run after the joints were read.
     """
@@ -61,11 +61,11 @@ class LockstepLinks(ServoLinks, Protocol):
         ...
 
     def send_request(self, request: Request) -> None:
-        """As the gateway: send a request to the servo loop."""
+        """Send a request to the servo loop, in the gateway's place."""
         ...
 
     def send_model(self, update: ModelUpdate) -> None:
-        """As the gateway: send a model to the servo loop."""
+        """Send a model to the servo loop, in the gateway's place."""
         ...
 
     def raise_stop(self) -> None:
@@ -73,7 +73,7 @@ class LockstepLinks(ServoLinks, Protocol):
         ...
 
     def take_events(self) -> list[Event]:
-        """As the gateway: the events that have arrived since the last call."""
+        """Events since the last call, in the gateway's place."""
         ...
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ class FlightFile:
         self._recorder: FlightRecorder | None = None
 
     def send(self, message: StepMessage) -> bool:
-        """Write a message; a file takes every one."""
+        """Write a message; always accepted."""
         if isinstance(message, RecordingStart):
             self._recorder = FlightRecorder(self._path, message.settings, message.fingerprint)
         else:
@@ -119,7 +119,7 @@ class MemoryLinks:
         self._cameras: dict[str, MemoryVisionLinks] = {}
 
     def receive(self) -> GatewayMessages:
-        """What was sent since the last call."""
+        """Messages sent since the last call."""
         if not self.gateway_alive:
             return GatewayMessages()
         messages = GatewayMessages(True, tuple(self._requests), self._model_update)
@@ -138,11 +138,11 @@ class MemoryLinks:
         return raised
 
     def step_recorder(self) -> FlightFile | None:
-        """The recording's file, where one was asked for."""
+        """Writer of the recording, where one was requested."""
         return self._recorder
 
     def publish_prior(self, prior: Prior) -> None:
-        """Hand a prior to its camera."""
+        """Hand a prior to its camera's vision loop."""
         self._cameras[prior.camera].prior = prior
 
     def publish_state(self, state: ServoState) -> None:
@@ -154,7 +154,7 @@ class MemoryLinks:
         self._events.extend(events)
 
     def vision(self, camera: str) -> MemoryVisionLinks:
-        """The links of a camera's vision loop; one a camera."""
+        """Links of a camera's vision loop; created once per camera."""
         return self._cameras.setdefault(camera, MemoryVisionLinks())
 
     def send_request(self, request: Request) -> None:
@@ -196,7 +196,7 @@ class MemoryVisionLinks:
         self._observation = observation
 
     def take(self) -> CameraObservation | None:
-        """The observation, where it was not taken before."""
+        """The observation, unless it was taken before."""
         observation, self._observation = self._observation, None
         return observation
 
@@ -217,7 +217,7 @@ class _ScheduledCamera:
         self._due_ns = self._clock.now_ns() + round(next(self._loop) * 1e9)
 
     def run(self) -> None:
-        """Run as far as the loop gets without waiting, where it is due; the first time after it was opened."""
+        """Run the vision loop, where it is due, until it waits; for the first time once the camera is open."""
         while self._due_ns <= self._clock.now_ns():
             self._resume()
 
@@ -306,7 +306,7 @@ class LockstepCell:
             loop.run()
 
     def step(self) -> StepOutputs:
-        """One cycle of the servo loop, one period of virtual time later."""
+        """Run one cycle of the servo loop, one period of virtual time later."""
         inputs, outputs = self.servo.cycle(self._pacing)
         fresh = self.links.take_events()
         self.status = outputs.status
@@ -330,7 +330,7 @@ class LockstepCell:
         )
 
     def request(self, command: Command, operator: str = "lockstep") -> None:
-        """Send a command and do not wait for its reply."""
+        """Send a command without waiting for its reply."""
         self._request_number += 1
         self.links.send_request(Request(self._request_number, operator, command))
 
@@ -348,7 +348,7 @@ class LockstepCell:
             self.step()
 
     def wait_for(self, wanted: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
-        """Step until an event with number > ``since`` fits. Raises LockstepTimeoutError."""
+        """Step until an event with number > ``since`` matches. Raises LockstepTimeoutError."""
         seen = 0
         for _ in range(round(timeout_s * 1e9 / self.period_ns) + 1):
             for event in self.events[seen:]:

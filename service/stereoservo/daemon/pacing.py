@@ -1,4 +1,4 @@
-"""Pacing of the servo loop by a clock: absolute deadlines on a fixed grid, statistics, real-time scheduling.
+"""Pacing of the servo loop by a clock: absolute deadlines on a fixed grid, timing statistics, real-time scheduling.
 
 Slot k is at ``start + k * period`` whatever happened before, so that an oversleep does not shift the later ones. A
 cycle that ran over its slot's end skips the slots that have passed instead of catching up with a burst.
@@ -19,7 +19,7 @@ _BINS = 48 << _SUB_BITS
 
 
 class LoopStatistics(msgspec.Struct, frozen=True):
-    """Counts and quantiles of the loop's cycles since its start. Lateness: wake-up behind its slot [us]."""
+    """Counts and quantiles of the loop's cycles since its start. Lateness: time of waking after the slot [us]."""
 
     rate_hz: float
     cycles: int
@@ -34,7 +34,7 @@ class LoopStatistics(msgspec.Struct, frozen=True):
 
 
 class Histogram:
-    """Non-negative integers in bins of constant relative width (1/16); exact below 32."""
+    """Histogram of non-negative integers in bins of constant relative width (1/16); exact below 32."""
 
     def __init__(self) -> None:
         self._bins = [0] * _BINS
@@ -49,16 +49,14 @@ class Histogram:
         self.maximum = max(self.maximum, value)
 
     def quantile(self, fraction: float) -> float:
-        """The value below or at which ``fraction`` of the counted ones lie (upper edge of its bin, at most
-        the maximum).
-        """
+        """Value that ``fraction`` of the counted ones do not exceed (upper edge of its bin, at most the maximum)."""
         if not self.count:
             return 0.0
-        wanted = fraction * self.count
+        rank = fraction * self.count
         seen = 0
         for index, count in enumerate(self._bins):
             seen += count
-            if count and seen >= wanted:
+            if count and seen >= rank:
                 return float(min(_upper_edge(index), self.maximum))
         return float(self.maximum)
 
@@ -74,7 +72,7 @@ def _upper_edge(index: int) -> int:
 
 
 class ClockPacing:
-    """Starts the cycles at ``start + k * period``. ``now`` and ``sleep`` are injected for virtual time.
+    """Pacing of cycles at ``start + k * period``. ``now`` and ``sleep`` are injected for virtual time.
 
     Time spent stopped in a debugger or a suspended machine shows as skipped slots, never as a burst of
     cycles.
@@ -138,8 +136,8 @@ class ClockPacing:
 
 
 def prepare_realtime(priority: int) -> list[str]:
-    """Freeze the garbage collector's generations and ask for SCHED_FIFO (``priority`` 0: leave the
-    scheduler alone).
+    """Freeze the garbage collector's generations and request SCHED_FIFO (``priority`` 0: leave the scheduler as it
+    is).
 
     Returns warnings, each with its remedy; the loop runs without as well, and may wake late under load.
     """
@@ -160,7 +158,7 @@ def prepare_realtime(priority: int) -> list[str]:
 
 @contextmanager
 def realtime_for_a_while(priority: int) -> Iterator[list[str]]:
-    """As :func:`prepare_realtime`, for a program that goes on afterwards. Yields the warnings."""
+    """Context manager: `prepare_realtime`, undone at its end. Yields the warnings."""
     before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         yield prepare_realtime(priority)

@@ -1,4 +1,4 @@
-"""Control of the daemon's processes: end with the parent, termination signals, environment, log line."""
+"""Process control of the daemon: death with the parent, termination signals, environment, logging."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent(parent: int, how: signal.Signals) -> None:
-    """Have the kernel send ``how`` when the parent dies; exits at once where ``parent`` has died already.
+    """Have the kernel send ``how`` when the parent dies; exits at once where ``parent`` has already died.
 
     The kernel watches the parent's *thread*, so processes must be spawned from a thread that lives as long
     as it should.
@@ -26,8 +26,8 @@ def die_with_parent(parent: int, how: signal.Signals) -> None:
 
 
 class Termination:
-    """SIGTERM, SIGINT and the terminal's end (SIGHUP, unless it is ignored: nohup) as a flag. After the first one
-    the process has ``grace_s`` to end; then SIGALRM kills it.
+    """Flag set by SIGTERM, SIGINT and hang-up of the terminal (SIGHUP, unless it is ignored: nohup). After the
+    first one the process has ``grace_s`` to end; then SIGALRM kills it.
     """
 
     def __init__(self, grace_s: float = 5.0) -> None:
@@ -48,7 +48,7 @@ class Termination:
 
     @property
     def asked(self) -> bool:
-        """Whether the process has been asked to end."""
+        """Whether termination was requested."""
         return self.signals > 0
 
 
@@ -58,7 +58,7 @@ def write_log(process: str, message: str) -> None:
 
 
 def child_environment() -> dict[str, str]:
-    """The environment of every child: one thread for BLAS, so that nothing competes with the loop."""
+    """Environment of every child: one thread for BLAS, so that nothing competes with the loop."""
     return {
         **os.environ,
         "OPENBLAS_NUM_THREADS": "1",

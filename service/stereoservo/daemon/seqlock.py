@@ -1,4 +1,4 @@
-"""Sequence-locked slots in shared memory: newest-only hand-over between processes, and the stop slot.
+"""Sequence-locked slots in shared memory, which pass only the newest record between processes; the stop slot.
 
 Python cannot fence memory (aarch64 may reorder the stores), so the sequence lock is only the fast path:
 every record carries a CRC-32 over its sequence number and bytes, and a reader believes nothing else. Files
@@ -30,7 +30,7 @@ _STOP_MAGIC_WORD, _RAISED_WORD, _ACKNOWLEDGED_WORD, _COUNT_WORD = range(4)
 
 
 class SlotError(Exception):
-    """A slot cannot be used: names the file, what it holds and what was expected.
+    """A slot cannot be used: names the file, its content and what was expected.
 
     Attributes:
         path: the slot's file.
@@ -44,25 +44,25 @@ class SlotError(Exception):
 
 
 def layout_hash(layout: str) -> int:
-    """A 64-bit number that names a record layout, e.g. ``"CameraObservation.1"``."""
+    """64-bit hash of a record layout's name, e.g. ``"CameraObservation.1"``."""
     data = layout.encode()
     return zlib.crc32(data) << 32 | zlib.crc32(data[::-1] + b"stereoservo")
 
 
 def create_slot(path: Path, capacity: int, layout: str) -> None:
-    """Make the file of a slot for records of up to ``capacity`` bytes; an existing fitting file stays as
+    """Create the file of a slot for records of up to ``capacity`` bytes; an existing one of that layout is left as
     it is.
     """
     size = _HEADER_BYTES + capacity
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         header = os.pread(fd, 24, 0)
-        wanted = struct.pack("=QQQ", _MAGIC, layout_hash(layout), capacity)
-        if header == wanted and os.fstat(fd).st_size == size:
+        expected = struct.pack("=QQQ", _MAGIC, layout_hash(layout), capacity)
+        if header == expected and os.fstat(fd).st_size == size:
             return
         os.ftruncate(fd, 0)
         os.ftruncate(fd, size)
-        os.pwrite(fd, wanted, 0)
+        os.pwrite(fd, expected, 0)
     finally:
         os.close(fd)
 
@@ -119,7 +119,7 @@ def _open(path: Path, layout: str) -> tuple[_Mapping, int]:
 
 
 class SlotWriter:
-    """The one writer of a slot, enforced by a file lock that dies with its process.
+    """The single writer of a slot, enforced by a file lock that is released when its process dies.
 
     Raises SlotError: another live writer, another layout.
     """
@@ -171,7 +171,7 @@ class SlotWriter:
 
 
 class SlotReader:
-    """One of any number of readers.
+    """A reader of a slot; there may be any number.
 
     ``torn`` counts reads that met a writer at work and were retried; ``missed`` counts polls that gave up
     after ``retries`` of them (the record is then taken at the next poll).
@@ -186,11 +186,11 @@ class SlotReader:
 
     @property
     def epoch(self) -> int:
-        """Counts the writers this slot has had."""
+        """Number of writers this slot has had."""
         return int(self._mapping.words[_EPOCH_WORD])
 
     def poll(self) -> bytes | None:
-        """The newest record if it was not read before, else None."""
+        """The newest record unless it was read before, else None."""
         return self._read(skip=self._seen)
 
     def newest(self) -> bytes | None:
@@ -233,13 +233,13 @@ def _crc(sequence: int, record: bytes) -> int:
 
 
 def create_stop_slot(path: Path) -> None:
-    """Make the file of a stop slot, with no stop raised."""
+    """Create the file of a stop slot, with no stop raised."""
     path.write_bytes(struct.pack("=QQQQ", _STOP_MAGIC, 0, 0, 0))
     path.chmod(0o600)
 
 
 class StopSlot:
-    """One word that any process may raise and the servo process reads each cycle and acknowledges.
+    """A word in shared memory that any process may raise; the servo process reads and acknowledges it each cycle.
 
     Two processes that raise it at once both write a fresh word; whichever wins, the reader sees a change.
     The count is for people to read and may miss one of two simultaneous raises.
@@ -253,7 +253,7 @@ class StopSlot:
         self._seen = self._mapping.words[_ACKNOWLEDGED_WORD]
 
     def raise_stop(self) -> int:
-        """Ask for a stop; returns the word to be checked with :meth:`acknowledged`."""
+        """Request a stop; returns the word to pass to :meth:`acknowledged`."""
         words = self._mapping.words
         word = max(time.monotonic_ns(), words[_RAISED_WORD] + 1)
         words[_COUNT_WORD] += 1
@@ -266,11 +266,11 @@ class StopSlot:
 
     @property
     def count(self) -> int:
-        """How often a stop was raised since the cell was started."""
+        """Number of stops raised since the cell was started."""
         return int(self._mapping.words[_COUNT_WORD])
 
     def poll(self) -> bool:
-        """For the servo process: whether a stop was raised since the last poll; acknowledges it."""
+        """Whether a stop was raised since the last poll; acknowledges it. For the servo process only."""
         raised = self._mapping.words[_RAISED_WORD]
         if raised == self._seen:
             return False

@@ -56,7 +56,7 @@ class PacketChannel:
         return self._open
 
     def send(self, message: bytes) -> bool:
-        """Send whole or not at all; False where the peer does not drain its socket or has gone.
+        """Send a whole message or nothing; False where the peer does not drain its socket or has gone.
 
         Raises ChannelError for messages over ``MAX_MESSAGE_BYTES``.
         """
@@ -106,7 +106,7 @@ class PacketChannel:
 
 
 class ChannelServer:
-    """Listens on a unix socket file; ``accept`` is polled."""
+    """Listens on a unix socket file; `accept` must be polled."""
 
     def __init__(self, path: Path, *, single: bool = False, max_peers: int = 32) -> None:
         check_socket_path(path)
@@ -122,7 +122,7 @@ class ChannelServer:
         self.peers: list[PacketChannel] = []
 
     def accept(self) -> list[PacketChannel]:
-        """Take waiting peers, drop those that have gone; returns the new ones."""
+        """Accept waiting peers, drop those that have gone; returns the new ones."""
         self.peers = [peer for peer in self.peers if peer.is_open]
         fresh: list[PacketChannel] = []
         while True:

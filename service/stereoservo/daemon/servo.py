@@ -1,4 +1,4 @@
-"""The servo loop: read joints and observations, step the core, command the joint driver, publish the result.
+"""The servo loop: reads joints and observations, steps the core, commands the joint driver, publishes the result.
 
 `ServoProcess` is the loop on given links, pacing and clock; `main` runs it as a process of its own. That process holds
 nothing that could delay the arm: no zenoh, no scipy solver, no images, and it logs at its start and end only. Whatever
@@ -103,7 +103,7 @@ class ServoProcess:
             self.driver.close()
 
     def _stop(self) -> None:
-        # In a dry run somebody else may be driving this arm: not even a stop is sent.
+        # In a dry run another process may be driving this arm: not even a stop is sent.
         if not self._dry_run:
             self.driver.stop()
 
@@ -139,7 +139,7 @@ class ServoProcess:
         self._differences = report.reasons
 
     def _apply_driver_request(self, outputs: StepOutputs, now_ns: int) -> None:
-        """Change the driver's state as the core asks; where the driver refuses, the next step sees a fault."""
+        """Change the driver's state as the core requests; where the driver refuses, the next step sees a fault."""
         request = outputs.driver_request
         if request == "":
             return
@@ -162,7 +162,7 @@ class ServoProcess:
     # -- gateway --------------------------------------------------------------------------------------------
 
     def _receive(self, now_ns: int) -> GatewayMessages:
-        """The gateway's messages; a hold is added where it has fallen silent and the arm moves."""
+        """The gateway's messages; a hold is added where it has been silent and the arm moves."""
         messages = self._links.receive()
         if messages.heard:
             self._heard_ns = now_ns
@@ -174,7 +174,7 @@ class ServoProcess:
         return messages
 
     def _publish(self, outputs: StepOutputs, pacing: Pacing) -> None:
-        """Priors to the cameras; state and events to the gateway."""
+        """Publish priors to the cameras, and state and events to the gateway."""
         for prior in outputs.priors:
             self._links.publish_prior(prior)
         if self._statistics is None or self._cycles % self._statistics_every == 0:
@@ -196,7 +196,7 @@ class ServoProcess:
     # -- one cycle ------------------------------------------------------------------------------------------
 
     def cycle(self, pacing: Pacing, *, stop: bool = False) -> tuple[StepInputs, StepOutputs]:
-        """Wait for the next cycle; read, step, write, publish. ``stop`` asks the core to brake (shutdown)."""
+        """Run one cycle: wait, read, step, write, publish. ``stop`` requests the core to brake (shutdown)."""
         pacing.wait()
         now_ns = self._clock.now_ns()
         joints = self._read(now_ns)
@@ -224,7 +224,7 @@ class ServoProcess:
         return inputs, outputs
 
     def come_to_rest(self, pacing: Pacing, cut_short: Callable[[], bool]) -> None:
-        """Let the core brake until its command is zero, at most ``REST_TIMEOUT_S`` or until ``cut_short``."""
+        """Cycle until the core's command is zero, at most ``REST_TIMEOUT_S`` or until ``cut_short``."""
         until = self._clock.now_ns() + int(REST_TIMEOUT_S * 1e9)
         first = True
         while not cut_short() and self._clock.now_ns() < until:
@@ -242,7 +242,7 @@ def make_driver(plan: RunPlan, clock: Clock) -> JointDriver:
 
 
 def _configure(process: ServoProcess, termination: Termination, clock: MonotonicClock) -> None:
-    """Connect, trying again where the driver's error allows it. Raises DriverError."""
+    """Connect, with retries where the driver's error allows it. Raises DriverError."""
     for attempt in range(CONFIGURE_TRIES):
         try:
             process.configure()
@@ -254,7 +254,7 @@ def _configure(process: ServoProcess, termination: Termination, clock: Monotonic
 
 
 def run(plan: RunPlan, termination: Termination) -> None:
-    """Run until asked to end; the drives are stopped whatever happens."""
+    """Run until terminated; the drives are stopped in any case."""
     directories = plan.directories
     clock = MonotonicClock()
     hardware = hardware_lock_path(

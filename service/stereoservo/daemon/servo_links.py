@@ -1,4 +1,4 @@
-"""The servo process's links to the other processes: slots in shared memory and sockets."""
+"""The servo process's links to the other processes, by slots in shared memory and sockets."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RETAINED_EVENTS = 2048
 
 
 class EventOutbox:
-    """The last ``RETAINED_EVENTS`` events, encoded, so that a restarted gateway can be sent what it missed."""
+    """The last ``RETAINED_EVENTS`` events, encoded, so that a restarted gateway can receive those it missed."""
 
     def __init__(self) -> None:
         self._retained: deque[tuple[int, bytes]] = deque(maxlen=RETAINED_EVENTS)
@@ -47,7 +47,7 @@ class EventOutbox:
         self._sent = last_known
 
     def flush(self, peer: PacketChannel) -> None:
-        """Send what is due, as far as the socket takes it."""
+        """Send queued events, as far as the socket accepts them."""
         if not self._retained or self._retained[-1][0] <= self._sent:
             return
         for seq, data in self._retained:
@@ -58,7 +58,7 @@ class EventOutbox:
 
 
 class _RecorderPeer:
-    """The gateway's end of the step socket as a `StepSink`."""
+    """The gateway's end of the step socket, as a `StepSink`."""
 
     def __init__(self, channel: PacketChannel) -> None:
         self.channel = channel
@@ -130,7 +130,7 @@ class ProcessLinks:
         self._state.write(encode(state))
 
     def publish_events(self, events: tuple[Event, ...]) -> None:
-        """Queue events and send what waits, as far as the gateway's socket takes it."""
+        """Queue events and send those that wait, as far as the gateway's socket accepts them."""
         self._outbox.add(events)
         if self._gateway is not None and self._gateway.is_open:
             self._outbox.flush(self._gateway)

@@ -1,4 +1,4 @@
-"""The supervisor: starts, watches and restarts the processes of one cell; owns its lock and runtime directory.
+"""The supervisor: starts, monitors and restarts the processes of one cell; owns its lock and runtime directory.
 
 A gateway or vision process that ends is started again after a growing pause. The servo process is never
 started again: when it ends, everything stops. Children die with the supervisor, whatever kills it (the
@@ -49,7 +49,7 @@ STEADY_S = 30.0
 
 
 class StartError(Exception):
-    """The daemon cannot start; the text is for the person at the cell."""
+    """The daemon cannot start; the text is for the operator."""
 
 
 class ServoDiedError(Exception):
@@ -58,7 +58,7 @@ class ServoDiedError(Exception):
 
 @dataclass
 class Child:
-    """One process under watch."""
+    """One supervised process."""
 
     name: str
     arguments: list[str]
@@ -91,7 +91,7 @@ class Supervisor:
         self._reporter = Reporter(self.plan.directories.reports_socket, "supervisor", MonotonicClock())
 
     def run(self, termination: Termination, on_ready: Callable[[], None]) -> None:
-        """Start all, watch until asked to end, stop all. Raises StartError, ServoDiedError."""
+        """Start all processes, monitor them until terminated, stop them. Raises StartError, ServoDiedError."""
         try:
             for child in self.children:
                 _start(child)
@@ -144,7 +144,7 @@ class Supervisor:
         self._reporter.flush()
 
     def stop(self) -> None:
-        """Stop the arm first, then the rest; every child is reaped."""
+        """Stop the arm first, then the processes; every child is reaped."""
         _end([self.servo], SERVO_END_S)
         _end([child for child in self.children if child is not self.servo], OTHERS_END_S)
 
@@ -178,8 +178,7 @@ def _end(children: list[Child], grace_s: float) -> None:
 def prepare(
     cell_path: Path, options: PlanOptions, directories: CellDirectories, termination: Termination
 ) -> RunPlan | None:
-    """Check the cell with its drivers, compile the kernels, lay out the slots; None when asked to end
-    meanwhile.
+    """Check the cell with its drivers, compile the kernels, create the slots; None when terminated meanwhile.
 
     Raises StartError.
     """
@@ -212,8 +211,8 @@ def prepare(
 
 
 def clean(directories: CellDirectories) -> None:
-    """Remove what a run leaves in the runtime directory; the lock files stay, and what another process (an emulator)
-    holds by a lock ``NAME.lock`` beside it.
+    """Remove the files of a run from the runtime directory, except lock files, and files that another process (an
+    emulator) holds by a lock ``NAME.lock`` beside them.
     """
     if not directories.runtime.is_dir():
         return
@@ -232,7 +231,7 @@ def run_cell(
     record: str = "",
     on_ready: Callable[[RunPlan], None] = lambda plan: None,
 ) -> int:
-    """Run the daemon of a cell until SIGTERM or SIGINT; gives the signal that ended it.
+    """Run the daemon of a cell until SIGTERM or SIGINT; returns the signal that ended it.
 
     Raises CellFileError, DirectoryError, AlreadyRunningError, StartError, ServoDiedError, each after
     everything stopped.

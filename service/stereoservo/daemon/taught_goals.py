@@ -1,4 +1,4 @@
-"""Taught goals by name and their JSON file: set-points seen when a goal was shown, and the model in use.
+"""Taught goals by name and their JSON file: set-points observed at teaching, with the model in use then.
 
 Schema 2 keeps beside the set-points of the moving body all other markers that were seen (the workpiece's, the tool's)
 and the cameras of the model, so that a goal can be transferred to the workpiece's present pose or to other cameras.
@@ -69,7 +69,7 @@ class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TaughtFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file."""
+    """Content of the file of taught goals."""
 
     schema: int
     goals: dict[str, TaughtGoal] = {}
@@ -82,7 +82,7 @@ def feature_target(event: Event, epoch: int, body: tuple[int, ...] | None = None
 
 
 def taught_goal(event: Event, model: CellModel, created: str, tool: tuple[MarkerId, ...] = ()) -> TaughtGoal:
-    """The goal that is stored for a ``taught`` event, with the model that was in use."""
+    """The goal to store for a ``taught`` event, with the model that was in use."""
     return TaughtGoal(
         feature_target(event, model.epoch, model.marker_ids),
         () if event.joints is None else tuple(float(q) for q in event.joints),
@@ -134,7 +134,7 @@ def _pixels(event: Event) -> dict[str, dict[int, Pixel]]:
 def _some(
     pixels: dict[str, dict[int, Pixel]], body: tuple[int, ...], *, of_body: bool
 ) -> dict[str, dict[int, Pixel]]:
-    """Of the pixels those of the body, or those that are not; cameras without any are left out."""
+    """Pixels of the body's markers, or of the others; cameras without any are left out."""
     kept = {
         camera: {marker: pixel for marker, pixel in points.items() if (marker in body) == of_body}
         for camera, points in pixels.items()
@@ -143,7 +143,8 @@ def _some(
 
 
 def load_taught(path: Path, model_of: ModelOf = lambda _: None) -> dict[str, TaughtGoal]:
-    """All taught goals of a cell; none where there is no file. ``model_of``: for goals of schema 1.
+    """All taught goals of a cell; none where there is no file. ``model_of``: returns the model of an epoch, for
+    goals of schema 1.
 
     Raises TaughtFileError.
     """
@@ -168,7 +169,7 @@ def load_taught(path: Path, model_of: ModelOf = lambda _: None) -> dict[str, Tau
 
 
 def migrated(goal: TaughtGoal, model: CellModel | None) -> TaughtGoal:
-    """A goal of schema 1, in which all markers are set-points, with what its ``model`` adds."""
+    """A goal of schema 1, in which all markers are set-points, with the data that its ``model`` adds."""
     if model is None:
         return goal
     seen = goal.target.set_points

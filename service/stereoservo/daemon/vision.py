@@ -1,4 +1,4 @@
-"""The vision loop of one camera: poll the driver, detect with the prior, publish the newest observation.
+"""The vision loop of one camera: polls the driver, detects with the prior, publishes the newest observation.
 
 `camera_loop` is the loop on given links and clock; `main` runs it as a process of its own. Errors of the camera are
 reported and answered by reconnecting with growing pauses, never by ending.
@@ -58,7 +58,7 @@ EXIT_SETUP = 3
 
 
 class Reporter:
-    """Sends reports to the gateway, oldest first; the last 64 that it cannot take yet are kept."""
+    """Sends reports to the gateway, oldest first; keeps the last 64 unsent ones."""
 
     def __init__(self, path: Path, origin: str, clock: Clock) -> None:
         self._path = path
@@ -75,7 +75,7 @@ class Reporter:
         self.flush()
 
     def flush(self) -> None:
-        """Send the waiting reports, as far as the gateway takes them."""
+        """Send the waiting reports, as far as the gateway accepts them."""
         if not self._waiting:
             return
         if self._channel is None or not self._channel.is_open:
@@ -115,7 +115,9 @@ class VisionSlots:
 
 
 class CameraPipeline:
-    """Driver and detector of one camera: publishes what is seen in the newest frame; ``images`` records all frames."""
+    """Driver and detector of one camera: publishes the observation of the newest frame; ``images`` records all
+    frames.
+    """
 
     def __init__(
         self,
@@ -148,7 +150,7 @@ class CameraPipeline:
             self._driver.close()
 
     def poll(self) -> bool:
-        """Take what arrived; True where an observation was published. Raises DriverError."""
+        """Process the frames that arrived; True where an observation was published. Raises DriverError."""
         arrived = self._driver.poll()
         if not arrived:
             return False
@@ -189,7 +191,8 @@ def camera_loop(
     camera: str,
     poll_s: float,
 ) -> Generator[float]:
-    """Run a camera for ever, and yield how many seconds to wait before it is resumed; closing it closes the camera.
+    """Generator that runs a camera for ever and yields the seconds to wait before it is resumed; closing it closes
+    the camera.
 
     Every failure is reported once and answered by a reconnect after a growing pause.
     """
@@ -231,7 +234,7 @@ def run_camera(
     sleep: Callable[[float], None],
     between: Callable[[], None],
 ) -> None:
-    """Run a `camera_loop` until ``ended``, and call ``between`` after each of its parts; closes the camera."""
+    """Run a `camera_loop` until ``ended``, calling ``between`` after each of its parts; closes the camera."""
     with closing(loop):
         while not ended():
             pause_s = next(loop)
@@ -241,7 +244,7 @@ def run_camera(
 
 
 def run(plan: RunPlan, camera: str, termination: Termination) -> None:
-    """Run the process of ``camera`` until asked to end."""
+    """Run the process of ``camera`` until terminated."""
     directories = plan.directories
     clock = MonotonicClock()
     section = next(section for section in plan.cell.camera if section.name == camera)

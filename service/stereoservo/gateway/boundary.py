@@ -1,4 +1,6 @@
-"""Error boundary for untrusted messages: an exception becomes a refusal, counted and logged, and ends no process."""
+"""Error boundary for untrusted messages: an exception becomes a refusal, counted and logged, and never ends the
+process.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,14 @@ EXPECTED_ERRORS = (MessageError, InvalidKeyError, TransferError)
 
 
 class LimitedLog:
-    """Log of what clients can cause as often as they like: a line a second at most; ``count``: of all of them."""
+    """Rate-limited log of what clients can cause at will: at most a line a second; ``count``: of all occurrences."""
 
     def __init__(self) -> None:
         self.count = 0
         self._logged = -LOG_INTERVAL_S
 
     def add(self, text: str) -> None:
-        """Count, and log unless another line was logged within the last second."""
+        """Count an occurrence, and log it unless another line was logged within the last second."""
         self.count += 1
         now = time.monotonic()
         if now - self._logged >= LOG_INTERVAL_S:
@@ -36,14 +38,14 @@ class LimitedLog:
 
 
 class Boundary:
-    """Takes the messages of one thread. ``refusals`` counts and logs those that raised."""
+    """Error boundary of one thread. ``refusals`` counts and logs messages whose handling raised."""
 
     def __init__(self, boot: str) -> None:
         self.refusals = LimitedLog()
         self._boot = boot
 
     def take(self, key: str, work: Callable[[], None], refuse: Callable[[Reply], None]) -> None:
-        """Do ``work`` for a message that came on ``key``; where it raises, call ``refuse`` with the refusal."""
+        """Do ``work`` for a message received on ``key``; where it raises, call ``refuse`` with the refusal."""
         try:
             work()
         except Exception as error:
@@ -53,7 +55,7 @@ class Boundary:
 
 
 def _message(error: Exception) -> str:
-    """The first sentence of a refusal."""
+    """First sentence of a refusal."""
     if isinstance(error, TransferError):
         return "no goal could be made"
     if isinstance(error, EXPECTED_ERRORS):

@@ -27,16 +27,16 @@ from stereoservo.messages.wire import Synthesise
 
 
 def synthesise(
-    wanted: Synthesise, model: CellModel | None, observations: MarkerObservations, created: str
+    request: Synthesise, model: CellModel | None, observations: MarkerObservations, created: str
 ) -> tuple[TaughtGoal, str]:
-    """A goal from drawn points and the pose of the tool on the workpiece, and in words how well it is known.
+    """Goal from drawn points and the pose of the tool on the workpiece, and a description of its accuracy.
 
     The markers that the arm does not move are seen now; they place the drawing. Raises TransferError.
     """
     if model is None:
         raise TransferError("the cell has no model yet: calibrate first")
-    fixed, moving = wanted.workpiece, wanted.tool
-    pose = np.array(wanted.pose).reshape(4, 4)
+    fixed, moving = request.workpiece, request.tool
+    pose = np.array(request.pose).reshape(4, 4)
     try:
         drawn_points(np.zeros((1, 3)), pose)
     except GeometryError as error:
@@ -50,25 +50,34 @@ def synthesise(
         raise TransferError(
             f"markers {listed(shared)} are of the body that moves before the cameras; the drawing is placed by others"
         )
-    standing, ids = sorted(fixed), sorted(moving)
+    static_markers, ids = sorted(fixed), sorted(moving)
     seen = {marker for points in observations.values() for marker in points}
-    require_still(observations, standing, "markers")
-    now = observed_views(observations, model, standing)
+    require_still(observations, static_markers, "markers")
+    now = observed_views(observations, model, static_markers)
     frame = model_frame(model)
-    missing = [marker for marker in standing if marker not in seen]
-    if len(standing) - len(missing) < MIN_MARKERS:
+    missing = [marker for marker in static_markers if marker not in seen]
+    if len(static_markers) - len(missing) < MIN_MARKERS:
         raise TransferError(
             f"markers {listed(missing)} of the drawing are not seen now; 3 or more are needed"
         )
-    drawn = drawn_points(np.array([fixed[m] for m in standing]))
-    change, said = align_points(
-        family_between(DRAWING, frame, False), DRAWING, frame, drawn, None, now, standing, "drawing placed"
+    drawn = drawn_points(np.array([fixed[m] for m in static_markers]))
+    change, description = align_points(
+        family_between(DRAWING, frame, False),
+        DRAWING,
+        frame,
+        drawn,
+        None,
+        now,
+        static_markers,
+        "drawing placed",
     )
     points = drawn_points(np.array([moving[m] for m in ids]), pose)
     set_points, deviations, note = reproject_set_points(
         model, ids, move_points(change.H, points), carried_point_covariance(change, points), "drawn"
     )
-    return _drawn_goal(model, set_points, deviations, ids, observations, standing, created), f"{said}; {note}"
+    return _drawn_goal(
+        model, set_points, deviations, ids, observations, static_markers, created
+    ), f"{description}; {note}"
 
 
 def _drawn_goal(
@@ -77,16 +86,16 @@ def _drawn_goal(
     sigmas: Deviations,
     ids: list[int],
     observations: MarkerObservations,
-    standing: list[int],
+    static_markers: list[int],
     created: str,
 ) -> TaughtGoal:
-    """Set-points of drawn markers as if they had been shown, with the markers that placed them."""
+    """Goal with the set-points of drawn markers as if they had been taught, and the markers that located them."""
     of_body = {c: {m: p for m, p in seen.items() if m in model.marker_ids} for c, seen in set_points.items()}
     others = {
         c: {m: p for m, p in seen.items() if m not in model.marker_ids} for c, seen in set_points.items()
     }
     for camera, seen in observations.items():
-        for marker in standing:
+        for marker in static_markers:
             if marker in seen:
                 others.setdefault(camera, {})[marker] = seen[marker].pixel
                 sigmas.setdefault(camera, {})[marker] = seen[marker].sigma

@@ -1,4 +1,4 @@
-"""Calibrations and model checks: collects the samples, runs the fit in a process of its own, installs the model."""
+"""Jobs of calibration and model check: collects the samples, runs the fit in a child process, installs the model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stereoservo.messages.wire import CalibrationResult
 
 
 class CalibrationJobs:
-    """The cell's model and how it comes about. ``model`` is the one that was given to the core last.
+    """The cell's model and the jobs that produce it. ``model`` is the one sent to the core last.
 
     ``notes``: what is wrong with the model files, until a newer model is there.
     """
@@ -44,7 +44,7 @@ class CalibrationJobs:
         self.notes: tuple[str, ...] = ()
 
     def load(self, core_epoch: int) -> None:
-        """Give the newest fitting model of the disk to the core, unless that (epoch ``core_epoch``) has it."""
+        """Send the newest fitting model on disk to the core, unless that (epoch ``core_epoch``) has it."""
         model, passed = self._models.newest_fitting(self._settings)
         used = "no model is used" if model is None else f"model epoch {model.epoch} is used instead"
         self.notes = tuple(f"model passed over: {text}; {used}" for text in passed)
@@ -55,7 +55,7 @@ class CalibrationJobs:
             self.model = model
 
     def core_event(self, event: Event, *, fresh: bool) -> None:
-        """Take an event of the core; ``fresh``: it was not acted upon before a restart of the gateway."""
+        """Handle an event of the core; ``fresh``: it was not handled before a restart of the gateway."""
         self._job.add(event)
         if event.kind == "calibration_finished" and fresh:
             self._start_fit()
@@ -64,14 +64,14 @@ class CalibrationJobs:
         elif event.kind == "model" and self._handed is not None:
             handed, self._handed = self._handed, None
             self.notes = ()
-            self._tell_taken(*handed)
+            self._report_applied(*handed)
         elif event.kind == "warning" and event.message.startswith("model refused"):
             goal_id = self._fit_id if self._handed is None else self._handed[0]
             self._handed = None
             self._failed(goal_id, event.message)
 
-    def _tell_taken(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
-        """The core works with the model that was handed over."""
+    def _report_applied(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
+        """Report that the core has applied the model that was sent."""
         if isinstance(what, ZeroReset):
             self._log.add("zeros_reset", message=what.message, id=goal_id, reset=what, origin="gateway")
             return
@@ -123,14 +123,14 @@ class CalibrationJobs:
             self._failed(self._check_id, str(error), getattr(error, "code", ""))
 
     def poll(self) -> None:
-        """Report the progress of a running fit or check, and act on its result."""
+        """Report the progress of a running fit or check, and handle its result."""
         if self._fit is not None:
             self._poll_fit(self._fit)
         if self._check is not None:
             self._poll_check(self._check)
 
     def _poll_fit(self, fit: FitJob) -> None:
-        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        ended = fit.ended  # read first, so that the output before the end is processed, too
         for step in fit.poll():
             self._log.add(
                 "fit_progress",
@@ -173,12 +173,12 @@ class CalibrationJobs:
             kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
             self._failed(self._fit_id, f"{assess_failure(code, str(error)).text} {kept}", code)
             return
-        self._hand_over(model, self._fit_id, result, fit.model_path)
+        self._send_to_core(model, self._fit_id, result, fit.model_path)
 
-    def _hand_over(
+    def _send_to_core(
         self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path
     ) -> None:
-        """Send a model to the core, which takes it once the arm is at rest; ``what`` is reported then."""
+        """Send a model to the core, which applies it once the arm is at rest; ``what`` is reported then."""
         if not self._link.send_model(model):
             self._failed(goal_id, f"the servo process does not take the model; it is saved as {path}")
             return
@@ -210,13 +210,13 @@ class CalibrationJobs:
         except ModelFileError as error:
             self._failed(self._check_id, str(error))
         else:
-            self._hand_over(model, self._check_id, reset, path)
+            self._send_to_core(model, self._check_id, reset, path)
 
     def _failed(self, goal_id: str, message: str, code: str = "") -> None:
         self._log.add("calibration_failed", message=message, id=goal_id, name=code, origin="gateway")
 
     def cancel(self) -> None:
-        """End what runs. Idempotent."""
+        """Cancel the running job. Idempotent."""
         for job in (self._fit, self._check):
             if job is not None:
                 job.close()

@@ -1,4 +1,4 @@
-"""Child processes that fit or check a model, polled without waiting."""
+"""Child processes that fit or check a model, polled without blocking."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FIT_TIMEOUT_S = 600.0
 
 
 class FitFailedError(Exception):
-    """A fit gave no model, a check no answer; ``code`` is the calibration's."""
+    """A fit gave no model, or a check no report; ``code`` is the calibration's."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -74,13 +74,13 @@ class ChildJob:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended (it is ended after ``FIT_TIMEOUT_S``)."""
+        """Whether the process has ended (it is killed after ``FIT_TIMEOUT_S``)."""
         if self.seconds > FIT_TIMEOUT_S:
             self.cancel()
         return self._process.poll() is not None
 
     def require(self, key: str) -> Any:
-        """The value it printed under ``key``. Raises FitFailedError with its own error, or with how it ended."""
+        """The value printed under ``key``. Raises FitFailedError with the child's own error, or with how it ended."""
         if key in self.said:
             return self.said[key]
         if failure := self.said.get("error"):
@@ -92,20 +92,20 @@ class ChildJob:
         raise FitFailedError("fit_process", f"the process ended with exit code {code}: {last}")
 
     def close(self) -> None:
-        """End it, and release what it held. Idempotent."""
+        """Terminate it and release its resources. Idempotent."""
         self.cancel()
         self._output.close()
         self._errors.close()
 
     def cancel(self) -> None:
-        """End it. Idempotent."""
+        """Terminate it. Idempotent."""
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
 
 
 class FitJob(ChildJob):
-    """A running fit: gives a model or the cause of its failure, and later a report."""
+    """A running fit: yields a model or the cause of its failure, and later a report."""
 
     def __init__(self, trials: TrialData, model_path: Path, epoch: int) -> None:
         self.model_path = model_path
@@ -119,11 +119,11 @@ class FitJob(ChildJob):
 
     @property
     def decided(self) -> bool:
-        """Whether there is a model, or a cause why there is none."""
+        """Whether the model, or the cause of the failure, is available."""
         return "model" in self.said or "error" in self.said or self.ended
 
     def model(self) -> tuple[CellModel, Acceptance, float]:
-        """The model, what is to be said of it, and the seconds it took. Raises FitFailedError, ModelFileError."""
+        """The model, its notes, and the seconds that the fit took. Raises FitFailedError, ModelFileError."""
         self.require("model")
         if self._seconds is None:
             self._seconds = self.seconds
@@ -151,7 +151,7 @@ class CheckJob(ChildJob):
         return msgspec.convert(self.require("check"), CheckReport)
 
     def reset(self) -> tuple[CellModel, ZeroReset]:
-        """The model with moved zeros, and what was moved. Raises FitFailedError, ModelFileError."""
+        """The model with corrected zeros, and the corrections. Raises FitFailedError, ModelFileError."""
         reset = msgspec.convert(self.require("reset"), ZeroReset)
         return load_model(Path(reset.model)), reset
 
@@ -164,7 +164,7 @@ def calibration_result(
     trials: Path | None,
     seconds: float,
 ) -> CalibrationResult:
-    """The figures of a fit that clients want. Raises FitFailedError where the model carries no statistics."""
+    """Figures of a fit for clients. Raises FitFailedError where the model carries no statistics."""
     statistics = model.statistics
     if statistics is None:
         raise FitFailedError("no_statistics", f"{path}: the fitted model carries no statistics")

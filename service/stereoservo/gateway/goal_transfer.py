@@ -1,7 +1,7 @@
 """Set-points of taught goals for a moved workpiece, other cameras or a remounted body, by reprojection (thesis 8.6).
 
 A goal keeps the pixels of the moving body (or of a tool on it), of the workpiece, and the cameras that saw them. What
-stood still relative to the goal, the ``common`` markers, gives the map from the frame of teaching to that of now
+stood still relative to the goal, the ``common`` markers, gives the map from the frame of teaching to the present one
 (`geometry.alignment`); the goal's points go along and are projected again. Nothing here waits or moves.
 """
 
@@ -40,63 +40,63 @@ from stereoservo.messages.goals import FeatureTarget, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
 
 MOUNTED_PX = 5.0
-"""Where cameras alone have changed, goal and kinematics agree within this, or the body was mounted anew."""
+"""Where cameras alone have changed, goal and kinematics agree within this, or the body was remounted."""
 
 
 @dataclass(frozen=True)
 class TransferredGoal:
-    """Set-points for the model in use, and in words how they came about and how well they are known."""
+    """Set-points for the model in use, with a description of their origin and accuracy."""
 
     target: FeatureTarget
     note: str
 
 
 def resolve(
-    wanted: TaughtTarget, goal: TaughtGoal, model: CellModel | None, observations: MarkerObservations
+    requested: TaughtTarget, goal: TaughtGoal, model: CellModel | None, observations: MarkerObservations
 ) -> TransferredGoal:
-    """A taught goal as set-points of the body for the current model and cameras. Raises TransferError."""
-    if wanted.relative_to is None and not goal.tool:
+    """Set-points of a taught goal for the current model and cameras. Raises TransferError."""
+    if requested.relative_to is None and not goal.tool:
         return _as_taught(goal, model)
     if model is None:
         raise TransferError("the cell has no model yet: calibrate first")
     if goal.model is None:
         raise TransferError(
-            f"{wanted.name!r} was taught by an earlier version, and the model of its epoch "
+            f"{requested.name!r} was taught by an earlier version, and the model of its epoch "
             f"{goal.target.model_epoch} is gone: teach it again"
         )
     same = goal.model.epoch == model.epoch
     if model.mount == "eye_in_hand":
-        return _relative_to_cameras(wanted, goal, model, observations, same)
+        return _relative_to_cameras(requested, goal, model, observations, same)
     old, new = taught_frame(goal.model), model_frame(model)
     taught = taught_views(goal)
-    if wanted.relative_to is None:
+    if requested.relative_to is None:
         if not same:
             raise TransferError(
-                f"{wanted.name!r} was taught with model epoch {goal.model.epoch}, the cell has {model.epoch}: send it "
-                'relative to the "workpiece", or to the "cameras"'
+                f"{requested.name!r} was taught with model epoch {goal.model.epoch}, the cell has {model.epoch}: send "
+                'it relative to the "workpiece", or to the "cameras"'
             )
-        change, said = _nothing_moved(), "where it was taught"
+        change, origin = _nothing_moved(), "where it was taught"
     else:
-        change, said = _common_change(wanted, goal, taught, old, new, model, observations, same)
-    points, spread, names = _points_when_taught(goal, taught, old, new, model, observations, same)
+        change, origin = _common_change(requested, goal, taught, old, new, model, observations, same)
+    points, covariance, names = _points_when_taught(goal, taught, old, new, model, observations, same)
     moved = move_points(change.H, points)
     set_points, _, note = reproject_set_points(
-        model, names, moved, carried_point_covariance(change, points, spread), "carried over"
+        model, names, moved, carried_point_covariance(change, points, covariance), "carried over"
     )
-    if wanted.relative_to == "cameras" and not goal.tool:
+    if requested.relative_to == "cameras" and not goal.tool:
         _require_same_mounting(goal, model, names, moved)
     elif not goal.tool and not same:
         note += (
             f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
         )
-    return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{said}; {note}")
+    return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")
 
 
 def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
-    """The recorded pixels; those of cameras relocalized since are reprojected into the current images.
+    """The recorded pixels; those of cameras that were relocalized since are reprojected into the current images.
 
     Re-anchoring keeps the frame, to the bit: the goal's points are still what the cameras of teaching make of it.
-    Mobile cameras are found anew within one epoch.
+    Mobile cameras are re-estimated within one epoch.
     """
     taught = goal.model
     if model is None or taught is None or not _same_frame(taught, model):
@@ -106,35 +106,40 @@ def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
         camera.name for camera in model.cameras
         if then.get(camera.name) != (tuple(camera.matrix.ravel().tolist()), tuple(camera.lens.tolist()))
     ]  # fmt: skip
-    said = {name: pixels for name, pixels in goal.target.set_points.items() if name not in moved}
+    kept_pixels = {name: pixels for name, pixels in goal.target.set_points.items() if name not in moved}
     if not moved:  # other joint zeros, say: whether the goal holds is the core's to judge
         return TransferredGoal(goal.target, "")
     if not set(moved) & set(goal.target.set_points):
-        return TransferredGoal(FeatureTarget(said, model.epoch), "")
+        return TransferredGoal(FeatureTarget(kept_pixels, model.epoch), "")
     views = taught_views(goal)
     names = [marker for marker in views.ids if marker in model.marker_ids]
-    points, spread = views.subset(names).points()
+    points, covariance = views.subset(names).points()
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(known) < MIN_MARKERS:
         raise TransferError(
             f"camera {listed(moved)} was moved since it was taught, and {len(known)} of its markers "
             f"({listed(names[k] for k in known)}) are known from two cameras; 3 or more are needed: teach it again"
         )
-    anew, _, note = reproject_set_points(
+    reprojected_pixels, _, note = reproject_set_points(
         model,
         [names[k] for k in known],
         points[known],
-        spread[known],
+        covariance[known],
         "in the pixels of the camera as it stands now",
     )
-    said |= {name: anew[name] for name in moved if name in goal.target.set_points and name in anew}
+    kept_pixels |= {
+        name: reprojected_pixels[name]
+        for name in moved
+        if name in goal.target.set_points and name in reprojected_pixels
+    }
     return TransferredGoal(
-        FeatureTarget(said, model.epoch), f"camera {listed(moved)} was moved since it was taught; {note}"
+        FeatureTarget(kept_pixels, model.epoch),
+        f"camera {listed(moved)} was moved since it was taught; {note}",
     )
 
 
 def _same_frame(taught: TaughtModel, model: CellModel) -> bool:
-    """Whether one model comes from the other by re-anchoring: what fixes the frame is the same to the bit."""
+    """Whether one model is a relocalization of the other: the parts that fix the frame are bitwise equal."""
     upgrade = model.projective_to_euclidean
     return (
         taught.stratum == model.stratum
@@ -148,7 +153,7 @@ def _nothing_moved() -> FrameChange:
 
 
 def _common_change(
-    wanted: TaughtTarget,
+    requested: TaughtTarget,
     goal: TaughtGoal,
     taught: MarkerViews,
     old: AlignmentFrame,
@@ -157,11 +162,11 @@ def _common_change(
     observations: MarkerObservations,
     same: bool,
 ) -> tuple[FrameChange, str]:
-    """The map of the common markers since the goal was taught, and a sentence on its evidence."""
-    common = _common(wanted, goal, model, observations)
+    """Map of the common markers since the goal was taught, and a sentence on its evidence."""
+    common = _common(requested, goal, model, observations)
     before, now = taught.subset(common), observed_views(observations, model, common)
     require_still(observations, common, "the common markers")
-    if wanted.relative_to == "cameras" and same:
+    if requested.relative_to == "cameras" and same:
         away = np.sqrt(((now.pixels - before.pixels) ** 2).sum(axis=-1))
         if np.nanmax(away, initial=0.0) > RESIDUAL_PX + DEVIATIONS * float(
             np.nanmax(now.sigmas, initial=0.0)
@@ -173,23 +178,23 @@ def _common_change(
             )
     family = family_between(old, new, same)
     return align_points(
-        family, old, new, *before.points(), now, common, f"relative to the {wanted.relative_to}"
+        family, old, new, *before.points(), now, common, f"relative to the {requested.relative_to}"
     )
 
 
 def _common(
-    wanted: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations
+    requested: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations
 ) -> list[int]:
-    """The common markers by id: those asked for, or all that were seen then and are seen now."""
+    """Common markers by id: those requested, or all that were observed then and are observed now."""
     then = {marker for points in goal.others.values() for marker in points} - set(goal.tool)
     now = {marker for points in observations.values() for marker in points} - set(model.marker_ids)
-    for marker in wanted.common:
+    for marker in requested.common:
         for seen, when in ((then, "when it was taught"), (now, "now")):
             if marker not in seen:
                 raise TransferError(
                     f"common marker {marker} is not seen {when}; seen: {listed(sorted(seen))}"
                 )
-    common = sorted(set(wanted.common) or then & now)
+    common = sorted(set(requested.common) or then & now)
     if len(common) < min(POINTS_NEEDED.values()):
         raise TransferError(
             f"{len(common)} markers beside the body were seen when it was taught and are seen now "
@@ -210,37 +215,44 @@ def _points_when_taught(
     observations: MarkerObservations,
     same: bool,
 ) -> tuple[FloatArray, FloatArray, list[int]]:
-    """Points (n, 4) of the body's markers at the goal in the frame of teaching, covariances, ids.
+    """Points (n, 4) of the body's markers at the goal in the frame of teaching, with covariances and ids.
 
-    By themselves, or, where the goal is meant by a tool's features, by where the body sits on that tool now: mounting
-    the body anew does not change the goal.
+    From the taught pixels or, where the goal is defined by a tool's features, from the present pose of the body on
+    that tool, so that remounting the body does not change the goal.
     """
     tool = list(goal.tool)
     if not set(tool) <= set(model.marker_ids):
         require_still(observations, [*tool, *model.marker_ids], "the tool's and the body's markers")
         then, now = taught.subset(tool), observed_views(observations, model, tool)
-        points, spread = now.points()
+        points, covariance = now.points()
         back, _ = align_points(
-            family_between(new, old, same), new, old, points, spread, then, tool, "the tool, by its features"
+            family_between(new, old, same),
+            new,
+            old,
+            points,
+            covariance,
+            then,
+            tool,
+            "the tool, by its features",
         )
         names = [m for m in model.marker_ids if m not in tool]
         body = observed_views(observations, model, names)
-        points, spread = body.points()
-        points, spread = move_points(back.H, points), carried_point_covariance(back, points, spread)
+        points, covariance = body.points()
+        points, covariance = move_points(back.H, points), carried_point_covariance(back, points, covariance)
     else:
         names = [m for m in (tool or taught.ids) if m in model.marker_ids]
-        points, spread = taught.subset(names).points()
+        points, covariance = taught.subset(names).points()
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(known) < MIN_MARKERS:
         raise TransferError(
             f"{len(known)} markers of the body ({listed(names[k] for k in known)}) are known from two cameras; 3 or "
             "more are needed"
         )
-    return points[known], spread[known], [names[k] for k in known]
+    return points[known], covariance[known], [names[k] for k in known]
 
 
 def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int], moved: FloatArray) -> None:
-    """Check by the arm's kinematics that the body is mounted as it was. Raises TransferError."""
+    """Check by the arm's kinematics that the body is mounted as at teaching. Raises TransferError."""
     if len(goal.joints) != len(model.joint_names):
         return
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
@@ -261,23 +273,24 @@ def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int],
 
 
 def _relative_to_cameras(
-    wanted: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations, same: bool
+    requested: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations, same: bool
 ) -> TransferredGoal:
-    """With cameras on the arm: they shall see the common markers as they were taught, so the standing body goes along.
+    """Set-points with cameras on the arm: the goal is relative to the common markers, which the static body belongs
+    to.
 
-    The common markers stand on a workpiece that has moved within the scene (relative to the model's body).
+    The common markers are on a workpiece that has moved within the scene (relative to the model's body).
     """
-    if wanted.relative_to != "workpiece" or goal.tool or not same:
+    if requested.relative_to != "workpiece" or goal.tool or not same:
         raise TransferError(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
             f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach anew"
         )
     frame = model_frame(model)
-    common = _common(wanted, goal, model, observations)
+    common = _common(requested, goal, model, observations)
     body = list(model.marker_ids)
     require_still(observations, [*common, *body], "markers")
     then, now = taught_views(goal).subset(common), observed_views(observations, model, common)
-    back, said = align_points(
+    back, origin = align_points(
         family_between(frame, frame, True),
         frame,
         frame,
@@ -286,14 +299,14 @@ def _relative_to_cameras(
         common,
         "relative to the workpiece",
     )
-    points, spread = observed_views(observations, model, body).points()
+    points, covariance = observed_views(observations, model, body).points()
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     names = [body[k] for k in known]
     set_points, _, note = reproject_set_points(
         model,
         names,
         move_points(back.H, points[known]),
-        carried_point_covariance(back, points[known], spread[known]),
+        carried_point_covariance(back, points[known], covariance[known]),
         "carried over",
     )
-    return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{said}; {note}")
+    return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")

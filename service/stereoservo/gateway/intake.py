@@ -40,11 +40,11 @@ REPLY_TIMEOUT_S = 1.0
 PLANNED_REPLY_TIMEOUT_S = 5.0
 """A goal is planned, a slice a cycle, before it is answered."""
 RESET_REPLY_TIMEOUT_S = 10.0
-"""A driver that connects anew and configures its drives answers nothing meanwhile."""
+"""A driver that reconnects and configures its drives does not reply meanwhile."""
 PATIENCE_S: dict[type, float] = {RunGoal: PLANNED_REPLY_TIMEOUT_S, Reset: RESET_REPLY_TIMEOUT_S}
 KNOWN_GOALS = 1000
 TOLD_EVERY_S = 1.0
-"""Refused set-points of a stream, which nobody waits for, are told by events no more often than this."""
+"""Refused set-points of a stream have no reply; events report them no more often than this."""
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Intake:
     def _take(self, query: Any, message: Any, work: Callable[[str, bytes], tuple[str, Command]]) -> None:
         key = str(message.key_expr)
         if query is not None and "*" in key:
-            query.drop()  # somebody looks around; goals and commands are addressed
+            query.drop()  # a wildcard query; goals and commands need exact keys
             return
         payload = payload_of(message)
         streamed = query is None and b'"update"' in payload
@@ -158,7 +158,7 @@ class Intake:
         return operator, RunGoal(self._resolved(goal))
 
     def _resolved(self, goal: Goal) -> Goal:
-        """The goal as the core takes it: taught ones as set-points, standing markers as their pixels."""
+        """The goal in the core's form: taught goals as set-points, static markers as their pixels."""
         try:
             if isinstance(goal.target, IncidenceTarget):
                 return msgspec.structs.replace(goal, target=self._teaching.resolve_incidence(goal.target))
@@ -189,7 +189,7 @@ class Intake:
     # -- from the core --------------------------------------------------------------------------------------
 
     def core_reply(self, event: Event) -> None:
-        """The core's answer to a request."""
+        """Handle the core's reply to a request."""
         pending = self._pending.pop(event.request, None)
         if pending is None:
             return
@@ -210,7 +210,7 @@ class Intake:
         self._answer(pending.query, reply, pending.operator, streamed)
 
     def expire(self) -> None:
-        """Answer what the core left unanswered."""
+        """Reply to requests that the core left unanswered."""
         now = time.monotonic()
         for number in [number for number, pending in self._pending.items() if now > pending.deadline]:
             pending = self._pending.pop(number)
@@ -248,5 +248,5 @@ class Intake:
 
 
 def payload_of(message: Any) -> bytes:
-    """The bytes of a query or a sample; none are empty."""
+    """Payload bytes of a query or a sample; empty where there are none."""
     return b"" if message.payload is None else bytes(message.payload.to_bytes())

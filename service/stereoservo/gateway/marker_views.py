@@ -23,8 +23,9 @@ UNKNOWN_SIGMA_PX = 0.1
 
 @dataclass(frozen=True)
 class MarkerViews:
-    """Markers ``ids`` in cameras: ``Ps`` (c, 3, 4), ``lenses`` (c, 4), ``sizes`` (c, 2); ``pixels`` (c, n, 2) ideal,
-    NaN where not seen, ``sigmas`` (c, n) [px]. ``scene`` (m, 4): points that are in front of all cameras.
+    """Observations of markers ``ids`` in several cameras: ``Ps`` (c, 3, 4), ``lenses`` (c, 4), ``sizes`` (c, 2);
+    ``pixels`` (c, n, 2) ideal, NaN where not seen, ``sigmas`` (c, n) [px]. ``scene`` (m, 4): points that are in
+    front of all cameras.
     """
 
     cameras: tuple[str, ...]
@@ -38,7 +39,7 @@ class MarkerViews:
 
     @classmethod
     def empty(cls, model: CellModel, ids: Sequence[int]) -> MarkerViews:
-        """The cameras of a model, nothing seen yet."""
+        """Views of a model's cameras without observations."""
         shape = (len(model.cameras), len(ids))
         return cls(
             tuple(camera.name for camera in model.cameras),
@@ -52,7 +53,7 @@ class MarkerViews:
         )
 
     def add(self, camera: str, seen: Mapping[int, tuple[tuple[float, float], float]]) -> None:
-        """Enter raw pixels with their deviations; cameras and markers that are not of these views are passed over."""
+        """Enter raw pixels with their deviations; cameras and markers outside of these views are ignored."""
         known = [marker for marker in seen if marker in self.ids]
         if camera not in self.cameras or not known:
             return
@@ -65,7 +66,7 @@ class MarkerViews:
         self.sigmas[c, kept] = np.array([seen[known[k]][1] for k in there]) / bend
 
     def subset(self, ids: Sequence[int]) -> MarkerViews:
-        """The same of some markers, in their order; those that are not there are unseen."""
+        """The views of some markers, in their order; missing ones are unseen."""
         pixels = np.full((len(self.cameras), len(ids), 2), np.nan)
         sigmas = np.full((len(self.cameras), len(ids)), np.inf)
         for k, marker in enumerate(ids):
@@ -79,11 +80,11 @@ class MarkerViews:
     def points(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 4) at depth 1 in the first camera and their covariances (n, 4, 4); NaN where not seen twice."""
         points = triangulate(self.Ps, self.pixels, self.sigmas, iterations=6)
-        spread = np.full((len(points), 4, 4), np.nan)
+        covariance = np.full((len(points), 4, 4), np.nan)
         known = np.isfinite(points).all(axis=1)
         if known.any():
-            spread[known] = triangulation_covariance(self.Ps, points[known], self.sigmas[:, known])
-        return points, spread
+            covariance[known] = triangulation_covariance(self.Ps, points[known], self.sigmas[:, known])
+        return points, covariance
 
     def front_signs(self) -> FloatArray:
         """``(c,)``: the sign of the third row's product with a point in front of each camera, 1 for the first."""
@@ -92,7 +93,7 @@ class MarkerViews:
         return np.where((depths > 0).sum(axis=0) * 2 >= len(self.scene), 1.0, -1.0)
 
     def raw(self, pixels: FloatArray) -> FloatArray:
-        """Raw pixels (c, n, 2) of ideal ones; NaN beyond a lens's fold."""
+        """Raw pixels (c, n, 2) of ideal ones; NaN outside of a lens's image."""
         return np.array([distort(lens, seen) for lens, seen in zip(self.lenses, pixels, strict=True)])
 
 
@@ -159,8 +160,6 @@ def _frame(stratum: Stratum, Ps: FloatArray, plane: FloatArray, upgrade: FloatAr
         return AlignmentFrame(Ps)
     try:
         affine: FloatArray | None = projective_to_affine(plane)
-    except (
-        GeometryError
-    ):  # the plane passes through the first camera: a Euclidean frame says where it is, too
+    except GeometryError:  # the plane passes through the first camera; a Euclidean frame determines it, too
         affine = upgrade
     return AlignmentFrame(Ps, affine, upgrade if stratum == "metric" else None)

@@ -1,4 +1,4 @@
-"""Newest observations of all markers by camera, averaged over frames while a marker is static."""
+"""Cache of the newest observations of all markers by camera, averaged over frames while a marker is static."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MarkerObservations = Mapping[str, Mapping[int, MarkerObservation]]
 
 
 class ObservationCache:
-    """Keeps the last frames of each camera. ``systematic_px`` by camera: what does not average out."""
+    """The last frames of each camera. ``systematic_px`` by camera: error that does not average out."""
 
     def __init__(self, systematic_px: Mapping[str, float]) -> None:
         self._systematic = dict(systematic_px)
@@ -41,11 +41,11 @@ class ObservationCache:
         }
 
     def add(self, observation: CameraObservation) -> None:
-        """Take a frame."""
+        """Add a frame."""
         self._frames[observation.camera].append(observation)
 
     def now(self, now_ns: int) -> dict[str, dict[int, MarkerObservation]]:
-        """Observations by camera from frames received within `FRESH_S`; markers of the newest frame only."""
+        """Current observations by camera, from frames received within `FRESH_S`; only markers of the newest frame."""
         return {camera: self._camera_observations(camera, now_ns) for camera in self._frames}
 
     def _camera_observations(self, camera: str, now_ns: int) -> dict[int, MarkerObservation]:
@@ -67,7 +67,7 @@ class ObservationCache:
 def _average(
     track: list[tuple[np.ndarray[tuple[int], np.dtype[np.float64]], float]], systematic: float
 ) -> MarkerObservation:
-    """The mean pixel of a static marker, the newest pixel of a moving one."""
+    """Mean pixel of a static marker, newest pixel of a moving one."""
     pixels = np.array([pixel for pixel, _ in track])
     variance = float(np.mean([variance for _, variance in track]))
     mean = pixels.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Files of a cell's state directory that outlive a run: taught goals, models, the journal; written atomically."""
+"""Persistent files of a cell's state directory: taught goals, models, the journal; written atomically."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TaughtStore:
         return tuple(sorted(self.goals))
 
     def add(self, name: str, goal: TaughtGoal) -> None:
-        """Store a goal in place of an older one of that name. Raises OSError."""
+        """Store a goal, replacing one of the same name. Raises OSError."""
         self.goals[name] = goal
         save_taught(self._path, self.goals)
 
@@ -42,7 +42,7 @@ class ModelStore:
         self._directory = directory
 
     def path(self, epoch: int) -> Path:
-        """The file of a model."""
+        """File of a model."""
         return self._directory / f"model-{epoch:06d}.json"
 
     def epochs(self) -> list[int]:
@@ -52,18 +52,18 @@ class ModelStore:
         )
 
     def next_epoch(self) -> int:
-        """One more than the last."""
+        """The last epoch plus one."""
         return max(self.epochs(), default=0) + 1
 
     def of_epoch(self, epoch: int) -> CellModel | None:
-        """The model of an epoch, None where its file is gone or damaged."""
+        """Model of an epoch, None where its file is missing or damaged."""
         try:
             return load_model(self.path(epoch))
         except ModelFileError:
             return None
 
     def newest_fitting(self, settings: CoreSettings) -> tuple[CellModel | None, list[str]]:
-        """The newest model that fits the cell's joints and cameras, and why newer ones were passed over."""
+        """Newest model that fits the cell's joints and cameras, and why newer ones were skipped."""
         passed = []
         for epoch in reversed(self.epochs()):
             path = self.path(epoch)
@@ -72,15 +72,15 @@ class ModelStore:
             except ModelFileError as error:
                 passed.append(str(error))
                 continue
-            misfit = _misfit(model, settings)
-            if not misfit:
+            mismatch = _mismatch(model, settings)
+            if not mismatch:
                 return model, passed
-            passed.append(f"{path}: {misfit}")
+            passed.append(f"{path}: {mismatch}")
         return None, passed
 
 
-def _misfit(model: CellModel, settings: CoreSettings) -> str:
-    """Why ``model`` is not one of this cell; empty when it is."""
+def _mismatch(model: CellModel, settings: CoreSettings) -> str:
+    """Reason why ``model`` does not belong to this cell; empty where it does."""
     if model.joint_names != settings.joint_names or model.joint_kinds != settings.joint_kinds:
         return f"is of joints {_joints(model)}; the cell has {_joints(settings)}"
     of_model = [(camera.name, camera.width, camera.height) for camera in model.cameras]
@@ -97,7 +97,7 @@ def _misfit(model: CellModel, settings: CoreSettings) -> str:
 
 
 def _joints(of: CellModel | CoreSettings) -> str:
-    """Names, with the kinds of those that are not revolute."""
+    """Joint names, with the kinds of those that are not revolute."""
     return ", ".join(
         name if kind == "revolute" else f"{name} ({kind})"
         for name, kind in zip(of.joint_names, of.joint_kinds, strict=True)
@@ -105,7 +105,7 @@ def _joints(of: CellModel | CoreSettings) -> str:
 
 
 class Journal:
-    """Events, one JSON object a line, for people; the older half gives way when the file has grown large."""
+    """Log of events for people, one JSON object a line; the older half is dropped when the file has grown large."""
 
     def __init__(self, path: Path, limit: int = JOURNAL_BYTES) -> None:
         self._path = path

@@ -27,11 +27,11 @@ MIN_MARKERS = 3
 
 
 class TransferError(Exception):
-    """A taught goal cannot be transferred, or a drawn one not be placed; the text has cause and values."""
+    """A taught goal cannot be transferred, or a CAD goal not be located; the text has cause and values."""
 
 
 def require_still(observations: MarkerObservations, markers: list[int], what: str) -> None:
-    """Raises TransferError naming those of ``markers`` that move."""
+    """Raise TransferError naming those of ``markers`` that move."""
     moving = sorted(
         {m for points in observations.values() for m in markers if m in points and points[m].moves}
     )
@@ -44,16 +44,16 @@ def align_points(
     old: AlignmentFrame,
     new: AlignmentFrame,
     points: FloatArray,
-    spread: FloatArray | None,
+    covariance: FloatArray | None,
     now: MarkerViews,
     common: list[int],
     what: str,
 ) -> tuple[FrameChange, str]:
-    """The map of points (n, 4) onto where markers are seen; refused where they have not moved as one."""
+    """Map of points (n, 4) onto their observed markers; refused where they have not moved rigidly."""
 
     def fit(rows: BoolArray) -> tuple[FrameChange, FloatArray]:
         kept = np.flatnonzero(rows)
-        own = None if spread is None else spread[kept]
+        own = None if covariance is None else covariance[kept]
         change = align(
             family, old, new, points[kept], now.pixels[:, kept], now.sigmas[:, kept], own, [common[k] for k in kept]
         )  # fmt: skip
@@ -82,7 +82,7 @@ def align_points(
 
 
 def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float) -> str:
-    """Which single marker, left out, makes the others agree; empty where none does, or too few are left."""
+    """The single marker without which the others agree; empty where there is none, or too few are left."""
     best = (limit, -1)
     for k in np.flatnonzero(usable):
         without = usable.copy()
@@ -90,7 +90,7 @@ def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float
         try:
             _, residuals = fit(without)
         except GeometryError:
-            continue  # too few are left, or they are flat: nothing is said of this one
+            continue  # too few are left, or they are coplanar: this one cannot be tested
         best = min(best, (float(np.nanmax(residuals)), int(k)))
     if best[1] < 0:
         return ""
@@ -101,14 +101,15 @@ def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float
 
 
 def reproject_set_points(
-    model: CellModel, names: list[int], points: FloatArray, spread: FloatArray, what: str
+    model: CellModel, names: list[int], points: FloatArray, covariance: FloatArray, what: str
 ) -> tuple[Pixels, Deviations, str]:
-    """Raw set-points of points (n, 4) by camera and marker, their deviations [px], and in words how well known.
+    """Raw set-points of points (n, 4) by camera and marker, their deviations [px], and a description of their
+    accuracy.
 
     A point outside of an image is none there. Raises TransferError behind a camera, and where too few remain.
     """
     views = MarkerViews.empty(model, names)
-    pixels, deviations = reprojected(views.Ps, points, spread)
+    pixels, deviations = reprojected(views.Ps, points, covariance)
     depths = np.einsum("cj,nj->cn", views.Ps[:, 2], points) * views.front_signs()[:, None]
     if not (depths > 0).all():
         camera, k = (int(i) for i in np.argwhere(~(depths > 0))[0])

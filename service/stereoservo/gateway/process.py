@@ -82,7 +82,7 @@ GATEWAY_VERBS = ("record", "synthesise")
 
 
 class Gateway:
-    """All that the gateway process holds; ``run_once`` is one pass of its loop."""
+    """State of the gateway process; ``run_once`` is one pass of its loop."""
 
     def __init__(self, plan: RunPlan) -> None:
         self.plan = plan
@@ -159,7 +159,7 @@ class Gateway:
         self._publishers.event.put(payload)
 
     def _use_model(self, model: CellModel) -> None:
-        """The core works with ``model``, which was made for moved cameras."""
+        """Use ``model``, made for moved cameras, now that the core has applied it."""
         self._calibration.model = model
 
     def _context(self) -> GoalContext:
@@ -170,7 +170,7 @@ class Gateway:
     # -- the loop -------------------------------------------------------------------------------------------
 
     def run_once(self) -> bool:
-        """One pass; whether there was anything to do."""
+        """Run one pass; returns whether there was anything to do."""
         self._servo.poll_connection()
         if self._servo.connected and self._state is not None and not self._greeted:
             self._greeted = True
@@ -224,7 +224,9 @@ class Gateway:
         return busy
 
     def _answer(self, query: Any, work: Callable[[Any], bytes], key: str = "") -> None:
-        """Reply with what ``work`` makes of ``query``, on ``key`` (default: the query's own, where it is concrete)."""
+        """Reply to ``query`` with the result of ``work``, on ``key`` (default: the query's own, where it is
+        concrete).
+        """
         asked = str(query.key_expr)
         if not key and "*" in asked:
             query.drop()
@@ -242,14 +244,14 @@ class Gateway:
             return encode(self._record(decode(payload, Record)))
         return encode(Reply(True, self._teaching.synthesise(decode(payload, Synthesise)), boot=self.boot))
 
-    def _record(self, wanted: Record) -> Reply:
+    def _record(self, request: Record) -> Reply:
         try:
-            if wanted.on and wanted.images:
+            if request.on and request.images:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._servo.records = wanted.on
-        if not wanted.on:
+        self._servo.records = request.on
+        if not request.on:
             steps = self._recordings.stop()
             return Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
         if self._recordings.running:
@@ -284,7 +286,7 @@ class Gateway:
             self._recordings.path if self._recordings.running else "",
         )
 
-    # -- what the core says ---------------------------------------------------------------------------------
+    # -- events of the core --------------------------------------------------------------------------------
 
     def _core_event(self, event: Event) -> None:
         if event.kind == "reply":
@@ -359,7 +361,7 @@ class Gateway:
     # -- life -----------------------------------------------------------------------------------------------
 
     def _announce(self) -> None:
-        """Say that the daemon is up: ``daemon.json``. Not before the servo process takes requests."""
+        """Announce the daemon in ``daemon.json``, once the servo process accepts requests."""
         plan = self.plan
         info = DaemonInfo(
             cell=plan.cell.cell.name,
@@ -376,7 +378,7 @@ class Gateway:
         temporary.replace(path)
 
     def close(self) -> None:
-        """Finish the recording, end the fit, close the sessions within a time limit."""
+        """Finish the recording, cancel the fit, close the sessions within a time limit."""
         self._calibration.cancel()
         self._relocalization.cancel()
         for item in self._servo.steps(100_000):
@@ -405,7 +407,7 @@ class Gateway:
 
 
 def run(plan: RunPlan, termination: Termination) -> None:
-    """Run until asked to end."""
+    """Run until terminated."""
     gateway = Gateway(plan)
     try:
         while not termination.asked:
@@ -413,7 +415,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
                 time.sleep(IDLE_S)
         for _ in range(
             FINAL_PASSES
-        ):  # what the servo process said last, that it stopped above all, is still told
+        ):  # the last events of the servo process, above all that it stopped, are still published
             if not gateway.run_once():
                 break
     finally:

@@ -1,4 +1,6 @@
-"""Messages that the gateway publishes (state, features, cell info, numbered events), and the thread for replies."""
+"""Messages that the gateway publishes (state, features, cell info, numbered events), and the thread that sends
+replies.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,7 @@ SILENT = frozenset({"reply"})
 
 
 class ReplyThread:
-    """Replies leave from here: a client that hangs may block a reply, and must not block the gateway."""
+    """Thread that sends replies, so that a hung client cannot block the gateway."""
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[Any, str, bytes] | None] = queue.SimpleQueue()
@@ -55,7 +57,9 @@ class ReplyThread:
         self._thread.start()
 
     def reply(self, query: Any, payload: bytes, key: str = "") -> None:
-        """Answer ``query`` on ``key`` (default: the query's own, which must then be concrete) and let it go."""
+        """Queue a reply to ``query`` on ``key`` (default: the query's own, which must then be concrete) and drop
+        the query.
+        """
         self._queue.put((query, key or str(query.key_expr), payload))
 
     def _work(self) -> None:
@@ -68,13 +72,13 @@ class ReplyThread:
                 self._unsent.add(f"a reply on {key!r} could not be sent: {type(error).__name__}: {error}")
 
     def close(self) -> None:
-        """Send what waits, within a second, and end."""
+        """Send queued replies for a second at most, and end."""
         self._queue.put(None)
         self._thread.join(1.0)
 
 
 class EventLog:
-    """Numbers events per boot, keeps the last ones, publishes each."""
+    """Numbers the events of a boot, keeps the last ones, publishes each."""
 
     def __init__(self, boot: str, publish: Callable[[bytes], None]) -> None:
         self._boot = boot
@@ -83,7 +87,7 @@ class EventLog:
         self.last = 0
 
     def add(self, kind: str, *, t_ns: int | None = None, **fields: Any) -> EventMessage:
-        """Publish an event of the gateway's own, or of another process."""
+        """Publish an event of the gateway, or of another process."""
         self.last += 1
         now_ns = time.monotonic_ns()
         stamp = now_ns if t_ns is None else t_ns
@@ -133,7 +137,7 @@ def state_message(
     last_event: int,
     notes: tuple[str, ...] = (),
 ) -> StateMessage:
-    """The state as clients see it; numbers that are not finite are left out."""
+    """The state in the clients' format; numbers that are not finite are left out."""
     status, loop = state.status, state.loop
     names = tuple(joint.name for joint in plan.joints.joints)
     now_ns = time.monotonic_ns()
@@ -194,7 +198,7 @@ def _finite(names: tuple[str, ...], values: Any) -> dict[str, float]:
 
 
 def features_message(observation: CameraObservation) -> FeaturesMessage:
-    """An observation as clients see it. Raises MessageError for numbers that are not finite."""
+    """An observation in the clients' format. Raises MessageError for numbers that are not finite."""
     if not (np.isfinite(observation.pixels).all() and np.isfinite(observation.covariances).all()):
         raise MessageError(
             f"camera {observation.camera}: frame {observation.seq} holds numbers that are not finite"
@@ -214,7 +218,7 @@ def features_message(observation: CameraObservation) -> FeaturesMessage:
 
 
 class Publishers:
-    """One zenoh publisher a key."""
+    """The zenoh publishers, one a key."""
 
     def __init__(self, session: Any, keys: KeySpace, cameras: tuple[str, ...]) -> None:
         drop = zenoh.CongestionControl.DROP
@@ -227,7 +231,7 @@ class Publishers:
 
     @property
     def all(self) -> list[Any]:
-        """All of them, to undeclare."""
+        """All publishers, for undeclaring."""
         return [self.state, self.event, *self.features.values()]
 
 

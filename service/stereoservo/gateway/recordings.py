@@ -20,7 +20,7 @@ from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 LAST_WORD_S = 5.0
-"""How long vision processes have to finish their files before the gateway says that they did not."""
+"""How long vision processes have to finish their files before the gateway reports that they did not."""
 
 
 class CannotRecordError(Exception):
@@ -46,7 +46,7 @@ class ImageRecordings:
         return bool(self._directory) and self._until is None
 
     def check(self) -> None:
-        """Raise CannotRecordError where no camera of the cell delivers pictures."""
+        """Raise CannotRecordError where no camera of the cell delivers images."""
         if not self._cameras:
             names = ", ".join(self._others)
             raise CannotRecordError(
@@ -55,7 +55,7 @@ class ImageRecordings:
             )
 
     def begin(self, recording: Path) -> None:
-        """Have all cameras record beside ``recording``."""
+        """Request all cameras to record beside ``recording``."""
         if self._until is not None:
             self._until = 0.0  # the recording before has had its time
             self.poll()
@@ -69,13 +69,13 @@ class ImageRecordings:
         )  # fmt: skip
 
     def end(self) -> None:
-        """Have them end. Idempotent."""
+        """Request them to stop. Idempotent."""
         if self.running:
             self._path.unlink(missing_ok=True)
             self._until = time.monotonic() + LAST_WORD_S
 
     def add_report(self, images: RecordedImages) -> None:
-        """Take what a vision process said of its recording."""
+        """Add a vision process's report on its recording."""
         if self._directory and Path(images.file).parent == Path(self._directory):
             self._told[images.camera] = images
 
@@ -108,7 +108,7 @@ class ImageRecordings:
 
 
 class Recordings:
-    """The recording that runs, if one does. ``path``: its file, or that of the last one."""
+    """The current flight recording, if any. ``path``: its file, or that of the last one."""
 
     def __init__(self, plan: RunPlan, log: EventLog) -> None:
         self._plan = plan
@@ -125,14 +125,14 @@ class Recordings:
         return self._recorder is not None
 
     def want_images(self) -> None:
-        """Record images, too: now, or with the recording that is about to begin. Raises CannotRecordError."""
+        """Also record images: now, or with the recording that is about to begin. Raises CannotRecordError."""
         self.images.check()
         self._with_images = True
         if self._recorder is not None and not self.images.running:
             self.images.begin(self._recorder.path)
 
     def take(self, item: StepMessage) -> None:
-        """Take what the servo process sent; its first message begins a file."""
+        """Write messages of the servo process; the first one begins a file."""
         if isinstance(item, RecordingStart):
             again = self._with_images
             self.stop()
@@ -145,7 +145,7 @@ class Recordings:
             self._recorder.write(item)
 
     def _new_path(self) -> Path:
-        """The file that was asked for; another where it exists (a gateway that was restarted goes on in a new one)."""
+        """The requested file; another name where it exists (a restarted gateway continues in a new file)."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         wanted = Path(self._plan.record) if self._plan.record not in ("", "auto") else None
         if wanted is not None:
@@ -153,7 +153,7 @@ class Recordings:
         return self._plan.directories.recordings / f"{self._plan.cell.cell.name}-{stamp}.mcap"
 
     def stop(self) -> int:
-        """Finish the file, and have the images finished; gives the number of its steps. Idempotent."""
+        """Finish the file and the image recordings; returns the number of its steps. Idempotent."""
         self._with_images = False
         self.images.end()
         if self._recorder is None:

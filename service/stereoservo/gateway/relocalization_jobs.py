@@ -1,4 +1,4 @@
-"""Relocalization of moved cameras, in a process of its own, on request of the core."""
+"""Jobs that relocalize moved cameras, in a child process, on request of the core."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class RelocalizationJob(ChildJob):
     def __init__(self, job: RelocalizationPoses, model_path: Path, new_path: Path, epoch: int) -> None:
         self.cameras = job.events[-1].cameras
         self.goal = job.events[-1].id
-        sights = new_path.with_name("reanchor.msgpack")
-        save_events(sights, job.events)
+        events_file = new_path.with_name("reanchor.msgpack")
+        save_events(events_file, job.events)
         super().__init__(
             "stereoservo.daemon.jobs.relocalization_job",
-            str(sights),
+            str(events_file),
             str(model_path),
             str(new_path),
             "--epoch",
@@ -38,13 +38,13 @@ class RelocalizationJob(ChildJob):
         )
 
     def report(self) -> tuple[CellModel, RelocalizationReport]:
-        """The new model and what is to be said of it. Raises FitFailedError, ModelFileError."""
+        """The new model and a message on it. Raises FitFailedError, ModelFileError."""
         report = msgspec.convert(self.require("reanchored"), RelocalizationReport)
         return load_model(Path(report.model)), report
 
 
 class RelocalizationJobs:
-    """Answers the core's events ``reanchor``. ``model``: gives the model in use, ``take`` makes another the one."""
+    """Handles the core's events ``reanchor``. ``model``: returns the model in use, ``take`` replaces it."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class RelocalizationJobs:
         self._handed: CellModel | None = None
 
     def core_event(self, event: Event, *, fresh: bool) -> None:
-        """Take an event of the core; ``fresh``: it was not acted upon before a restart of the gateway."""
+        """Handle an event of the core; ``fresh``: it was not handled before a restart of the gateway."""
         if event.kind == "reanchor":
             self._job.add(event)
             if fresh:
@@ -73,7 +73,7 @@ class RelocalizationJobs:
             self._keep_adjusted(event)
 
     def _keep_adjusted(self, event: Event) -> None:
-        """Replace the matrix of a mobile camera that has moved, in the model and in its file."""
+        """Store the re-estimated matrix of a mobile camera in the model and in its file."""
         model = self._model()
         if model is None or event.matrix is None or model.epoch != event.epoch:
             return
@@ -102,11 +102,11 @@ class RelocalizationJobs:
             self._refuse(str(error))
 
     def poll(self) -> None:
-        """When the process has ended, hand its model over, or say why there is none."""
+        """Once the process has ended, send its model to the core, or report why there is none."""
         fit = self._fit
         if fit is None:
             return
-        ended = fit.ended  # asked first: what it said before it ended is then read, too
+        ended = fit.ended  # read first, so that the output before the end is processed, too
         for _ in fit.poll():
             pass
         if not ended:
@@ -140,14 +140,14 @@ class RelocalizationJobs:
         self._link.send_command(ReanchorRefused(message), OPERATOR)
 
     def cancel(self) -> None:
-        """End what runs. Idempotent."""
+        """Cancel the running job. Idempotent."""
         if self._fit is not None:
             self._fit.close()
         self._fit = None
 
 
 def with_matrix(model: CellModel, camera: str, matrix: FloatArray) -> CellModel:
-    """The model with one camera's matrix (3, 4) another."""
+    """The model with one camera's matrix (3, 4) replaced."""
     cameras = tuple(
         msgspec.structs.replace(known, matrix=matrix.copy()) if known.name == camera else known
         for known in model.cameras

@@ -1,4 +1,6 @@
-"""Connection of the gateway to the servo process: requests and heartbeats out; events, state and step records in."""
+"""Connection of the gateway to the servo process: sends requests and heartbeats, receives events, state and step
+records.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ RECONNECT_EVERY_S = 0.1
 
 
 class ServoConnection:
-    """Connection to the servo process; reconnects by itself, blocks never. ``records``: take step records, too."""
+    """Connection to the servo process; reconnects by itself, never blocks. ``records``: also receive step records."""
 
     def __init__(self, directories: CellDirectories) -> None:
         self._directories = directories
@@ -47,7 +49,7 @@ class ServoConnection:
 
     @property
     def connected(self) -> bool:
-        """Whether the servo process takes requests."""
+        """Whether the servo process accepts requests."""
         return self._control is not None and self._control.is_open
 
     def poll_connection(self) -> None:
@@ -97,7 +99,7 @@ class ServoConnection:
         return [steps_decoder.decode(data) for data in self._steps.receive(limit)]
 
     def state(self) -> ServoState | None:
-        """The servo process's newest state, if it is new."""
+        """The servo process's newest state, None unless it is new."""
         data = self._state.poll()
         return None if data is None else state_decoder.decode(data)
 

@@ -1,4 +1,4 @@
-"""Thread and zenoh session that handle stop and enable, apart from all other traffic."""
+"""Thread with its own zenoh session that handles stop and enable, separate from all other traffic."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ACKNOWLEDGE_S = 0.1
 
 
 class StopThread:
-    """Takes stops and enables on a session of its own, so that no flood on other keys delays them."""
+    """Handles stop and enable on a session of its own, so that no load on other keys delays them."""
 
     def __init__(self, config: dict[str, Any], keys: KeySpace, plan: RunPlan, boot: str) -> None:
         self._session = open_session(config)
@@ -80,7 +80,7 @@ class StopThread:
         self._replies.reply(query, encode(reply))
 
     def close(self) -> None:
-        """End the thread, close the session."""
+        """End the thread and close the session."""
         self._ending.set()
         self._thread.join(1.0)
         self._replies.close()

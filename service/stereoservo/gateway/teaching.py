@@ -1,4 +1,4 @@
-"""Taught goals: stored with their model, made from drawings, and resolved to set-points for the current model."""
+"""Taught goals: stored with their model, made from CAD drawings, and resolved to set-points for the current model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KNOWN_TOOLS = 100
 
 
 class TaughtGoalRegistry:
-    """The cell's taught goals, the model that reads them, and what the cameras see now."""
+    """The cell's taught goals, with access to the current model and observations that resolve them."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class TaughtGoalRegistry:
                 self._tools.popitem(last=False)
 
     def taught(self, event: Event) -> None:
-        """Store what a ``taught`` event carries."""
+        """Store the goal of a ``taught`` event."""
         model = self._model()
         tool = self._tools.pop(event.request, ())
         if model is None:
@@ -69,26 +69,26 @@ class TaughtGoalRegistry:
             text = ", ".join(str(marker) for marker in missing)
             self._warn(event.name, f"no camera saw markers {text} of the tool")
             return
-        self._keep(event.name, taught_goal(event, model, _now(), tool))
+        self._save(event.name, taught_goal(event, model, _now(), tool))
 
-    def synthesise(self, wanted: Synthesise) -> str:
-        """Store a goal made from drawings; gives in words how well it is known. Raises TransferError."""
-        goal, note = synthesise(wanted, self._model(), self._seen(), _now())
-        if not self._keep(wanted.name, goal):
-            raise TransferError(f"goal {wanted.name!r} could not be saved; see the events")
-        message = f"goal {wanted.name!r} made from drawings: {note}"
-        self._log.add("taught", message=message, name=wanted.name, origin="gateway")
+    def synthesise(self, drawing: Synthesise) -> str:
+        """Store a goal made from CAD drawings; returns a description of its accuracy. Raises TransferError."""
+        goal, note = synthesise(drawing, self._model(), self._seen(), _now())
+        if not self._save(drawing.name, goal):
+            raise TransferError(f"goal {drawing.name!r} could not be saved; see the events")
+        message = f"goal {drawing.name!r} made from drawings: {note}"
+        self._log.add("taught", message=message, name=drawing.name, origin="gateway")
         return message
 
     def resolve(self, target: TaughtTarget) -> TransferredGoal:
-        """A taught goal as set-points. Raises KeyError, TransferError."""
+        """Set-points of a taught goal. Raises KeyError, TransferError."""
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
 
     def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
         """Incidences with static markers replaced by their current pixels. Raises TransferError."""
         observations = self._seen()
         incidences = tuple(
-            msgspec.structs.replace(spec, fixed=_standing(spec.fixed, observations))
+            msgspec.structs.replace(spec, fixed=_static_feature(spec.fixed, observations))
             if spec.fixed.markers
             else spec
             for spec in target.incidences
@@ -98,7 +98,7 @@ class TaughtGoalRegistry:
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())
 
-    def _keep(self, name: str, goal: TaughtGoal) -> bool:
+    def _save(self, name: str, goal: TaughtGoal) -> bool:
         try:
             self._store.add(name, goal)
         except OSError as error:
@@ -112,8 +112,8 @@ class TaughtGoalRegistry:
         )
 
 
-def _standing(feature: Feature, observations: MarkerObservations) -> Feature:
-    """A feature spanned by markers beside the body, by where two or more cameras see them now."""
+def _static_feature(feature: Feature, observations: MarkerObservations) -> Feature:
+    """Feature spanned by markers that are not on the body, by their current observations in two or more cameras."""
     pixels = {
         camera: tuple(seen[marker].pixel for marker in feature.markers)
         for camera, seen in observations.items()

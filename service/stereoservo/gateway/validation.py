@@ -1,6 +1,6 @@
-"""Validation of goals and commands that needs no state of the arm.
+"""Validation of goals and commands, as far as it does not depend on the state of the arm.
 
-Each problem names the field, its value and what would have been valid; all of them are told at once.
+Each problem names the field, its value and what would have been valid; all of them are reported at once.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _check_handover(goal: Goal, settings: CoreSettings) -> list[str]:
 
 
 def check_command(command: Command, context: GoalContext) -> list[str]:
-    """The problems of a command, like :func:`check_goal`."""
+    """The problems of a command; empty for a valid one."""
     if isinstance(command, Jog):
         return _check_jog(command, context.settings)
     if isinstance(command, UpdateGoal):
@@ -214,7 +214,7 @@ def _check_jog(command: Jog, settings: CoreSettings) -> list[str]:
 
 
 def _said(value: object) -> str:
-    """A value as a client wrote it."""
+    """A value in the form in which a client wrote it."""
     return msgspec.json.encode(value).decode() if isinstance(value, msgspec.Struct) else repr(value)
 
 
@@ -235,7 +235,7 @@ MAX_SIZE = 1e100
 
 @dataclass(frozen=True)
 class GoalContext:
-    """Settings, names of taught goals and markers against which goals are checked.
+    """Context of the checks: settings, names of taught goals, known markers.
 
     ``model_markers``: of the model in use, None where there is none.
     """
@@ -246,12 +246,12 @@ class GoalContext:
 
 
 def listed(names: Iterable[object]) -> str:
-    """Names for people."""
+    """Names as text."""
     return ", ".join(str(name) for name in names) or "none"
 
 
 def check_features(target: FeatureTarget, context: GoalContext, where: str = "target") -> list[str]:
-    """Set-points: cameras and markers that there are, pixels inside of images, enough markers."""
+    """Problems of set-points: unknown cameras or markers, pixels outside of images, too few markers."""
     cameras = {camera.name: camera for camera in context.settings.cameras}
     problems = []
     if not target.set_points:
@@ -325,14 +325,14 @@ def check_markers(where: str, markers: Sequence[int], context: GoalContext, *, b
 
 
 def check_homogeneous(where: str, point: Sequence[float]) -> list[str]:
-    """A homogeneous point: not zero, and of a size that can be squared."""
+    """Problems of a homogeneous point: zero, or components too large to be squared."""
     if not any(point):
         return [f"{where}: (0, 0, 0, 0) is no point; one coordinate at least differs from 0"]
     return _check_size(where, point)
 
 
 def _check_size(where: str, numbers: Sequence[float]) -> list[str]:
-    """Numbers of which only the ratios count: with others than these the norm overflows, or is zero."""
+    """Problems of numbers whose ratios alone count: the norm would overflow, or be zero."""
     largest = max(abs(number) for number in numbers)
     if 1.0 / MAX_SIZE <= largest <= MAX_SIZE:
         return []
@@ -342,7 +342,7 @@ def _check_size(where: str, numbers: Sequence[float]) -> list[str]:
 
 
 def check_points(target: PointTarget, context: GoalContext) -> list[str]:
-    """Projective points of markers: ids, no zero vector, three at least and not on one line."""
+    """Problems of markers' projective points: unknown ids, zero vectors, fewer than three, or collinear."""
     problems = check_markers("target.points", list(target.points), context, body=True)
     for marker, point in target.points.items():
         problems += check_homogeneous(f"target.points.{marker}", point)
@@ -359,7 +359,7 @@ def check_points(target: PointTarget, context: GoalContext) -> list[str]:
 
 
 def check_displacement(target: DisplacementTarget, context: GoalContext) -> list[str]:
-    """In exactly one frame, five markers that differ, and a matrix that can be a displacement."""
+    """Problems of a displacement: not in exactly one frame, not five different markers, or no valid matrix."""
     problems = []
     if (target.model_epoch is None) == (target.basis is None):
         given = "neither" if target.basis is None else "both"
@@ -384,7 +384,7 @@ def check_displacement(target: DisplacementTarget, context: GoalContext) -> list
 
 
 def check_taught(target: TaughtTarget, context: GoalContext) -> list[str]:
-    """A name that there is; common markers only with what they are common to."""
+    """Problems of a taught goal's name, and of common markers."""
     problems = []
     if target.name not in context.taught:
         problems.append(f"target.name: no taught goal {target.name!r}; taught: {listed(context.taught)}")
@@ -403,7 +403,7 @@ def check_taught(target: TaughtTarget, context: GoalContext) -> list[str]:
 
 
 def check_joint_target(target: JointTarget, settings: CoreSettings, where: str = "target") -> list[str]:
-    """Joints that there are, inside of their limits."""
+    """Problems of a joint target: unknown joints, positions outside of their limits."""
     problems = []
     if not target.positions:
         problems.append(f"{where}.positions: is empty; joints: {listed(settings.joint_names)}")
@@ -424,7 +424,7 @@ def check_joint_target(target: JointTarget, settings: CoreSettings, where: str =
 
 
 def check_incidence(target: IncidenceTarget, context: GoalContext) -> list[str]:
-    """Each feature given in one way, with as many points as its kind spans."""
+    """Problems of incidences: a feature not specified in exactly one way, or with the wrong number of points."""
     problems = []
     for k, incidence in enumerate(target.incidences):
         moving, _, fixed = incidence.kind.partition("-on-")

@@ -1,4 +1,4 @@
-"""zenoh configuration of the gateway's two sessions; refuses endpoints open to the network without TLS."""
+"""Zenoh configuration of the gateway's two sessions; endpoints open to the network require TLS."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def stop_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
 
 
 def check_endpoint(endpoint: str, tls: TlsSection | None) -> None:
-    """Check an endpoint that the daemon listens on or connects to: beyond this host, both sides show a certificate.
+    """Check an endpoint that the daemon listens on or connects to: beyond this host, both sides need a certificate.
 
     Parameters of zenoh behind the address (``?…``, ``#…``) are refused: they override the session's TLS options.
     Raises SessionError.
@@ -91,7 +91,7 @@ def check_endpoint(endpoint: str, tls: TlsSection | None) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether ``host`` is this host for certain: ``localhost``, 127.0.0.0/8 or [::1]. Other names are not looked up."""
+    """Whether ``host`` is certainly this host: ``localhost``, 127.0.0.0/8 or [::1]. Other names are not looked up."""
     if host.startswith("["):
         return host == "[::1]"
     try:

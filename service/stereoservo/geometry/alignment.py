@@ -1,4 +1,4 @@
-"""What brings known points onto the same points where cameras see them now, within the group that the frames allow.
+"""Alignment of known points with their current images, over the group of maps that the two frames allow.
 
 `moved_cameras.frame_change` for every stratum: a workpiece that has moved, cameras that were exchanged, points of a
 drawing (thesis 8.6: targets "can be reprojected onto images actually taken, even if the cameras have changed"). With
@@ -45,7 +45,7 @@ STRAIGHT = 1e-6
 
 @dataclass(frozen=True)
 class AlignmentFrame:
-    """A projective frame: its cameras (c, 3, 4), and what brings it to an affine and a Euclidean one, where known."""
+    """A projective frame: its cameras (c, 3, 4), and its maps to an affine and a Euclidean frame, where known."""
 
     Ps: FloatArray
     to_affine: FloatArray | None = None
@@ -64,7 +64,7 @@ def family_between(old: AlignmentFrame, new: AlignmentFrame, same_scale: bool) -
 
 
 def _algebra(family: Family) -> FloatArray:
-    """A basis (k, 4, 4) of the group's generators, with trace 0, so that determinants stay."""
+    """Basis (k, 4, 4) of the group's Lie algebra, with trace 0, so that determinants are preserved."""
     units = np.eye(16).reshape(16, 4, 4)
     moves = [units[3], units[7], units[11]]
     turns = [units[4 * i + j] - units[4 * j + i] for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -80,7 +80,7 @@ def _algebra(family: Family) -> FloatArray:
 
 
 def _upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[FloatArray, FloatArray]:
-    """What brings either frame to where the group's generators are those of `_algebra`."""
+    """Maps from either frame to the one in which `_algebra` holds."""
     pairs = {"rigid": "to_euclidean", "similar": "to_euclidean", "affine": "to_affine"}
     if family == "projective":
         return np.eye(4), np.eye(4)
@@ -138,7 +138,7 @@ def align(
     M_covariance: FloatArray | None = None,
     names: Sequence[int] | None = None,
 ) -> FrameChange:
-    """The map of a family from points ``(n, 4)`` of the old frame onto where the new cameras see them.
+    """Map of the family that moves points ``(n, 4)`` of the old frame onto their images in the new cameras.
 
     Of least reprojection error over ``pixels_new`` (c, n, 2) [px], NaN where missing, ``sigmas`` (c, n) or a number
     [px]; ``M_covariance`` (n, 4, 4) as for `homography_refine`. ``names`` (n,): what to call the points. With the sign
@@ -159,13 +159,16 @@ def align(
             points=called[both].tolist(),
         )
     own = None if M_covariance is None else np.asarray(M_covariance, dtype=np.float64)
-    spread = triangulation_covariance(new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both])
-    _refuse_flat(family, M_new[both], spread, called[both].tolist())
+    covariance_px = triangulation_covariance(
+        new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both]
+    )
+    _refuse_flat(family, M_new[both], covariance_px, called[both].tolist())
     up_old, up_new = _upgrades(family, old, new)
     T = _start(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
     views = _Views(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
-    # About the points' middle, in units of their spread: turns and moves are then told apart well.
+    # About the points' centroid, in units of their standard deviation: rotations and translations are then well
+    # distinguished.
     local = _local(family, move_points(up_new, M_new[both])) @ up_new
     generators = np.linalg.inv(local) @ _algebra(family) @ local
     T = _descend(T, generators, views)
@@ -192,7 +195,7 @@ class _Views:
     covariance: FloatArray | None
 
     def whitening(self, T: FloatArray) -> FloatArray:
-        """``(n, 2c, 2c)`` at the map ``T`` (4, 4): the points' own covariance goes along with it."""
+        """Whitening ``(n, 2c, 2c)`` at the map ``T`` (4, 4), which also moves the points' own covariance."""
         return pixel_whitening(self.Ps, T, self.M, self.weights, self.covariance)
 
     def residuals(self, T: FloatArray, whitening: FloatArray) -> FloatArray:
@@ -203,7 +206,7 @@ class _Views:
         return whitened
 
     def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
-        """Derivatives (r, k) of the residuals by ``exp(Σ x Ĝ) T`` at x = 0."""
+        """Derivatives (r, k) of the residuals by x in ``exp(Σ x Ĝ) T`` at x = 0."""
         moved = self.M @ T.T
         by_point = projection_jacobian_many(self.Ps, moved)
         by_map = np.einsum("cnij,knj->ncik", by_point, moved @ generators.transpose(0, 2, 1))
@@ -228,7 +231,7 @@ def _descend(T: FloatArray, generators: FloatArray, views: _Views) -> FloatArray
                 break
             step = 0.5 * step
         else:
-            return T  # no direction leads down: this is the minimum, as far as numbers tell
+            return T  # no direction of descent: this is the minimum to rounding
         if float(np.abs(step).max()) < CONVERGED:
             break
     return T
@@ -254,7 +257,7 @@ def _similarity(x: FloatArray, y: FloatArray, family: Family) -> FloatArray:
 
 
 def _local(family: Family, X: FloatArray) -> FloatArray:
-    """Coordinates about the points ``(n, 4)`` of an upgraded frame."""
+    """Coordinates of the points ``(n, 4)`` of an upgraded frame relative to their centroid."""
     if family == "projective":
         return whitener(X)
     x = X[:, :3] / X[:, 3:]
@@ -295,13 +298,13 @@ def reprojected(Ps: FloatArray, M: FloatArray, covariance: FloatArray) -> tuple[
     ``covariance`` (n, 4, 4) of the points.
     """
     J = projection_jacobian_many(Ps, M)
-    spread = np.einsum("cnij,njk,cnlk->cnil", J, covariance, J)
-    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[..., -1], 0.0))
+    covariance_px = np.einsum("cnij,njk,cnlk->cnil", J, covariance, J)
+    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_px)[..., -1], 0.0))
     return project_many(Ps, M), deviations
 
 
 def drawn_points(coordinates: FloatArray, placed: FloatArray | None = None) -> FloatArray:
-    """Homogeneous points ``(n, 4)`` of drawn ones ``(n, 3)``, after the rigid motion ``placed`` (4, 4), if given.
+    """Homogeneous points ``(n, 4)`` of CAD points ``(n, 3)``, after the rigid motion ``placed`` (4, 4), if given.
 
     Raises GeometryError where that is none: a mirror image, a change of size.
     """

@@ -79,7 +79,7 @@ def reprojection_residuals(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
 def check_views(
     Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels ``(c, n, 2)`` with 0 for missing ones, and weights ``(c, n)`` with 0 for missing ones.
+    """Pixels ``(c, n, 2)`` and weights ``(c, n)``, both with 0 for missing ones.
 
     Raises GeometryError on shapes that do not fit and on weights that are not finite or negative.
     """

@@ -1,4 +1,4 @@
-"""Radial lens distortion with one parameter and its own centre: between ideal pinhole pixels and raw pixels.
+"""Radial lens distortion with one parameter and its own centre: ideal (pinhole) pixels to raw pixels and back.
 
 A ``lens`` is ``(k, cu, cv, r0)``: the raw pixel of an ideal one ``p`` is ``c + (p - c)(1 + k |p - c|² / r0²)``
 with the centre ``c = (cu, cv)`` [px] and the reference radius ``r0`` [px], half the image width. With square
@@ -91,7 +91,7 @@ not show it."""
 GRID = (-0.3, -0.2, -0.13, -0.08, -0.04, 0.0, 0.04, 0.08, 0.13)
 """Radial parameters at half the image width that are tried as starts."""
 MOST_UNCERTAIN = 1.0
-"""Standard deviation of the radial parameter above which the lines do not tell it."""
+"""Standard deviation of the radial parameter above which the lines do not determine it."""
 LINE_ITERATIONS = 60
 
 
@@ -109,8 +109,8 @@ def lens_from_lines(lines: Sequence[FloatArray], sigma: float, width: int, heigh
 
     The centre is held by a weak prior (``CENTRE_SHARE``), which the covariance includes. The covariance is at the
     larger of the stated and the estimated noise. Raises GeometryError: ``shape``, ``too_few`` (three pixels a line,
-    at least), ``not_finite``, ``degenerate`` where the lines do not tell the distortion (all of them through the
-    middle, say), ``no_convergence``.
+    at least), ``not_finite``, ``degenerate`` where the lines do not determine the distortion (such as when all pass
+    through the centre), ``no_convergence``.
     """
     pixels, starts = _checked(lines, sigma)
     middle = straight_lens(width, height)
@@ -180,7 +180,7 @@ def _projected(
     lens: FloatArray, pixels: FloatArray, starts: npt.NDArray[np.int64], sigma: float
 ) -> tuple[FloatArray, FloatArray]:
     """Distances (n,) of raw pixels from the images of their best lines [sigmas], and their derivatives (n, 3) by
-    (k, cu, cv) with the lines free to follow.
+    (k, cu, cv) with the lines eliminated.
     """
     ideal = undistort(lens, pixels)
     if not np.isfinite(ideal).all():

@@ -92,9 +92,7 @@ def fundamental_robust(
 
 
 def _sampled(left: FloatArray, right: FloatArray, threshold: float, max_iterations: int) -> FloatArray | None:
-    """``F`` (3, 3) by MAGSAC, where its search ends without a model by least median of squares; None where neither
-    finds one.
-    """
+    """``F`` (3, 3) by MAGSAC, else by least median of squares; None where neither finds one."""
     parameters = cv2.UsacParams()
     parameters.confidence = 0.9999
     parameters.isParallel = False
@@ -219,7 +217,7 @@ ROUNDING_PX = 1e-8
 
 
 def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
-    """How many times larger, in variance, the misfit of one homography to matches (n, 2) [px] is than that of ``F``.
+    """Variance ratio of the residuals of one homography to those of ``F``, for matches (n, 2) [px].
 
     About 1 where the points lie on one plane or the cameras share a centre; each with its own degrees of freedom.
     Infinite where no homography is found.
@@ -233,7 +231,7 @@ def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
     # A transfer carries the left image's noise, too, stretched by the map.
     of_plane = (transfer**2).sum() / (2 * len(left) - 8) / (1.0 + abs(np.linalg.det(H[:2, :2])))
     of_pair = (sampson_distances(F, left, right) ** 2).sum() / max(1, len(left) - 7)
-    # Two copies of one image leave rounding errors, whose ratio says nothing.
+    # Two copies of one image leave rounding errors, whose ratio is meaningless.
     return float(of_plane / max(of_pair, ROUNDING_PX**2))
 
 
@@ -285,6 +283,6 @@ def _rank_two(F: FloatArray) -> FloatArray:
 
 
 def _unit(F: FloatArray) -> FloatArray:
-    """Unit Frobenius norm, largest entry positive: one F has one representation."""
+    """``F`` with unit Frobenius norm and its largest entry positive, so that its representation is unique."""
     unit: FloatArray = F / (np.linalg.norm(F) * np.sign(F.flat[np.argmax(np.abs(F))]))
     return unit

@@ -95,8 +95,8 @@ def unit_rows(rows: FloatArray) -> FloatArray:
 
 
 def whitener(points: FloatArray) -> FloatArray:
-    """``W`` (4, 4) that gives ``W M / |M|`` of points ``(n, 4)`` unit second moments: the conditioning of
-    linear fits.
+    """Map ``W`` (4, 4) that gives the normalised points ``W M / |M|`` of ``(n, 4)`` unit second moments:
+    conditioning of linear fits.
 
     Raises GeometryError where the points are coplanar.
     """
@@ -111,13 +111,13 @@ def whitener(points: FloatArray) -> FloatArray:
 
 
 def move_points(H: FloatArray, M: FloatArray) -> FloatArray:
-    """``H M`` (..., 4) of points ``(..., 4)`` under a map ``H`` (4, 4): heights are kept as H makes them."""
+    """``H M`` (..., 4) of points ``(..., 4)`` under a map ``H`` (4, 4), without normalisation of the scale."""
     moved: FloatArray = np.asarray(M, dtype=np.float64) @ H.T
     return moved
 
 
 class GeometryError(ValueError):
-    """Degenerate or malformed geometric input. The text says what, the value, and what would have been
+    """Degenerate or malformed geometric input. The text holds the cause, the value, and what would be
     valid.
 
     Attributes: code: short machine-readable cause: ``"shape"``, ``"not_finite"``, ``"too_few"``,

@@ -58,7 +58,7 @@ def unit_determinant(H: FloatArray, what: str) -> FloatArray:
 def pixel_whitening(
     Ps: FloatArray, H: FloatArray, M: FloatArray, weights: FloatArray, M_covariance: FloatArray | None
 ) -> FloatArray:
-    """``(n, 2c, 2c)``: pixel differences of each point into uncorrelated ones of unit size, 0 where not seen.
+    """Whitening ``(n, 2c, 2c)`` of the pixel differences of each point, 0 where not seen.
 
     ``weights`` (c, n) [1/px]. The points' own covariance, if given, is carried into the images to first order.
     """
@@ -66,6 +66,6 @@ def pixel_whitening(
     if M_covariance is None:
         return w[:, :, None] * np.eye(w.shape[1])
     J = projection_jacobian_many(Ps @ H, M).transpose(1, 0, 2, 3).reshape(len(M), -1, 4) * w[..., None]
-    spread = np.linalg.cholesky(np.eye(w.shape[1]) + J @ M_covariance @ J.transpose(0, 2, 1))
-    whitening: FloatArray = np.linalg.inv(spread) * w[:, None, :]
+    root = np.linalg.cholesky(np.eye(w.shape[1]) + J @ M_covariance @ J.transpose(0, 2, 1))
+    whitening: FloatArray = np.linalg.inv(root) * w[:, None, :]
     return whitening

@@ -29,7 +29,7 @@ REGULAR = 5.0
 
 @dataclass(frozen=True)
 class Incidence:
-    """A constraint on a homography: what ``first`` spans shall, once moved, lie in what ``second`` spans (2.77).
+    """A constraint on a homography: the span of ``first``, once moved, lies in the span of ``second`` (2.77).
 
     ``first`` (K, 4) points in the first frame, ``second`` (K', 4) points in the second one: 1 a point, 2 a line,
     3 a plane; K = K' makes them coincide. The reverse, K > K', is not linear in H: give it to the inverse map.
@@ -196,8 +196,8 @@ def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray,
             singular=singular,
         )
     # Of the determinant, relative: tr(H⁻¹ dH) over the covariance of dH.
-    spread = np.linalg.inv(H).T.ravel() @ chart @ (rows.T / singular)
-    deviations = 1.0 / max(float(np.linalg.norm(spread)), 1e-300)
+    covariance_px = np.linalg.inv(H).T.ravel() @ chart @ (rows.T / singular)
+    deviations = 1.0 / max(float(np.linalg.norm(covariance_px)), 1e-300)
     if deviations < REGULAR:
         raise GeometryError(
             "degenerate",
@@ -210,7 +210,7 @@ def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray,
 
 @dataclass(frozen=True)
 class _PixelTargets:
-    """Flat lists of what moved points are compared to: index of the point, of the camera, and the target."""
+    """Targets of moved points, as flat lists: index of the point, index of the camera, pixel."""
 
     pixel_at: tuple[list[int], list[int]]
     pixels: FloatArray
@@ -275,7 +275,9 @@ class _PixelTargets:
         for size, at in self.plane_at.items():
             X = moved[at] / (moved[at] @ Ps[0, 2])[:, None]
             B = self.planes[size]
-            spread = B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
+            covariance_px = (
+                B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
+            )
             offset = np.einsum("nij,nj->ni", B, X)
-            parts.append(np.linalg.solve(np.linalg.cholesky(spread), offset[..., None]).ravel())
+            parts.append(np.linalg.solve(np.linalg.cholesky(covariance_px), offset[..., None]).ravel())
         return np.concatenate(parts)

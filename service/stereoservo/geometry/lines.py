@@ -117,9 +117,9 @@ def nearest_line(L: FloatArray) -> FloatArray:
         raise GeometryError(
             "degenerate", f"d and m are parallel and equal in {L.tolist()}; no line is nearest"
         )
-    middle = 0.5 * (lengths[0] + lengths[1])
-    plus = plus * (middle / lengths[0])[..., None]
-    minus = minus * (middle / lengths[1])[..., None]
+    mean_length = 0.5 * (lengths[0] + lengths[1])
+    plus = plus * (mean_length / lengths[0])[..., None]
+    minus = minus * (mean_length / lengths[1])[..., None]
     line: FloatArray = 0.5 * np.concatenate([plus + minus, plus - minus], axis=-1)
     return line
 
@@ -181,13 +181,13 @@ def crossing_angles(Ps: FloatArray, segments: FloatArray) -> FloatArray:
     """
     c, n = segments.shape[:2]
     angles = np.full((c, c, n), np.nan)
-    middle = segments.mean(axis=2)
+    mean_length = segments.mean(axis=2)
     along = segments[:, :, 1] - segments[:, :, 0]
     for i, j in itertools.permutations(range(c), 2):
         epipole = Ps[i] @ camera_centre(Ps[j])
-        towards = epipole[:2] - epipole[2] * middle[i]
-        sine = along[i, :, 0] * towards[:, 1] - along[i, :, 1] * towards[:, 0]
-        angles[i, j] = np.arctan2(np.abs(sine), np.abs((along[i] * towards).sum(axis=1)))
+        to_epipole = epipole[:2] - epipole[2] * mean_length[i]
+        sine = along[i, :, 0] * to_epipole[:, 1] - along[i, :, 1] * to_epipole[:, 0]
+        angles[i, j] = np.arctan2(np.abs(sine), np.abs((along[i] * to_epipole).sum(axis=1)))
     return angles
 
 
@@ -245,7 +245,7 @@ def _refuse_epipolar(Ps: FloatArray, segments: FloatArray, sigma: float) -> None
     with np.errstate(divide="ignore"):
         limit = np.maximum(CERTAINTY * np.sqrt(2.0) * sigma / length, 1e-9)
     angles = crossing_angles(Ps, segments)
-    # A pair tells the line where both of its images cross the epipolar lines for certain.
+    # A pair determines the line where both of its images cross the epipolar lines significantly.
     told = (angles > limit[:, None]) & (angles.transpose(1, 0, 2) > limit[None, :])
     lost = np.flatnonzero(~told.any(axis=(0, 1)))
     if len(lost):

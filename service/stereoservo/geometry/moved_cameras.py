@@ -22,7 +22,7 @@ from stereoservo.geometry.homogeneous import GeometryError, unit_rows, whitener
 from stereoservo.numerics.arrays import FloatArray
 
 OFF_PLANE = 5.0
-"""Standard deviations by which points must stand off their best common plane not to count as coplanar."""
+"""Standard deviations by which points must lie off their best common plane not to count as coplanar."""
 EXACT = 1e-9
 """Standard deviation, relative to their norm, that points without a covariance are taken to have."""
 
@@ -46,10 +46,10 @@ def plane_deviations(points: FloatArray, covariance: FloatArray | None = None) -
         Q, R = np.linalg.qr(stack)
         plane: FloatArray = np.asarray(np.linalg.solve(R, np.linalg.svd(Q[:n])[2][3]), dtype=np.float64)
         plane = plane / np.linalg.norm(plane)
-        spread = np.sqrt(np.einsum("i,nij,j->n", plane, covariance, plane))
-        weights = 1.0 / np.where(spread > 0, spread, 1.0)
+        deviation = np.sqrt(np.einsum("i,nij,j->n", plane, covariance, plane))
+        weights = 1.0 / np.where(deviation > 0, deviation, 1.0)
         weights = weights / weights.max()
-    deviations = (points @ plane) / np.where(spread > 0, spread, 1.0)
+    deviations = (points @ plane) / np.where(deviation > 0, deviation, 1.0)
     return plane, float(np.sqrt(np.mean(deviations**2)))
 
 
@@ -99,7 +99,8 @@ class FrameChange:
 def carried_point_covariance(
     change: FrameChange, M: FloatArray, M_covariance: FloatArray | None = None
 ) -> FloatArray:
-    """First-order covariance ``(m, 4, 4)`` of carried points ``H M`` from that of H and, if given, of the points.
+    """First-order covariance ``(m, 4, 4)`` of transformed points ``H M`` from that of H and, if given, of the
+    points.
 
     Both taken as independent: for points that are not among those that gave H.
     """
@@ -124,7 +125,7 @@ class ResectedCamera:
 
 
 def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -> ResectedCamera:
-    """One moved camera in the frame of scene points ``(n, 4)`` that stood still, n >= 6, from ``pixels`` (n, 2) [px].
+    """One moved camera in the frame of static scene points ``(n, 4)``, n >= 6, from ``pixels`` (n, 2) [px].
 
     Of least reprojection error (`resection`); NaN pixels are left out, ``sigma`` [px] is their noise. Raises
     GeometryError for fewer than six points and where they, or noise, leave the camera undetermined (coplanar points).
@@ -143,20 +144,22 @@ def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -
     whitened = chart @ (rows.T / singular)
     _refuse_flat_view(moved, whitened)
     # Back from the whitened frame, and to the gauge of unit norm.
-    spread = (whitened.T.reshape(-1, 3, 4) @ root).reshape(-1, 12).T
-    spread = spread - np.outer(P.ravel(), P.ravel() @ spread)
+    deviation = (whitened.T.reshape(-1, 3, 4) @ root).reshape(-1, 12).T
+    deviation = deviation - np.outer(P.ravel(), P.ravel() @ deviation)
     residuals = reprojection_residuals(P[None], M, pixels[None]).ravel() / sigma
     freedom = residuals.size - 11
-    return ResectedCamera(P, spread @ spread.T, float(np.sqrt(residuals @ residuals / freedom)), freedom)
+    return ResectedCamera(
+        P, deviation @ deviation.T, float(np.sqrt(residuals @ residuals / freedom)), freedom
+    )
 
 
-def _refuse_flat_view(P: FloatArray, spread: FloatArray) -> None:
+def _refuse_flat_view(P: FloatArray, deviation: FloatArray) -> None:
     """Raise GeometryError where a homography of the points' plane explains the pixels within noise.
 
     ``P`` (3, 4) with the points' best plane as first coordinate, and a root ``spread`` (12, 11) of its covariance:
     without a significant first column the images are those of points in the plane.
     """
-    column, root = P[:, 0], spread[[0, 4, 8]]
+    column, root = P[:, 0], deviation[[0, 4, 8]]
     deviations = float(np.sqrt(column @ np.linalg.solve(root @ root.T, column) / 3.0))
     if deviations < OFF_PLANE:
         raise GeometryError(

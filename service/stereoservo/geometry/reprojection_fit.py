@@ -1,4 +1,4 @@
-"""Least squares of the reprojection error over any motion with parameters: one solver for chapters 3 and 4.
+"""Least squares of the reprojection error over any parameterized motion; the solver of thesis chapters 3 and 4.
 
 A motion maps its parameters to the displacements of all stops. Points are given, or free and eliminated by the Schur
 complement (variable projection). Pixels are ideal ones [px], NaN where missing.
@@ -59,7 +59,7 @@ def read_images(Ps: FloatArray, pixels: FloatArray, sigma: FloatArray | float) -
 
 
 def with_rest(motion: Motion) -> Motion:
-    """The same with the rest pose, the identity, as the first stop."""
+    """The images with the rest pose, the identity, as the first stop."""
 
     def moved(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         H, slopes = motion(x)
@@ -79,7 +79,7 @@ class Linearisation:
 
 
 def point_charts(M: FloatArray) -> FloatArray:
-    """Orthonormal complements (m, 4, 3) of points (m, 4): their three freedoms, the scale left out."""
+    """Orthonormal complements (m, 4, 3) of points (m, 4): their three degrees of freedom without the scale."""
     return np.asarray(np.linalg.svd(M[:, None, :])[2][:, 1:].transpose(0, 2, 1), dtype=np.float64)
 
 
@@ -107,7 +107,7 @@ def linearise(
 
 
 def without_points(at: Linearisation) -> tuple[FloatArray, FloatArray]:
-    """Residuals (m, r) and motion derivatives (m, r, q) projected off what the points can absorb."""
+    """Residuals (m, r) and motion derivatives (m, r, q) with the points eliminated by projection."""
     Q = np.linalg.qr(at.points)[0]
     residuals = at.residuals - (Q @ (Q.transpose(0, 2, 1) @ at.residuals[..., None]))[..., 0]
     return residuals, at.motion - Q @ (Q.transpose(0, 2, 1) @ at.motion)
@@ -178,7 +178,7 @@ def _damped_step(information: FloatArray, gradient: FloatArray, damping: float) 
 
 
 def covariance_of(information: FloatArray, what: str) -> FloatArray:
-    """Inverse of an information matrix (q, q). Raises GeometryError where the data leave a direction open."""
+    """Inverse of an information matrix (q, q). Raises GeometryError where the data leave a direction undetermined."""
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     if not values[0] > UNDETERMINED * values[-1]:

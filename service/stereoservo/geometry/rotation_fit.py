@@ -117,8 +117,8 @@ def _fit(
             angles=theta.shape,
         )
     G = check_rotation_generator(generator)
-    sights = (images.weights > 0).sum(axis=(0, 1))
-    known: BoolArray = np.asarray(np.isfinite(points).all(axis=1) & (sights >= (2 if free_points else 1)))
+    views = (images.weights > 0).sum(axis=(0, 1))
+    known: BoolArray = np.asarray(np.isfinite(points).all(axis=1) & (views >= (2 if free_points else 1)))
     used = Images(images.cameras, images.pixels[:, :, known], images.weights[:, :, known])
     size = 10 + (3 * int(known.sum()) if free_points else 0)
     if used.measurements < size:
@@ -140,7 +140,7 @@ def _fit(
     back: FloatArray = np.asarray(np.linalg.inv(W), dtype=np.float64)
     found = conjugate(back, rotation_from_parameters(best.x, chart))
     changes = conjugate(back, rotation_parameter_derivatives(best.x, chart)).reshape(10, 16)
-    spread = changes.T @ covariance @ changes
+    covariance_x = changes.T @ covariance @ changes
     own = rotation_chart(found)
     parameters = rotation_parameters(found, own)
     inverse = np.linalg.pinv(rotation_parameter_derivatives(parameters, own).reshape(10, 16).T)
@@ -151,8 +151,8 @@ def _fit(
         found,
         own,
         parameters,
-        np.asarray(inverse @ spread @ inverse.T, dtype=np.float64),
-        np.asarray(spread, dtype=np.float64),
+        np.asarray(inverse @ covariance_x @ inverse.T, dtype=np.float64),
+        np.asarray(covariance_x, dtype=np.float64),
         estimated,
         best.cost,
         used.measurements - size,

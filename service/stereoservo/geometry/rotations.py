@@ -1,7 +1,7 @@
 """Projective rotations: Jordan frames and their geometry, generators from homographies, minimal parameters
 (thesis 4).
 
-Exponential, logarithm and single generators stand in `displacements`; the fit to pixels in `rotation_fit`.
+Exponential, logarithm and single generators are in `displacements`; the fit to pixels in `rotation_fit`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class RotationFrame:
     """A frame in which a projective rotation is one about z: ``H = S⁻¹ J_R(θ) S`` (4.9).
 
     ``planes`` (4, 4): rows ``h₁..h₄`` of S; ``points`` (4, 4): rows ``k₁..k₄``, the columns of S⁻¹. Which
-    of the points on the axis is at infinity, and which of the planes across it, no rotation tells.
+    of the points on the axis is at infinity, and which of the planes normal to it, no rotation determines.
     """
 
     planes: FloatArray
@@ -90,12 +90,12 @@ def rotation_frame(G: FloatArray) -> RotationFrame:
 
 @dataclass(frozen=True, eq=False)
 class RotationChart:
-    """Where the ten parameters of (4.43) stand: ``order`` (4,) is the permutation Y of the coordinates.
+    """Layout of the ten parameters of (4.43): ``order`` (4,) is the permutation Y of the coordinates.
 
     Coordinates so ordered, ``h'₁₁ = 1`` and ``h'₂₁ = 0`` are fixed and ``h'₂₂`` is the second pivot. The
     charts of a calibration's bundle span the same ten freedoms as directions of conjugation, which reach
     every joint kind and stratum but only near their centre; this one is explicit and good wherever
-    ``h'₂₂ ≠ 0``, so that its ten numbers say by themselves which rotation is meant.
+    ``h'₂₂ ≠ 0``, so that its ten numbers determine the rotation by themselves.
     """
 
     order: npt.NDArray[np.int64]

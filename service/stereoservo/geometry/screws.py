@@ -59,7 +59,7 @@ def exp_twist(X: FloatArray) -> FloatArray:
 
 
 def _sine_excess(theta: FloatArray) -> FloatArray:
-    """``(θ - sinθ)/θ³``, to rounding at 0."""
+    """Coefficient ``(θ - sinθ)/θ³``, accurate at 0."""
     s = theta**2
     series = (1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156))))) / 6
     large = np.where(s > 0.25, theta, 1.0)
@@ -80,7 +80,7 @@ def twist_vectors(T: FloatArray, tolerance: float = 1e-9) -> tuple[FloatArray, F
     """``w`` [rad/s] and ``v`` [m/s] (..., 3) of Euclidean twists (..., 4, 4): the reverse of `twist_matrix`.
 
     Raises GeometryError where one is no twist: its last row or its block's symmetric part is above ``tolerance`` of
-    its norm; then it stands in another frame.
+    its norm; then it is in another frame.
     """
     T = np.asarray(T, dtype=np.float64)
     block = T[..., :3, :3]
@@ -94,6 +94,6 @@ def twist_vectors(T: FloatArray, tolerance: float = 1e-9) -> tuple[FloatArray, F
             f"a matrix is no Euclidean twist: {worst:.3g} of it is not; conjugate it by H_PE first",
             excess=worst,
         )
-    odd = 0.5 * (block - np.swapaxes(block, -1, -2))
-    w = np.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], axis=-1)
+    odd_part = 0.5 * (block - np.swapaxes(block, -1, -2))
+    w = np.stack([odd_part[..., 2, 1], odd_part[..., 0, 2], odd_part[..., 1, 0]], axis=-1)
     return w, T[..., :3, 3].copy()

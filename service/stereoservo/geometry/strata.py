@@ -111,8 +111,8 @@ def triangular_root(omega: FloatArray) -> FloatArray:
     return K
 
 
-def heights_of_one_side(plane: FloatArray, points: FloatArray) -> FloatArray:
-    """``plane`` (4,) with the sign that gives points ``(n, 4)`` positive heights (2.47).
+def oriented_plane(plane: FloatArray, points: FloatArray) -> FloatArray:
+    """``plane`` (4,) with the sign that gives points ``(n, 4)`` positive scales ``plane @ M`` (2.47).
 
     The points are scaled so that they are in front (depth 1 in the first camera). Raises GeometryError naming those on
     the other side: a plane at infinity that cuts a finite object is wrong.

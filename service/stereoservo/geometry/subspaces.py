@@ -85,7 +85,7 @@ def incidence_matrix(planes: FloatArray, points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Relation:
-    """How two subspaces lie to one another.
+    """Relative position of two subspaces.
 
     ``position``; ``dimension`` d of their intersection, -1 if disjoint; ``intersection`` a multi-column
     (d + 1, N); ``sines`` (min(K, L)) of the principal angles between the first and the second, ascending.
@@ -129,5 +129,5 @@ def relation(first: FloatArray, second: FloatArray, tolerance: float = TOLERANCE
 
 
 def coincident(first: FloatArray, second: FloatArray, tolerance: float = TOLERANCE) -> bool:
-    """Whether two spans are one (2.77): equal dimensions and a vanishing incidence matrix."""
+    """Whether two spans coincide (2.77): equal dimensions and a vanishing incidence matrix."""
     return relation(first, second, tolerance).position == "coincident"

@@ -1,4 +1,5 @@
-"""Translations from images of a moved scene, motions that are none left out (thesis 3.2.2, 3.2.3).
+"""Robust estimation of translations from images of a moved scene, with outlier motions rejected (thesis 3.2.2,
+3.2.3).
 
 Every motion is judged by itself, and then by the plane at infinity that most of them agree on. All thresholds
 follow from the noise of the pixels.
@@ -16,7 +17,7 @@ from stereoservo.geometry.cameras import triangulate, triangulation_covariance
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.reprojection_fit import Images, covariance_of, minimise, read_images, with_rest
-from stereoservo.geometry.strata import heights_of_one_side
+from stereoservo.geometry.strata import oriented_plane
 from stereoservo.geometry.translation_fit import (
     TranslationFit,
     bundle_translations,
@@ -46,7 +47,7 @@ HEIGHT_DEVIATION = 1.0 / 3.0
 
 @dataclass(frozen=True, eq=False)
 class MotionJudgement:
-    """One motion from rest, judged.
+    """Result of the test of one motion from rest.
 
     ``reason`` why it is left out, empty where it is used: ``unseen`` (too few points before and after),
     ``points`` (no homography fits: wrong matches), ``conditioning`` (``σ₂`` of the homography's generator above
@@ -56,7 +57,7 @@ class MotionJudgement:
     explain it; ``excess`` the chi-square by which the translation fits worse than the homography, of nine
     freedoms; ``distance`` the squared Mahalanobis distance of its plane from that of the others, of three;
     ``height_deviation`` the largest relative standard deviation of a point's height above its own plane: a motion above
-    `HEIGHT_DEVIATION` tells too little by itself, but adds to others. NaN where not computed.
+    `HEIGHT_DEVIATION` determines too little by itself, but adds to others. NaN where not computed.
     """
 
     reason: Reason
@@ -69,7 +70,7 @@ class MotionJudgement:
 
 @dataclass(frozen=True, eq=False)
 class TranslationEstimate:
-    """``fit`` of the motions ``used`` (n,) bool, and the verdict on each of the n."""
+    """``fit`` of the motions ``used`` (n,) bool, and the test result of each of the n."""
 
     fit: TranslationFit
     used: BoolArray
@@ -78,7 +79,9 @@ class TranslationEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What was seen: images of all stops, points (m, 4) at rest, NaN where unknown, and whether they are ``flat``."""
+    """Observations: images of all stops, points (m, 4) at rest, NaN where unknown, and whether they are coplanar
+    (``flat``).
+    """
 
     images: Images
     pixels: FloatArray
@@ -120,7 +123,7 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Single:
-    """One motion by itself: its plane at infinity in the chart of `_height_one`, None where it has none."""
+    """One motion tested by itself: its plane at infinity in the chart of `_height_one`, None where it has none."""
 
     plane: FloatArray | None
     covariance: FloatArray | None
@@ -198,8 +201,8 @@ def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
 
 
 def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
-    """Largest standard deviation of the heights ``hᵀM`` of points (m, 4), relative to the heights, where that of the
-    points' middle is one. NaN points are left out.
+    """Largest standard deviation of the scales ``hᵀM`` of points (m, 4), relative to the scales, where that of the
+    points' centroid is one. NaN points are left out.
     """
     M = points[np.isfinite(points).all(axis=1)]
     M = M / (M @ fit.plane)[:, None]
@@ -209,7 +212,7 @@ def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
 
 
 def _require_heights(scene: _Scene, fit: TranslationFit) -> None:
-    """Raise GeometryError where the plane at infinity is not known well enough, or cuts the points."""
+    """Raise GeometryError where the plane at infinity is too uncertain, or passes between the points."""
     points = scene.rest[np.isfinite(scene.rest).all(axis=1)]
     deviation = scene.deviation(fit)
     if not deviation <= HEIGHT_DEVIATION:
@@ -223,7 +226,7 @@ def _require_heights(scene: _Scene, fit: TranslationFit) -> None:
             limit=HEIGHT_DEVIATION,
             coplanar=scene.flat,
         )
-    heights_of_one_side(fit.plane, points)
+    oriented_plane(fit.plane, points)
 
 
 def _joint(scene: _Scene, used: BoolArray) -> TranslationFit:
@@ -236,7 +239,7 @@ def _joint(scene: _Scene, used: BoolArray) -> TranslationFit:
 
 
 def _judge_alone(scene: _Scene, stop: int) -> _Single:
-    """Rest and one stop: does a homography fit, is it a translation, and with which plane at infinity?"""
+    """Test of one motion from rest: does a homography fit, is it a translation, and with which plane at infinity?"""
     nan = float("nan")
     images, rest, weighting, pair = scene.images, scene.rest, scene.weighting, [0, stop]
     try:
@@ -289,41 +292,41 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
         reason = "conditioning"
     if reason:
         return _Single(None, None, MotionJudgement(reason, conditioning, least, excess))
-    z, spread = _height_one(W, rest, fit.plane, fit.plane_covariance)
+    z, variance = _height_one(W, rest, fit.plane, fit.plane_covariance)
     deviation = scene.deviation(fit)
-    return _Single(z, spread, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
+    return _Single(z, variance, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
 
 
 def _second_singular_noise(
     left: FloatArray, H: FloatArray, slopes: FloatArray, covariance: FloatArray
 ) -> float:
-    """What ``σ₂`` of the generator of a true translation exceeds with probability `TAIL`, from the homography's
-    covariance (15, 15), G weighted by ``left``: by Weyl at most the norm of the
-    error, whose square is nearly a scaled chi-square.
+    """Value that ``σ₂`` of the generator of a true translation exceeds with probability `TAIL`, from the
+    homography's covariance (15, 15), G weighted by ``left``: by Weyl at most the norm of the error, whose square
+    is nearly a scaled chi-square.
     """
     gamma = float(np.trace(H)) / 4.0
     traces = np.trace(slopes, axis1=1, axis2=2)
     errors = left @ (slopes / gamma - traces[:, None, None] * H / (4.0 * gamma**2))
     errors = errors.reshape(len(slopes), 16)
     C = errors.T @ covariance @ errors
-    mean, spread = float(np.trace(C)), float((C * C).sum())
-    freedom = mean**2 / spread
-    return float(np.sqrt(spread / mean * chi2_distribution.isf(TAIL, freedom)))
+    mean, variance = float(np.trace(C)), float((C * C).sum())
+    freedom = mean**2 / variance
+    return float(np.sqrt(variance / mean * chi2_distribution.isf(TAIL, freedom)))
 
 
 def _height_one(
     W: FloatArray, points: FloatArray, plane: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """A plane (4,) as three coordinates, and their covariance (3, 3): whitened, of height one at the points'
-    middle, where planes that pass far from the points do not differ by scale.
+    """Chart of a plane (4,): three coordinates and their covariance (3, 3), whitened, scaled to 1 at the points'
+    centroid.
     """
     M = points[np.isfinite(points).all(axis=1)] @ W.T
-    middle = (M / np.linalg.norm(M, axis=1, keepdims=True)).mean(axis=0)
-    across = np.linalg.svd(middle[None])[2][1:]
+    centroid = (M / np.linalg.norm(M, axis=1, keepdims=True)).mean(axis=0)
+    across = np.linalg.svd(centroid[None])[2][1:]
     back = np.linalg.inv(W).T
     h = back @ plane
-    height = float(h @ middle)
-    J = across @ (np.eye(4) - np.outer(h / height, middle)) @ back / height
+    height = float(h @ centroid)
+    J = across @ (np.eye(4) - np.outer(h / height, centroid)) @ back / height
     return across @ h / height, np.asarray(J @ covariance @ J.T, dtype=np.float64)
 
 
@@ -336,9 +339,10 @@ def _distance(single: _Single, plane: FloatArray, covariance: FloatArray) -> flo
 
 
 def _largest_agreement(singles: list[_Single]) -> BoolArray:
-    """The motions that agree with the one that most agree with; of equals, the one that knows its plane best.
+    """Largest consensus set: the motions that agree with the one most others agree with; of equals, the one with
+    the most accurate plane.
 
-    Motions that tell too little by themselves agree with anything: only where there are no others are they asked.
+    Motions that determine too little by themselves agree with anything; they are used only where there are no others.
     """
     limit = float(chi2_distribution.isf(TAIL, 3))
     best: tuple[int, float, BoolArray] | None = None

@@ -1,6 +1,6 @@
 """Maximum likelihood of projective translations that share the plane at infinity (thesis 3.2.3, (3.40)).
 
-Six parameters for one motion, 3 + 3n for n: of the plane ``h`` the largest entry stands still (its scale is
+Six parameters for one motion, 3 + 3n for n: of the plane ``h`` the largest entry is fixed (its scale is
 no parameter), and the entry of each ``k`` beside it follows from ``hᵀk = 0`` (3.39 with errata). Solved by
 `reprojection_fit` in coordinates whitened over the points. Pixels are ideal ones [px], NaN where missing.
 """
@@ -47,7 +47,7 @@ class TranslationFit:
     evaluations: int
 
     def agrees(self, tail: float = 1e-3) -> bool:
-        """Whether the cost is one that the stated noise exceeds with a probability above ``tail``."""
+        """Whether the stated noise exceeds the cost with a probability above ``tail``."""
         return bool(self.cost <= chi2_distribution.isf(tail, max(1, self.freedom)))
 
 
@@ -226,7 +226,7 @@ def _only(images: Images, known: BoolArray) -> Images:
 def _answer(
     best: Minimum, chart: SharedPlane, covariance: FloatArray, W: FloatArray, points: FloatArray, freedom: int
 ) -> TranslationFit:
-    """The fit in the caller's frame: ``h = Wᵀ h_w`` of unit norm, the points on its positive side."""
+    """The fit transformed to the caller's frame: ``h = Wᵀ h_w`` of unit norm, the points on its positive side."""
     h_white, k_white = chart.vectors(best.x)
     h = W.T @ h_white
     size = float(np.linalg.norm(h)) * (1.0 if np.nansum(np.sign(points @ h)) >= 0 else -1.0)
@@ -255,7 +255,7 @@ def plane_basis(M: FloatArray) -> FloatArray:
 
 
 def planar_map(Ps: FloatArray, m: FloatArray, depth: FloatArray, pixels: FloatArray) -> FloatArray:
-    """``D`` (4, 3) with ``P_c D m`` at the pixels, up to scale, of plane coordinates m (n, 3), linear.
+    """Map ``D`` (4, 3), linear, such that ``P_c D m`` are, up to scale, the pixels of plane coordinates m (n, 3).
 
     ``depth`` (c, n) before the motion divides the equations; pixels (c, n, 2) [px], NaN where missing. Raises
     GeometryError for fewer than 11 equations or points that leave D undetermined (collinear).
@@ -286,9 +286,9 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
     basis = plane_basis(M)
     B, normal = basis[:, :3], basis[:, 3]
     m = M @ B
-    spread = np.linalg.qr(m / np.linalg.norm(m, axis=1, keepdims=True))[1]
+    factor = np.linalg.qr(m / np.linalg.norm(m, axis=1, keepdims=True))[1]
     depth = np.einsum("cj,nj->cn", Ps[:, 2], M)
-    unit = M / np.linalg.norm(m @ np.linalg.inv(spread), axis=1, keepdims=True)
+    unit = M / np.linalg.norm(m @ np.linalg.inv(factor), axis=1, keepdims=True)
     jacobian = projection_jacobian_many(Ps, unit)
     left = np.linalg.cholesky(np.einsum("cnai,cnaj->ij", jacobian, jacobian)).T
     weighted = []
@@ -298,9 +298,9 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
         values = np.linalg.eigvals(B.T @ D)
         pairs = [(abs(values[i] - values[j]), values[i] + values[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
         gamma = 0.5 * float(min(pairs, key=lambda pair: float(pair[0]))[1].real)
-        weighted.append(left @ (D / gamma - B) @ spread.T)
+        weighted.append(left @ (D / gamma - B) @ factor.T)
     v = np.linalg.svd(np.concatenate(weighted))[2][0]
-    g = np.linalg.solve(spread, v)
+    g = np.linalg.solve(factor, v)
     k = np.stack([np.linalg.solve(left, G @ v) for G in weighted])
     return _last_freedom(B @ g, normal, k, left)
 
@@ -308,7 +308,7 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
 def _last_freedom(
     within: FloatArray, normal: FloatArray, k: FloatArray, left: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """``h = within + η normal`` with ``hᵀk`` least over the motions; the k then put onto the plane."""
+    """Plane ``h = within + η normal`` with least ``hᵀk`` over the motions; the k then projected onto the plane."""
     across = k @ normal
     if not np.linalg.norm(across) > ACROSS * np.linalg.norm(k):
         raise GeometryError(

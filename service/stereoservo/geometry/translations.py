@@ -1,7 +1,7 @@
 """Projective translations: Jordan frames, and direction and plane at infinity from homographies (thesis 3).
 
 A projective translation is ``H = I + k hᵀ`` with ``hᵀk = 0``: ``k`` (4,) the direction of translation at
-infinity, ``h`` (4,) the plane at infinity (3.13, 3.14). Exponential, logarithm and generators stand in
+infinity, ``h`` (4,) the plane at infinity (3.13, 3.14). Exponential, logarithm and generators are in
 `displacements`; the fits to pixels in `translation_fit`.
 """
 
@@ -78,7 +78,7 @@ def translation_homography(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
 
 @dataclass(frozen=True, eq=False)
 class Weighting:
-    """Coordinates in which the norm of a generator G is taken: ``left G right⁻¹``, both (4, 4).
+    """Coordinates ``left G right⁻¹``, both (4, 4), in which the norm of a generator G is taken.
 
     The rank-one matrix nearest to a measured one depends on them. Identities are the thesis's choice: the
     projective frame as it is.
@@ -116,7 +116,7 @@ FLAT = 1e-12
 
 
 def conditioner(M: FloatArray) -> FloatArray:
-    """``W`` (4, 4) as `homogeneous.whitener` gives it, for coplanar points (m, 4) too.
+    """`homogeneous.whitener`, extended to coplanar points (m, 4).
 
     Raises GeometryError for fewer than four points.
     """
@@ -128,8 +128,8 @@ def conditioner(M: FloatArray) -> FloatArray:
 
 
 def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
-    """The weighting in which the norm of G is, to first order, the rms motion of points M (m, 4) in the images of
-    cameras (c, 3, 4) [px], as far as a product of one matrix a side can be.
+    """Weighting in which the norm of G is, to first order, the rms motion of points M (m, 4) in the images of
+    cameras (c, 3, 4) [px], as far as one matrix on each side can express it.
 
     Raises GeometryError for fewer than five points, and points or cameras that leave a direction out of the images.
     """
@@ -157,7 +157,7 @@ def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
 
 @dataclass(frozen=True, eq=False)
 class TranslationSVD:
-    """What the singular value decomposition of one homography says (3.36).
+    """Singular value decomposition of one homography, with its plane and direction (3.36).
 
     ``direction`` (4,) and ``plane`` (4,), both of unit norm; ``generator`` (4, 4), the nilpotent of that plane
     nearest to the measured one; ``singular`` (4,) descending, in px with `image_weighting`.

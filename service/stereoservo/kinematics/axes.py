@@ -1,4 +1,4 @@
-"""Joint axes of a model as lines of the Euclidean (or affine) frame in which it is a rigid mechanism."""
+"""Joint axes of a model, as lines of the Euclidean (or affine) frame of its stratum."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class FramedModel:
-    """A model's parts in a frame of its own stratum.
+    """A model's parts in a frame of its stratum (projective, affine or Euclidean).
 
     Metric: Euclidean up to scale, the left camera ``K [I | 0]``. Affine: infinity is (0, 0, 0, 1). Projective: any.
     ``generators`` (n, 4, 4) as motions of the markers at the zero, base first, with the sense of an arm that
@@ -30,7 +30,7 @@ class FramedModel:
 
 
 def framed(model: CellModel) -> FramedModel:
-    """The parts of ``model`` in the frame of its stratum."""
+    """Transform the parts of ``model`` into the frame of its stratum."""
     frame = stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean)
     back = np.asarray(np.linalg.inv(frame), dtype=np.float64)
     points = model.marker_points @ frame.T
@@ -86,13 +86,13 @@ def joint_axes(kinds: tuple[str, ...], generators: FloatArray) -> Axes:
 
 
 def unit(v: FloatArray) -> FloatArray:
-    """``v`` (3,) at length 1."""
+    """Normalised ``v`` (3,)."""
     result: FloatArray = v / np.linalg.norm(v)
     return result
 
 
 def axis_angle(u: FloatArray, v: FloatArray) -> float:
-    """Angle [rad] in [0, π] between directions (3,), exact near 0 and π, too."""
+    """Angle [rad] in [0, π] between directions (3,); accurate near 0 and π."""
     return float(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
 
 
@@ -102,9 +102,9 @@ def common_normal(
     """Feet (3,), (3,) of the common normal on two lines that are not parallel."""
     normal = np.cross(u1, u2)
     square = float(normal @ normal)
-    apart = c2 - c1
-    foot1 = c1 + u1 * (np.cross(apart, u2) @ normal / square)
-    foot2 = c2 + u2 * (np.cross(apart, u1) @ normal / square)
+    between = c2 - c1
+    foot1 = c1 + u1 * (np.cross(between, u2) @ normal / square)
+    foot2 = c2 + u2 * (np.cross(between, u1) @ normal / square)
     return foot1, foot2
 
 

@@ -1,5 +1,5 @@
-"""The arm as the cameras see it: a product of exponentials of projective generators (thesis 5). Readable
-reference.
+"""Forward kinematics and Jacobians in the cameras' projective frame: a product of exponentials (thesis 5).
+Reference in numpy.
 
 The loop itself runs on :mod:`stereoservo.kinematics.kernels`, which are tested against this module.
 """
@@ -20,7 +20,7 @@ KIND_CODES = {"revolute": 0, "prismatic": 1}
 
 
 class ChainError(ValueError):
-    """A chain or a configuration is malformed; ``data`` holds the values that the message speaks of."""
+    """A chain or a configuration is malformed; ``data`` holds the values in the message."""
 
     def __init__(self, message: str, **data: Any) -> None:
         super().__init__(message)
@@ -33,7 +33,7 @@ class ProjectiveChain:
 
     ``kinds``: ``"revolute"`` [rad] or ``"prismatic"`` [m] for each joint. ``generators`` (n, 4, 4) at the
     zero. ``zero`` (n,): the configuration at which H is the identity. ``tip_first``: cameras ride on the tip and
-    the markers stand still (eye-in-hand), so that the joint next to them, the base's, acts first:
+    the markers are static (eye-in-hand), so that the joint next to them, the base's, acts first:
     ``H(q) = exp((qₙ−zₙ)Ĥₙ)…exp((q₁−z₁)Ĥ₁)``, joints still counted from the base, signs inside the generators.
     Raises ChainError on shapes or kinds
     that do not fit.
@@ -72,7 +72,7 @@ class ProjectiveChain:
 
     @property
     def kind_codes(self) -> npt.NDArray[np.uint8]:
-        """``(n,)`` as the kernels take them: 0 revolute, 1 prismatic."""
+        """Joint kinds (n,) as codes for the kernels: 0 revolute, 1 prismatic."""
         return np.array([KIND_CODES[kind] for kind in self.kinds], dtype=np.uint8)
 
     @property
@@ -97,9 +97,7 @@ class ProjectiveChain:
         return np.array(self.partial_displacements(q)[-1])
 
     def operators_at(self, q: FloatArray) -> FloatArray:
-        """``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4): the joints' generators where the arm is now
-        (5.21).
-        """
+        """Generators at the present configuration, ``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4) (5.21)."""
         order = list(self.order)
         partial = self.partial_displacements(q)[:-1]
         operators = np.empty_like(self.generators)

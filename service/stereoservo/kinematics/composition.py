@@ -1,8 +1,8 @@
-"""How joints compose: what a small motion of all joints does to points and to the operators themselves.
+"""Composition of joint displacements: the effect of a small motion of all joints on points and on the operators.
 
-An arm re-zeroed where it stands (Theorem 10) needs no more than its operators there: ``H(q+Δq) H(q)⁻¹`` is their
-product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the loop runs the
-kernels ``displace`` and ``move_operators``.
+An arm re-zeroed at its present configuration (Theorem 10) needs no more than its operators there: ``H(q+Δq)
+H(q)⁻¹`` is their product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the
+loop runs the kernels ``displace`` and ``move_operators``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Composition(IntEnum):
     """The order in which the joints of an arm act on the markers."""
 
     BASE_FIRST = 0
-    """Product of exponentials, the base's joint leftmost (5.18): cameras stand."""
+    """Product of exponentials, the base's joint leftmost (5.18): cameras are static."""
     TIP_FIRST = 1
     """The tip's joint leftmost: cameras ride on the tip."""
     SIMULTANEOUS = 2
@@ -29,7 +29,7 @@ class Composition(IntEnum):
 
 
 def displacement(operators: FloatArray, composition: Composition, step: FloatArray) -> FloatArray:
-    """What a motion of the joints by ``step`` (n,) does to points: (4, 4). ``operators`` (n, 4, 4) before it."""
+    """Displacement (4, 4) of points by a motion ``step`` (n,) of the joints; ``operators`` (n, 4, 4) before it."""
     if composition == Composition.SIMULTANEOUS:
         return exp_twist_reference(np.tensordot(step, operators, axes=1))
     H = np.eye(4)
@@ -56,7 +56,7 @@ def _order(composition: Composition, n: int) -> range:
 
 @kernel
 def _follow_joint(H: FloatArray, operator: FloatArray, step: float, product: FloatArray) -> None:
-    """``H exp(step Ĥ)`` in place of ``H`` (4, 4); ``product`` (4, 4): scratch."""
+    """Multiply ``H`` (4, 4) in place: ``H exp(step Ĥ)``; ``product`` (4, 4) is scratch."""
     multiply4_into(H, exp_twist(step * operator), product)
     for i in range(4):
         for k in range(4):
@@ -98,19 +98,20 @@ def move_operators(operators: FloatArray, composition: int, step: FloatArray) ->
 
 
 def displacement_basis(projective_to_euclidean: FloatArray, points: FloatArray) -> FloatArray:
-    """Twists (6, 4, 4): translations along three axes, then rotations about them through the middle of ``points``
-    (m, 4). A unit of translation is the largest distance of a point from the middle, so that all six are of one size.
+    """Twists (6, 4, 4): translations along three axes, then rotations about them through the centroid of ``points``
+    (m, 4). A unit of translation is the largest distance of a point from the centroid, so that all six are of
+    similar size.
     """
     H = np.asarray(projective_to_euclidean, dtype=np.float64)
     euclidean = points @ H.T
     euclidean = euclidean[:, :3] / euclidean[:, 3:]
-    middle = euclidean.mean(axis=0)
-    size = float(np.sqrt(((euclidean - middle) ** 2).sum(axis=1).max())) or 1.0
+    centroid = euclidean.mean(axis=0)
+    size = float(np.sqrt(((euclidean - centroid) ** 2).sum(axis=1).max())) or 1.0
     basis = np.zeros((6, 4, 4))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         basis[k, k, 3] = size
         basis[3 + k, j, i], basis[3 + k, i, j] = 1.0, -1.0
-        basis[3 + k, j, 3], basis[3 + k, i, 3] = -middle[i], middle[j]
+        basis[3 + k, j, 3], basis[3 + k, i, 3] = -centroid[i], centroid[j]
     twists: FloatArray = np.linalg.inv(H) @ basis @ H
     return twists

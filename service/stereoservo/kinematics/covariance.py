@@ -1,4 +1,4 @@
-"""Propagation of a model's covariance to anything that no change of its projective frame alters.
+"""Propagation of a model's covariance to quantities that do not depend on the choice of its projective frame.
 
 A quantity is a function of the model: an angle between axes, an intrinsic parameter through
 ``projective_to_euclidean``, a predicted pixel. Its derivative is taken along the principal axes of the covariance, a
@@ -25,7 +25,7 @@ class NoCovarianceError(ValueError):
 
 
 def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
-    """The model with its parameters (p,) off by ``x`` along the directions of its covariance.
+    """The model with its parameters (p,) changed by ``x`` along the directions of its covariance.
 
     Generators are conjugated, so that they keep their algebra; points are scaled back to height 1 over the plane
     at infinity. Neither statistics nor covariance are carried. Raises NoCovarianceError, ValueError.
@@ -94,7 +94,8 @@ def standard_deviations(model: CellModel, function: Callable[[CellModel], FloatA
 
 
 def covariance_axes(model: CellModel) -> FloatArray:
-    """``L`` (p, r) with ``L Lᵀ`` = the covariance: its principal axes as correlations, each one deviation long.
+    """Root ``L`` (p, r) of the covariance, ``L Lᵀ``: its principal axes as correlations, each scaled to one
+    deviation.
 
     Raises NoCovarianceError.
     """

@@ -1,7 +1,7 @@
-"""Denavit-Hartenberg rows of a metric model, with one known length for the scale (5.1, 5.2; thesis 5.5.2).
+"""Denavit-Hartenberg parameters of a metric model, scaled by one known length (5.1, 5.2; thesis 5.5.2).
 
 Row j, base first, is what joint j does and the link behind it: ``Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β)``, with ``θ = q +
-theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j stands before joint j: its r_j,
+theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j precedes joint j: its r_j,
 α_j and l_j (r is the length, l the offset; the text under it has them exchanged) are a, α and d of row j-1 here.
 
 Conventions, where the classical ones leave a choice or fail:
@@ -13,11 +13,11 @@ Conventions, where the classical ones leave a choice or fail:
   a small second angle β takes its place (Hayati): x goes from the end of the row before, square to axis j, to axis
   j+1;
 - prismatic joints have no place: their axis is led through the end of the row before (``a = 0``), and through the
-  first revolute axis where they begin the chain; where it is parallel to its neighbour, x goes on as it was;
+  first revolute axis where they begin the chain; where it is parallel to its neighbour, x stays as it was;
 - the base's frame is free: theta and d of row 1 are 0, and so is the d with which the first axis of another direction
   leaves those parallel to the first. What is behind the last axis is the tool's: that row is 0.
 
-``chosen`` names the entries that such a choice sets: no measurement stands behind them.
+``chosen`` names the entries that such a choice sets, without a measurement.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ from stereoservo.numerics.arrays import FloatArray
 LinkKind = Literal["skew", "meeting", "parallel", "to_prismatic", "last"]
 
 PARALLEL = np.radians(5.0)
-"""Angle between axes [rad] below which a row is told with β in place of d."""
+"""Angle between axes [rad] below which a row has β in place of d."""
 MEETING = 0.01
 """Distance between axes, as a share of the arm's size, below which they count as meeting."""
 COLUMNS = ("a", "alpha", "beta", "d", "theta")
 
 
 class ReadOutError(ValueError):
-    """A model does not hold what was asked of it.
+    """The model does not contain the requested quantity.
 
     Attributes:
         code: ``stratum``, ``unknown_name``, ``length``.
-        data: the values the message speaks of.
+        data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -68,7 +68,8 @@ class ReadOutError(ValueError):
 
 
 class KnownLength(msgspec.Struct, frozen=True):
-    """The one length that a metric model lacks: ``metres`` of a thing named by ``what`` and ``of``.
+    """The known length that fixes the scale of a metric model: ``metres`` of a quantity named by ``what`` and
+    ``of``.
 
     ``a`` or ``d`` of a joint's row, ``prismatic`` (one unit of that joint), ``markers`` (two ids), ``baseline``
     (two cameras' names).
@@ -80,7 +81,8 @@ class KnownLength(msgspec.Struct, frozen=True):
 
 
 class DhRow(msgspec.Struct, frozen=True):
-    """One row: ``a``, ``d`` [m], ``alpha``, ``beta``, ``theta`` [rad], each with its standard deviation.
+    """Denavit-Hartenberg parameters of one link: ``a``, ``d`` [m], ``alpha``, ``beta``, ``theta`` [rad], each with
+    its standard deviation.
 
     ``theta`` (revolute) and ``d`` (prismatic) are the offsets at joint position 0; ``scale``: metres for one unit
     of a prismatic joint. A standard deviation is None where the model carries no covariance, 0 for entries in
@@ -106,7 +108,7 @@ class DhRow(msgspec.Struct, frozen=True):
 
 
 def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...]:
-    """Rows of a metric ``model``, base first, in metres by the ``known`` length.
+    """Denavit-Hartenberg rows of a metric ``model``, base first, scaled by the ``known`` length.
 
     Raises ReadOutError: ``stratum`` (not metric), ``unknown_name``, ``length`` (not positive, or the model's is zero).
     """
@@ -120,12 +122,19 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
 
     values = read(model).reshape(-1, 6)
     if not np.isfinite(values[:, :5]).all():
-        raise ReadOutError("length", f"the model's {_told(known)} is zero: it gives no scale")
+        raise ReadOutError("length", f"the model's {_length_name(known)} is zero: it gives no scale")
     deviations = standard_deviations(model, read)
-    spread = None if deviations is None else deviations.reshape(-1, 6)
+    deviations_by_row = None if deviations is None else deviations.reshape(-1, 6)
     chosen = chosen_columns(axes, links)
     return tuple(
-        _row(name, kind, links[j].link, values[j], None if spread is None else spread[j], chosen[j])
+        _row(
+            name,
+            kind,
+            links[j].link,
+            values[j],
+            None if deviations_by_row is None else deviations_by_row[j],
+            chosen[j],
+        )
         for j, (name, kind) in enumerate(zip(model.joint_names, parts.kinds, strict=True))
     )
 
@@ -135,36 +144,36 @@ def _row(
     kind: str,
     link: LinkKind,
     values: FloatArray,
-    spread: FloatArray | None,
+    deviations_by_row: FloatArray | None,
     chosen: tuple[str, ...],
 ) -> DhRow:
-    """A row of its six values and their standard deviations, where there are any."""
+    """A row from its six values and their standard deviations, if any."""
     slides = kind == "prismatic"
-    told = {column: float(value) for column, value in zip(COLUMNS, values, strict=False)}
+    columns = {column: float(value) for column, value in zip(COLUMNS, values, strict=False)}
 
     def std(column: str) -> float | None:
-        if spread is None:
+        if deviations_by_row is None:
             return None
-        return 0.0 if column in chosen else float(spread[COLUMNS.index(column)])
+        return 0.0 if column in chosen else float(deviations_by_row[COLUMNS.index(column)])
 
     return DhRow(
         joint=joint,
         kind=kind,
         link=link,
         scale=float(values[5]) if slides else None,
-        scale_std=float(spread[5]) if slides and spread is not None else None,
+        scale_std=float(deviations_by_row[5]) if slides and deviations_by_row is not None else None,
         chosen=chosen,
         a_std=std("a"),
         alpha_std=std("alpha"),
         beta_std=std("beta"),
         d_std=std("d"),
         theta_std=std("theta"),
-        **told,
+        **columns,
     )
 
 
 def chosen_columns(axes: Axes, links: tuple[Convention, ...]) -> tuple[tuple[str, ...], ...]:
-    """For each row the columns that a convention sets."""
+    """Columns of each row that are set by a convention and not measured."""
     first, leaves = base_leaves(axes)
     by_link: dict[LinkKind, set[str]] = {
         "skew": {"beta"},
@@ -203,7 +212,7 @@ def dh_values(
 
 
 def _length(parts: FramedModel, axes: Axes, table: FloatArray, known: KnownLength, names: CellModel) -> float:
-    """The known length in the lengths of the frame."""
+    """The known length in the units of the frame."""
     if known.what == "markers":
         i, k = (names.marker_ids.index(int(marker)) for marker in known.of)
         return float(np.linalg.norm(parts.points[i, :3] - parts.points[k, :3]))
@@ -217,7 +226,7 @@ def _length(parts: FramedModel, axes: Axes, table: FloatArray, known: KnownLengt
     return float(abs(table[j, 0 if known.what == "a" else 3]))
 
 
-def _told(known: KnownLength) -> str:
+def _length_name(known: KnownLength) -> str:
     return f"{known.what} of {', '.join(str(name) for name in known.of)}"
 
 
@@ -249,7 +258,7 @@ def _check_known(model: CellModel, known: KnownLength) -> None:
     if len(known.of) != count or len(set(known.of)) != count or not set(known.of) <= set(valid):
         raise ReadOutError(
             "unknown_name",
-            f"known length {_told(known)}: {count} of {', '.join(str(name) for name in valid) or 'none'} needed",
+            f"known length {_length_name(known)}: {count} of {', '.join(str(name) for name in valid) or 'none'} needed",
             of=known.of,
             valid=valid,
         )
@@ -257,14 +266,14 @@ def _check_known(model: CellModel, known: KnownLength) -> None:
 
 @dataclass(frozen=True)
 class Convention:
-    """How one link is told: its kind, and the sense of x beside ``z_j x z_j+1`` where axes cross."""
+    """Convention of one link: its kind, and the sense of x relative to ``z_j x z_j+1`` where axes intersect."""
 
     link: LinkKind
     sense: float = 1.0
 
 
 def conventions(parts: FramedModel) -> tuple[Convention, ...]:
-    """How each link of a mechanism is told, by the module's conventions."""
+    """Convention of each link of a mechanism, by the rules of this module."""
     axes = axes_at_origin(parts)
     plain = tuple(Convention(_link_kind(axes, j)) for j in range(len(axes.kinds)))
     table = dh_table(axes, plain)
@@ -326,7 +335,7 @@ def dh_table(axes: Axes, links: tuple[Convention, ...]) -> FloatArray:
 def _link(
     axes: Axes, j: int, convention: Convention, start: FloatArray, before: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where link j leaves its axis (3,), its x (3,), and ``a, α, β`` (3,).
+    """Foot point (3,) of link j on its axis, its x (3,), and ``a, α, β`` (3,).
 
     ``start``, ``before`` (3,): the end of the row before and its x.
     """
@@ -361,14 +370,14 @@ def _two_angles(z: FloatArray, x: FloatArray, z_next: FloatArray) -> tuple[float
 
 
 def _square_to(z: FloatArray, x: FloatArray | None) -> FloatArray:
-    """``x`` made square to ``z``, or anything square to it where there is none."""
+    """Projection of ``x`` normal to ``z``, or any normal where there is none."""
     if x is None or np.linalg.norm(np.cross(z, x)) < 1e-3:
         x = np.eye(3)[int(np.argmin(np.abs(z)))]
     return unit(x - z * (x @ z))
 
 
 def base_leaves(axes: Axes) -> tuple[int, int]:
-    """The first revolute joint, and the last one of those parallel to it before an axis of another direction.
+    """Indices of the first revolute joint, and of the last one parallel to it before an axis of another direction.
 
     Both are the number of joints where there is no such joint.
     """
@@ -383,7 +392,7 @@ def base_leaves(axes: Axes) -> tuple[int, int]:
 
 
 def _base_origin(axes: Axes) -> FloatArray:
-    """The base's origin (3,), free by nature: chosen so that no row tells a length that is only its choice.
+    """Origin (3,) of the base, a free choice: such that no row contains an arbitrary length.
 
     On the first revolute axis, at the height at which the first axis of another direction leaves those parallel to it.
     """

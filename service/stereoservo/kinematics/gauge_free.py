@@ -1,4 +1,4 @@
-"""What a model says that no choice of frame or scale changes: named quantities with their standard deviations.
+"""Gauge-invariant quantities of a model (independent of frame and scale), named, with their standard deviations.
 
 What a stratum does not determine is listed, too, with the reason. In every stratum: where a marker is seen at the
 zero, how each joint moves it in each image, and where the axes are seen. Affine: coordinates in units of prismatic
@@ -28,7 +28,7 @@ from stereoservo.numerics.arrays import FloatArray
 class Quantity(msgspec.Struct, frozen=True):
     """A named quantity. ``std`` is None where the model carries no covariance.
 
-    ``value`` is None where the model does not determine it; ``reason`` then says why.
+    ``value`` is None where the model does not determine it; ``reason`` then holds the cause.
     """
 
     name: str
@@ -57,7 +57,7 @@ def gauge_free_quantities(model: CellModel) -> list[Quantity]:
 
 
 def not_identified(model: CellModel) -> list[tuple[str, str]]:
-    """What the model leaves open, and why: ``(name, reason)``."""
+    """Quantities that the model leaves undetermined, with the reason: ``(name, reason)``."""
     turning = [
         name for name, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "revolute"
     ]

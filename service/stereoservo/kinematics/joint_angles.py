@@ -1,7 +1,7 @@
-"""Joint angles measured by the cameras; homing; encoder zeros (thesis 4.5.4, (4.45)).
+"""Joint angles estimated from images: homing and encoder zeros (thesis 4.5.4, (4.45)).
 
 No initial guess is asked for: the search starts all over joint space, and every configuration that the pixels
-leave possible is told. Angles of revolute joints are told modulo 2π, nearest the middle of their limits.
+leave possible is told. Angles of revolute joints are modulo 2π, nearest the centre of their limits.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray, BoolArray]]
 
 @dataclass(frozen=True, eq=False)
 class JointAngles:
-    """Joints ``q`` (n,) [rad or m] of least image error, with ``covariance`` (n, n) at the stated noise.
+    """Joints ``q`` (n,) [rad or m] of least reprojection error, with ``covariance`` (n, n) at the stated noise.
 
     ``cost``: sum of squares over the stated variances, with ``freedom`` measurements less joints.
     """
@@ -70,9 +70,9 @@ def measured_joints(
     start: FloatArray | None = None,
     largest_deviation: float = LARGEST_DEVIATION,
 ) -> tuple[JointAngles, ...]:
-    """Every configuration that the pixels of ``problem`` leave possible, the best first.
+    """All configurations that the pixels of ``problem`` admit, the best first.
 
-    ``limits`` (n, 2) [rad or m] confine the search; without them revolute joints may stand anywhere, prismatic ones
+    ``limits`` (n, 2) [rad or m] confine the search; without them revolute joints may be anywhere, prismatic ones
     need theirs. ``start`` (n,) looks only near a configuration. Raises JointAnglesError: ``limits``, ``too_few``
     (fewer coordinates than joints), ``no_agreement`` (no configuration explains the pixels), ``outside_limits``,
     ``not_observable`` with the joints whose deviation exceeds ``largest_deviation`` [rad or m].
@@ -99,7 +99,7 @@ def measured_joints(
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
     _refuse_open(problem, q[ordered[0]], largest_deviation)
-    found = _told_apart(problem, q[ordered], costs[ordered])
+    found = _distinct_configurations(problem, q[ordered], costs[ordered])
     inside = tuple(angles for angles in found if _inside(angles, bounds))
     if not inside:
         raise JointAnglesError(
@@ -112,8 +112,8 @@ def measured_joints(
 
 
 def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]:
-    """Which ends of the search, of ``costs`` (s,), the pixels do not rule out, the best first. Raises JointAnglesError
-    where even the best does not explain them.
+    """Ends of the search, of ``costs`` (s,), that the pixels do not rule out, the best first. Raises
+    JointAnglesError where even the best does not explain them.
     """
     best = float(costs.min())
     freedom = max(0, problem.freedom)
@@ -132,8 +132,8 @@ def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]
     return np.asarray(possible[np.argsort(costs[possible], kind="stable")], dtype=np.int64)
 
 
-def _told_apart(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list[JointAngles]:
-    """Each configuration once, from ends ``q`` (s, n) in order of their ``costs`` (s,)."""
+def _distinct_configurations(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list[JointAngles]:
+    """Distinct configurations from ends ``q`` (s, n) in order of their ``costs`` (s,)."""
     found: list[JointAngles] = []
     for end, cost in zip(q, costs, strict=True):
         slope = problem.linearise(end[None])[1][0]
@@ -147,8 +147,9 @@ def _told_apart(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list
 
 @dataclass(frozen=True, eq=False)
 class Homing:
-    """The way home: ``displacement`` (n,) = home less current joints [rad or m], with ``covariance`` (n, n) that holds
-    the noise of both images; ``current`` as measured. Other ways that the image leaves possible: ``alternatives``.
+    """Result of homing: ``displacement`` (n,) = home less current joints [rad or m], with ``covariance`` (n, n)
+    that includes the noise of both images; ``current`` as measured; other displacements that the image admits:
+    ``alternatives``.
     """
 
     displacement: FloatArray
@@ -164,8 +165,8 @@ def homing_problem(
     pixels: FloatArray,
     sigma: FloatArray | float,
 ) -> JointProblem:
-    """The problem (4.45) of pixels (c, m, 2) [px], one point or more, of what stood at ``home_pixels`` (c, m, 2) in
-    the configuration ``home`` (n,).
+    """The problem (4.45) of pixels (c, m, 2) [px] of one static point or more, which were at ``home_pixels`` (c, m,
+    2) in the configuration ``home`` (n,).
 
     The points are reconstructed from the home images, and weigh by their covariance from there on. Raises
     JointAnglesError where no point is seen by two cameras at home.
@@ -176,7 +177,7 @@ def homing_problem(
     return joint_problem(seen, points, pixels, sigma, point_covariance=covariance)
 
 
-def way_home(
+def homing_displacement(
     problem: JointProblem,
     home: FloatArray,
     *,
@@ -184,7 +185,7 @@ def way_home(
     start: FloatArray | None = None,
     largest_deviation: float = LARGEST_DEVIATION,
 ) -> Homing:
-    """The joint displacement back to ``home`` (n,) of a `homing_problem`, from anywhere.
+    """Joint displacement back to ``home`` (n,) of a `homing_problem`, from any configuration.
 
     Raises JointAnglesError as `measured_joints` does.
     """
@@ -221,7 +222,7 @@ def joint_zeros(
 
     One stop will do where it shows enough; more stops add up. ``limits`` (n, 2) are those of the offsets, default a
     full turn and, for prismatic joints, 1 m to either side. Raises JointAnglesError as `measured_joints` does:
-    ``not_observable`` names the joints on which the images say nothing.
+    ``not_observable`` names the joints that the images do not determine.
     """
     kinds = seen.chain.kinds
     default = np.array([[-np.pi, np.pi] if kind == "revolute" else [-1.0, 1.0] for kind in kinds])
@@ -288,7 +289,7 @@ def _bounds(seen: SeenChain, limits: FloatArray | None, *, local: bool) -> Float
 
 
 def _starts(bounds: FloatArray) -> FloatArray:
-    """A grid, or an even sequence, over the limits (n, 2): (s, n)."""
+    """Start configurations (s, n): a grid, or an even sequence, over the limits (n, 2)."""
     n = len(bounds)
     per_joint = min(GRID, int(STARTS ** (1.0 / n) + 1e-9))
     if per_joint >= 8:
@@ -300,7 +301,7 @@ def _starts(bounds: FloatArray) -> FloatArray:
 
 
 def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Levenberg-Marquardt of all tries ``q`` (s, n) at once: where they end, costs (s,), in front (s,)."""
+    """Levenberg-Marquardt from all starts ``q`` (s, n) at once: end configurations, costs (s,), in front (s,)."""
     q = q.copy()
     error, slope, front = linearise(q)
     cost = (error**2).sum(axis=1)
@@ -336,7 +337,7 @@ def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArra
 
 
 def _distinct(q: FloatArray, seen: SeenChain) -> FloatArray:
-    """One of each group of tries (s, n) that came together within a hundredth."""
+    """One of each group of configurations (s, n) that agree within a hundredth."""
     turn = np.array([2.0 * np.pi if kind == "revolute" else np.inf for kind in seen.chain.kinds])
     folded = np.where(np.isfinite(turn), np.mod(q, turn), q)
     _, first = np.unique(np.round(folded / 0.01).astype(np.int64), axis=0, return_index=True)
@@ -344,7 +345,7 @@ def _distinct(q: FloatArray, seen: SeenChain) -> FloatArray:
 
 
 def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
-    """Revolute angles (s, n) within half a turn of the middle of their limits."""
+    """Revolute angles (s, n) wrapped to within half a turn of the centre of their limits."""
     revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
     middle = np.where(revolute, bounds.mean(axis=1), 0.0)
     turned = middle + np.mod(q - middle + np.pi, 2.0 * np.pi) - np.pi
@@ -352,7 +353,7 @@ def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
 
 
 def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
-    """Raise where the pixels leave a joint's position open at ``q`` (n,)."""
+    """Raise JointAnglesError where the pixels do not determine a joint's position at ``q`` (n,)."""
     slope = problem.linearise(q[None])[1][0]
     _, singular, rows = np.linalg.svd(slope, full_matrices=True)
     padded = np.zeros(len(q))
@@ -371,13 +372,13 @@ def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
         )
 
 
-def _same(apart: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
-    """Whether two ends of a search, ``apart`` (n,) and ``worse`` in cost, are one configuration: within a tenth of a
-    deviation, or in one basin, where the cost grows as the square of the distance.
+def _same(difference: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
+    """Whether two ends of a search, ``apart`` (n,) and ``worse`` in cost, are one configuration: within a tenth of
+    a deviation, or in one basin of attraction, where the cost grows as the square of the distance.
     """
     revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
-    apart = np.where(revolute, np.mod(apart + np.pi, 2.0 * np.pi) - np.pi, apart)
-    return bool(np.abs(apart).max() < 1e-6 or apart @ information @ apart < 1e-2 + 4.0 * worse)
+    difference = np.where(revolute, np.mod(difference + np.pi, 2.0 * np.pi) - np.pi, difference)
+    return bool(np.abs(difference).max() < 1e-6 or difference @ information @ difference < 1e-2 + 4.0 * worse)
 
 
 def _inside(angles: JointAngles, bounds: FloatArray) -> bool:

@@ -1,4 +1,5 @@
-"""Image error of known points as a function of the joints alone: residuals and derivatives, many tries at once.
+"""Reprojection error of known points as a function of the joints: residuals and derivatives, for many
+configurations at once.
 
 The thesis's objective (4.42) over the joint angles (4.45), for any chain, mount and number of cameras. Points may
 carry a covariance; the residuals are then whitened by what pixels and points leave open together.
@@ -20,11 +21,11 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 
 class JointAnglesError(ValueError):
-    """Joint angles cannot be told from the images. The text says why, the value, and what would do.
+    """Joint angles cannot be estimated from the images; the text holds the cause, the value and what would suffice.
 
     Attributes:
         code: ``shape``, ``too_few``, ``limits``, ``not_observable``, ``no_agreement``, ``outside_limits``.
-        data: the values that the message speaks of; ``joints`` names those that are not observable.
+        data: the values in the message; ``joints`` names those that are not observable.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -35,9 +36,9 @@ class JointAnglesError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class SeenChain:
-    """A chain and the cameras that see its points, or ride on it: ``cameras`` (c, 3, 4) to ideal pixels, ``lenses``
-    (c, 4) from them to raw ones. Third rows of the cameras are positive on points in front, as a calibration
-    gives them.
+    """A chain and the cameras that observe its points, or are mounted on it: ``cameras`` (c, 3, 4) to ideal pixels,
+    ``lenses`` (c, 4) from them to raw ones. Third rows of the cameras are positive on points in front, as a
+    calibration gives them.
     """
 
     chain: ProjectiveChain
@@ -97,7 +98,7 @@ def pinhole_lenses(cameras: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class JointProblem:
-    """Pixels of known points at joints ``q + offsets[k]``, for one unknown ``q`` (n,).
+    """Least-squares problem of one unknown ``q`` (n,): pixels of known points at joints ``q + offsets[k]``.
 
     ``points`` (m, 4) at the chain's zero; ``point_roots`` (m, 4, 4) with ``root rootᵀ`` their covariance, or None
     where they are exact; ``pixels`` (k, c, m, 2) ideal [px], 0 where missing; ``roots`` (k, c, m, 2, 2) [1/px] that
@@ -118,12 +119,13 @@ class JointProblem:
 
     @property
     def freedom(self) -> int:
-        """Measurements less parameters, the uncertain points counted as both."""
+        """Degrees of freedom: measurements less parameters (uncertain points count as both)."""
         return self.measurements - self.seen.chain.joints
 
     def moved(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """``m = P H M`` (s, k, c, m, 3) and its derivatives in the joints (s, k, c, m, 3, n) of
-        tries ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and in front of every camera that sees it (s,).
+        """Projected points ``m = P H M`` (s, k, c, m, 3) and their derivatives in the joints (s, k, c, m, 3, n) at
+        configurations ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and whether each lies in front of every camera that
+        sees it (s,).
         """
         s, n = q.shape
         k = len(self.offsets)
@@ -137,8 +139,8 @@ class JointProblem:
         return np.moveaxis(images, -1, -2), np.moveaxis(changes, (-1, -3), (-3, -1)), through, front
 
     def linearise(self, q: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Whitened residuals (s, r), derivatives (s, r, n), and in front (s,), of tries ``q`` (s, n): predicted less
-        measured pixels.
+        """Whitened residuals (s, r) (predicted less measured pixels), derivatives (s, r, n), and in front (s,), at
+        configurations ``q`` (s, n).
         """
         images, changes, through, front = self.moved(q)
         here = self.roots[..., 0, 0] > 0
@@ -160,8 +162,8 @@ class JointProblem:
         return error.reshape(s, -1), slope.reshape(s, -1, n), front
 
     def linearise_rays(self, q: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """The same with unit rays in place of pixels: bounded, and aware of what lies behind a camera. A search from
-        far away needs that.
+        """Like `linearise`, with unit rays in place of pixels: bounded, and valid behind a camera, as a search from
+        far away needs.
         """
         images, changes, _, front = self.moved(q)
         blocks = np.linalg.inv(self.seen.cameras[:, :, :3])[:, None]
@@ -231,8 +233,8 @@ def joint_problem(
 def points_seen(
     seen: SeenChain, q: FloatArray, pixels: FloatArray, sigma: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (m, 4) as they stand at the chain's zero, and their covariance (m, 4, 4), from raw ``pixels`` (c, m, 2)
-    [px] at ``q`` (n,).
+    """Points (m, 4) at the chain's zero, and their covariance (m, 4, 4), from raw ``pixels`` (c, m, 2) [px] at
+    ``q`` (n,).
 
     NaN and 0 where fewer than two cameras see a point. Depth is 1 in the first camera at ``q``. Raises
     JointAnglesError for shapes that do not fit.
@@ -244,8 +246,8 @@ def points_seen(
     points = triangulate(seen.cameras, np.where(given[..., None], here.pixels[0], np.nan), noise)
     known = np.isfinite(points).all(axis=1)
     covariance = np.zeros((len(points), 4, 4))
-    spread = np.where(given, noise, np.inf)
-    covariance[known] = triangulation_covariance(seen.cameras, points[known], spread[:, known])
+    sigmas = np.where(given, noise, np.inf)
+    covariance[known] = triangulation_covariance(seen.cameras, points[known], sigmas[:, known])
     back: FloatArray = np.asarray(np.linalg.inv(seen.chain.displacement(q)), dtype=np.float64)
     return points @ back.T, back @ covariance @ back.T
 

@@ -1,4 +1,4 @@
-"""The model of a cell: what self-calibration learns and the core works with; one versioned file."""
+"""The calibrated model of a cell, and its versioned file: joints, cameras, lenses, markers, covariance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 MODEL_SCHEMA = 2
 READABLE_SCHEMAS = (1, 2)
-"""Schema 1 knew neither lenses nor mounts: pinholes that stand still."""
+"""Schema 1 has neither lenses nor mounts: static pinhole cameras."""
 
 Stratum = Literal["projective", "affine", "metric"]
 
@@ -40,7 +40,7 @@ class CameraModel(msgspec.Struct, frozen=True, eq=False):
 
 
 class JointStatistics(msgspec.Struct, frozen=True):
-    """How well one joint's trial motion fits: residual rms [px], number of stops, range driven [rad or m].
+    """Fit of one joint's trial motion: residual rms [px], number of stops, range driven [rad or m].
 
     ``expected_px``: what the rms should be at the stated sigmas, ``σ √(1 - trace(H_j) / n_j)`` with the trial's own
     share of the hat matrix; ``standard_error_px``: of the rms about it. None in files written before.
@@ -73,12 +73,13 @@ class FitStatistics(msgspec.Struct, frozen=True, eq=False):
 
 
 class JointLoads(msgspec.Struct, frozen=True, eq=False):
-    """What the joints' drives said of their loads in the trial motions: where thresholds of contact come from.
+    """Joint loads that the drives reported in the trial motions; the thresholds of collision detection come from
+    them.
 
     ``efforts`` (n, n) [N m or N, or shares of the rated torque]: entry (j, k) is the farthest that joint j's effort
     went from its moving mean, and stayed for a few samples, while joint k moved. ``largest_efforts`` (n,): largest
     magnitude of all. ``following_errors`` (n,): likewise, from zero [rad or m]. ``velocities`` (n,): highest speed
-    commanded [rad/s or m/s]. None where the drives do not tell.
+    commanded [rad/s or m/s]. None where the drives do not report them.
     """
 
     velocities: FloatArray
@@ -88,7 +89,7 @@ class JointLoads(msgspec.Struct, frozen=True, eq=False):
 
 
 class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
-    """Covariance of all free parameters of a model and what each of them moves, in the model's projective frame.
+    """Covariance of all free parameters of a model, with the direction of each, in the model's projective frame.
 
     ``covariance`` (p, p), parameters in the order of the fields, joint by joint, camera by camera and so on:
 
@@ -117,7 +118,7 @@ class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
 
 
 class CellModel(msgspec.Struct, frozen=True, eq=False):
-    """Projective kinematics, cameras and markers in one projective frame.
+    """Calibrated model: projective kinematics, cameras and markers in one projective frame.
 
     ``generators`` (n, 4, 4): joint operators at ``zero`` (n,), revolute ones with eigenvalues (0, 0, i, -i),
     prismatic ones nilpotent (5.18). ``marker_points`` (m, 4): markers at the zero, orbital heights such that
@@ -125,7 +126,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     stratum is ``metric``. ``mount``: of all its cameras; eye-in-hand chains
     are ``tip_first``. ``epoch`` is unique for each model a cell ever had.
 
-    Stratum ``projective``: the plane at infinity is not identifiable (all axes parallel, say);
+    Stratum ``projective``: the plane at infinity is not identifiable (such as with all axes parallel);
     ``plane_at_infinity`` is then the least singular vector of (5.59): joints keep the heights ``a @ M`` that
     it gives, but parallelism must not be read from it.
     """
@@ -160,7 +161,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
 
 
 class ModelFileError(Exception):
-    """A model, or a model file, does not fit.
+    """A model, or a model file, is invalid.
 
     Attributes:
         path: the file, or ``"<model>"`` for a model in memory.
@@ -186,7 +187,7 @@ ALGEBRA_TOLERANCE = 1e-6
 
 
 def check_model(model: CellModel, path: Path | str = "<model>") -> None:
-    """Check shapes, finiteness and the algebra of a model.
+    """Check shapes, finiteness and algebraic constraints of a model. Raises ModelFileError.
 
     Raises ModelFileError naming the field, its value and what would have been valid.
     """
@@ -295,7 +296,7 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
 
 
 def _check_metric(model: CellModel, upgrade: FloatArray, path: Path | str) -> None:
-    """H_PE must bring the operators to Euclidean twists: a rotation's part skew, a translation's zero (5.56)."""
+    """Check that H_PE maps the operators to Euclidean twists: a rotation's part skew, a translation's zero (5.56)."""
     key = "projective_to_euclidean"
     values = np.linalg.svd(upgrade / max(float(np.abs(upgrade).max()), 1e-300), compute_uv=False)
     if not values[3] > RANK_TOLERANCE * values[0]:
@@ -315,7 +316,7 @@ def _check_metric(model: CellModel, upgrade: FloatArray, path: Path | str) -> No
 
 
 def _check_scene(model: CellModel, path: Path | str) -> None:
-    """Check the static points: ids of nothing on the arm, heights 1, covariances."""
+    """Check the static points: ids not on the arm, scales 1, covariances."""
     ids, points, covariances = model.scene_ids, model.scene_points, model.scene_covariances
     for marker in ids:
         if ids.count(marker) > 1:
@@ -373,8 +374,8 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
         for i, basis in enumerate(bases):
             where = f"covariance.{key}[{i}]"
             if basis.shape[1:] != shape:
-                wanted = ", ".join(str(n) for n in shape)
-                raise ModelFileError(path, where, f"has shape {basis.shape}; (p, {wanted}) is needed")
+                needed = ", ".join(str(n) for n in shape)
+                raise ModelFileError(path, where, f"has shape {basis.shape}; (p, {needed}) is needed")
             if not np.isfinite(basis).all():
                 raise ModelFileError(path, where, "has entries that are not finite")
             p += len(basis)
@@ -484,7 +485,7 @@ def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
 
 
 def _shaped(given: ModelCovariance) -> ModelCovariance:
-    """Empty lists of directions say nothing of their shape in JSON: give it back to them."""
+    """Restore the shape of empty lists of directions, which JSON does not keep."""
 
     def shaped(bases: tuple[FloatArray, ...], *shape: int) -> tuple[FloatArray, ...]:
         return tuple(basis if basis.size else np.zeros((0, *shape)) for basis in bases)
@@ -499,7 +500,7 @@ def _shaped(given: ModelCovariance) -> ModelCovariance:
 
 
 def save_model(model: CellModel, path: Path) -> None:
-    """Write a model file, whole or not at all. Raises ModelFileError, OSError."""
+    """Write a model file atomically. Raises ModelFileError, OSError."""
     write_atomically(path, encode_model(model))
 
 
@@ -513,7 +514,7 @@ def load_model(path: Path) -> CellModel:
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError where `write_atomically` cannot put a file: no such folder, or something else stands there."""
+    """Raise OSError where `write_atomically` cannot write a file: no such folder, or the path is not a file."""
     if not path.parent.is_dir():
         code = errno.ENOTDIR if path.parent.exists() else errno.ENOENT
         raise OSError(code, f"{os.strerror(code)}: a folder that exists is needed", str(path.parent))
@@ -530,7 +531,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` so that a reader, or a crash, sees the old file or the new one whole.
+    """Write ``data`` such that a reader, or a crash, leaves either the old file or the new one complete.
 
     Raises OSError, for a path that holds anything but a regular file, too: replacing a device would destroy it.
     """

@@ -38,7 +38,7 @@ def algebra(stratum: Stratum, kind: Kind) -> FloatArray:
     """Basis (a, 4, 4) of the Lie algebra that moves a joint of ``kind``: gl(4), aff(3), or that of the
     similarities.
 
-    Affine and metric algebras stand in a frame whose plane at infinity is (0, 0, 0, 1). Metric revolute
+    Affine and metric algebras are those of a frame whose plane at infinity is (0, 0, 0, 1). Metric revolute
     joints do without the scale: a scaling moves no axis that a translation does not, and Cayley's map of both
     at once leaves the group.
     """
@@ -93,7 +93,7 @@ def exponentials(generators: FloatArray, kinds: tuple[Kind, ...], q: FloatArray)
 def camera_basis(
     matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum
 ) -> FloatArray:
-    """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) that are no gauge.
+    """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) without gauge freedoms.
 
     ``other``: all but the matrix's own scale (11). ``right``: in addition without what a change of frame that
     keeps the left camera does: 4 freedoms in the projective (7 left), 1 in the affine and metric strata (10

@@ -1,4 +1,6 @@
-"""Quantities that any calibrated model has, whatever its stratum: what the images show of markers, axes and lenses."""
+"""Gauge-invariant quantities of a calibrated model: those of the images (markers, axes, lenses), and those of each
+stratum.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +31,23 @@ from stereoservo.numerics.arrays import FloatArray
 Values = Callable[[FramedModel], FloatArray]
 
 FARTHEST_LINE = 1e6
-"""Distance from the image's middle [image widths] up to which the image of an axis is told."""
+"""Distance from the image's middle [image widths] up to which the image of an axis is listed."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Quantities that are computed together: names with units, and their values (k,) of a framed model."""
+    """Quantities that are computed together: names with units, and a function of a framed model that returns their
+    values (k,).
+    """
 
     names: tuple[tuple[str, str], ...]
     values: Values
 
 
 def sights(model: CellModel, parts: FramedModel) -> Group:
-    """Raw pixels of the middle marker at the zero, and how each joint moves it (5.38)."""
+    """Quantities of the markers' images: raw pixels of the central marker at the zero, and how each joint moves it
+    (5.38).
+    """
     marker = _middle_marker(parts)
     label = f"marker {model.marker_ids[marker]}"
     names: list[tuple[str, str]] = []
@@ -65,19 +71,21 @@ def sights(model: CellModel, parts: FramedModel) -> Group:
 
 
 def sense_of(model: CellModel) -> float:
-    """-1 where the joints carry the cameras: `framed` tells generators as of an arm that carries the markers."""
+    """Sign of joint motion: -1 where the joints carry the cameras, since `framed` gives generators as of an arm
+    that carries the markers.
+    """
     return -1.0 if model.tip_first else 1.0
 
 
 def _middle_marker(parts: FramedModel) -> int:
-    """The marker nearest to the middle of the first camera's image of them."""
+    """Marker nearest to the centroid of the markers in the first camera's image."""
     pixels = project(parts.cameras[0], parts.points)
     return int(np.argmin(np.linalg.norm(pixels - pixels.mean(axis=0), axis=1)))
 
 
 def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
-    """Ideal images of the revolute axes at the zero: angle of the line in [0°, 180°) from u towards v, and how far to
-    the right of it, looking along it, the image's middle lies.
+    """Quantities of the revolute axes' ideal images at the zero: angle of the line in [0°, 180°) from u towards v,
+    and signed distance of the image's centre to its right.
     """
     groups = []
     for j, (joint, kind) in enumerate(zip(model.joint_names, model.joint_kinds, strict=True)):
@@ -111,7 +119,7 @@ def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
 
 
 def lenses(model: CellModel) -> list[Group]:
-    """Distortion where the model has any."""
+    """Quantities of lens distortion, where the model has any."""
     groups = []
     for c, camera in enumerate(model.cameras):
         if camera.lens[0] == 0.0:
@@ -152,7 +160,7 @@ def affine_quantities(model: CellModel, parts: FramedModel) -> list[Group]:
 
 
 def _spanning(parts: FramedModel, slides: list[int]) -> list[int]:
-    """The first three prismatic joints whose directions span space, or none."""
+    """First three prismatic joints whose directions span space, or none."""
     steps = parts.generators[slides, :3, 3]
     steps = steps / np.linalg.norm(steps, axis=1)[:, None]
     chosen: list[int] = []
@@ -167,7 +175,7 @@ def _spanning(parts: FramedModel, slides: list[int]) -> list[int]:
 
 
 def _coordinates(model: CellModel, parts: FramedModel, slides: list[int]) -> list[Group]:
-    """From the first marker to each other one, in units of three prismatic joints that span space."""
+    """Quantities: from the first marker to each other one, in units of three prismatic joints that span space."""
     basis = _spanning(parts, slides)
     if not basis or len(parts.points) < 2:
         return []
@@ -180,14 +188,14 @@ def _coordinates(model: CellModel, parts: FramedModel, slides: list[int]) -> lis
 
     def values(parts: FramedModel) -> FloatArray:
         steps = parts.generators[basis, :3, 3]
-        apart = parts.points[1:, :3] - parts.points[0, :3]
-        return np.asarray(np.linalg.solve(steps.T, apart.T).T.ravel(), dtype=np.float64)
+        offsets = parts.points[1:, :3] - parts.points[0, :3]
+        return np.asarray(np.linalg.solve(steps.T, offsets.T).T.ravel(), dtype=np.float64)
 
     return [Group(names, values)]
 
 
 def _heights(model: CellModel, parts: FramedModel, slides: list[int]) -> list[Group]:
-    """Of the markers above one another along a revolute axis, in units of a prismatic joint that leads out."""
+    """Quantities: heights of markers along a revolute axis, in units of a prismatic joint that is not normal to it."""
     turns = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
     if not turns or not slides or len(parts.points) < 2:
         return []
@@ -214,13 +222,15 @@ def _heights(model: CellModel, parts: FramedModel, slides: list[int]) -> list[Gr
 
 
 def _turning_plane(G: FloatArray) -> FloatArray:
-    """Normal covector (3,) of the planes in which an affine rotation turns: the left kernel of its 3x3 block."""
+    """Normal covector (3,) of the planes of an affine rotation: the left kernel of its 3x3 block."""
     result: FloatArray = np.linalg.svd(G[:3, :3].T)[2][2]
     return result
 
 
 def _parallel_axes(model: CellModel, parts: FramedModel) -> list[Group]:
-    """Of three parallel revolute axes in a row: ratio of their distances, and the angle at the middle one."""
+    """Quantities of three successive parallel revolute axes: ratio of their distances, and the angle at the middle
+    one.
+    """
     turns = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
     groups = []
     for three in zip(turns, turns[1:], turns[2:], strict=False):
@@ -256,7 +266,7 @@ def _fixed_point(G: FloatArray) -> FloatArray:
 
 
 def _plane_arm(G: FloatArray, other: FloatArray) -> FloatArray:
-    """From the axis of ``G`` to that of ``other`` (2,), in a frame of the turning plane that the rotation keeps square.
+    """Vector (2,) from the axis of ``G`` to that of ``other``, in an orthonormal frame of the plane of rotation.
 
     ``A³ = -A``: ``-A²`` projects along the axis, and ``e``, ``A e`` are square to each other and of one length.
     """
@@ -297,7 +307,9 @@ def _vergence(model: CellModel, c: int) -> Group:
 
 
 def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]:
-    """Of successive axes; where two revolute ones are nearly parallel, the two small angles of Hayati, with a sign."""
+    """Quantities: angles of successive axes; of nearly parallel revolute ones the two small signed angles of
+    Hayati.
+    """
     two = [
         link.link == "parallel" and kind == "revolute"
         for link, kind in zip(links, model.joint_kinds, strict=True)
@@ -320,7 +332,9 @@ def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]
 
 
 def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]) -> Group:
-    """Common normals, offsets along axes, baselines, marker distances, prismatic units, over the largest of the arm."""
+    """Quantities: common normals, offsets along axes, baselines, marker distances, prismatic units, over the arm's
+    largest length.
+    """
     named = _named_lengths(model, parts, links)
     measured = _measured_lengths(parts, links)
     usable = [
@@ -342,7 +356,7 @@ def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
 def _named_lengths(
     model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
 ) -> list[tuple[str, bool]]:
-    """Name of each measured length and whether it is the arm's; an empty name: set by convention."""
+    """Name of each measured length and whether it is the arm's; an empty name where a convention sets it."""
     chosen_of = chosen_columns(axes_at_origin(parts), links)
     names: list[tuple[str, bool]] = []
     for j, joint in enumerate(model.joint_names):

@@ -1,4 +1,4 @@
-"""The screw picture of visual servoing (8.2): camera, hand, tool and base screws, their transfer, joint velocities.
+"""Screws of camera, hand, tool and base, their transfer between links, and joint velocities from them (8.2).
 
 A screw is the velocity of a rigid motion: the vector ``(v, w)`` [m/s, rad/s] in a Euclidean frame, ``v`` the velocity
 of what passes the frame's origin; or the operator ``T̂ = [[w]ₓ v; 0 0]``, (4, 4), of which the conjugate ``Ĥ`` exists in
@@ -33,11 +33,11 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
 TWIST_TOLERANCE = 1e-4
-"""What an operator may leave beside a Euclidean twist, relative to it, before it is said to be in another frame."""
+"""What an operator may leave beside a Euclidean twist, relative to it, before it counts as one of another frame."""
 
 
 class Screw(NamedTuple):
-    """``v`` (3,) [m/s] and ``w`` (3,) [rad/s] of a Euclidean frame."""
+    """A velocity screw: ``v`` (3,) [m/s] and ``w`` (3,) [rad/s] of a Euclidean frame."""
 
     v: FloatArray
     w: FloatArray
@@ -55,15 +55,15 @@ def point_interaction(S: FloatArray, moving_camera: bool = False) -> FloatArray:
 
 
 def screw_of_points(S: FloatArray, S_dot: FloatArray, moving_camera: bool = False) -> Screw:
-    """The screw that moves points ``(k, 3)`` [m] at velocities ``(k, 3)`` [m/s] best, k >= 3 (8.15).
+    """Least-squares screw of points ``(k, 3)`` [m] with velocities ``(k, 3)`` [m/s], k >= 3 (8.15).
 
     Raises GeometryError for fewer than three points, and where they lie on one line, about which a turn is not seen.
     """
     S, rates = _finite("points", S), _finite("velocities", S_dot)
     if len(S) < 3:
         raise GeometryError("too_few", f"{len(S)} points; three fix a screw", points=len(S))
-    spread = np.linalg.svd(S - S.mean(axis=0), compute_uv=False)
-    if not spread[1] > 1e-9 * max(float(spread[0]), float(np.abs(S).max())):
+    singular = np.linalg.svd(S - S.mean(axis=0), compute_uv=False)
+    if not singular[1] > 1e-9 * max(float(singular[0]), float(np.abs(S).max())):
         raise GeometryError("degenerate", "the points lie on one line; a turn about it moves none of them")
     J = point_interaction(S, moving_camera).reshape(-1, 6)
     vector = np.asarray(np.linalg.lstsq(J, rates.ravel(), rcond=None)[0], dtype=np.float64)
@@ -83,7 +83,7 @@ def screw_operator(screw: Screw) -> FloatArray:
 
 
 def operator_screw(T: FloatArray, tolerance: float = TWIST_TOLERANCE) -> Screw:
-    """The screw of a Euclidean operator ``T̂`` (4, 4). Raises GeometryError where it is none: it is in another frame."""
+    """Screw of a Euclidean operator ``T̂`` (4, 4). Raises GeometryError where the operator is not Euclidean."""
     w, v = twist_vectors(T, tolerance)
     return Screw(v, w)
 
@@ -103,12 +103,12 @@ def hand_from_camera(H_HC: FloatArray, camera: FloatArray) -> FloatArray:
 
 
 def hand_from_tool(H_HL: FloatArray, H_LC: FloatArray, camera: FloatArray) -> FloatArray:
-    """``T̂_H = T_HL (T_LC(t) T̂_C T_LC⁻¹(t)) T_HL⁻¹`` (..., 4, 4) (8.18): through the tool that the camera sees."""
+    """``T̂_H = T_HL (T_LC(t) T̂_C T_LC⁻¹(t)) T_HL⁻¹`` (..., 4, 4) (8.18): through a tool that the camera observes."""
     return conjugate(H_HL, conjugate(H_LC, camera))
 
 
 def hand_from_base(H_HB: FloatArray, base: FloatArray) -> FloatArray:
-    """``T̂_H = T_HB(Q) T̂_B T_HB⁻¹(Q)`` (..., 4, 4) (8.19): along the arm as it stands."""
+    """``T̂_H = T_HB(Q) T̂_B T_HB⁻¹(Q)`` (..., 4, 4) (8.19): along the arm at its present configuration."""
     return conjugate(H_HB, base)
 
 
@@ -119,10 +119,10 @@ def base_from_hand(H_HB: FloatArray, hand: FloatArray) -> FloatArray:
 
 
 def seen_from_other_end(operators: FloatArray, H_other_from_this: FloatArray) -> FloatArray:
-    """The joints' operators (n, 4, 4) as they move what stands at one end, for cameras that stand at the other.
+    """Joint operators (n, 4, 4) of the motion of one end of the arm relative to cameras at the other end.
 
     ``operators`` at the present configuration, in the frame of this end; ``H_other_from_this`` (4, 4) the present link.
-    What moved by ``Ĥ_j`` now stands, and the world moves by ``−Ĥ_j``. The composition turns with it: BASE_FIRST for
+    What moved by ``Ĥ_j`` is now static, and the world moves by ``−Ĥ_j``. The composition is reversed: BASE_FIRST for
     TIP_FIRST.
     """
     return -conjugate(H_other_from_this, operators)
@@ -151,7 +151,7 @@ def joint_velocity(operators: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 class StratumError(ValueError):
-    """A model cannot tell Cartesian velocities.
+    """The model's stratum does not determine Cartesian velocities.
 
     Attributes: stratum: of the model. missing: what would make it able to.
     """
@@ -203,7 +203,7 @@ def base_link(poses: FloatArray, displacements: FloatArray) -> BaseLink:
     """The link from the model's frame, of any stratum, to the robot's base, from poses that the robot reports.
 
     ``poses`` (k, 4, 4): base from hand [m]; ``displacements`` (k, 4, 4): of the marker body from some zero, in the
-    model's frame, normalised, at the same stops: cameras stand, k >= 3 with turns about two axes. With
+    model's frame, normalised, at the same stops: static cameras, k >= 3 with rotations about two axes. With
     ``B_i = T_i T_0⁻¹`` and ``D_i = H_i H_0⁻¹`` the link fulfils ``H_base D_i = B_i H_base``: linear in it and, where
     the turns are not all about parallel axes, with one solution up to its factor, Euclidean and in metres whatever the
     model's stratum was. ``residual``: rms of the equations at ``|H_base| = 1``. Raises GeometryError naming what is
@@ -233,7 +233,8 @@ def base_link(poses: FloatArray, displacements: FloatArray) -> BaseLink:
 def cartesian_velocity(
     operators: FloatArray, velocity: FloatArray, H_frame: FloatArray, tolerance: float = TWIST_TOLERANCE
 ) -> Screw:
-    """``(v, w)`` [m/s, rad/s] in a Euclidean frame of what joint velocities ``velocity`` (n,) do to the marker body.
+    """Screw ``(v, w)`` [m/s, rad/s] of the marker body, in a Euclidean frame, at joint velocities ``velocity``
+    (n,).
 
     ``operators`` (n, 4, 4) in the model's frame; ``H_frame`` (4, 4) from it to the frame of the command:
     `camera_frame`, ``base_link(...).H_base``, or ``T_HB @ H_base`` for the hand's. For cameras in the hand
@@ -245,12 +246,13 @@ def cartesian_velocity(
 
 
 def command_operators(H_frame: FloatArray, centre: FloatArray | None = None) -> FloatArray:
-    """Operators (6, 4, 4) in the model's frame of the six unit commands ``v_x … w_z`` of a robot that takes ``(v, w)``.
+    """Operators (6, 4, 4), in the model's frame, of the six unit commands ``v_x … w_z`` of a robot that takes ``(v,
+    w)``.
 
     ``H_frame`` (4, 4) as for `cartesian_velocity`; ``centre`` (3,) [m] in the command's frame: the point about which it
     turns, its origin if None (robots that turn about the tool's point give it at every step). They are an arm with
-    ``Composition.SIMULTANEOUS``. With commands in a frame that stands, and about its origin, they stay; in the hand's
-    frame ``H_frame`` moves with the hand.
+    ``Composition.SIMULTANEOUS``. With commands in a static frame, and about its origin, they are constant; in the
+    hand's frame ``H_frame`` moves with the hand.
     """
     units = np.eye(3)
     point = np.zeros(3) if centre is None else np.asarray(centre, dtype=np.float64)
@@ -263,7 +265,7 @@ def command_operators(H_frame: FloatArray, centre: FloatArray | None = None) -> 
 
 
 def tool_frame(markers: FloatArray, H_frame: FloatArray) -> FloatArray:
-    """A frame allocated onto three markers ``(3, 4)`` of the tool: ``T_frame_tool`` (4, 4) from tool coordinates.
+    """Frame defined by three markers ``(3, 4)`` of the tool: ``T_frame_tool`` (4, 4) from tool coordinates.
 
     Origin in the first, x towards the second, the third in the xy plane with y > 0; in the Euclidean frame of
     ``H_frame`` (4, 4). With the pose ``T_BH`` of the hand ``T_HL = T_BH⁻¹ T_BL`` is the tool-hand link, which stays

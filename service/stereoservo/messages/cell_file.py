@@ -46,7 +46,7 @@ class JointsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One ``[[camera]]``. ``mobile``: it may be moved at any time, and is adjusted to the arm while it moves."""
+    """One ``[[camera]]``. ``mobile``: may be moved at any time, and is re-estimated while it moves."""
 
     name: Name
     driver: str
@@ -58,7 +58,8 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[scene]``: ``static``, marker ids that stand still for good: of nothing that the arm moves (a plate on a wall).
+    """``[scene]``: ``static``, ids of markers that never move (e.g. a plate on a wall) and that the arm does not
+    carry.
 
     Calibration triangulates them; a camera that is bumped is known, and re-anchored, by them.
     """
@@ -107,7 +108,7 @@ class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[safety.contact]``: collision detection by joint efforts and following errors.
 
-    ``effort`` [as the driver tells it] and ``following`` [rad or m]: thresholds by joint, in place of those that the
+    ``effort`` [as the driver reports it] and ``following`` [rad or m]: thresholds by joint, in place of those that the
     calibration's motions have taught. These are ``factor`` times what was seen there. A stop takes ``samples`` joint
     samples beyond the threshold, one after the other.
     """
@@ -135,7 +136,8 @@ class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``calibration.spread``: at each stop of the joints before ``joint``, that joint visits several positions.
+    """``calibration.spread``: at each stop of the joints before ``joint``, that joint is measured at several
+    positions.
 
     A flat plate so becomes a body in space: 4 dots at 4 positions are 16 points (thesis fig. 5.16). The positions are
     ``base ± range``, equally apart; ``range`` [rad or m] defaults to ``calibration.range`` of that joint, or 0.6 rad,
@@ -259,7 +261,7 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
 
 
 def _check_numbers(value: Any, key: str, path: Path | str) -> None:
-    """No number may be infinite, NaN or too large to carry: an infinite time-out is a time-out switched off."""
+    """Check that no number is infinite, NaN or too large: an infinite time-out would be a disabled time-out."""
     if isinstance(value, dict):
         for name, item in value.items():
             _check_numbers(item, f"{key}.{name}" if key else str(name), path)
@@ -317,7 +319,9 @@ def _check_limits(cell: CellFile, path: Path | str) -> None:
 
 
 def _check_value(key: str, joint: str, value: Any, cell: CellFile, path: Path | str) -> None:
-    """One value for a joint against its limits: a configuration, a range of trial motion, a side of a keep-out."""
+    """Check one value of a joint against its limits: a configuration, a range of trial motion, a bound of a
+    keep-out.
+    """
     limit = next(limit for limit in cell.safety.limit if limit.joint == joint)
     margin = cell.safety.position_margin
     low, high = limit.min + margin, limit.max - margin
@@ -395,13 +399,17 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
 
 
 def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:
-    """The values of a key that takes one of a few words."""
+    """Valid values of a key that takes one of a few words."""
     if section is None:
         return []
     info = msgspec.inspect.type_info(section)
     assert isinstance(info, msgspec.inspect.StructType)
-    wanted = next((field.type for field in info.fields if field.encode_name == name), None)
-    return [str(word) for word in wanted.values] if isinstance(wanted, msgspec.inspect.LiteralType) else []
+    field_type = next((field.type for field in info.fields if field.encode_name == name), None)
+    return (
+        [str(word) for word in field_type.values]
+        if isinstance(field_type, msgspec.inspect.LiteralType)
+        else []
+    )
 
 
 _SECTIONS: dict[str, type[msgspec.Struct]] = {

@@ -11,9 +11,9 @@ Status = Literal["holds", "drifting", "recalibrate"]
 
 
 class FoundCause(msgspec.Struct, frozen=True):
-    """Something that changed. ``ratio``: twice the log of its likelihood ratio, chi-square with ``freedoms`` where
+    """A detected change. ``ratio``: twice the log of its likelihood ratio, chi-square with ``freedoms`` where
     nothing changed. ``effect_px``: rms change of the pixels. ``value``, ``deviation``: drift of a joint's zero
-    [rad or m]; of a camera or body the angle it turned [rad].
+    [rad or m]; of a camera or body the rotation angle [rad].
     """
 
     kind: Literal["camera", "cameras", "body", "marker", "joint", "unexplained"]
@@ -27,8 +27,8 @@ class FoundCause(msgspec.Struct, frozen=True):
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """A cause taken by itself, whether significant or not, for the trend: parameters (q,), the upper triangle of their
-    information (q (q + 1) / 2,), and the rms change of the pixels that they make [px].
+    """Estimate of one cause by itself, significant or not, for the trend: parameters (q,), the upper triangle of
+    their information (q (q + 1) / 2,), and the rms change of the pixels that they make [px].
     """
 
     kind: CauseKind

@@ -20,7 +20,7 @@ class DirectoryError(Exception):
 
 @dataclass(frozen=True)
 class CellDirectories:
-    """The two directories of one cell."""
+    """Runtime and state directory of one cell."""
 
     cell: str
     runtime: Path
@@ -48,7 +48,7 @@ class CellDirectories:
 
     @property
     def journal(self) -> Path:
-        """Goals and faults, one JSON object a line."""
+        """Journal of goals and faults, one JSON object a line."""
         return self.state / "journal.jsonl"
 
     @property
@@ -58,12 +58,12 @@ class CellDirectories:
 
     @property
     def daemon_lock(self) -> Path:
-        """Held by the supervisor."""
+        """Lock file that the supervisor holds."""
         return self.runtime / "daemon.lock"
 
     @property
     def servo_lock(self) -> Path:
-        """Held by the servo process."""
+        """Lock file that the servo process holds."""
         return self.runtime / "servo.lock"
 
     @property
@@ -136,7 +136,7 @@ def cell_directories(cell: str) -> CellDirectories:
 
 
 def create_directories(directories: CellDirectories) -> None:
-    """Make both, readable by their owner only. Raises DirectoryError."""
+    """Create both directories, readable by their owner only. Raises DirectoryError."""
     _private(directories.runtime.parent, RUNTIME_VARIABLE)
     _private(directories.runtime, RUNTIME_VARIABLE)
     for path in (directories.state, directories.models, directories.recordings):

@@ -1,4 +1,4 @@
-"""Running daemons: how to find them, and how to start one as a child process."""
+"""Discovery of running daemons, and a daemon as a child process."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class NotRunningError(Exception):
 
 
 class DaemonError(Exception):
-    """A daemon that was started did not come up; carries its exit code and what it said."""
+    """A daemon that was started did not come up; carries its exit code and its output."""
 
     def __init__(self, message: str, code: int | None, output: str) -> None:
         super().__init__(message)
@@ -61,7 +61,7 @@ def daemon_info(directories: CellDirectories) -> DaemonInfo | None:
 
 
 def live_cells() -> list[DaemonInfo]:
-    """All daemons of this user that are up."""
+    """All running daemons of this user."""
     root = runtime_root()
     if not root.is_dir():
         return []
@@ -117,7 +117,7 @@ class DaemonProcess:
                 stream.close()
 
     def wait_ready(self, timeout_s: float = 600.0) -> DaemonInfo:
-        """Wait until it takes requests. Raises DaemonError with what it said."""
+        """Wait until it accepts requests. Raises DaemonError with its output."""
         until = time.monotonic() + timeout_s
         while time.monotonic() < until:
             code = self.process.poll()
@@ -136,7 +136,7 @@ class DaemonProcess:
         return self._log.read_text(errors="replace").strip() if self._log is not None else ""
 
     def stop(self, how: signal.Signals = signal.SIGTERM, timeout_s: float = 20.0) -> int:
-        """End it in good order; gives its exit code. Idempotent."""
+        """Terminate it in good order; returns its exit code. Idempotent."""
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:

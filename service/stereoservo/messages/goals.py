@@ -57,7 +57,7 @@ class PointTarget(msgspec.Struct, frozen=True, tag="points", tag_field="kind", f
 class DisplacementTarget(
     msgspec.Struct, frozen=True, tag="displacement", tag_field="kind", forbid_unknown_fields=True
 ):
-    """A displacement of the marker body from where it is: 4x4, row-major, projective, current -> goal.
+    """A displacement of the marker body from its present pose: 4x4, row-major, projective, current -> goal.
 
     Either in the frame of the model of ``model_epoch``, or in the projective basis of five markers ``basis`` of the
     body, no four of them in a plane: in the coordinates in which these are e1 … e4 and (1, 1, 1, 1) now, so that no
@@ -70,10 +70,10 @@ class DisplacementTarget(
 
 
 class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", forbid_unknown_fields=True):
-    """A goal that was shown before, by its name.
+    """A taught goal, by its name.
 
     ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
-    relative to the ``common`` markers that stand on the workpiece, which may have moved since. ``"cameras"``: the
+    relative to the ``common`` markers on the workpiece, which may have moved since. ``"cameras"``: the
     ``common`` markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen
     when it was taught and now; empty: all that are both.
     """
@@ -90,7 +90,7 @@ class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", f
 
 
 class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A point, line or plane: the span of one, two or three points, given in exactly one way.
+    """A point, line or plane: the span of one, two or three points, specified in exactly one way.
 
     ``markers``: of the moving body, as they move. ``points``: homogeneous, in the frame of the goal's ``model_epoch``.
     ``pixels``: for each of two or more cameras the points' raw pixels, where they are.
@@ -107,7 +107,7 @@ IncidenceKind = Literal[
 
 
 class IncidenceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``moving`` (of the body) shall lie on ``fixed`` (in the scene) (2.5.3)."""
+    """Incidence constraint: ``moving`` (of the body) shall lie on ``fixed`` (in the scene) (2.5.3)."""
 
     kind: IncidenceKind
     moving: Feature
@@ -117,7 +117,8 @@ class IncidenceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class IncidenceTarget(
     msgspec.Struct, frozen=True, tag="incidence", tag_field="kind", forbid_unknown_fields=True
 ):
-    """Incidences; the other freedoms are left alone, or given to ``secondary`` in their null space.
+    """Incidence constraints; the remaining degrees of freedom stay free, or serve ``secondary`` in their null
+    space.
 
     ``secondary``: joint positions, or set-points, approached as far as the incidences allow.
     """
@@ -132,7 +133,7 @@ StreamedTarget = FeatureTarget | PointTarget
 
 
 class Centre(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The point of the body that moves on a straight line, in exactly one way.
+    """Point of the body that moves on a straight line, specified in exactly one way.
 
     ``markers``: their affine middle. ``point``: homogeneous, where it is now in the frame of the model of
     ``model_epoch``, moving with the body.
@@ -144,7 +145,8 @@ class Centre(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AdaptiveGain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``λ(e) = (near − far) exp(−slope·e / (near − far)) + far``: ``near`` at no error, ``far`` at a large one [1/s].
+    """Adaptive gain ``λ(e) = (near − far) exp(−slope·e / (near − far)) + far``: ``near`` at no error, ``far`` at a
+    large one [1/s].
 
     ``slope`` [1/s per 100 px]: how fast it falls from ``near``.
     """
@@ -155,7 +157,7 @@ class AdaptiveGain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A goal as a client states it. What is None takes the cell's default.
+    """A goal as a client states it; for fields that are None the cell's default applies.
 
     ``lease_s``: the goal is aborted when no renewal arrives for so long (None: no lease). ``tolerance_px``: largest
     pixel distance over visible markers and cameras, held ``hold_frames`` frames. ``speed_scale`` may only lower.
@@ -233,7 +235,7 @@ class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command",
     """Move the set-points of the active goal: a moving target, streamed at 30 to 200 Hz. It also renews the lease.
 
     ``stamp_s``: the client's time of this set-point; from two of them the target's velocity is fed forward. None: the
-    time of arrival stands in.
+    time of arrival is used.
     """
 
     id: GoalId
@@ -244,7 +246,7 @@ class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command",
 class AcknowledgeGoal(
     msgspec.Struct, frozen=True, tag="acknowledge", tag_field="command", forbid_unknown_fields=True
 ):
-    """A reached goal with ``acknowledge_s`` may be left: the queue goes on."""
+    """Release a reached goal with ``acknowledge_s``, so that the queue continues."""
 
     id: GoalId
 
@@ -295,9 +297,10 @@ class Calibrate(
 ):
     """Run the trial motions of the cell file and fit a model.
 
-    ``check``: run the short check motion instead, and say whether the model still holds. ``lease_s``: the motion ends
-    when no renewal arrives for so long (None: no lease); the fit that follows it needs no client. ``reset_zeros``, with
-    ``check``: where the zeros of joints have drifted, and nothing else, make a model with moved zeros.
+    ``check``: run the short check motion instead, and report whether the model still holds. ``lease_s``: the motion
+    ends when no renewal arrives for so long (None: no lease); the fit that follows it needs no client.
+    ``reset_zeros``, with ``check``: where the zeros of joints have drifted, and nothing else, make a model with
+    moved zeros.
     """
 
     id: GoalId
@@ -307,7 +310,7 @@ class Calibrate(
 
 
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbid_unknown_fields=True):
-    """Store what the cameras see now, averaged over ``frames`` frames a camera, as a goal named ``name``.
+    """Store the current observations, averaged over ``frames`` frames a camera, as a goal named ``name``.
 
     ``tool``: the markers by which the goal is meant, features of the tool rather than the hand's own; three or more.
     The gateway keeps them; to the core they mean nothing.
@@ -321,7 +324,7 @@ class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbi
 class ReanchorRefused(
     msgspec.Struct, frozen=True, tag="reanchor_refused", tag_field="command", forbid_unknown_fields=True
 ):
-    """The fit's answer to the event ``reanchor`` where it cannot find the cameras: what is suspended stays so.
+    """Reply of the fit to the event ``reanchor`` where it cannot relocalize the cameras; they stay suspended.
 
     From the process that fits; no client may send it.
     """
@@ -352,7 +355,7 @@ Command = (
 
 
 class Request(msgspec.Struct, frozen=True):
-    """A command on its way to the core: answered by exactly one reply event with the same ``request`` number."""
+    """A command for the core: answered by exactly one reply event with the same ``request`` number."""
 
     request: int
     operator: str

@@ -1,4 +1,4 @@
-"""The zenoh key space ``stereoservo/v1/<cell>/…``; names in it are checked, since zenoh accepts nearly any key."""
+"""The zenoh key space ``stereoservo/v1/<cell>/…``, with checks of the names in it (zenoh accepts nearly any key)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class InvalidKeyError(ValueError):
 
 
 def check_name(kind: str, name: str) -> str:
-    """``name`` itself where it may stand in a key. Raises InvalidKeyError."""
+    """``name`` itself where it is valid in a key. Raises InvalidKeyError."""
     if not NAME.fullmatch(name):
         raise InvalidKeyError(
             f"{kind} {name!r}: letters, digits, '_' and '-' are valid, up to 64, a letter or digit first"
@@ -40,7 +40,7 @@ def check_name(kind: str, name: str) -> str:
 
 
 class KeySpace:
-    """The keys of one cell. Raises InvalidKeyError for names that cannot stand in a key."""
+    """Keys of one cell. Raises InvalidKeyError for names that are invalid in a key."""
 
     def __init__(self, cell: str) -> None:
         self.prefix = f"{ROOT}/{check_name('cell', cell)}"

@@ -1,4 +1,6 @@
-"""File locks (``flock``): one daemon per cell, one per hardware channel; the kernel releases them at its death."""
+"""File locks (``flock``): one daemon per cell, one per hardware channel; the kernel releases them when the holder
+dies.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +16,10 @@ CHANNEL_OPTIONS = ("channel", "device", "port", "source", "address")
 
 
 class AlreadyRunningError(Exception):
-    """Somebody else holds a lock.
+    """Another process holds the lock.
 
     Attributes:
-        what: what the lock stands for.
+        what: what the lock protects.
         pid: its holder, 0 where unknown.
         path: the lock file.
     """
@@ -47,7 +49,7 @@ class FileLock:
         os.pwrite(self._fd, b"%d\n" % os.getpid(), 0)
 
     def release(self) -> None:
-        """Let go. The file stays: unlinking it would race with the next holder. Idempotent."""
+        """Release the lock. The file stays: unlinking it would race with the next holder. Idempotent."""
         if self._fd >= 0:
             os.ftruncate(self._fd, 0)
             os.close(self._fd)

@@ -1,4 +1,4 @@
-"""The struct `Reason`: why the arm is slow, held or faulted, as code, value, threshold, unit and a hint in words."""
+"""The struct `Reason`: why the arm is slow, held or in fault, as code, value, threshold, unit and a hint as text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Reason(msgspec.Struct, frozen=True):
     """One entry of the status set.
 
     ``code`` is stable and machine-readable, e.g. ``JOINT_LIMIT``; ``subject`` names the joint, camera or marker;
-    ``value`` and ``threshold`` are in ``unit``; ``hint`` tells the person at the cell how to leave.
+    ``value`` and ``threshold`` are in ``unit``; ``hint`` is a remedy for the operator.
     """
 
     code: str

@@ -29,7 +29,7 @@ class CameraHealth(msgspec.Struct, frozen=True):
     """Agreement of one camera's newest frame with the model.
 
     Chi-square per degree of freedom, rms innovation [px], the ``worst`` marker (-1: none) and its innovation.
-    ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``. ``timing``: in words, where the stamps are
+    ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``. ``timing``: as text, where the stamps are
     seen to be wrong.
     """
 

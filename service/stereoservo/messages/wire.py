@@ -67,7 +67,7 @@ COMMANDS: dict[str, type[Command]] = {
 
 
 class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", forbid_unknown_fields=True):
-    """Begin or end a flight recording. The gateway's own business: the core does not hear of it.
+    """Start or stop a flight recording. Handled by the gateway, not forwarded to the core.
 
     ``images``: with what the cameras deliver, in the directory ``NAME.images`` beside the recording ``NAME.mcap``.
     """
@@ -79,7 +79,7 @@ class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", for
 class Synthesise(
     msgspec.Struct, frozen=True, tag="synthesise", tag_field="command", forbid_unknown_fields=True
 ):
-    """Make the goal ``name`` from drawings. The gateway's own business: the core does not hear of it.
+    """Make the goal ``name`` from CAD drawings. Handled by the gateway, not forwarded to the core.
 
     ``workpiece``, ``tool``: marker -> (x, y, z) in the coordinates of either's drawing, one unit of length for both.
     ``pose`` 4x4, row-major: from the tool's drawing to the workpiece's, in the position of alignment. The workpiece's
@@ -93,7 +93,7 @@ class Synthesise(
 
 
 class MessageError(ValueError):
-    """A message cannot be sent or taken: names the place in it, the value and what would have been valid."""
+    """An invalid message: names the place in it, the value and what would have been valid."""
 
 
 class JointInfo(msgspec.Struct, frozen=True):
@@ -201,14 +201,14 @@ class StateMessage(msgspec.Struct, frozen=True):
     notes: tuple[str, ...] = ()
     """Remarks for the cell's keeper, on a damaged model file for instance."""
     progress: float | None = None
-    """Of the active goal's way, 0 to 1, where it is known."""
+    """Path parameter of the active goal, 0 to 1, where it is known."""
     seconds_left: float | None = None
     efforts: dict[str, float] = {}
-    """As the drives tell them [N m or N, or shares of the rated torque]; empty where they do not."""
+    """As the drives report them [N m or N, or shares of the rated torque]; empty where they do not."""
     following_errors: dict[str, float] = {}
     """Set less actual position [rad or m]."""
     effort_limits: dict[str, float] = {}
-    """How far efforts may go from their moving mean before the arm stops for a contact; absent where nobody knows."""
+    """How far efforts may go from their moving mean before the arm stops for a contact; absent where unknown."""
     following_limits: dict[str, float] = {}
     """How large following errors may become before the arm stops for a contact."""
     health: Health = Health()
@@ -232,7 +232,7 @@ class CalibrationResult(msgspec.Struct, frozen=True):
     """Result of a calibration. ``covariance_ok``: the residuals are what the measurement noise explains
     (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
     ``seconds``: what the fit took. ``report`` (a page), ``figures`` (for programs), ``trials``: files on the daemon's
-    host; the report is there once ``calibration_report`` was told.
+    host; the report is there once the event ``calibration_report`` was sent.
     """
 
     rms_px: float
@@ -257,7 +257,7 @@ class CalibrationResult(msgspec.Struct, frozen=True):
 
 
 class EventMessage(msgspec.Struct, frozen=True):
-    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal it speaks of."""
+    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal that it concerns."""
 
     seq: int
     boot: str
@@ -281,8 +281,8 @@ class EventMessage(msgspec.Struct, frozen=True):
 
 
 class EventList(msgspec.Struct, frozen=True):
-    """Answer to ``get …/event?from=N``: at most a few hundred; ``next`` is where to go on, ``first`` the
-    oldest kept.
+    """Reply to ``get …/event?from=N``: at most a few hundred; ``next`` is where to continue, ``first`` the oldest
+    kept.
     """
 
     boot: str
@@ -335,7 +335,7 @@ def schema(name: str, laws: Sequence[str]) -> bytes:
 
 
 def _list_laws(tree: Any, laws: list[str]) -> None:
-    """Add ``laws`` as the valid values, in place, wherever a schema holds the name of a law."""
+    """Insert ``laws`` as the valid values, in place, wherever a schema holds the name of a law."""
     if isinstance(tree, dict):
         if tree.get("title") == LAW_TITLE:
             tree["enum"] = laws
@@ -369,8 +369,7 @@ def require_finite(tree: Any, where: str = "") -> None:
 
 
 def decode(data: bytes, kind: type[_T]) -> _T:
-    """Take a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do
-    not.
+    """Decode a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do not.
 
     Raises MessageError, whatever the bytes: too large, not JSON, a number that is not finite, a field that does not
     fit.
@@ -383,7 +382,9 @@ def decode(data: bytes, kind: type[_T]) -> _T:
 
 
 def read(data: bytes, kind: type[_T]) -> _T:
-    """A message of the daemon's, as large as it is. Raises MessageError like :func:`decode`, whatever the bytes."""
+    """Decode a message of the daemon, without a size limit. Raises MessageError like :func:`decode`, whatever the
+    bytes.
+    """
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
@@ -393,7 +394,7 @@ def read(data: bytes, kind: type[_T]) -> _T:
 
 
 def _undecodable(error: Exception, data: bytes) -> str:
-    """Why ``data`` is not JSON."""
+    """Reason why ``data`` is not valid JSON."""
     if isinstance(error, RecursionError):
         return "payload is nested too deeply; a message has few levels"
     if isinstance(error, UnicodeDecodeError):
@@ -404,7 +405,7 @@ def _undecodable(error: Exception, data: bytes) -> str:
 
 
 def _misfit(error: str, data: bytes, kind: Any) -> str:
-    """A validation error with its place, the value that was given, and the words that would have been valid."""
+    """Validation error with its place, the given value, and the valid words."""
     text, _, where = error.partition(" - at `")
     if where.startswith("key` in `"):
         return f"a key of {where.removeprefix('key` in `$.').rstrip('`')}: {text}"
@@ -416,7 +417,7 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
         value: Any = msgspec.json.decode(data)
     except (
         Exception
-    ):  # what the typed decoder, which ends at the first misfit, did not reach; the place alone is told
+    ):  # values that the typed decoder, which ends at the first error, did not reach; only the place is named
         return f"{place}: {text}"
     for part in place.split("."):
         value = value.get(part) if isinstance(value, dict) and "[" not in part else None
@@ -429,7 +430,7 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
 
 @functools.cache
 def _valid_words() -> dict[str, tuple[str, ...]]:
-    """The values of those fields of a goal that take one of a few words, by the field's place in the message."""
+    """Valid values of those fields of a goal that take one of a few words, by the field's place in the message."""
     return {
         **{
             field.name: tuple(

@@ -1,4 +1,4 @@
-"""Types of the arrays that pass between modules."""
+"""Type aliases of numpy arrays."""
 
 from __future__ import annotations
 

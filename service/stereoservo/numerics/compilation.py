@@ -1,4 +1,4 @@
-"""How kernels are compiled: by numba, cached on disk, in exact arithmetic."""
+"""Decorator that compiles kernels with numba: cached on disk, without fastmath."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small linear algebra in numba: without BLAS, LAPACK or fastmath. Tested against numpy.
+"""Small dense linear algebra in numba: without BLAS, LAPACK or fastmath. Tested against numpy.
 
 Explicit loops in a fixed order: the same input gives the same bits on one machine. Arrays are float64.
 """
@@ -25,7 +25,7 @@ rounding.
 
 @kernel
 def cholesky_solve(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
-    """Solve ``N x = b`` for symmetric ``N`` (n, n), which is overwritten by its factor.
+    """Solve ``N x = b`` for symmetric positive ``N`` (n, n), which is overwritten by its Cholesky factor.
 
     Returns the smallest pivot over the largest diagonal; 0 (and ``x = 0``) where ``N`` is singular or not
     finite.
@@ -73,7 +73,7 @@ def cholesky_solve(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
 
 @kernel
 def add_equation(row: FloatArray, error: float, weight: float, N: FloatArray, b: FloatArray) -> None:
-    """One equation ``row·x = error`` of squared weight ``weight`` into the normal equations ``N x = b``.
+    """Add one equation ``row·x = error`` of squared weight ``weight`` to the normal equations ``N x = b``.
 
     ``row`` (n,); of ``N`` (n, n) the lower triangle is added to.
     """
@@ -88,7 +88,7 @@ def add_equation(row: FloatArray, error: float, weight: float, N: FloatArray, b:
 def add_pixel_equations(
     rows: FloatArray, u: float, v: float, weight: float, N: FloatArray, b: FloatArray
 ) -> None:
-    """`add_equation` for the two ``rows`` (2, n) of a pixel and its errors ``u``, ``v``."""
+    """Add the two equations of a pixel: `add_equation` for ``rows`` (2, n) and errors ``u``, ``v``."""
     for i in range(b.shape[0]):
         weighted_u, weighted_v = weight * rows[0, i], weight * rows[1, i]
         b[i] += weighted_u * u + weighted_v * v

@@ -30,7 +30,7 @@ class DriverError(Exception):
 
     Attributes:
         code: short machine-readable cause, e.g. ``"not_configured"``, ``"option"``, ``"connection_lost"``.
-        data: the values the message speaks of.
+        data: the values in the message.
         retry: whether the same call may succeed later without a change of configuration.
     """
 
@@ -42,7 +42,7 @@ class DriverError(Exception):
 
 
 class JointSpec(msgspec.Struct, frozen=True):
-    """A joint's name, kind and limits: those of the machine; the cell's can only be tighter."""
+    """A joint's name, kind and the machine's limits; the cell's own can only be tighter."""
 
     name: str
     kind: JointKindName
@@ -112,7 +112,7 @@ class JointState(msgspec.Struct, frozen=True, eq=False):
 
 
 class CommandReport(msgspec.Struct, frozen=True, eq=False):
-    """Joint velocities (n,) that were commanded (``asked``) and sent, and the reasons why they differ."""
+    """Joint velocities (n,) that were commanded (``asked``) and sent, with reasons for the difference."""
 
     seq: int
     t_ns: int
@@ -160,7 +160,7 @@ class Prior(msgspec.Struct, frozen=True, eq=False):
 
 @runtime_checkable
 class Clock(Protocol):
-    """The one source of time that drivers and the loop read."""
+    """Source of time of the drivers and the loop."""
 
     def now_ns(self) -> int:
         """Monotonic time [ns]."""
@@ -169,7 +169,7 @@ class Clock(Protocol):
 
 @dataclass(frozen=True)
 class DriverContext:
-    """The surroundings that a driver gets at construction, beside its own options.
+    """Context of a driver, given to its constructor beside its own options.
 
     ``camera``, ``mount``: of a camera driver or detector, as the cell file has them.
     """
@@ -187,7 +187,7 @@ class DriverContext:
 
 @runtime_checkable
 class JointDriver(Protocol):
-    """An arm. Constructed as ``Driver(options, context)``; the constructor connects to nothing."""
+    """Protocol of an arm. Constructed as ``Driver(options, context)``; the constructor does not connect."""
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
 
@@ -250,7 +250,9 @@ class ExaminableJointDriver(Protocol):
 
 @runtime_checkable
 class CameraDriver(Protocol):
-    """A camera. Constructed as ``Driver(options, context)`` with ``context.camera`` its name in the cell."""
+    """Protocol of a camera. Constructed as ``Driver(options, context)`` with ``context.camera`` its name in the
+    cell.
+    """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
 
@@ -280,10 +282,10 @@ class CameraDriver(Protocol):
 
 
 class CameraStatistics(msgspec.Struct, frozen=True):
-    """Counts of a camera driver since ``activate``: ``frames`` that its source gave, ``dropped`` ones that never
-    came (gaps of its sequence or its grid), ``frozen`` ones withheld since they repeat the one before, ``reconnects``.
+    """Counts of a camera driver since ``activate``: ``frames`` received, ``dropped`` ones that never arrived (gaps
+    of its sequence or its grid), ``frozen`` ones withheld because they repeat the previous one, ``reconnects``.
 
-    ``settings``: what the source was asked for and what it says it does, by name, e.g. ``{"exposure": (10.0, 12.0)}``.
+    ``settings``: requested and reported settings of the source by name, e.g. ``{"exposure": (10.0, 12.0)}``.
     """
 
     frames: int = 0
@@ -304,7 +306,7 @@ class CountingCameraDriver(Protocol):
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds markers in one camera's images. Constructed as ``Detector(options, context)``."""
+    """Protocol of a detector of markers in one camera's images. Constructed as ``Detector(options, context)``."""
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
 

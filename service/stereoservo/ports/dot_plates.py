@@ -3,8 +3,8 @@ printer.
 
 A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on
 the edge from corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly
-collinear, and the edge dot's fraction together with the two inner dots tells the faces apart. A detector
-may use the pattern of *one face* up to scale; how the faces are joined to a body is known to nobody but
+collinear, and the edge dot's fraction together with the two inner dots distinguishes the faces. A detector
+may use the pattern of *one face* up to scale; how the faces are joined to a body is known only to
 the simulation's truth.
 """
 
@@ -22,7 +22,7 @@ INNER = (5, 6)
 
 @dataclass(frozen=True, eq=False)
 class DotFace:
-    """One planar face.
+    """One planar face with seven dots.
 
     ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen
     from in front. Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids`` name the
@@ -73,7 +73,7 @@ WORKPIECE: tuple[DotFace, ...] = (
     seven_dots("c", 14, 0.44, ((0.46, 0.85), (0.83, 0.49)), side=0.048, radius=0.005, margin=0.012),
     seven_dots("d", 21, 0.56, ((0.49, 0.34), (0.85, 0.30)), side=0.048, radius=0.005, margin=0.012),
 )
-"""Two smaller faces for what stands beside the body, ids 14..20 and 21..27."""
+"""Two smaller faces for a workpiece beside the body, ids 14..20 and 21..27."""
 
 MORE: tuple[DotFace, ...] = (
     seven_dots("e", 28, 0.35, ((0.61, 0.17), (0.34, 0.78))),

@@ -1,6 +1,6 @@
 """Reader and writer of recorded images: ``NAME.avi`` (FFV1, gray, lossless) with stamps and CRCs in ``NAME.jsonl``.
 
-FFV1 with flipped bytes decodes silently into other pixels; the CRC of every frame's pixels is what tells. The sidecar
+FFV1 with flipped bytes decodes silently into other pixels; only the CRC of every frame's pixels shows it. The sidecar
 is JSON Lines: a header, a line a frame, written after its frame, and an end line, which a recording whose process was
 killed lacks. Such a recording is read as far as video and sidecar both go.
 """
@@ -30,7 +30,7 @@ LONGEST_LINE = 4096
 MOST_SURPLUS = 1000
 """Frames without a line are counted up to here."""
 SLOWEST_MS = 10_000
-"""A file that gives no frame for so long, one that goes on in a hole of gigabytes say, is taken to end there."""
+"""A file that gives no frame for so long, for example one with a hole of gigabytes, is taken to end there."""
 GIB = 1 << 30
 
 
@@ -53,7 +53,7 @@ class ImageFileError(Exception):
 
 
 class ImageHeader(msgspec.Struct, frozen=True, tag="header", tag_field="line"):
-    """First line. ``clock``: of the stamps; they compare with others of the same ``boot`` of the host only.
+    """First line of the sidecar. ``clock``: of the stamps, which compare only within the same ``boot`` of the host.
 
     ``width``, ``height``: of the pictures; the video's are rounded up to even numbers.
     """
@@ -84,7 +84,7 @@ class ImageLine(msgspec.Struct, frozen=True, tag="frame", tag_field="line", omit
 
 
 class ImageEnd(msgspec.Struct, frozen=True, tag="end", tag_field="line"):
-    """Last line of a recording that was closed: its frames, those left out in all, and why it ended."""
+    """Last line of a recording that was closed: number of frames, number left out, and why it ended."""
 
     frames: int
     left_out: int
@@ -93,7 +93,9 @@ class ImageEnd(msgspec.Struct, frozen=True, tag="end", tag_field="line"):
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """Limits at which a recording ends: size of the video, time between first and last frame, space left to others."""
+    """Limits at which a recording ends: size of the video, time between first and last frame, disk space to leave
+    free.
+    """
 
     max_bytes: int = 64 * GIB
     max_seconds: float = 4 * 3600.0
@@ -111,7 +113,9 @@ def crc_of(image: ImageArray) -> int:
 
 
 def boot_id() -> str:
-    """Which boot of this host the monotonic clock counts from; empty where the system does not tell."""
+    """Id of the host's current boot, from which the monotonic clock counts; empty where the system does not report
+    it.
+    """
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -124,7 +128,7 @@ def sidecar_of(video: Path) -> Path:
 
 
 class ImageWriter:
-    """Writes one camera's frames. Not for several threads at once.
+    """Writes one camera's frames. Not thread-safe.
 
     What was appended survives the end of the process, but for what the container's writer still holds: the last
     256 KiB of the video at most.
@@ -282,7 +286,7 @@ class ImageWriter:
         except OSError as error:
             raise ImageFileError(self.path, "disk", f"cannot be finished: {error.strerror}") from error
         finally:
-            with suppress(OSError):  # told already: by the line that could not be written
+            with suppress(OSError):  # reported already: by the line that could not be written
                 self._sidecar.close()
 
     def __enter__(self) -> ImageWriter:
@@ -376,7 +380,7 @@ class ImageReader:
         return Frame(self.header.camera, line.seq, line.t_shutter_ns, line.t_received_ns, pixels)
 
     def skip(self) -> ImageLine | None:
-        """Pass the next frame over unchecked; its line, None at the end. Raises ImageFileError (``sidecar``)."""
+        """Skip the next frame unchecked; returns its line, None at the end. Raises ImageFileError (``sidecar``)."""
         return self._next(decode=False)[0]
 
     def _next(self, *, decode: bool) -> tuple[ImageLine | None, ImageArray | None]:
@@ -477,7 +481,7 @@ class ImageReader:
 
 
 def _open_header(path: Path, video: Path) -> tuple[IO[bytes], ImageHeader]:
-    """The sidecar, past its first line. Raises ImageFileError (``no_sidecar``, ``foreign_sidecar``)."""
+    """The sidecar, positioned after its first line. Raises ImageFileError (``no_sidecar``, ``foreign_sidecar``)."""
     try:
         file = open(path, "rb")  # noqa: SIM115 - lives as long as the reader
     except FileNotFoundError as error:
@@ -509,7 +513,7 @@ def _open_header(path: Path, video: Path) -> tuple[IO[bytes], ImageHeader]:
 
 
 def image_lines(video: Path) -> Iterator[ImageLine]:
-    """The frames that the sidecar of a recording tells of, in order; the video is not looked at.
+    """Frames that a recording's sidecar lists, in order; the video is not read.
 
     Ends at the first line that is none: what comes before it holds. Raises ImageFileError (``no_sidecar``,
     ``foreign_sidecar``).

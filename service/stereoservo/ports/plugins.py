@@ -36,12 +36,12 @@ class Plugin:
 
 
 def names(group: str) -> tuple[str, ...]:
-    """Names of a group, sorted; imports nothing."""
+    """Names of a group's plug-ins, sorted; imports nothing."""
     return tuple(sorted({entry.name for entry in entry_points(group=group)}))
 
 
 def list_plugins(group: str, *, check: bool = False) -> list[Plugin]:
-    """All plug-ins of a group; ``check`` imports each and notes its error. Never raises for a broken one."""
+    """All plug-ins of a group; ``check`` imports each and reports its error. Never raises for a broken one."""
     found = []
     for entry in sorted(entry_points(group=group), key=lambda e: e.name):
         error = ""
@@ -55,7 +55,7 @@ def list_plugins(group: str, *, check: bool = False) -> list[Plugin]:
 
 
 def load(group: str, name: str) -> Any:
-    """Import one plug-in. Raises PluginError: unknown (lists what there is) or broken (gives its error)."""
+    """Import one plug-in. Raises PluginError: unknown (lists the known names) or broken (gives its error)."""
     matching = [entry for entry in entry_points(group=group) if entry.name == name]
     known = names(group)
     kind = group.rpartition(".")[2].replace("_", " ").removesuffix("s")

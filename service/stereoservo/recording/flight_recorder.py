@@ -1,4 +1,4 @@
-"""The flight recorder: writes step records and state checkpoints into an MCAP file."""
+"""Flight recorder: writes the servo loop's step records and state checkpoints into an MCAP file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FlightRecorder:
         self._add("header", header, 0)
 
     def write(self, message: RecordedStep | RecordedCheckpoint) -> None:
-        """Append what the servo loop sent, and the gap before it."""
+        """Append what the servo loop sent, with the gap before it."""
         if message.lost:
             self.gap(message.lost, message.t_ns)
         if isinstance(message, RecordedCheckpoint):

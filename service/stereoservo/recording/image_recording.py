@@ -29,7 +29,7 @@ ImageReport = Callable[[str, str, RecordedImages | None], None]
 
 @dataclass
 class _Recording:
-    """One recording: the queue of frames, under ``lock``, and the result once its thread has ended."""
+    """One recording: the queue of frames, guarded by ``lock``, and the result once its thread has ended."""
 
     number: int
     file: Path
@@ -50,7 +50,7 @@ class _Recording:
 class ImageRecorder:
     """Records one camera while a recording is requested. ``report(kind, message, images)`` is called with each result.
 
-    Never raises on what the disk or the camera does: a recording that cannot go on ends and is reported.
+    Never raises on what the disk or the camera does: a recording that cannot continue ends and is reported.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class ImageRecorder:
         self._recording: _Recording | None = None
 
     def take(self, delivered: list[Frame] | list[CameraObservation]) -> None:
-        """Queue what the camera delivered, copied; whatever the thread does, this takes no longer than the copy."""
+        """Queue a copy of the frames that the camera delivered; never waits for the thread."""
         recording = self._recording
         if recording is None:
             return
@@ -169,7 +169,7 @@ class ImageRecorder:
                         raise
                     continue
                 missing = 0
-        except Exception as error:  # a recording may fail in any way; the camera goes on
+        except Exception as error:  # a recording may fail in any way; the camera continues
             recording.failed, recording.why = True, str(error) or type(error).__name__
         finally:
             with recording.lock:
@@ -205,7 +205,7 @@ def _end(recording: _Recording) -> None:
 
 
 def _next(recording: _Recording) -> tuple[Frame, int] | None:
-    """The next frame that waits, with how many before it were left out; None once none will come."""
+    """Next queued frame, with the number left out before it; None once none will come."""
     with recording.lock:
         while not recording.waiting and not recording.ending:
             recording.lock.wait()

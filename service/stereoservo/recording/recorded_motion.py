@@ -32,7 +32,8 @@ class RestInterval:
 @dataclass(frozen=True)
 class RecordedMotion:
     """Steps (s,) of a recording: ``now_ns``, ``step`` number, ``asked``, whether the core commanded zero velocity;
-    joint samples (k,), (k, n) of their own times; ``calibration_ns``: when the last calibration was asked for, or -1.
+    joint samples (k,), (k, n) at their own times; ``calibration_ns``: time of the last request to calibrate, or
+    -1.
     """
 
     settings: CoreSettings
@@ -44,7 +45,7 @@ class RecordedMotion:
     calibration_ns: int
 
     def joints_at(self, t_ns: int) -> FloatArray | None:
-        """Joints (n,) at ``t_ns``, between two samples; None outside of the recording."""
+        """Joints (n,) at ``t_ns``, interpolated between two samples; None outside of the recording."""
         after = int(np.searchsorted(self.joint_ns, t_ns))
         if after == 0 or after == len(self.joint_ns):
             return None
@@ -102,15 +103,15 @@ def _calibrates(record: StepRecord) -> bool:
     )
 
 
-def rest_intervals(flight: RecordedMotion, settle_s: float) -> list[RestInterval]:
-    """The intervals at rest in order; from the last calibration's start on, where there was one.
+def rest_intervals(motion: RecordedMotion, settle_s: float) -> list[RestInterval]:
+    """Intervals at rest in order; only those after the last calibration's start, where there was one.
 
     An interval begins where zero velocity is commanded and needs ``settle_s`` to settle, as in the calibration motion.
     It ends where a joint moves all the same (by hand, for example); the remainder needs ``settle_s`` again.
     """
-    now, moving = flight.now_ns, _moving(flight)
-    still = flight.asked & (now >= flight.calibration_ns)
-    still[1:] &= (np.diff(flight.step) == 1) | ~still[:-1]  # where steps are missing, the arm may have moved
+    now, moving = motion.now_ns, _moving(motion)
+    still = motion.asked & (now >= motion.calibration_ns)
+    still[1:] &= (np.diff(motion.step) == 1) | ~still[:-1]  # where steps are missing, the arm may have moved
     found: list[RestInterval] = []
     k, count = 0, len(now)
     while k < count:
@@ -130,13 +131,13 @@ def rest_intervals(flight: RecordedMotion, settle_s: float) -> list[RestInterval
     return found
 
 
-def _moving(flight: RecordedMotion) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _moving(motion: RecordedMotion) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Whether some joint is faster than ``AT_REST`` at each step (s,)."""
     newest = np.clip(
-        np.searchsorted(flight.joint_ns, flight.now_ns, side="right") - 1, 0, len(flight.joint_ns) - 1
+        np.searchsorted(motion.joint_ns, motion.now_ns, side="right") - 1, 0, len(motion.joint_ns) - 1
     )
-    before = np.searchsorted(flight.joint_ns, flight.joint_ns[newest] - SPEED_OVER_NS, side="left")
-    span_s = np.maximum(flight.joint_ns[newest] - flight.joint_ns[before], 1) * 1e-9
-    speed = np.abs(flight.positions[newest] - flight.positions[before]).max(axis=1) / span_s
+    before = np.searchsorted(motion.joint_ns, motion.joint_ns[newest] - SPEED_OVER_NS, side="left")
+    span_s = np.maximum(motion.joint_ns[newest] - motion.joint_ns[before], 1) * 1e-9
+    speed = np.abs(motion.positions[newest] - motion.positions[before]).max(axis=1) / span_s
     fast: np.ndarray[tuple[int], np.dtype[np.bool_]] = (before < newest) & (speed > AT_REST)
     return fast

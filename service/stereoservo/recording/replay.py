@@ -1,4 +1,4 @@
-"""Replay of a flight recording: the recorded inputs through the same core, outputs compared bit for bit."""
+"""Replay of a flight recording: the recorded inputs through the same core, with the outputs compared bit for bit."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _cause(error: Exception, topic: str, recorded: Fingerprint | None) -> str:
 
 
 def _laws_of_goals(inputs: StepInputs, default: str) -> set[str]:
-    """Names of the laws that goals of this step are to be driven by."""
+    """Names of the laws of the goals that this step requests."""
     goals = [request.command.goal for request in inputs.requests if isinstance(request.command, RunGoal)]
     return {g.law or default for g in goals if not isinstance(g.target, JointTarget | IncidenceTarget)}
 

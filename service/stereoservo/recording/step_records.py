@@ -22,7 +22,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 
 class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
-    """Inputs of step ``step``, the velocity that came of it, and a CRC of all outputs."""
+    """Inputs of step ``step``, the resulting velocity, and a CRC of all outputs."""
 
     step: int
     inputs: StepInputs
@@ -32,7 +32,7 @@ class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
 
 
 class Fingerprint(msgspec.Struct, frozen=True):
-    """What bit-for-bit replay depends on."""
+    """Versions and platform on which bit-for-bit replay depends."""
 
     stereoservo: str
     python: str
@@ -132,7 +132,7 @@ StepMessage = RecordingStart | RecordedStep | RecordedCheckpoint
 
 
 class StepSink(Protocol):
-    """One connected recorder, as the servo loop sees it."""
+    """Protocol of one connected recorder."""
 
     def send(self, message: StepMessage) -> bool:
         """Hand a message over; False where the recorder cannot take it now."""
@@ -155,7 +155,7 @@ class StepStream:
         self.dropped = 0
 
     def before(self, sink: StepSink | None, core: ServoCore, now_ns: int) -> None:
-        """Begin where ``sink`` is a new recorder; send a checkpoint of ``core`` when one is due."""
+        """Begin the stream where ``sink`` is a new recorder; send a checkpoint of ``core`` when one is due."""
         if sink is not self._connected:
             self._connected = sink
             self._sink = sink if sink is not None and sink.send(self._start) else None
@@ -168,7 +168,7 @@ class StepStream:
                 self._since_checkpoint, self._lost = 0, 0
 
     def after(self, inputs: StepInputs, outputs: StepOutputs) -> None:
-        """Send the step."""
+        """Send the step's record."""
         if self._sink is None:
             return
         self._since_checkpoint += 1

@@ -1,4 +1,6 @@
-"""``bench calibration``: the fit of a thesis-sized problem, its cost an image, and a dense least squares beside it."""
+"""``bench calibration``: duration of a fit of the thesis's size, CPU time per image, and scipy's dense least
+squares as a baseline.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,7 @@ def run_calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict
 
 
 def _per_image(cell: SyntheticCell, seed: int, progress: ProgressCall) -> list[dict[str, float]]:
-    """CPU time of one fit over its number of images."""
+    """CPU time of one fit divided by its number of images."""
     rows = []
     for k, images in enumerate(IMAGES):
         stops = max(4, round(images / (len(cell.kinds) * len(cell.poses))))
@@ -87,7 +89,7 @@ def _per_image(cell: SyntheticCell, seed: int, progress: ProgressCall) -> list[d
 def _beside_scipy(
     cell: SyntheticCell, trials: TrialData, count: int, seed: int, progress: ProgressCall
 ) -> dict[str, Any]:
-    """The metric bundle, ours and scipy's on the dense Jacobian of the same residuals, from one common start."""
+    """Duration of the metric bundle, ours and scipy's on the dense Jacobian of the same residuals, from one start."""
     parts = framed(exact_model(cell))
     truth = RigModel(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
     data = measurements(trials, trials.visible, trials.positions - parts.zero)

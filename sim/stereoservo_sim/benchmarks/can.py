@@ -1,4 +1,6 @@
-"""``bench can``: transports under a bare cycle, and six emulated drives under the driver, each beside its baseline."""
+"""``bench can``: CAN transports under a bare cycle, and the driver with six emulated drives, each beside a
+baseline.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ TARGETS = {
 
 
 def run_can(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Figures of all parts; ``repetitions`` scales their length, ``seed`` has nothing to decide."""
+    """Figures of all parts; ``repetitions`` scales their length, ``seed`` has no effect."""
     total = len(TRANSPORTS) + 3
     transports = {}
     for k, name in enumerate(TRANSPORTS):

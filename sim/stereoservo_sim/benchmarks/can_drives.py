@@ -1,4 +1,6 @@
-"""The driver ``canopen`` against six emulated CiA 402 drives in another process, over serial-line CAN on TCP."""
+"""Benchmark of the driver ``canopen`` with six emulated CiA 402 drives in another process, over serial-line CAN on
+TCP.
+"""
 
 from __future__ import annotations
 
@@ -52,13 +54,16 @@ next to nothing of the bus, whose limit is that of the cycle alone."""
 
 
 def bench_options(rate_hz: float) -> CanOptions:
-    """Six CiA 402 drives of the shipped cell, with velocity as only feedback beside status and position."""
+    """Options of the shipped cell's six CiA 402 drives, with velocity as the only feedback beside status and
+    position.
+    """
     options, _ = drives_of_cell(load_cell_file(shipped_cell_path("hil-can")))
     return msgspec.structs.replace(options, rate_hz=rate_hz, feedback=("velocity",), **TOLERANT)
 
 
 def run_drives(rate_hz: float, seconds: float, *, bit_time: bool) -> dict[str, Any]:
-    """Enabled and moving for ``seconds``; an empty loop of the same rate beside it, in a process of its own.
+    """Timing of an enabled, moving arm for ``seconds``, with an empty loop of the same rate in its own process as
+    baseline.
 
     A fault ends the run and is a figure: ``fault``, None where there was none.
     """
@@ -92,7 +97,7 @@ def _told(error: DriverError) -> dict[str, str]:
 
 
 def _move(driver: CanJointDriver, rate_hz: float, seconds: float) -> dict[str, Any]:
-    """The caller's loop until its time or the first fault is over; counts of the bus thread in it."""
+    """Run the caller's loop until its time or the first fault; returns counts of the bus thread."""
     assert driver.bus is not None
     cycles, thread = driver.master.statistics, driver.bus.statistics
     before = cycles.cycles, cycles.incomplete, thread.skipped
@@ -129,9 +134,10 @@ def _move(driver: CanJointDriver, rate_hz: float, seconds: float) -> dict[str, A
 
 
 class _CpuMeter:
-    """CPU a cycle: of the bus thread, and of the process with the caller's loop; medians of segments, and the whole.
+    """Measures CPU time per cycle: of the bus thread, and of the process with the caller's loop; medians of
+    segments, and the whole.
 
-    A machine that others use slows some segments down; their median tells more of the code than the whole does.
+    A machine that others use slows some segments down; their median is a better measure of the code than the whole.
     """
 
     def __init__(self, driver: CanJointDriver) -> None:
@@ -145,7 +151,7 @@ class _CpuMeter:
         return self._statistics.cycles, process, process - time.thread_time()
 
     def look(self) -> None:
-        """Every cycle: ends a segment when it is long enough."""
+        """Call every cycle: ends a segment when it is long enough."""
         if self._statistics.cycles - self._last[0] >= SEGMENT_CYCLES:
             now = self._read()
             self._segments.append(_per_cycle_ms(self._last, now))
@@ -178,7 +184,7 @@ def _empty_figures(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 class _Pump(Subscriptions):
-    """A link for the bring-up, and the cycle after it, in one thread."""
+    """A link for the bring-up and the cycle after it, in one thread."""
 
     def __init__(self, channel: Channel) -> None:
         super().__init__()
@@ -206,7 +212,8 @@ class _Pump(Subscriptions):
 
 
 def saturate(seconds: float) -> dict[str, Any]:
-    """With frames that take their time on the wire: a new cycle as soon as all answers to the last are in.
+    """Highest cycle rate with frames that take their time on the wire: each cycle starts as soon as all replies are
+    in.
 
     ``bus_busy``: share of the time that the bits of all frames took, by their exact lengths.
     """
@@ -248,7 +255,7 @@ def saturate(seconds: float) -> dict[str, Any]:
 
 
 def _answered(codec: Codec, pump: _Pump) -> bool:
-    """Whether all answers to a poll come in time."""
+    """Whether all replies to a poll arrive in time."""
     missing, until = codec.expected, time.monotonic() + ANSWER_S
     while missing and (left := until - time.monotonic()) > 0:
         for frame in pump.receive(left):
@@ -259,7 +266,7 @@ def _answered(codec: Codec, pump: _Pump) -> bool:
 
 
 def fastest_paced(rates_hz: list[float], seconds: float) -> dict[str, Any]:
-    """With frames that take their time on the wire, the driver at ``rates_hz`` (ascending): the highest held."""
+    """Highest of ``rates_hz`` (ascending) that the driver holds with frames that take their time on the wire."""
     limit = cycle_load(LENGTHS, 1.0, 1_000_000).max_rate_hz
     trials = []
     held = 0.0

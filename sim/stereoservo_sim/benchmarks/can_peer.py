@@ -1,4 +1,4 @@
-"""The other processes of ``bench can``: an adapter with six answering nodes, emulated drives, an empty loop.
+"""Peer processes of ``bench can``: an adapter with six replying nodes, emulated drives, an empty loop.
 
 Run as a module with ``echo tcp|pty``, ``drives OPTIONS`` (JSON) or ``empty RATE_HZ SECONDS``. The first line on stdout
 says where they listen; they end with their stdin. The empty loop is ``ready`` then and begins with a line on stdin.
@@ -42,14 +42,14 @@ LOOP_PRIORITY, DRIVES_PRIORITY = 50, 5
 
 @contextmanager
 def real_time(priority: int) -> Iterator[str]:
-    """SCHED_FIFO for this thread, as the daemon has it, where that is allowed; what it has, in words."""
+    """Set SCHED_FIFO for this thread, as the daemon does, where permitted; returns the scheduling as text."""
     with realtime_for_a_while(priority) as refused:
         yield "ordinary scheduling: SCHED_FIFO is not allowed here" if refused else f"SCHED_FIFO {priority}"
 
 
 @contextmanager
 def peer(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run one of these processes: it, and its first line. Ends it."""
+    """Context manager that runs one of these processes; yields it and its first line."""
     process = subprocess.Popen(
         [sys.executable, "-m", __name__, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -72,7 +72,7 @@ def peer(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def serve_echo(kind: str) -> None:
-    """An adapter whose bus has six nodes that answer every SYNC."""
+    """Serve an adapter whose bus has six nodes that reply to every SYNC."""
     if kind == "tcp":
         with socket.create_server(("127.0.0.1", 0)) as server:
             print(f"socket://127.0.0.1:{server.getsockname()[1]}", flush=True)
@@ -106,15 +106,15 @@ def _answer_syncs(fd: int) -> None:
 
 
 def serve_drives(text: str) -> None:
-    """Emulated drives of an ideal plant on a free TCP port. ``text``: ``{"bit_time": …, "options": …}``."""
-    from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint
-    from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+    """Serve emulated drives with an ideal plant on a free TCP port. ``text``: ``{"bit_time": …, "options": …}``."""
+    from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint
+    from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 
     wanted: dict[str, Any] = json.loads(text)
     options = msgspec.convert(wanted["options"], CanOptions)
     settings = DrivesSettings(plant="ideal", bit_time=wanted["bit_time"])
-    rack = make_rack(options, settings, t_ns=time.monotonic_ns())
-    server = RackServer(rack, open_endpoint("socket://127.0.0.1:0", options.bitrate))
+    emulator = make_bus_emulator(options, settings, t_ns=time.monotonic_ns())
+    server = BusServer(emulator, open_endpoint("socket://127.0.0.1:0", options.bitrate))
     ended = False
 
     def end() -> None:
@@ -128,7 +128,7 @@ def serve_drives(text: str) -> None:
 
 
 def empty_loop(rate_hz: float, seconds: float) -> dict[str, Any]:
-    """A loop that only waits for absolute deadlines: how late it came [µs], which slots it missed.
+    """Run a loop that only waits for absolute deadlines: its lateness [µs], and the slots it missed.
 
     A slot is missed as the drivers' bus thread misses it: when more than half of its period is over.
     """

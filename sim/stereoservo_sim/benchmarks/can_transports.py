@@ -1,4 +1,4 @@
-"""Transports of CAN under the cycle of six drives: SYNC and six commands out, twelve answers in, nothing else."""
+"""Benchmark of CAN transports under the cycle of six drives: SYNC and six commands out, twelve replies in."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class _InlinePeer:
 
 
 class _Transport:
-    """A channel and, where the nodes are in this process, them."""
+    """A channel and, where they run in this process, its nodes."""
 
     def __init__(self, settings: ChannelSettings, inline: bool) -> None:
         self.channel = Channel(settings)
         self._inline = _InlinePeer(settings) if inline else None
 
     def cycle(self) -> bool:
-        """One cycle; False where an answer is missing."""
+        """Run one cycle; False where a reply is missing."""
         self.channel.send(CYCLE)
         if self._inline is not None:
             self._inline.answer()
@@ -90,7 +90,7 @@ def _line(transport: str) -> Iterator[_Transport]:
 
 
 def time_transport(transport: str, seconds: float, paced_cycles: int) -> dict[str, Any]:
-    """Cycles back to back for ``seconds``, then paced ones. ``latency_ms``: SYNC sent to the last answer."""
+    """Time unpaced cycles for ``seconds``, then paced ones. ``latency_ms``: SYNC sent to the last reply."""
     with real_time(LOOP_PRIORITY), _line(transport) as line:
         for _ in range(5):
             line.cycle()
@@ -112,7 +112,7 @@ def time_transport(transport: str, seconds: float, paced_cycles: int) -> dict[st
 
 
 def _paced(line: _Transport, cycles: int) -> list[float]:
-    """Seconds of each cycle that came complete, at the paced rate or as fast as the transport can."""
+    """Durations [s] of each complete cycle, at the paced rate or as fast as the transport can."""
     latencies = []
     due = time.monotonic()
     for _ in range(cycles):

@@ -1,4 +1,4 @@
-"""``bench cycle``: the stereo control step, kernels beside readable numpy, and whole steps of the servo core."""
+"""``bench cycle``: duration of the stereo control step (kernels and numpy) and of whole steps of the servo core."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def with_kernels(p: dict[str, Any]) -> FloatArray:
 
 
 def in_one_call(p: dict[str, Any]) -> Callable[[int], object]:
-    """The same step, in one kernel call from joints and pixels to velocities."""
+    """Joint velocities (6,) in one kernel call from joints and pixels."""
     cycle = StereoCycle(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["Ps"], p["markers"])
     H, _ = chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"])
     pixels, _ = project_points(p["Ps"], transform_points(H, p["markers"]))
@@ -84,7 +84,7 @@ def in_one_call(p: dict[str, Any]) -> Callable[[int], object]:
 
 
 def law_calls(p: dict[str, Any]) -> dict[str, Callable[[int], object]]:
-    """One step of every law on the same problem, as the loop calls it: scene and task at hand."""
+    """One step of every law on the same problem, called as the loop does."""
     H, operators = chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"])
     points = transform_points(H, p["markers"])
     pixels, _ = project_points(p["Ps"], points)
@@ -106,7 +106,7 @@ def _law_step(law: Law, scene: Scene, task: Task, options: Options, _: int) -> L
 
 
 def with_reference(p: dict[str, Any]) -> FloatArray:
-    """The same by the readable numpy reference."""
+    """Joint velocities (6,) of the same step by the numpy reference."""
     chain = ProjectiveChain(("revolute",) * 6, p["generators"], np.zeros(6))
     points = p["markers"] @ chain.displacement(p["q"]).T
     jacobian = chain.image_jacobian(p["Ps"], p["q"], points)
@@ -151,7 +151,7 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
 
 
 def core_steps(law: LawName, count: int, seed: int) -> list[float]:
-    """Seconds of each of ``count`` steps of a core that drives the simulated arm to a goal by ``law``."""
+    """Durations [s] of ``count`` steps of a core that drives the simulated arm to a goal by ``law``."""
     loop = _Loop(rx90(), seed)
     loop.step(model_update=ModelUpdate(exact_model(loop.cell)))
     loop.step(requests=(Request(1, "bench", Enable()),))
@@ -181,7 +181,7 @@ def core_steps(law: LawName, count: int, seed: int) -> list[float]:
 
 
 class _Loop:
-    """A core in virtual time: perfect joints, images without noise one frame late."""
+    """A core in virtual time with perfect joints, and noise-free images that are one frame late."""
 
     def __init__(self, cell: SyntheticCell, seed: int) -> None:
         self.cell, self.seed = cell, seed
@@ -191,7 +191,7 @@ class _Loop:
         self.times: list[float] = []
 
     def step(self, **inputs: Any) -> StepOutputs:
-        """One step, timed; then the arm moves as commanded."""
+        """Run and time one step; then the arm moves as commanded."""
         period_ns = round(1e9 / RATE_HZ)
         self.now_ns += period_ns
         self.seq += 1

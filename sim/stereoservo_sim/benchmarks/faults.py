@@ -1,4 +1,4 @@
-"""``bench faults``: every fault of the CAN arm, injected; when it was known and when all axes stood."""
+"""``bench faults``: injects every fault of the CAN arm and measures the time to detection and to rest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The process whose driver moves the arm in ``bench faults``: can be killed, stopped, or told to hang.
+"""The driver's process in ``bench faults``, which moves the arm and can be killed, stopped, or made to hang.
 
 Run as a module with the driver's options (JSON) and a speed [rad/s]. Prints JSON lines: ``moving``, ``fault``,
 ``hangs`` with ``t_ns`` of CLOCK_MONOTONIC. A line on stdin makes its loop hang; the end of stdin ends it.
@@ -24,12 +24,12 @@ WARM_S = 0.6
 
 
 def say(event: str, **data: object) -> None:
-    """One line to the parent."""
+    """Write one line to the parent."""
     print(json.dumps({"event": event, **data}), flush=True)
 
 
 def move(driver: CanJointDriver, speed: float) -> None:
-    """The caller's loop: reads and writes whatever comes, tells of the first fault."""
+    """The caller's loop: reads and writes continuously, reports the first fault."""
     period = 1.0 / driver.options.rate_hz
     velocities = np.full(len(driver.options.joint), speed)
     begun = due = time.monotonic()
@@ -58,7 +58,7 @@ def move(driver: CanJointDriver, speed: float) -> None:
 
 
 def main(options: str, speed: float) -> None:
-    """Configure, reset what an earlier trial left, enable, move."""
+    """Configure, reset faults of an earlier trial, enable, move."""
     context = DriverContext(MonotonicClock(), "bench", Path(), Path())
     driver = CanJointDriver(json.loads(options), context)
     with real_time(LOOP_PRIORITY):

@@ -1,4 +1,4 @@
-"""Faults in real time: driver and emulated drives in two processes over serial-line CAN on TCP.
+"""Fault trials in real time: driver and emulated drives in two processes over serial-line CAN on TCP.
 
 From the order (or the signal) to the last axis's rest, by the emulator's events; both are CLOCK_MONOTONIC. Machines are
 shared: a fault that comes before it was ordered is a stall's, is counted and tried again; beside the times stand
@@ -67,7 +67,7 @@ MASTER_BOUND_MS = 150.0
 
 
 class StalledError(Exception):
-    """The machine stood still: the fault was there before it was ordered."""
+    """The trial is void: the machine stalled, and a fault occurred before one was injected."""
 
 
 class _Master:
@@ -90,7 +90,7 @@ class _Master:
         self.lines.put({"event": "ended"})
 
     def expect(self, event: str, limit_s: float) -> dict[str, Any]:
-        """The next line, which has to be ``event``. Raises StalledError with what came instead."""
+        """The next line, which must be ``event``. Raises StalledError with what came instead."""
         try:
             line = self.lines.get(timeout=limit_s)
         except queue.Empty:
@@ -100,7 +100,7 @@ class _Master:
         return line
 
     def fault(self) -> dict[str, Any] | None:
-        """The first fault that it told of, if it did."""
+        """The first fault that it reported, if any."""
         while not self.lines.empty():
             line = self.lines.get()
             if line["event"] == "fault":
@@ -126,7 +126,7 @@ class _Master:
 
 
 def _strike(emulator: EmulatorProcess, master: _Master, fault: str, order: str) -> int:
-    """Make the fault happen; when [ns]."""
+    """Inject the fault; returns the time [ns]."""
     if order:
         asked_ns = time.monotonic_ns()
         emulator.order(order)
@@ -174,7 +174,7 @@ def _trial(
 
 
 def _settle(emulator: EmulatorProcess, cure: str) -> None:
-    """The cause goes away, the drives stand."""
+    """Remove the cause, and wait until the drives are at rest."""
     if cure:
         emulator.order(cure)
     time.sleep(0.2)

@@ -1,4 +1,6 @@
-"""``bench features``: the dot detector on the simulated cell's pictures, tracking and cold, beside OpenCV labelling."""
+"""``bench features``: duration of dot detection on simulated images (tracking, acquisition), with OpenCV labelling
+as a baseline.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ IMAGES = 8
 
 
 def run_features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Milliseconds an image of 640x480: search with nothing known, windows about a prior, one labelling pass.
+    """Milliseconds per image of 640x480: search without a prior, windows at a prior, one labelling pass.
 
     And what is found how well, in four pictures a repetition of each of the conditions of ``robustness``.
     """

@@ -1,4 +1,4 @@
-"""How often the dot detector finds its faces, and how well, under what light, lens, sensor and clutter do."""
+"""Robustness of the dot detector: detection rate and accuracy under light, lens, sensor and clutter effects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ ROWS: dict[str, Conditions] = {
     "jpeg 75": Conditions(jpeg=75),
     "jpeg 50": Conditions(jpeg=50),
 }
-"""Dots of 10 px, tilts to 50 degrees, 2 grey levels of noise, 0.7 px of blur where nothing else is said."""
+"""Dots of 10 px, tilts to 50 degrees, 2 grey levels of noise, 0.7 px of blur where nothing else is stated."""
 REFERENCE_PX = {
     "n0": 0.011,
     "n2 b.7": 0.013,
@@ -63,7 +63,7 @@ TRACKED_DOTS = 4
 
 @dataclass
 class _Tally:
-    """What was found in the pictures of one row, by one way of looking."""
+    """Counts of one row's images, for one mode of detection."""
 
     faces: int = 0
     dots: int = 0

@@ -1,4 +1,4 @@
-"""Pictures of the default faces whose dots' centres are known, under what light, lens and sensor do to them.
+"""Synthetic images of the default faces with known dot centres, with light, lens and sensor effects.
 
 A dot is an ellipse drawn by area coverage on a grid of FINE points a pixel, blurred there as a lens does it (before the
 pixels sample it), lit, and only then given noise and whole grey levels.
@@ -59,7 +59,7 @@ class Conditions:
 
 
 def look(tilt: float, azimuth: float, roll: float, distance: float, at: FloatArray) -> FloatArray:
-    """Homography (3, 3) of a plane [m] whose origin is seen at pixel ``at`` from ``distance`` [m]; angles [rad]."""
+    """Homography (3, 3) of a plane [m] whose origin is imaged at pixel ``at`` from ``distance`` [m]; angles [rad]."""
     K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
     axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     R = cv2.Rodrigues(axis * tilt)[0] @ cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0]
@@ -68,7 +68,7 @@ def look(tilt: float, azimuth: float, roll: float, distance: float, at: FloatArr
 
 
 def project(H: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (n, 2) of the plane to pixels (n, 2)."""
+    """Project points (n, 2) of the plane to pixels (n, 2)."""
     homogeneous = np.column_stack([points, np.ones(len(points))]) @ H.T
     pixels: FloatArray = homogeneous[:, :2] / homogeneous[:, 2:]
     return pixels
@@ -145,7 +145,9 @@ def _add(coverage: npt.NDArray[np.float32], conic: FloatArray, blur: float) -> N
 def _cover(
     image: npt.NDArray[np.float32], conic: FloatArray, conditions: Conditions, rng: np.random.Generator
 ) -> None:
-    """Cover an ellipse from one side to the depth of the cut by something dark, its edge as blurred as the dots'."""
+    """Cover an ellipse from one side, to the depth of the cut, by something dark with an edge as blurred as the
+    dots'.
+    """
     centre = -np.linalg.solve(conic[:2, :2], conic[:2, 2])
     level = -(conic[2, 2] + conic[:2, 2] @ centre)
     angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -164,7 +166,7 @@ def _cover(
 
 
 def _as_taken(image: npt.NDArray[np.float32], conditions: Conditions, rng: np.random.Generator) -> ImageArray:
-    """Light, motion, noise, whole levels, compression."""
+    """Apply light, motion blur, noise, quantisation and compression."""
     if conditions.gradient:
         image *= 1.0 - conditions.gradient * np.arange(WIDTH, dtype=np.float32) / (WIDTH - 1)
     if conditions.banding:
@@ -183,7 +185,7 @@ def _as_taken(image: npt.NDArray[np.float32], conditions: Conditions, rng: np.ra
 
 
 def _moved(image: npt.NDArray[np.float32], length: float, angle: float) -> npt.NDArray[np.float32]:
-    """The picture smeared evenly along a line, about its middle."""
+    """The image with motion blur along a line, about its centre."""
     u, v = np.meshgrid(np.fft.rfftfreq(WIDTH), np.fft.fftfreq(HEIGHT))
     smear = np.sinc(length * (u * np.cos(angle) + v * np.sin(angle)))
     moved: npt.NDArray[np.float32] = np.fft.irfft2(np.fft.rfft2(image) * smear, image.shape).astype(

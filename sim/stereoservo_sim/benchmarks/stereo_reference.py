@@ -1,4 +1,4 @@
-"""The stereo law (8.36) in numpy, as one would write it first: what the kernels are compared with."""
+"""Numpy reference of the stereo law (8.36), the baseline of the kernels."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ DAMPING = 1e-6
 
 
 class StereoStep(NamedTuple):
-    """Joint velocity (n,) [rad/s or m/s], largest pixel error over seen markers [px], conditioning (0:
-    singular).
+    """Result of a step: joint velocity (n,) [rad/s or m/s], largest pixel error over seen markers [px],
+    conditioning (0: singular).
     """
 
     velocity: FloatArray

@@ -1,4 +1,4 @@
-"""Repeated timing of calls, and what the machine was and did meanwhile."""
+"""Repeated timing of calls, with the machine's properties and load."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def summary(samples: list[float], scale: float = 1.0, digits: int = 4) -> dict[s
 
 
 def machine() -> dict[str, Any]:
-    """Facts that a figure means nothing without."""
+    """Properties of the machine and its software, which a figure needs."""
     import numba
 
     return {
@@ -74,7 +74,7 @@ def _processor() -> str:
 
 
 def stolen_ticks() -> tuple[int, int] | None:
-    """Stolen and total ticks of all processors since boot; None where the system does not tell."""
+    """Stolen and total ticks of all processors since boot; None where the system does not report them."""
     if not sys.platform.startswith("linux"):
         return None
     try:

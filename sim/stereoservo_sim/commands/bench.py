@@ -100,7 +100,7 @@ def _find(what: str) -> Bench:
 
 
 def _show(answer: dict[str, Any], console: Console) -> None:
-    """One line a figure, nested names joined by points; of faults, tables."""
+    """Print one line a figure, nested names joined by points; tables of faults."""
     if answer["bench"] == "faults":
         from stereoservo_sim.benchmarks.faults import show_faults
 

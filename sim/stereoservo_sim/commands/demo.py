@@ -1,4 +1,4 @@
-"""``stereoservo demo``: the main job on the embedded simulated cell."""
+"""``stereoservo demo``: calibrates the simulated cell, teaches goals and reaches them."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def demo(
 
 
 def _check(cell: CellFile, lockstep: bool) -> None:
-    """Raises ValueError where a cell cannot be demonstrated: nothing is simulated that could be judged."""
+    """Check that a cell can be demonstrated, with a simulation that can be judged. Raises ValueError."""
     true_cell(cell)
     emulated = has_emulated_drives(cell)
     streams = [camera.name for camera in cell.camera if camera.driver == "video"]
@@ -107,7 +107,7 @@ def _check(cell: CellFile, lockstep: bool) -> None:
 
 @contextmanager
 def _telling() -> Iterator[DemonstrationProgress]:
-    """Progress on a terminal, plain lines elsewhere; both on stderr."""
+    """Reporter of progress: a bar on a terminal, plain lines elsewhere; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield DemonstrationProgress(tell=_line(console), progress=lambda _: None)

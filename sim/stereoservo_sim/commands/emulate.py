@@ -1,4 +1,4 @@
-"""``stereoservo emulate WHAT CELL``: stand-ins for a cell's hardware."""
+"""``stereoservo emulate WHAT CELL``: runs emulated drives or cameras in place of a cell's hardware."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _drives(settings: _Settings, termination: Termination) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path, key: str) -> Iterator[None]:
-    """What is wrong with a cell's options, with the file and the section that they stand in."""
+    """Error of a cell's options, with its file and section."""
     from stereoservo.ports.devices import DriverError
     from stereoservo_sim.emulators.fault_engine import EmulationError
 
@@ -119,8 +119,8 @@ def _named(path: Path, key: str) -> Iterator[None]:
 def _serve(
     path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination
 ) -> None:
-    from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint, served_channel
-    from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_rack
+    from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint, served_channel
+    from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_bus_emulator
     from stereoservo_sim.emulators.console import Console, Printer
     from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
@@ -131,7 +131,7 @@ def _serve(
     endpoint = open_endpoint(settings.channel or served_channel(options), options.bitrate)
     try:
         with _named(path, "joints.options"):
-            rack = make_rack(
+            emulator = make_bus_emulator(
                 options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent
             )
     except BaseException:
@@ -139,19 +139,19 @@ def _serve(
         raise
     try:
         for text in settings.orders:
-            rack.order(text, rack.t_ns)
+            emulator.order(text, emulator.t_ns)
     except FaultCommandError as error:
         endpoint.close()
         raise typer.BadParameter(str(error), param_hint="--order") from error
     printer = Printer(settings.as_json)
-    server = RackServer(rack, endpoint)
+    server = BusServer(emulator, endpoint)
     console = Console(server, printer)
     console.attach()
     with contextlib.suppress(OSError):  # not allowed: then without
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     gc.freeze()  # what was imported is not looked through again
     printer.say(
-        "ready", f"listening on {server.channel}", channel=server.channel, t_ns=rack.start_ns, pid=os.getpid(),
+        "ready", f"listening on {server.channel}", channel=server.channel, t_ns=emulator.start_ns, pid=os.getpid(),
         nodes=[joint.node_id for joint in options.joint], bit_time=drives.bit_time,
     )  # fmt: skip
     try:

@@ -1,4 +1,4 @@
-"""``stereoservo reproduce EXPERIMENT``: runs an experiment and prints its figures beside those to compare with."""
+"""``stereoservo reproduce EXPERIMENT``: runs an experiment and prints its figures beside the published ones."""
 
 from __future__ import annotations
 

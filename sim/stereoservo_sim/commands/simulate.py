@@ -1,4 +1,4 @@
-"""``stereoservo simulate TASKS.csv``: alignment tasks in closed loop, judged on the truth."""
+"""``stereoservo simulate TASKS.csv``: runs alignment tasks in closed loop and evaluates them against ground truth."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ LAW = LawOption(DEFAULT_LAW)
 
 
 class ArmOption(StrEnum):
-    """--arm"""
+    """Values of --arm."""
 
     FREE = "free"
     RX90 = "rx90"
 
 
 class CalibrationOption(StrEnum):
-    """--calibration"""
+    """Values of --calibration."""
 
     SELF = "self"
     EXACT = "exact"
@@ -42,7 +42,7 @@ class CalibrationOption(StrEnum):
 
 
 class JacobianOption(StrEnum):
-    """--jacobian"""
+    """Values of --jacobian."""
 
     CURRENT = "current"
     DESIRED = "desired"
@@ -51,7 +51,7 @@ class JacobianOption(StrEnum):
 
 
 class PointsOption(StrEnum):
-    """--points"""
+    """Values of --points."""
 
     PREDICTED = "predicted"
     TRIANGULATED = "triangulated"

@@ -1,4 +1,4 @@
-"""A cell whose drives or cameras are emulated by processes of their own, on channels of their own."""
+"""Cell files of the demonstration whose drives or cameras are emulated in processes of their own."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)
 SOURCE = re.compile(r"^(\s*source\s*=\s*)\"http://127\.0\.0\.1:\d+/", re.MULTILINE)
 ANY_SERVER = "http://127.0.0.1:0"
-"""For emulated cameras: any free port of this host; the emulator tells which."""
+"""For emulated cameras: any free port of this host; the emulator reports which."""
 ANY_PORT = "socket://127.0.0.1:0"
-"""For an emulator: any free port of this host; it tells which."""
+"""For an emulator: any free port of this host, which it reports."""
 
 
 def has_emulated_drives(cell: CellFile) -> bool:
-    """Whether the cell file says what to put in the place of its drives."""
+    """Whether the cell file has a section of emulated drives."""
     return "drives" in cell.emulate
 
 
 def has_emulated_cameras(cell: CellFile) -> bool:
-    """Whether the cell file says what to put in the place of its cameras."""
+    """Whether the cell file has a section of emulated cameras."""
     return "cameras" in cell.emulate
 
 
 def move_to_server(cell_path: Path, folder: Path, channel: str) -> Path:
-    """A copy of the cell file in ``folder`` whose cameras of driver ``video`` look at the server ``channel``.
+    """Copy of the cell file in ``folder`` whose cameras of driver ``video`` use the server ``channel``.
 
     ``channel``: ``http://127.0.0.1:PORT``. Raises ValueError where no camera's ``source`` is an address of this host.
     """
@@ -42,7 +42,7 @@ def move_to_server(cell_path: Path, folder: Path, channel: str) -> Path:
 
 
 def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
-    """A copy of the cell file in ``folder`` whose joint driver speaks over ``channel``; ``eds`` stays the same file.
+    """Copy of the cell file in ``folder`` whose joint driver uses ``channel``; ``eds`` stays the same file.
 
     Raises ValueError where the file has no ``[joints.options]`` with a ``channel``.
     """

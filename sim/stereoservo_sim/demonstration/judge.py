@@ -1,4 +1,4 @@
-"""Judges the demonstration from its flight recording and the simulated truth, out of the controller's sight."""
+"""Evaluation of the demonstration from its flight recording and the simulated ground truth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ JUDGED_S = 1.0
 
 @dataclass
 class Course:
-    """What a cell did, step by step: times (k,), errors (k,), commands (k, n), goals' ids, and every event."""
+    """Time series of a cell's run: times (k,), errors (k,), commands (k, n), goals' ids, and every event."""
 
     t_ns: IntArray
     error_px: FloatArray
@@ -32,7 +32,7 @@ class Course:
 
 @dataclass
 class RecordedDemonstration(Course):
-    """A course out of a recording that was replayed, and the calibration's stops."""
+    """Time series from a replayed recording, with the calibration's stops."""
 
     result: ReplayResult
     trials: TrialData | None
@@ -40,7 +40,9 @@ class RecordedDemonstration(Course):
 
 @dataclass(frozen=True)
 class Judgement:
-    """One goal against the truth. Errors are of the mean over one second after the arm came to rest at the goal."""
+    """Evaluation of one goal against ground truth. Errors are of the mean over one second after the arm came to
+    rest.
+    """
 
     name: str
     law: str
@@ -61,7 +63,7 @@ class Judgement:
 
 
 def read_flight(recording: Path) -> RecordedDemonstration:
-    """Replay a recording and keep what the report needs. Raises RecordingError."""
+    """Replay a recording and collect what the report needs. Raises RecordingError."""
     times: list[int] = []
     errors: list[float] = []
     commands: list[FloatArray] = []
@@ -101,7 +103,9 @@ def judge_goal(
     truth_q: FloatArray,
     cell: SimulatedCell,
 ) -> Judgement:
-    """Judge the goal that was taught as ``name`` and run with ``law``. Raises LookupError where it was not flown."""
+    """Evaluate the goal that was taught as ``name`` and executed with ``law``. Raises LookupError where it was not
+    executed.
+    """
     taught = next((e for e in flight.events if e.kind == "taught" and e.name == name), None)
     if taught is None:
         raise LookupError(f"goal {name!r} was never taught")
@@ -138,7 +142,7 @@ def judge_goal(
 
 
 def _flown(name: str, flight: Course) -> tuple[Event, Event]:
-    """Start and end of the visual goal that came after all teaching: the n-th taught is the n-th flown."""
+    """Start and end of the execution of the n-th taught goal, which follows all teaching in the same order."""
     taught = [e.name for e in flight.events if e.kind == "taught"]
     begun = [e for e in flight.events if e.kind == "goal_started" and e.name in LAWS]
     order = taught.index(name)
@@ -150,7 +154,7 @@ def _flown(name: str, flight: Course) -> tuple[Event, Event]:
 
 
 def _during(times: IntArray, positions: FloatArray, start_ns: int, end_ns: int) -> FloatArray:
-    """Every fifth true sample of a span. Raises LookupError where there is none."""
+    """Every fifth ground truth sample of an interval. Raises LookupError where there is none."""
     inside = positions[(times >= start_ns) & (times <= end_ns)]
     if len(inside) == 0:
         raise LookupError(f"no true joint position between {start_ns} and {end_ns} ns")

@@ -1,4 +1,4 @@
-"""The demonstration as real processes: a daemon, and a client over zenoh."""
+"""The demonstration with real processes: a daemon, and a client over zenoh."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class LiveDemonstrator:
         self._client.enable()
 
     def calibrate(self) -> Calibrated:
-        """Calibrate; the model is read from where the daemon stored it."""
+        """Calibrate; the model is read from the daemon's file."""
         start = time.monotonic()
         result = self._client.calibrate(self._hear)
         seconds = time.monotonic() - start
@@ -42,11 +42,11 @@ class LiveDemonstrator:
             self._progress(event.progress)
 
     def move(self, joints: dict[str, float]) -> None:
-        """Joint goal."""
+        """Execute a joint goal."""
         self._reach(self._client.goal(JointTarget(joints)))
 
     def teach(self, name: str, frames: int) -> None:
-        """Teach what is seen."""
+        """Teach the current view."""
         self._client.teach(name, frames)
 
     def home(self) -> None:
@@ -64,12 +64,12 @@ class LiveDemonstrator:
         return plan.seconds
 
     def servo(self, target: VisualTarget, law: LawName) -> str:
-        """Run a goal to its end, under a lease."""
+        """Execute a goal to its end, under a lease."""
         result = self._ended(self._client.goal(target, law=law, lease_s=2.0))
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
     def _ended(self, handle: GoalHandle) -> GoalResult:
-        """Wait for a goal's end. Raises ClientError where the cell is held, since nobody here would resume it."""
+        """Wait for a goal's end. Raises ClientError where the cell is held, since nobody would resume it."""
         while True:
             try:
                 return handle.wait(LOOK_EVERY_S)

@@ -14,7 +14,7 @@ from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
 
 
 class LockstepDemonstrator:
-    """``scenario.Operator`` on a cell in lockstep."""
+    """``scenario.Operator`` of a cell in lockstep."""
 
     def __init__(self, cell: LockstepCell, seed: int, progress: Callable[[float], None]) -> None:
         self._cell = cell
@@ -27,19 +27,19 @@ class LockstepDemonstrator:
         self._operator.enable()
 
     def calibrate(self) -> Calibrated:
-        """Trial motions and fit; ``seconds`` are virtual."""
+        """Run trial motions and fit; ``seconds`` are virtual."""
         start_ns = self._cell.clock.now_ns()
         model = self._operator.calibrate(lambda _, fraction: self._progress(fraction))
         return Calibrated(model, (self._cell.clock.now_ns() - start_ns) * 1e-9)
 
     def move(self, joints: dict[str, float]) -> None:
-        """Joint goal."""
+        """Execute a joint goal."""
         event = self._operator.goal(JointTarget(joints))
         if event.kind != "goal_reached":
             raise RuntimeError(f"the arm did not reach the pose to be shown: {event.message}")
 
     def teach(self, name: str, frames: int) -> None:
-        """Teach what is seen."""
+        """Teach the current view."""
         self._operator.teach(name, frames)
 
     def home(self) -> None:
@@ -55,7 +55,7 @@ class LockstepDemonstrator:
         return self._operator.planned(target, law=law).seconds
 
     def servo(self, target: VisualTarget, law: LawName) -> str:
-        """Run a goal to its end."""
+        """Execute a goal to its end."""
         event = self._operator.goal(target, law=law)
         return (
             "reached"

@@ -37,7 +37,7 @@ CALIBRATION_TIMEOUT_S = 1800.0
 
 
 class LockstepRefusalError(Exception):
-    """The cell refused a command, or aborted what was started; carries the event."""
+    """The cell refused a command, or aborted its execution; carries the event."""
 
     def __init__(self, event: Event) -> None:
         super().__init__(event.message)
@@ -45,7 +45,7 @@ class LockstepRefusalError(Exception):
 
 
 class LockstepOperator:
-    """Drives a ``LockstepCell`` as a client drives a daemon; each call runs virtual time until its end."""
+    """Operates a ``LockstepCell`` as a client does a daemon; each call runs virtual time until its end."""
 
     def __init__(self, cell: LockstepCell, *, seed: int = 0) -> None:
         self.cell = cell
@@ -88,7 +88,9 @@ class LockstepOperator:
         self.cell.wait_for(lambda e: e.kind == "lifecycle" and e.name == Lifecycle.ACTIVE, 5.0, since - 1)
 
     def calibrate(self, progress: Callable[[str, float], None] | None = None) -> CellModel:
-        """Trial motions, fit in this process, model into the core. Raises LockstepRefusalError, CalibrationError."""
+        """Run trial motions, fit in this process, send the model to the core. Raises LockstepRefusalError,
+        CalibrationError.
+        """
         self.trials, end = self._measure(check=False)
         self._epoch += 1
         model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
@@ -96,13 +98,13 @@ class LockstepOperator:
         return model
 
     def check(self, model: CellModel) -> CheckReport:
-        """The check motion, held against ``model``. Raises LockstepRefusalError, CalibrationError."""
+        """Run the check motion and test ``model`` with it. Raises LockstepRefusalError, CalibrationError."""
         seen, _ = self._measure(check=True)
         return check_model_holds(model, seen, limit_px=self.cell.settings.tolerance_px)
 
     def reset_zeros(self, model: CellModel) -> tuple[CellModel, ZeroReset]:
-        """The check motion, and a model with moved joint zeros into the core. Raises LockstepRefusalError,
-        CalibrationError.
+        """Run the check motion and send a model with corrected joint zeros to the core. Raises
+        LockstepRefusalError, CalibrationError.
         """
         seen, end = self._measure(check=True)
         examined = examine_model(model, seen)
@@ -135,7 +137,7 @@ class LockstepOperator:
         return job.trials(), end
 
     def teach(self, name: str, frames: int = 20) -> Event:
-        """Store what the cameras see now as goal ``name``. Raises LockstepRefusalError."""
+        """Store the current observations as goal ``name``. Raises LockstepRefusalError."""
         reply = self._submit(Teach(name, frames))
         event = self.cell.wait_for(
             lambda e: e.name == name and e.kind in ("taught", "warning"), 30.0, reply.seq
@@ -152,7 +154,7 @@ class LockstepOperator:
         return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, reply.seq)
 
     def planned(self, target: Target | str, **options: object) -> PlanReport:
-        """The plan of a goal; nothing moves. Raises LockstepRefusalError when it is refused."""
+        """Plan of a goal, without motion. Raises LockstepRefusalError when it is refused."""
         reply = self._submit(RunGoal(self._goal(target, check=True, **options)))
         if reply.plan is None:
             raise ValueError(f"goals of this kind are not planned: {target}")

@@ -1,4 +1,4 @@
-"""One picture of a demonstration: what a camera sees at the start, where the markers go, how the errors shrink."""
+"""Overview image of a demonstration: a camera's view at the start, the markers' tracks, the decay of the errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A report of a servoing session as one HTML file: arrays in, pictures and tables out. Reads no clock.
+"""HTML report of a servoing session, from arrays; deterministic.
 
 The pictures are embedded, so that the file can be mailed as it is.
 """

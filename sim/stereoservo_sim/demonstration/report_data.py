@@ -1,4 +1,4 @@
-"""What a session report shows, as plain arrays: shapes in the docstrings, checked by :func:`check_shapes`."""
+"""Data of a session report as plain arrays, with a check of their shapes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class CalibrationPlots:
-    """A self-calibration. Missing pixels and residuals are NaN.
+    """Data of a self-calibration. Missing pixels and residuals are NaN.
 
     ``pixels`` and ``residuals`` (cameras, stops, markers, 2) [px]; ``joint`` (stops,) is the index of the
     joint that moved, -1 for a stop that belongs to none; ``sizes`` (cameras, 2) image width and height [px].
@@ -33,7 +33,7 @@ class CalibrationPlots:
 
 @dataclass(frozen=True)
 class GoalPlots:
-    """One goal. ``times_s`` (t,), ``error_px`` (t,) NaN where unknown, ``velocities`` (t, joints) [rad/s or
+    """Data of one goal. ``times_s`` (t,), ``error_px`` (t,) NaN where unknown, ``velocities`` (t, joints) [rad/s or
     m/s].
 
     ``path_m`` (p, 3) of the centre and ``line_m`` (2, 3), start and end of its straight line [m]. ``gain``
@@ -62,8 +62,7 @@ class GoalPlots:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Everything that one report shows. ``facts``: lines of the last table (seed, loop, versions), name to
-    value.
+    """All data of one report. ``facts``: lines of the last table (seed, loop, versions), name to value.
 
     ``velocity_limits`` (joints,) [rad/s or m/s] or None; ``tolerance_px``: what counts as reached.
     """

@@ -1,4 +1,4 @@
-"""Figures of a session report, drawn by matplotlib's Agg, without a display."""
+"""Figures of a session report, by matplotlib without a display."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.demonstration.report_data import CalibrationPlots, GoalPlots
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#8b5a2b")
-"""One a joint, in this order everywhere; told apart by colour-blind readers too (Okabe and Ito)."""
+"""One a joint, in this order everywhere; distinguishable for colour-blind readers, too (Okabe and Ito)."""
 
 DPI = 110
 LEAST_ERROR_PX = 1e-4
@@ -212,7 +212,7 @@ def _image_axis(axis: Any, name: str, size: IntArray) -> None:
 
 
 def _along_and_across(path: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Way along the line and distance from it, (p,) each [m]; along is 0 for a line of no length."""
+    """Distance along the line and from it, (p,) each [m]; along is 0 for a line of no length."""
     direction = line[1] - line[0]
     length = float(np.linalg.norm(direction))
     offset = path - line[0]

@@ -1,4 +1,4 @@
-"""The data of the demonstration's report, gathered from the recording, the model and the judgement."""
+"""Collection of the demonstration report's data from the recording, the model and the evaluation."""
 
 from __future__ import annotations
 

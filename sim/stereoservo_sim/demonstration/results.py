@@ -1,4 +1,4 @@
-"""Judges a demonstration, writes its report, and sums it up."""
+"""Results of a demonstration: evaluation, report, summary."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_ERROR_MM = 0.5
 
 
 def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
-    """Judge, write ``report.html`` and ``overview.png``, and give what ``demo --json`` prints.
+    """Evaluate, write ``report.html`` and ``overview.png``; returns what ``demo --json`` prints.
 
     ``seconds``: how long the demonstration took. Raises RecordingError, LookupError where a goal was never flown.
     """
@@ -58,7 +58,7 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
 
 
 def problems(model: CellModel, goals: Sequence[Judgement]) -> list[str]:
-    """What keeps a demonstration from having converged: the residual's chi-square at 99.9 %, goals, errors."""
+    """Reasons why a demonstration has not converged: the residual's chi-square at 99.9 %, goals, errors."""
     found = []
     statistics = model.statistics
     if statistics is None or not statistics.chi2_ok:

@@ -1,4 +1,4 @@
-"""Conducts the demonstration, as real processes or in lockstep, and gathers what is to be judged and reported."""
+"""Runs the demonstration, with real processes or in lockstep, and collects its data."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from stereoservo_sim.world.simulated_cell import goals_of
 
 
 class DemoFailedError(Exception):
-    """The demonstration did not do what it promises."""
+    """The demonstration did not succeed."""
 
 
 @dataclass(frozen=True)
 class DemonstrationProgress:
-    """Where the demonstration tells how it goes: lines of text, and a fraction of the work in hand."""
+    """Protocol of a progress reporter: lines of text, and a fraction of the present work."""
 
     tell: Callable[[str], None]
     progress: Callable[[float], None]
@@ -48,7 +48,7 @@ class DemonstrationProgress:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """Everything that judgement and report need."""
+    """Data of a demonstration for evaluation and report."""
 
     cell: CellFile
     joint_names: tuple[str, ...]
@@ -67,7 +67,7 @@ class Demonstration:
 def conduct_lockstep(
     cell_path: Path, out: Path, seed: int, stage: DemonstrationProgress, goals: Sequence[ShownGoal] = GOALS
 ) -> Demonstration:
-    """One process, virtual time, deterministic given the seed."""
+    """Run in one process in virtual time; deterministic given the seed."""
     cell = load_cell_file(cell_path)
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
@@ -113,7 +113,7 @@ def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], No
 def conduct_live(
     cell_path: Path, out: Path, seed: int, stage: DemonstrationProgress, goals: Sequence[ShownGoal] = GOALS
 ) -> Demonstration:
-    """Real processes: a daemon in directories of its own, and a client over zenoh."""
+    """Run with real processes: a daemon in directories of its own, and a client over zenoh."""
     cell = load_cell_file(cell_path)
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
@@ -150,7 +150,7 @@ def conduct_live(
 def _emulate_drives(
     ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress
 ) -> Path:
-    """Start the cell's emulated drives on a free port, to end with ``ends``; the cell file that speaks to them."""
+    """Start the cell's emulated drives on a free port, until ``ends``; returns a cell file that uses them."""
     drives = EmulatorProcess(cell_path, options=("--channel", ANY_PORT), log=out / "drives.log")
     channel = ends.enter_context(drives).wait_ready()
     stage.tell(f"emulated drives on {channel}")
@@ -160,7 +160,9 @@ def _emulate_drives(
 def _emulate_cameras(
     ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress
 ) -> Path:
-    """The same with the cell's cameras: they look at the arm through its history in the runtime directory."""
+    """Start the cell's emulated cameras, which read the arm's history in the runtime directory; otherwise as
+    `_emulate_drives`.
+    """
     cameras = EmulatorProcess(
         cell_path, what="cameras", options=("--channel", ANY_SERVER), log=out / "cameras.log"
     )

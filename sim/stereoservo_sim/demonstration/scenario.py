@@ -1,4 +1,4 @@
-"""What the demonstration does: which goals are shown, with which law each is reached again, and in which order."""
+"""Scenario of the demonstration: which goals are taught, by which law each is reached, and in which order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ JUDGE_S = 1.2  # rest after a goal, of which one second is judged
 
 @dataclass(frozen=True)
 class ShownGoal:
-    """A goal of the demonstration, one of ``world.goals_of``, the law that reaches it again, and how it is stated.
+    """A goal of the demonstration, one of ``world.goals_of``: the law that reaches it, and the kind of its target.
 
     ``taught``: by its name, the pixels that were shown. ``displacement``: by what the body has to do from where it is,
     a projective 4x4 in the model's frame, without a pixel of the goal.
@@ -41,7 +41,7 @@ GOALS = (
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What the calibration gave, and how long trial motions and fit took [s]."""
+    """Result of the calibration, with the durations of trial motions and fit [s]."""
 
     model: CellModel
     seconds: float
@@ -51,7 +51,9 @@ VisualTarget = TaughtTarget | DisplacementTarget
 
 
 class Operator(Protocol):
-    """Who works the cell: a client over zenoh, or the same in lockstep. Every call ends when the arm has done it."""
+    """Protocol of the cell's operator: a client over zenoh, or the same in lockstep. Every call returns when the
+    arm has finished.
+    """
 
     def enable(self) -> None: ...
 
@@ -68,11 +70,11 @@ class Operator(Protocol):
         ...
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
-        """Seconds that a goal would need, by a check that moves nothing."""
+        """Duration of a goal by its plan, without motion."""
         ...
 
     def servo(self, target: VisualTarget, law: LawName) -> str:
-        """Run a goal; gives its outcome: ``reached`` or what else ended it, with the message."""
+        """Execute a goal; returns its outcome: ``reached`` or what else ended it, with the message."""
         ...
 
     def rest(self, seconds: float) -> None: ...
@@ -85,7 +87,9 @@ def perform(
     tell: Callable[[str], None],
     goals: Sequence[ShownGoal] = GOALS,
 ) -> tuple[Calibrated, dict[str, str]]:
-    """The whole demonstration, ``goals`` shown at ``configurations`` (n,); the calibration and each goal's outcome."""
+    """Run the whole demonstration, ``goals`` taught at ``configurations`` (n,); returns the calibration and each
+    goal's outcome.
+    """
     operator.enable()
     tell("calibrating: each joint moves alone in view of both cameras")
     calibrated = operator.calibrate()
@@ -113,7 +117,7 @@ def perform(
 
 
 def displacement_to(model: CellModel, joints: FloatArray, goal: FloatArray) -> DisplacementTarget:
-    """What the marker body has to do from where it is at ``joints`` (n,) to where it is at ``goal`` (n,)."""
+    """Displacement of the marker body from its pose at ``joints`` (n,) to that at ``goal`` (n,)."""
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
     H = chain.displacement(goal) @ np.linalg.inv(chain.displacement(joints))
     return DisplacementTarget(tuple(H.ravel().tolist()), model_epoch=model.epoch)

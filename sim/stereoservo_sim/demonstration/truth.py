@@ -1,4 +1,4 @@
-"""The truth of a demonstration: the simulated cell as the cell file has it, and where its arm was all the time."""
+"""Ground truth of a demonstration: the simulated cell of a cell file, and its arm's true positions over time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POLL_S = 1.0
 
 
 def true_cell(cell: CellFile) -> SimulatedCell:
-    """The simulated cell that a cell file's cameras show: their mount, lenses, workpiece, under its own names.
+    """Simulated cell behind a cell file's cameras: their mount, lenses, workpiece, by the cell file's names.
 
     Cameras of driver ``video`` show what ``[emulate.cameras]`` puts at their address. Raises ValueError where a camera
     is none of the simulated rig.
@@ -79,13 +79,13 @@ class TruthLog:
         return cls(TrueJointHistory.open(runtime_dir / FILE_NAME))
 
     def take(self) -> None:
-        """Copy what is new."""
+        """Copy new samples."""
         self._next, times, positions = self._history.since(self._next)
         self._times.append(times)
         self._positions.append(positions)
 
     def follow(self) -> None:
-        """Copy from time to time, in a thread, until ``end``."""
+        """Copy periodically, in a thread, until ``end``."""
         self._thread = threading.Thread(target=self._run, name="truth-log", daemon=True)
         self._thread.start()
 
@@ -94,7 +94,7 @@ class TruthLog:
             self.take()
 
     def end(self) -> tuple[IntArray, FloatArray]:
-        """Stop following; times (k,) [ns] and positions (k, n)."""
+        """Stop copying; returns times (k,) [ns] and positions (k, n)."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join()

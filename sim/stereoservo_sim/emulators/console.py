@@ -1,4 +1,4 @@
-"""Orders from standard input, answers and events on standard output."""
+"""Console of an emulator: fault commands from standard input, replies and events on standard output."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LINES_WAITING = 10_000
 
 
 class EmulationEvent(Protocol):
-    """Something that happened at ``t_ns``: ``place`` is where as data, ``where()`` the same in words."""
+    """An event at ``t_ns``: ``place`` is where as data, ``where()`` the same as text."""
 
     @property
     def t_ns(self) -> int: ...
@@ -34,7 +34,7 @@ class EmulationEvent(Protocol):
 
 
 class OrderedServer(Protocol):
-    """An emulator's serving loop, as a console sees it. ``obey`` raises FaultCommandError."""
+    """Protocol of an emulator's serving loop for its console. ``obey`` raises FaultCommandError."""
 
     on_event: Callable[[Any], None] | None
 
@@ -49,7 +49,7 @@ class OrderedServer(Protocol):
 
 
 class Printer:
-    """Lines to standard output by a thread of its own: a reader that is slow or gone must not hold up the emulation."""
+    """Prints lines by a thread of its own, so that a slow or missing reader does not delay the emulation."""
 
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
@@ -59,7 +59,7 @@ class Printer:
         self._thread.start()
 
     def say(self, event: str, text: str, /, **data: Any) -> None:
-        """One line: ``text``, or with ``--json`` an object with ``event`` and ``data``."""
+        """Print one line: ``text``, or with ``--json`` an object with ``event`` and ``data``."""
         line = json.dumps({"event": event, **data}) if self.as_json else text
         try:
             self._lines.put_nowait(line)
@@ -67,7 +67,7 @@ class Printer:
             self.lost += 1
 
     def end(self) -> None:
-        """Print what waits, for a second at most."""
+        """Print queued lines, for a second at most."""
         self._lines.put(None)
         self._thread.join(1.0)
 
@@ -81,7 +81,7 @@ class Printer:
 
 
 class Console:
-    """Reads orders from ``descriptor`` in the server's loop, answers through ``printer``."""
+    """Reads fault commands from ``descriptor`` in the server's loop, replies through ``printer``."""
 
     def __init__(self, server: OrderedServer, printer: Printer, descriptor: int = 0) -> None:
         self._server = server
@@ -90,12 +90,12 @@ class Console:
         self._rest = b""
 
     def attach(self) -> None:
-        """Listen; the end of the input is only the end of orders."""
+        """Start reading; the end of the input only ends the commands."""
         self._server.on_event = self.event
         self._server.watch(self._descriptor, self._read)
 
     def event(self, event: EmulationEvent) -> None:
-        """Tell of an event. Times are [s] since the server's start."""
+        """Print an event. Times are [s] since the server's start."""
         seconds = (event.t_ns - self._server.start_ns) * 1e-9
         if not self._printer.as_json and event.kind == "order":
             return  # its answer says it
@@ -107,7 +107,7 @@ class Console:
         )  # fmt: skip
 
     def order(self, text: str) -> bool:
-        """Do an order and answer it; whether it was done."""
+        """Execute a fault command and print the reply; returns whether it succeeded."""
         try:
             answer = self._server.obey(text)
         except FaultCommandError as error:

@@ -18,7 +18,7 @@ from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
 
 class EmulatorError(Exception):
-    """What is emulated did not come up, or ended; carries what it said."""
+    """The emulator did not come up, or ended; carries its output."""
 
     def __init__(self, message: str, code: int | None, output: str) -> None:
         super().__init__(message)
@@ -27,11 +27,11 @@ class EmulatorError(Exception):
 
 
 class EmulatorProcess:
-    """Emulated drives or cameras of a cell in a process of their own; a context manager that ends them.
+    """An emulator of a cell's drives or cameras as a child process; a context manager that ends it.
 
     ``cell``: a cell file, or the name of a shipped cell. ``what``: ``drives`` or ``cameras``. ``options``: further ones
-    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it told so far, oldest
-    first, times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
+    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it reported so far,
+    oldest first, times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class EmulatorProcess:
         self._reader.start()
 
     def wait_ready(self, timeout_s: float = 120.0) -> str:
-        """Wait until it can be reached; its channel. Raises EmulatorError with what it said."""
+        """Wait until it is ready; returns its channel. Raises EmulatorError with its output."""
         until = time.monotonic() + timeout_s
         while not self._ready.wait(0.05):
             code = self.process.poll()
@@ -80,7 +80,7 @@ class EmulatorProcess:
         return self.channel
 
     def order(self, text: str, timeout_s: float = 10.0) -> str:
-        """Give an order (`help` lists them); the answer. Raises FaultCommandError, EmulatorError."""
+        """Send a fault command (`help` lists them); returns the reply. Raises FaultCommandError, EmulatorError."""
         if self.process.stdin is None or self.process.poll() is not None:
             raise EmulatorError(f"the {self._what} have ended", self.process.poll(), self.output())
         self.process.stdin.write(text.replace("\n", " ") + "\n")
@@ -94,13 +94,13 @@ class EmulatorProcess:
         return str(answer["answer"])
 
     def output(self) -> str:
-        """What it logged so far, and its error where it gave one."""
+        """Its log so far, and its error, if any."""
         logged = self._log.read_text(errors="replace").strip() if self._log is not None else ""
         errors = [str(event["error"]) for event in self.events if "error" in event]
         return "\n".join([part for part in (logged, *errors) if part])
 
     def stop(self, how: signal.Signals = signal.SIGTERM, timeout_s: float = 10.0) -> int:
-        """End it (drives without power, arm at rest); gives its exit code. Idempotent."""
+        """Terminate it (drives without power, arm at rest); returns its exit code. Idempotent."""
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:

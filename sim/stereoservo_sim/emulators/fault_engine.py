@@ -1,4 +1,4 @@
-"""Fault commands of an emulator: parsing, scheduling, taking back and logging, from one table of verbs.
+"""Engine of fault commands for all emulators: parsing, scheduling, undo and logging, from one table of verbs.
 
 An emulator declares its verbs once (:class:`Verb`: words, units, action, whether ``for TIME`` may follow) and hands the
 table to a :class:`FaultEngine`. A command is ``VERB WORDS [for TIME] [@ TIME]``; times count from the emulator's start.
@@ -36,7 +36,7 @@ class _VerbCommand(msgspec.Struct, frozen=True):
 
 
 class FaultCommand(_VerbCommand, frozen=True, kw_only=True):
-    """A parsed command; each emulator adds the fields of its words.
+    """A parsed command; each emulator adds the fields of its arguments.
 
     ``at_ns``: when, after the emulator's start; None: at once. ``for_ns``: it is taken back after that time; 0: never.
     """
@@ -52,7 +52,7 @@ Answer = str | tuple[str, Undo]
 
 
 class Word:
-    """One word of a command: its parser, and what applies when it is missing.
+    """One argument of a command: its parser, and its default.
 
     ``read`` gives the command's fields from the word and raises FaultCommandError. ``missing``: the error's text; None:
     the word is optional and the fields are ``default``.
@@ -71,7 +71,7 @@ class Word:
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb of an emulator's language.
+    """A verb of an emulator's fault commands.
 
     ``act(emulator, command)`` carries it out. ``lasting``: ``for TIME`` may follow; its ``act`` then gives an undo.
     ``fixed``: fields that no word sets. ``prepare`` rewrites the words before they are read; ``parse``, where given,
@@ -91,7 +91,7 @@ class Verb:
     logged: bool = True
 
     def fields(self, words: list[str]) -> dict[str, Any]:
-        """The command's fields from its words. Raises FaultCommandError."""
+        """Parse the command's fields from its words. Raises FaultCommandError."""
         words = words if self.prepare is None else self.prepare(words)
         if self.parse is not None:
             return self.parse(words)
@@ -108,8 +108,9 @@ class Verb:
 
 
 class FaultLanguage(Generic[Command]):
-    """The verbs of an emulator, and the commands that its texts parse to. ``example`` (a command that may last) and
-    ``note`` stand in the help."""
+    """The verbs of an emulator, and the type of its commands. ``example`` (a command that may last) and ``note``
+    appear in the help.
+    """
 
     def __init__(
         self, command: type[Command], verbs: Mapping[str, Verb], *, example: str, note: str = ""
@@ -121,11 +122,11 @@ class FaultLanguage(Generic[Command]):
 
     @property
     def lasting(self) -> tuple[str, ...]:
-        """Verbs that ``for TIME`` may follow."""
+        """Verbs that accept ``for TIME``."""
         return tuple(name for name, verb in self.verbs.items() if verb.lasting)
 
     def parse(self, text: str) -> Command:
-        """A command from its text, e.g. ``freeze left for 2s @ 1.5s``. Raises FaultCommandError."""
+        """Parse a command, e.g. ``freeze left for 2s @ 1.5s``. Raises FaultCommandError."""
         body, at, when = text.partition("@")
         words = body.split()
         if not words:
@@ -147,7 +148,7 @@ class FaultLanguage(Generic[Command]):
         return command
 
     def help_lines(self) -> list[str]:
-        """One line a verb, then what may follow a command."""
+        """Help text: one line a verb, then the common suffixes."""
         rows = [(verb.usage, verb.meaning) for verb in self.verbs.values()]
         width = max(len(usage) for usage, _ in rows)
         rows += [
@@ -172,13 +173,13 @@ class FaultLanguage(Generic[Command]):
 
 
 class FaultLog(Protocol):
-    """Where the engine writes what was done: ``kind`` is ``order`` or ``ended``."""
+    """Protocol of the engine's log: ``kind`` is ``order`` or ``ended``."""
 
     def __call__(self, t_ns: int, kind: str, command: Any, text: str) -> None: ...
 
 
 class FaultEngine(Generic[Command]):
-    """Commands to one emulator, carried out now or when due, taken back in time, and logged.
+    """Executes the fault commands of one emulator, now or when due, undoes them in time, and logs them.
 
     ``start_ns``: what the times of commands count from. ``check`` raises FaultCommandError where a command names what
     is not there. ``guard`` is held while something is done or taken back.
@@ -205,20 +206,20 @@ class FaultEngine(Generic[Command]):
         self._count = 0
 
     def parse(self, text: str) -> Command:
-        """The command of a text, its names checked. Raises FaultCommandError."""
+        """Parse a command and check its names. Raises FaultCommandError."""
         command = self._language.parse(text)
         self._check(command)
         return command
 
     def postpone(self, command: Command, now_ns: int) -> str | None:
-        """Schedule a command whose time is to come and give the answer; None where it is to be done now."""
+        """Schedule a command of the future and return the reply; None where it is due now."""
         if command.at_ns is None or self._start_ns + command.at_ns <= now_ns:
             return None
         self._schedule(self._start_ns + command.at_ns, command, None)
         return f"{command.verb} at {command.at_ns * 1e-9:g} s"
 
     def do(self, command: Command, now_ns: int) -> str:
-        """Carry a command out; the answer. Raises FaultCommandError."""
+        """Execute a command; returns the reply. Raises FaultCommandError."""
         self._check(command)
         verb = self._language.verbs[command.verb]
         with self._guard:
@@ -232,18 +233,18 @@ class FaultEngine(Generic[Command]):
         return answer
 
     def order(self, text: str, now_ns: int) -> str:
-        """Parse a text and do it, now or at its own time; the answer. Raises FaultCommandError."""
+        """Parse and execute a command, now or at its own time; returns the reply. Raises FaultCommandError."""
         command = self.parse(text)
         postponed = self.postpone(command, now_ns)
         return self.do(command, now_ns) if postponed is None else postponed
 
     def due_ns(self) -> int:
-        """When the next scheduled command is to be done or taken back."""
+        """Time at which the next scheduled command is to be executed or undone."""
         with self._lock:
             return self._waiting[0][0] if self._waiting else NEVER_NS
 
     def advance(self, now_ns: int) -> bool:
-        """Do or take back the first thing that is due by ``now_ns``; whether there was one.
+        """Execute or undo the first command that is due by ``now_ns``; returns whether there was one.
 
         A scheduled command that cannot be done any more is logged as refused.
         """
@@ -278,7 +279,7 @@ def at_most(words: list[str], count: int) -> None:
 
 
 def duration_ns(word: str) -> int:
-    """A time such as ``6ms`` [ns]; 0 needs no unit. Raises FaultCommandError."""
+    """Parse a duration such as ``6ms`` [ns]; 0 needs no unit. Raises FaultCommandError."""
     if word == "0":
         return 0
     match = _TIME.fullmatch(word)
@@ -291,12 +292,12 @@ def duration_ns(word: str) -> int:
 
 
 def time_word(name: str, missing: str) -> Word:
-    """A time [ns] for the field ``name``."""
+    """Argument: a duration [ns] for the field ``name``."""
     return Word(lambda word: {name: duration_ns(word)}, missing)
 
 
 def choice_word(valid: Mapping[str, Mapping[str, Any]], default: str | None = None) -> Word:
-    """One of the keys of ``valid``; the fields are its value. Without ``default`` it must be there."""
+    """Argument: one of the keys of ``valid``; the fields are its value. Without ``default`` it is required."""
 
     def read(word: str) -> dict[str, Any]:
         if word not in valid:

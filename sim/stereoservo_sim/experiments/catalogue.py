@@ -1,4 +1,4 @@
-"""All experiments of ``stereoservo reproduce``, declared once each, by name."""
+"""Catalogue of all experiments of ``stereoservo reproduce``, by name."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 
 
 def find_experiment(name: str) -> Experiment:
-    """The experiment of that name. Raises ExperimentError, listing those there are."""
+    """Experiment of that name. Raises ExperimentError, which lists the valid names."""
     if name not in EXPERIMENTS:
         known = ", ".join(sorted(EXPERIMENTS))
         raise ExperimentError(

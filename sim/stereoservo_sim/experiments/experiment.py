@@ -1,4 +1,4 @@
-"""The base of every experiment: options, run, JSON answer, figures, table for people, verdict.
+"""Base class of the experiments: options, run, JSON report, figures, printed table, comparison with the thesis.
 
 An experiment is declared once in :mod:`stereoservo_sim.experiments.catalogue`; what it computes is in the module that
 the declaration names, loaded when it runs. With NAME the experiment's name in snake case, that module (or the module of
@@ -33,12 +33,12 @@ LISTED, WIDEST = 200, 400
 
 
 class ExperimentError(Exception):
-    """Input of an experiment is missing, malformed or too little. The text says what, the value, what would
-    be valid.
+    """Invalid, missing or insufficient input of an experiment. The text holds the cause, the value, what would be
+    valid.
 
     Attributes:
         code: short machine-readable cause, e.g. ``"data_missing"``, ``"csv"``, ``"tag_not_seen"``.
-        data: the values that the message speaks of; plain JSON types.
+        data: the values in the message; plain JSON types.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -49,11 +49,11 @@ class ExperimentError(Exception):
 
 @dataclass(frozen=True)
 class Option:
-    """An option of the command line that an experiment takes.
+    """A command line option of an experiment.
 
     ``parse`` gives the argument from the given value and raises ExperimentError; ``argument`` is its name in
     ``run_NAME`` (default: the option's). ``default``: the value where none is given; None: ``run_NAME``'s own.
-    ``required``: what the error says where it is missing.
+    ``required``: the error message where it is missing.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Option:
 
     @property
     def flag(self) -> str:
-        """As on the command line, e.g. ``--hand-tag``."""
+        """Name on the command line, e.g. ``--hand-tag``."""
         return f"--{self.name.replace('_', '-')}"
 
 
@@ -90,7 +90,7 @@ class Experiment:
     reported_by: str = ""
 
     def run(self, seed: int, given: Mapping[str, Any], progress: ProgressCall) -> Any:
-        """The result, with the options that were ``given`` (None: not given). Raises ExperimentError."""
+        """Run with the options that were ``given`` (None: not given). Raises ExperimentError."""
         taken = {option.name for option in self.options}
         for name, value in given.items():
             if value is not None and name not in taken:
@@ -117,7 +117,7 @@ class Experiment:
         return paths
 
     def show(self, answer: dict[str, Any], console: Console) -> None:
-        """Print the answer for people, then what was assumed and written."""
+        """Print the report, then assumptions and written files."""
         (self._optional(self._named("show")) or show_rows)(answer, console)
         for assumption in answer.get("assumptions", []):
             console.print(f"assumed: {assumption}")
@@ -125,7 +125,7 @@ class Experiment:
             console.print(f"wrote {path}")
 
     def verdict(self, answer: dict[str, Any]) -> dict[str, bool]:
-        """Statements beside the thesis that hold or do not, those of several rows together."""
+        """Statements of the comparison with the thesis, true or false; those of several rows together."""
         statements: dict[str, bool] = {}
         for item in answer.get("beside_thesis", []):
             for name, value in item.items():
@@ -137,7 +137,7 @@ class Experiment:
         return f"{what}_{self.name.replace('-', '_')}"
 
     def _optional(self, function: str) -> Callable[..., Any] | None:
-        """A function of the experiment's modules, which are loaded now; None where they have none of that name."""
+        """A function of the experiment's modules, which are imported now; None where none has it."""
         for module in filter(None, (self.module, self.figures)):
             found = getattr(import_module(f"stereoservo_sim.experiments.{module}"), function, None)
             if found is not None:

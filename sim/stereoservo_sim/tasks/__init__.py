@@ -1,1 +1,1 @@
-"""Campaigns of alignment tasks: task files, arms, what is known of them, one task in closed loop, many in parallel."""
+"""Campaigns of alignment tasks: task files, arms, controller knowledge, closed-loop runs, many in parallel."""

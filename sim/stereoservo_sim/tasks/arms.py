@@ -1,7 +1,7 @@
-"""The arms that tasks are made with, in truth: where the plate is, and where a command takes it.
+"""Simulated arms of the alignment tasks: the plate's true pose, and its motion by joint velocities.
 
 ``free`` is a virtual arm of six Cartesian generators that act at once; ``rx90`` a serial arm of six revolute joints
-with limits. The controller knows the readings of their joints and nothing else.
+with limits. The controller has the readings of their joints only.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ RX90_LIMITS = np.radians(
 
 
 class TaskArm(Protocol):
-    """An arm in the middle of a task. ``pose`` (4, 4) of the plate in the rig, ``joints`` (n,): its readings."""
+    """Protocol of an arm during a task. ``pose`` (4, 4) of the plate in the rig, ``joints`` (n,): its readings."""
 
     pose: FloatArray
     joints: FloatArray
@@ -55,12 +55,13 @@ class TaskArm(Protocol):
     limits: FloatArray
 
     def move(self, velocity: FloatArray, dt_s: float) -> None:
-        """Run at ``velocity`` (n,) for ``dt_s``, exactly."""
+        """Move at ``velocity`` (n,) for ``dt_s``, exactly."""
         ...
 
 
 class FreeArm:
-    """Translations along and rotations about the rig's axes through the plate's middle at the start (re-based there).
+    """TaskArm with translations along and rotations about the rig's axes through the plate's centre at the start
+    (re-based there).
 
     ``joints``: the velocities' integrals, from zero.
     """
@@ -94,7 +95,7 @@ class SerialArm:
         self.pose = cell.flange(joints) @ PLATE_ON_FLANGE
 
     def move(self, velocity: FloatArray, dt_s: float) -> None:
-        """Integrate the joints. Limits are the caller's to watch."""
+        """Integrate the joints, without limits."""
         self.joints = self.joints + velocity * dt_s
         self.pose = self._cell.flange(self.joints) @ PLATE_ON_FLANGE
 
@@ -105,7 +106,7 @@ def _cameras() -> tuple[FloatArray, FloatArray]:
 
 
 def free_cell() -> SyntheticCell:
-    """The free arm at mid-range as a chain 3P3R whose joints move one at a time: what its trial motions show."""
+    """Synthetic cell of the free arm: a chain 3P3R at mid-range, for its trial motions."""
     # From joint frame to joint frame, z along x, y, z, x, y, z of the rig.
     turns = [rotation("y", 90), rotation("x", -90), np.eye(4)] * 2
     facing = MID_RANGE.copy()
@@ -145,14 +146,14 @@ def rx90_cell() -> SyntheticCell:
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Configurations of the RX 90 at a task's start and goal, the pair with the smallest largest joint motion."""
+    """Configurations of the RX 90 at a task's start and goal, the pair with the least maximum joint motion."""
 
     start: FloatArray
     goal: FloatArray
 
 
 def rx90_reach(cell: SyntheticCell, start: FloatArray, goal: FloatArray) -> Reach | None:
-    """How the RX 90 reaches two poses (4, 4) of the plate within its limits; None where it does not."""
+    """Configurations of the RX 90 for two poses (4, 4) of the plate within its limits; None where there are none."""
     back = np.linalg.inv(PLATE_ON_FLANGE)
     found = [
         inverse_kinematics(np.linalg.inv(cell.base) @ pose @ back, RX90_LIMITS) for pose in (start, goal)

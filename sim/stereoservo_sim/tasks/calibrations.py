@@ -1,5 +1,5 @@
-"""What the controller knows: learnt from trial motions (``self``), from the truth (``exact``), or metric and wrong
-(``coarse``).
+"""Controller knowledge in the tasks: learnt from trial motions (``self``), from ground truth (``exact``), or metric
+with errors (``coarse``).
 
 ``self``: joint by joint from mid-range, `STOPS` stops a joint as far as both cameras keep the plate in view,
 `FRAMES` noisy frames averaged at each, as the daemon does. From then on the arm's own readings say where it is: the
@@ -50,7 +50,7 @@ MAX_TURN, MAX_TRAVEL = np.radians(50.0), 0.25
 
 
 class TaskCalibration(NamedTuple):
-    """An arm with its model; None where it is metric and wrong, a task's own. ``facts``: for the report.
+    """An arm with its model; None where the model is metric with errors, drawn per task. ``facts``: for the report.
 
     ``focal_error`` (share), ``hand_eye_error_deg``: of a metric model.
     """
@@ -65,7 +65,7 @@ class TaskCalibration(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """What the controller knows when a task starts.
+    """The controller's model at the start of a task.
 
     ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4) and ``points`` (m, 4) of height ``plane_at_infinity @ M = 1``; the
     points by kinematics alone, None where the markers' places on the body are unknown. ``basis`` (r, 4, 4): operators
@@ -90,7 +90,7 @@ class Knowledge:
 
 
 def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed: int) -> TaskCalibration:
-    """Once a file and seed. Raises CalibrationError where the trial motions give no model."""
+    """Calibrate once per file and seed. Raises CalibrationError where the trial motions give no model."""
     cell = free_cell() if arm == "free" else rx90_cell()
     if calibration == "coarse":
         return metric_model(arm, cell, FOCAL_ERROR, HAND_EYE_ERROR_DEG)
@@ -102,13 +102,13 @@ def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed:
 def metric_model(
     arm: ArmName, cell: SyntheticCell, focal_error: float, hand_eye_error_deg: float
 ) -> TaskCalibration:
-    """Metric, with focal lengths too long by a share, and the arm turned about each task's own axis."""
+    """Metric model with focal lengths too long by a share, and the arm rotated about each task's own axis."""
     facts: dict[str, object] = {"focal_error": focal_error, "hand_eye_error_deg": hand_eye_error_deg}
     return TaskCalibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
 
 
 def self_calibrated(arm: ArmName, cell: SyntheticCell, noise_px: float, seed: int) -> TaskCalibration:
-    """From trial motions about the cell's home. Raises CalibrationError."""
+    """Model from trial motions about the cell's home. Raises CalibrationError."""
     started = time.perf_counter()
     cell = with_trial_ranges(cell)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
@@ -176,7 +176,7 @@ def known_at_start(calibration: TaskCalibration, task: AlignmentTask, reach: Rea
 
 
 def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the free arm's own joints read at a pose (4, 4): shift (3,) [m] and turn (3,) [rad] from mid-range.
+    """Readings of the free arm's joints at a pose (4, 4): shift (3,) [m] and rotation (3,) [rad] from mid-range.
 
     First the turn about the middle where the plate was, then the shift.
     """
@@ -185,7 +185,9 @@ def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _coarse(calibration: TaskCalibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
-    """Metric, in the rig's frame: focal lengths too long, the arm turned about the plate's middle at the start."""
+    """Metric model in the rig's frame: focal lengths too long, the arm rotated about the plate's centre at the
+    start.
+    """
     matrices = camera_matrices(1.0 + calibration.focal_error)
     infinity = np.array([0.0, 0.0, 0.0, 1.0])
     centres = _camera_centres(matrices, infinity)

@@ -1,4 +1,6 @@
-"""Many tasks in parallel: each seeded by itself, so that the number of processes changes nothing."""
+"""Parallel execution of many tasks, each with its own seed, so that results do not depend on the number of
+processes.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ _worker: tuple[TaskCalibration, LoopSettings] | None = None
 
 
 class SettingsError(Exception):
-    """Settings that no campaign can run with. The text says what would have been valid."""
+    """Invalid settings of a campaign. The text states what would be valid."""
 
     code = "settings"
 
@@ -89,12 +91,12 @@ def _run_chunk(chunk: Sequence[AlignmentTask]) -> list[TaskResult]:
 
 
 def default_jobs() -> int:
-    """Processors that this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 def summary(results: Sequence[TaskResult]) -> dict[str, Any]:
-    """Rates and extremes: over the reachable tasks, errors and deviations over the solved ones."""
+    """Rates and extremes of a campaign: over the reachable tasks; errors and deviations over the solved ones."""
     judged = [result for result in results if result.success is not None]
     solved = [result for result in judged if result.success]
     low, high = wilson(len(solved), len(judged)) if judged else (0.0, 1.0)

@@ -1,8 +1,7 @@
-"""One task in closed loop: the controller sees noisy pixels and commands; the judge sees the truth and says what came
-of it.
+"""One task in closed loop: the controller sees noisy pixels only, and is evaluated against ground truth.
 
 Set-points are the exact projections of the goal (a goal is taught at rest, averaged over many frames); the target
-points are found from them with what the controller knows.
+points are computed from them with the controller's model.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ NEGLIGIBLE_PX = 1e-4
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How tasks are run.
+    """Settings of the tasks' execution.
 
     ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws that could correct
     their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
@@ -79,13 +78,14 @@ class LoopSettings:
 
 
 class TaskResult(msgspec.Struct, frozen=True):
-    """What came of a task, judged on noise-free projections.
+    """Result of a task, evaluated on noise-free projections.
 
     ``success``: None where the arm cannot reach it. ``iterations``: until the error stayed below `SUCCESS_PX`, or all
     that were made. ``final_error_px``: mean over the last `REST_STEPS` of the largest error over markers and cameras
     used; ``floor_px``: what image noise leaves of it to this loop. ``line_deviation_mm``: the largest distance of
-    the plate's middle from the straight way. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
-    ``closest_view_px``: least distance of a marker from an image's border, on the whole way. ``reason``: why it failed.
+    the plate's middle from the straight path. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
+    ``closest_view_px``: least distance of a marker from an image's border, on the whole path. ``reason``: why it
+    failed.
     """
 
     id: int
@@ -106,7 +106,7 @@ class TaskResult(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The way that a task went: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines.
+    """Recorded path of a task: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines.
 
     ``joints`` (k, n): the arm's readings. ``task_errors`` (k - 1, e): what the law saw of its components at each step,
     NaN where it was not asked.
@@ -122,7 +122,7 @@ class Trace:
 def run_task(
     task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings
 ) -> tuple[TaskResult, Trace]:
-    """Run one task; the same task, calibration and settings give the same result, whatever ran before."""
+    """Run one task; deterministic given task, calibration and settings."""
     reach = None
     if settings.arm == "rx90":
         reach = rx90_reach(calibration.cell, task.start, task.goal)
@@ -135,7 +135,9 @@ def run_task(
 
 
 class Controller:
-    """Pixels and readings in, joint velocity out. It knows its `Knowledge` and the goal's pixels."""
+    """The controller: pixels and readings in, joint velocity out. It has its `Knowledge` and the goal's pixels
+    only.
+    """
 
     def __init__(
         self, knowledge: Knowledge, task: AlignmentTask, settings: LoopSettings, limits: FloatArray
@@ -155,18 +157,20 @@ class Controller:
         self._cameras = cameras_used(settings.law)
         self._wanted = np.ones(self._set_points.shape[:2])
         self._wanted[self._cameras :] = 0.0
-        self._middle = np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
+        self._centre_weights = (
+            np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
+        )
         self._task: Task | None = None
         self._plans = settings.law in LAWS and LAWS[settings.law].planned
         self._look_steps = round(LOOK_S * settings.rate_hz) if self._plans else 0
-        self._way: PlannedPath | None = None
+        self._path: PlannedPath | None = None
         self._limits = limits
         self._operators = knowledge.basis
 
     def step(self, pixels: FloatArray, seen: FloatArray, joints: FloatArray) -> FloatArray:
         """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,).
 
-        Raises RefusedError where a way has to be planned and there is none.
+        Raises RefusedError where a path must be planned and there is none.
         """
         knowledge = self._knowledge
         self._operators = knowledge.operators(joints)
@@ -177,15 +181,15 @@ class Controller:
         points = self.estimate.points
         if self._task is None:
             self._task = self._start(points)
-        task = self._task._replace(centre=self._middle @ points)
+        task = self._task._replace(centre=self._centre_weights @ points)
         scene = Scene(
             self._operators, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points,
             self.estimate.pixels, seen * self._wanted,
         )  # fmt: skip
         if self._plans:
-            if self._way is None:
-                self._way = plan_task_path(scene, task, joints, self._limits)
-            task = self._way.task_now(scene, task, joints, self._dt_s)
+            if self._path is None:
+                self._path = plan_task_path(scene, task, joints, self._limits)
+            task = self._path.task_now(scene, task, joints, self._dt_s)
         step = self._law(scene, task, self._options)
         self.task_error = step.error
         if self._joint_speed is None:
@@ -194,7 +198,7 @@ class Controller:
         return np.asarray(step.velocity * (self._joint_speed / max(fastest, self._joint_speed)))
 
     def moved(self, velocity: FloatArray) -> None:
-        """The arm's readings say that it moved at ``velocity`` for a step."""
+        """Update by the arm's readings after a step at ``velocity``."""
         self.estimate.moved(self._operators, velocity * self._dt_s)
 
     def _start(self, points: FloatArray) -> Task:
@@ -214,8 +218,8 @@ class Controller:
             rates=np.zeros_like(self._set_points),
             target_points=targets,
             target_known=np.ones(len(targets)),
-            centre=self._middle @ points,
-            centre_target=self._middle @ targets,
+            centre=self._centre_weights @ points,
+            centre_target=self._centre_weights @ targets,
             face=FACE,
         )
 
@@ -233,12 +237,12 @@ def _law(name: str, knowledge: Knowledge) -> Callable[[Scene, Task, Options], La
 
 
 def cameras_used(law: str) -> int:
-    """How many cameras a law looks through."""
+    """Number of cameras that a law uses."""
     return 1 if law in LAWS and LAWS[law].one_camera == "suffices" else 2
 
 
 def _arrays(knowledge: Knowledge) -> ModelArrays:
-    """As the daemon's search for the goal's pose takes a model."""
+    """The model in the form of the daemon's search for the goal's pose."""
     n, m = len(knowledge.basis), len(FACE) + 1
     return ModelArrays(
         generators=knowledge.basis,
@@ -317,7 +321,7 @@ def _run(
 
 
 def _seen(truth: PlateView, settings: LoopSettings, time_s: float) -> FloatArray:
-    """(c, m): 1 for markers that lie in the image of a camera that is not dropped, else 0."""
+    """Visibility (c, m): 1 for markers in the image of a camera that is not dropped, else 0."""
     seen = in_images(truth.pixels).astype(np.float64)
     if settings.drop_camera is not None:
         start, duration = settings.drop_camera
@@ -327,7 +331,7 @@ def _seen(truth: PlateView, settings: LoopSettings, time_s: float) -> FloatArray
 
 
 def _settled(errors: FloatArray, k: int, window: int) -> bool:
-    """Whether the error has been small for two windows, and does not fall any more from one to the other."""
+    """Whether the error has been small for two windows without a further decrease."""
     if k + 1 < 2 * window or not errors[k] < SUCCESS_PX or (k % max(window // 10, 1)):
         return False
     before, last = errors[k + 1 - 2 * window : k + 1 - window], errors[k + 1 - window : k + 1]

@@ -1,4 +1,4 @@
-"""Laws for comparison that no cell runs: camera by camera (8.37), and on metric points of a calibrated rig (8.17)."""
+"""Control laws for comparison only: camera by camera (8.37), and on metric points of a calibrated rig (8.17)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def euclidean_points(
 
 
 def _seen(scene: Scene, task: Task) -> FloatArray:
-    """Weights (m,) of the markers: of the camera that sees each best, 0 where the goal's point is not known."""
+    """Weights (m,) of the markers: of the camera that sees each best, 0 where the goal's point is unknown."""
     found: FloatArray = scene.weights.max(axis=0, initial=0.0) * (task.target_known > 0.0)
     return found
 

@@ -1,4 +1,4 @@
-"""The judge: Euclidean truth on noise-free projections, out of the controller's sight."""
+"""Evaluation of tasks: Euclidean ground truth on noise-free projections."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EYES = camera_poses()[:, :3, 3].copy()
 
 
 class PlateView(NamedTuple):
-    """What the cameras truly see of the plate: ``pixels`` (c, m, 2), and the worst over markers and cameras used.
+    """True images of the plate: ``pixels`` (c, m, 2), and the worst measures over markers and cameras used.
 
     ``margin_px``: to the nearest border, negative out of view; ``depth_m``; ``facing``: cosine of the angle at which a
     camera sees the plate's normal, negative where it sees the back.
@@ -43,19 +43,19 @@ class PlateView(NamedTuple):
 
 
 def sight(pose: FloatArray, cameras: int = len(MATRICES)) -> PlateView:
-    """The plate at ``pose`` (4, 4), in all images; judged in those of the first ``cameras``."""
+    """View of the plate at ``pose`` (4, 4) in all images; measures of those of the first ``cameras``."""
     return PlateView(*_sight(MATRICES, EYES, HOMOGENEOUS_MARKERS, pose, cameras))
 
 
 def in_images(pixels: FloatArray) -> npt.NDArray[np.bool_]:
-    """(c, m): which of the pixels (c, m, 2) are in their image."""
+    """Mask (c, m) of the pixels (c, m, 2) inside their image."""
     inside = (pixels >= 0.0) & (pixels < np.array([WIDTH, HEIGHT]))
     return np.asarray(inside.all(axis=-1))
 
 
 @kernel
 def _sight(
-    matrices: FloatArray, eyes: FloatArray, markers: FloatArray, pose: FloatArray, used: int
+    matrices: FloatArray, camera_centres: FloatArray, markers: FloatArray, pose: FloatArray, used: int
 ) -> tuple[FloatArray, float, float, float]:
     cameras, count = matrices.shape[0], markers.shape[0]
     pixels = np.empty((cameras, count, 2))
@@ -80,9 +80,9 @@ def _sight(
     for c in range(used):
         along, length = 0.0, 0.0
         for i in range(3):
-            way = eyes[c, i] - pose[i, 3]
-            along -= pose[i, 2] * way
-            length += way * way
+            offset = camera_centres[c, i] - pose[i, 3]
+            along -= pose[i, 2] * offset
+            length += offset * offset
         facing = min(facing, along / math.sqrt(length))
     return pixels, margin, nearest, facing
 
@@ -94,20 +94,20 @@ def error_px(pixels: FloatArray, set_points: FloatArray, cameras: int) -> float:
 
 
 def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> FloatArray:
-    """Distances (k,) [m] of the plate's middle in ``poses`` (k, 4, 4) from the line between ``start``'s and ``goal``'s.
+    """Distances (k,) [m] of the plate's centre in ``poses`` (k, 4, 4) from the line from ``start`` to ``goal``.
 
     From the segment: what is overshot counts.
     """
     a, b = start[:3, 3], goal[:3, 3]
-    way = b - a
-    length = float(way @ way)
+    offset = b - a
+    length = float(offset @ offset)
     from_a = poses[:, :3, 3] - a
-    share = np.clip(from_a @ way / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(poses))
-    return np.asarray(np.linalg.norm(from_a - share[:, None] * way, axis=1))
+    share = np.clip(from_a @ offset / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(poses))
+    return np.asarray(np.linalg.norm(from_a - share[:, None] * offset, axis=1))
 
 
 def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, cameras: int) -> float:
-    """Mean of the largest error over markers that image noise leaves to a loop at rest [px].
+    """Expected largest error over markers [px] of a loop at rest by image noise.
 
     The pose of least squares of each frame alone has the covariance ``σ²(JᵀJ)⁻¹``; a loop in which an error decays by
     ``exp(-gain·dt)`` a step lets ``λ/(2 - λ)``, ``λ = 1 - exp(-gain·dt)``, of it through. The mean over its directions

@@ -1,4 +1,4 @@
-"""Hard alignment tasks: to 180° and 0.6 m, near the borders of the images, so that the straight way leaves the view.
+"""Hard alignment tasks: up to 180° and 0.6 m, near the image borders, such that the straight path leaves the view.
 
 ``python -m stereoservo_sim.tasks.hard_tasks`` writes `tasks_hard.csv` beside this module; the same seed, the same file.
 Both end poses are visible in both cameras. Tasks are drawn until their straight way is of the kind whose turn it is
@@ -29,7 +29,7 @@ NEAR_PX = 20.0
 STEPS = 41
 FIRST_ID = 5000
 KINDS = ("leaves the view", "near a border", "shows the back", "as it comes")
-"""In turn: of the way on which the middle goes straight and the plate turns about one axis, the shorter way round."""
+"""In turn: of the way on which the middle goes straight and the plate turns about one axis, by the shorter rotation."""
 
 
 def shipped_tasks_path() -> Path:
@@ -63,7 +63,7 @@ def _task(seed: int, number: int) -> AlignmentTask:
         distance = float(np.linalg.norm(start[:3, 3] - goal[:3, 3]))
         if not (_visible(goal) and _visible(start) and distance <= MAX_DISTANCE_M):
             continue
-        margin, facing = straight_way(start, goal)
+        margin, facing = straight_path_margins(start, goal)
         wanted = {
             "leaves the view": margin < 0.0 and facing > 0.0,
             "shows the back": facing <= 0.0,
@@ -98,8 +98,8 @@ def _angle(rng: np.random.Generator, number: int, kind: str) -> float:
     return float(rng.uniform(0.0, 150.0))
 
 
-def straight_way(start: FloatArray, goal: FloatArray) -> tuple[float, float]:
-    """Least distance from the borders [px] and least cosine to the plate's normal on the straight way.
+def straight_path_margins(start: FloatArray, goal: FloatArray) -> tuple[float, float]:
+    """Least distance from the image borders [px] and least cosine to the plate's normal on the straight path.
 
     The middle goes on its line while the plate turns about one axis, the shorter way round.
     """
@@ -125,7 +125,7 @@ def _pose(rng: np.random.Generator) -> FloatArray:
 
 
 def _visible(pose: FloatArray) -> bool:
-    """Whether both cameras see the plate's front, no nearer to a border than allowed."""
+    """Whether both cameras see the plate's front, at the required distance from the borders."""
     seen: PlateView = sight(pose)
     return (
         seen.in_view

@@ -1,4 +1,4 @@
-"""What the controller makes of its pixels: the markers in its projective frame, predicted by kinematics and corrected.
+"""The controller's estimate of the markers in its projective frame: predicted by kinematics, corrected by pixels.
 
 As in the running cell: the innovation of all markers becomes one displacement of the body, of which each frame makes a
 share, so that noise is averaged over ``FILTER_S`` and a camera that drops out leaves the prediction to go on with. The
@@ -36,7 +36,7 @@ FIRST_ROUNDS = 5
 
 
 class MarkerEstimate:
-    """Points (m, 4) of height 1 and pixels (c, m, 2) at present, as the laws take them."""
+    """Current points (m, 4) of scale 1 and pixels (c, m, 2), in the laws' form."""
 
     def __init__(self, knowledge: Knowledge, source: PointsName, dt_s: float) -> None:
         self._knowledge = knowledge
@@ -49,7 +49,7 @@ class MarkerEstimate:
         self._residual = np.zeros((0, 0, 2))
 
     def moved(self, operators: FloatArray, step: FloatArray) -> None:
-        """The joints have moved by ``step`` (n,), with ``operators`` (n, 4, 4) before it."""
+        """Predict after a joint motion by ``step`` (n,), with ``operators`` (n, 4, 4) before it."""
         before, _ = project_points(self._knowledge.matrices, self.points)
         self.points = transform_points(
             displace(operators, int(self._knowledge.composition), step), self.points
@@ -58,7 +58,7 @@ class MarkerEstimate:
         self._rests = bool(np.abs(after - before).max() < REST_PX_S * self._dt_s)
 
     def seen(self, pixels: FloatArray, weights: FloatArray) -> None:
-        """A frame of every camera: pixels (c, m, 2), weights (c, m), 0 where a marker is not seen."""
+        """Correct by a frame of every camera: pixels (c, m, 2), weights (c, m), 0 where a marker is not seen."""
         if self.triangulates:
             self._triangulate(pixels, weights)
             return
@@ -96,7 +96,8 @@ def corrected(
     weights: FloatArray,
     share: float,
 ) -> FloatArray:
-    """Points (m, 4) displaced by ``share`` of what explains ``pixels`` (c, m, 2) best, ``basis`` (r, 4, 4).
+    """Points (m, 4) displaced by ``share`` of the least-squares displacement for ``pixels`` (c, m, 2), ``basis``
+    (r, 4, 4).
 
     The prediction counts as ``1/share - 1`` frames of all cameras; cameras of weight 0 say nothing now.
     """

@@ -1,4 +1,4 @@
-"""The law ``trajectory`` in a campaign: the way is planned before anything moves, or refused, and then followed."""
+"""The law ``trajectory`` in a campaign: the path is planned before the motion, or refused, and then tracked."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ VIEW_MARGIN_PX = 2.0
 JOINT_MARGIN = 0.02
 """Planned distance from the joints' limits [rad], likewise."""
 LARGEST_LAG_PX = 20.0
-"""Distance behind its way at which the body is waited for."""
+"""Distance behind its path at which the plan waits for the body."""
 SPEED_M, SPEED_RAD = 0.1, 0.6
 """[m/s], [rad/s]; accelerations reach them in half a second."""
 ACCELERATION_S = 0.5
 
 
 class NoPathError(Exception):
-    """No way leads there. ``reason``: why, and where on the way."""
+    """There is no path. ``reason``: why, and where on the path."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -35,7 +35,7 @@ class NoPathError(Exception):
 
 
 class PlannedPath:
-    """A plan that is being followed."""
+    """A planned path during its execution."""
 
     def __init__(self, planned: Plan, start: FloatArray, task: Task) -> None:
         self.plan = planned
@@ -44,10 +44,10 @@ class PlannedPath:
         self._time_s = 0.0
 
     def task_now(self, scene: Scene, task: Task, joints: FloatArray, dt_s: float) -> Task:
-        """Set-points where the plan has them now, and how fast they go from there to where it has them ``dt_s`` later.
+        """Current set-points of the plan, with their velocities as a difference over ``dt_s``.
 
         The same of its joints, for an arm at ``joints`` (n,).
-        The plan's time goes on by ``dt_s``, or less where the body lags.
+        The plan's time advances by ``dt_s``, or less where the body lags.
         """
         set_points = self._set_points(scene)
         apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
@@ -70,7 +70,7 @@ class PlannedPath:
 
 
 def plan_task_path(scene: Scene, task: Task, joints: FloatArray, limits: FloatArray) -> PlannedPath:
-    """The way from ``scene`` to ``task``; ``limits`` (n, 2) of the joints. Raises RefusedError."""
+    """Path from ``scene`` to ``task``; ``limits`` (n, 2) of the joints. Raises RefusedError."""
     n, cameras = len(joints), len(scene.matrices)
     # The free arm's first three joints are lengths; a serial arm's are all angles.
     speeds = np.full(n, SPEED_RAD)
@@ -106,7 +106,7 @@ def plan_task_path(scene: Scene, task: Task, joints: FloatArray, limits: FloatAr
 
 
 def describe_failure(failure: ClosestApproach) -> str:
-    """A failure in words."""
+    """A failure as text."""
     marker = f" of marker {failure.marker}" if failure.marker >= 0 else ""
     return (
         f"{failure.what} {failure.index}{marker} at {failure.share:.0%} of the way: {failure.value:.4g} "

@@ -1,4 +1,4 @@
-"""Tasks of the public file's kind, drawn anew: to 150° and 0.4 m, both ends in view of both cameras."""
+"""Random tasks like those of the public file: up to 150° and 0.4 m, both ends in view of both cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ASIDE_M, DOWN_M, DEPTHS_M = 0.25, 0.2, (0.8, 1.4)
 
 
 def random_tasks(seed: int, count: int) -> tuple[AlignmentTask, ...]:
-    """Angle and distance are drawn once a task, the rest until both ends are visible."""
+    """Random tasks; angle and distance are drawn once a task, the rest until both ends are visible."""
     rng = np.random.default_rng(seed)
     tasks: list[AlignmentTask] = []
     while len(tasks) < count:
@@ -32,7 +32,7 @@ def random_tasks(seed: int, count: int) -> tuple[AlignmentTask, ...]:
 def random_ends(
     rng: np.random.Generator, angle_deg: float, distance_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Start and goal (4, 4), so far apart in a random direction and turned about a random axis, in view or not."""
+    """Start and goal (4, 4) at a distance in a random direction and rotated about a random axis, in view or not."""
     goal, start = np.eye(4), np.eye(4)
     goal[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     goal[:3, 3] = rng.uniform(-ASIDE_M, ASIDE_M), rng.uniform(-DOWN_M, DOWN_M), rng.uniform(*DEPTHS_M)
@@ -42,7 +42,7 @@ def random_ends(
 
 
 def visible(pose: FloatArray) -> bool:
-    """Whether both cameras see the plate's front, no nearer to a border than allowed."""
+    """Whether both cameras see the plate's front, at the required distance from the borders."""
     seen = sight(pose)
     return (
         seen.in_view and seen.margin_px > BORDER_PX and seen.facing > np.cos(np.radians(MAX_VIEW_ANGLE_DEG))
@@ -50,6 +50,6 @@ def visible(pose: FloatArray) -> bool:
 
 
 def unit(rng: np.random.Generator) -> FloatArray:
-    """A unit vector (3,), uniform on the sphere."""
+    """Random unit vector (3,), uniform on the sphere."""
     v = rng.normal(size=3)
     return np.asarray(v / np.linalg.norm(v))

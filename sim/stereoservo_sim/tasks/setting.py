@@ -1,4 +1,4 @@
-"""The stage of task files v1, which their head comments state: two cameras, a plate of four markers, what fails.
+"""Scene of task files v1, as their head comments specify it: two cameras, a plate of four markers, limits.
 
 Rig frame: the middle of the baseline, x from the left to the right camera, z ahead [m]. Plate: its printed face looks
 along -z.
@@ -33,12 +33,12 @@ HOMOGENEOUS_MARKERS = np.hstack([MARKERS, np.ones((4, 1))])
 
 
 def intrinsics(scale: float = 1.0) -> FloatArray:
-    """(3, 3) with the focal length times ``scale``."""
+    """Intrinsics (3, 3) with the focal length times ``scale``."""
     return np.array([[FOCAL * scale, 0.0, CENTRE_U], [0.0, FOCAL * scale, CENTRE_V], [0.0, 0.0, 1.0]])
 
 
 def camera_poses() -> FloatArray:
-    """Left and right camera in the rig's frame: rMcl, rMcr (2, 4, 4)."""
+    """Poses rMcl, rMcr (2, 4, 4) of left and right camera in the rig's frame."""
     return np.array(
         [
             translation(-0.5 * BASELINE, 0, 0) @ rotation("y", YAW_DEG),
@@ -48,13 +48,13 @@ def camera_poses() -> FloatArray:
 
 
 def camera_matrices(focal_scale: float = 1.0) -> FloatArray:
-    """(2, 3, 4): points of the rig's frame to pixels."""
+    """Camera matrices (2, 3, 4): points of the rig's frame to pixels."""
     K = intrinsics(focal_scale)
     return np.array([K @ np.linalg.inv(pose)[:3] for pose in camera_poses()])
 
 
 def twist(direction: FloatArray, point: FloatArray | None = None) -> FloatArray:
-    """(4, 4): rotation about the unit ``direction`` (3,) through ``point`` (3,), or translation along it."""
+    """Twist (4, 4): rotation about the unit ``direction`` (3,) through ``point`` (3,), or translation along it."""
     T = np.zeros((4, 4))
     if point is None:
         T[:3, 3] = direction
@@ -66,6 +66,8 @@ def twist(direction: FloatArray, point: FloatArray | None = None) -> FloatArray:
 
 
 def cartesian_twists(middle: FloatArray, axes: FloatArray | None = None) -> FloatArray:
-    """Translations along and rotations about the columns of ``axes`` (3, 3) through ``middle`` (3,): (6, 4, 4)."""
+    """Twists (6, 4, 4): translations along and rotations about the columns of ``axes`` (3, 3) through ``middle``
+    (3,).
+    """
     columns = (np.eye(3) if axes is None else axes).T
     return np.array([twist(a) for a in columns] + [twist(a, middle) for a in columns])

@@ -1,4 +1,4 @@
-"""Task files: alignment tasks as CSV, read strictly, with line and column of what does not fit; and written."""
+"""Reader and writer of task files: alignment tasks as CSV; errors state line and column."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COLUMNS = ("id", "seed", "angle_deg", "trans_m", *ERROR_AXIS, *START, *GOAL)
 
 
 class TaskFileError(Exception):
-    """A task file does not fit. The text says where and what would have been valid.
+    """An invalid task file. The text states where, and what would be valid.
 
     Attributes:
         code: ``task_file``.
@@ -49,7 +49,7 @@ class TaskFileError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentTask:
-    """Move the plate from ``start`` to ``goal``, (4, 4) poses in the rig's frame.
+    """Task: move the plate from ``start`` to ``goal``, (4, 4) poses in the rig's frame.
 
     ``error_axis`` (3,): unit axis of the hand-eye error of the coarse calibration. ``angle_deg``, ``distance_m``: of
     the way, as the file states them.
@@ -65,7 +65,7 @@ class AlignmentTask:
 
 
 def read_tasks(path: Path) -> tuple[AlignmentTask, ...]:
-    """All tasks of a file, in its order. Raises TaskFileError."""
+    """All tasks of a file, in order. Raises TaskFileError."""
     header: list[str] | None = None
     tasks: list[AlignmentTask] = []
     lines: dict[int, int] = {}
@@ -114,7 +114,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _check_comment(path: Path, number: int, line: str) -> None:
-    """What a comment states of the stage must be what v1 fixes: other cameras would be other tasks."""
+    """Check that a comment on the scene agrees with v1: other cameras would make other tasks."""
     text = line.lstrip("#").strip()
     if text.startswith(VERSION_LINE):
         version = text.removeprefix(VERSION_LINE).split()[0] if text != VERSION_LINE else ""
@@ -218,7 +218,7 @@ def _integer(path: Path, number: int, row: dict[str, str], name: str) -> int:
 
 
 def tasks_text(tasks: Sequence[AlignmentTask], source: str) -> str:
-    """A task file's text that `read_tasks` reads back; ``source``: one line on where the tasks come from."""
+    """Text of a task file, which `read_tasks` reads; ``source``: one line on the tasks' origin."""
     left, right = (",".join(f"{v:.12g}" for v in pose.ravel()) for pose in camera_poses())
     markers = " ".join("({:g},{:g},{:g})".format(*marker) for marker in MARKERS)
     out = io.StringIO()

@@ -1,4 +1,4 @@
-"""Euclidean inverse kinematics of the synthetic RX 90 in closed form: the judge's, not the controller's."""
+"""Closed-form Euclidean inverse kinematics of the synthetic RX 90, for ground truth only."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def inverse_kinematics(flange: FloatArray, limits: FloatArray) -> FloatArray:
 
 
 def _wrist(R: FloatArray, flip: bool) -> tuple[float, float, float]:
-    """Angles of ``R = Rz Ry Rz``."""
+    """Wrist angles of ``R = Rz Ry Rz``."""
     fifth = float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
     if np.sin(fifth) < 1e-9:
         turn = np.arctan2(R[1, 0], R[1, 1])
@@ -53,7 +53,7 @@ def _wrist(R: FloatArray, flip: bool) -> tuple[float, float, float]:
 
 
 def _within(angles: FloatArray, limits: FloatArray) -> FloatArray:
-    """Every choice of whole turns that lies within the limits."""
+    """All solutions by whole turns that lie within the limits."""
     kept = []
     for row in angles:
         choices = []

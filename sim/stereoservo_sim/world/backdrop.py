@@ -1,4 +1,4 @@
-"""What stands behind the markers, drawn seldom: a room, or an even grey; `pybullet_backdrop` has one with the arm."""
+"""Background images behind the markers, redrawn rarely: a room, a uniform grey, or the arm by pybullet."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLAIN_LEVEL = 90
 
 
 class Backdrop:
-    """Grey images that cost too much for every frame: kept until the arm has moved and time has passed."""
+    """Background images that are too slow for every frame: cached until the arm has moved and time has passed."""
 
     def __init__(self) -> None:
         self._age = 0
@@ -27,7 +27,7 @@ class Backdrop:
         raise NotImplementedError
 
     def image(self, q: FloatArray) -> ImageArray:
-        """The image (height, width) with the arm about at ``q`` (n,) [rad]: not older than it must be."""
+        """Cached image (height, width) for the arm near ``q`` (n,) [rad]."""
         self._age += 1
         moved = self._q is None or float(np.abs(q - self._q).max()) > REFRESH_MOVE
         if self._image is None or (moved and self._age >= REFRESH_FRAMES):
@@ -44,13 +44,13 @@ class RoomBackdrop(Backdrop):
         self._camera = camera
 
     def image(self, q: FloatArray) -> ImageArray:
-        """The room; drawn once for a camera that stands."""
+        """Image of the room; drawn once for a static camera."""
         if self._image is not None and self._cell.stand is None:
             return self._image
         return super().image(q)
 
     def draw(self, q: FloatArray) -> ImageArray:
-        """The room from where the camera is with the arm at ``q`` (n,) [rad]."""
+        """Image of the room from the camera's pose with the arm at ``q`` (n,) [rad]."""
         camera = self._cell.in_world(self._camera, q)
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
         wall = 100 + 18 * np.cos(u / camera.width * 2.2) - 12 * v / camera.height
@@ -65,14 +65,14 @@ class RoomBackdrop(Backdrop):
 
 
 class PlainBackdrop(Backdrop):
-    """An even grey."""
+    """Uniform grey background."""
 
     def __init__(self, camera: PinholeCamera) -> None:
         super().__init__()
         self._image = np.full((camera.height, camera.width), PLAIN_LEVEL, dtype=np.uint8)
 
     def image(self, q: FloatArray) -> ImageArray:
-        """The same for any ``q``."""
+        """The uniform image, for any ``q``."""
         assert self._image is not None
         return self._image
 
@@ -83,7 +83,7 @@ BRIGHTNESS = 0.6  # of what pybullet's lamp gives
 
 
 class PybulletBackdrop(Backdrop):
-    """The arm by pybullet's own renderer, as a pinhole ``camera`` of the cell's rig sees it."""
+    """Background with the arm by pybullet's renderer, for a pinhole ``camera`` of the cell's rig."""
 
     def __init__(self, cell: SimulatedCell, camera: PinholeCamera) -> None:
         from stereoservo_sim.world.physics import PhysicsError, import_pybullet, load_robot
@@ -108,7 +108,7 @@ class PybulletBackdrop(Backdrop):
         self._projection = projection_matrix(camera).T.ravel().tolist()
 
     def draw(self, q: FloatArray) -> ImageArray:
-        """The arm at ``q`` (n,) [rad]."""
+        """Image of the arm at ``q`` (n,) [rad]."""
         for joint, position in enumerate(q.tolist()):
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         camera = self._cell.in_world(self._camera, q)

@@ -1,6 +1,4 @@
-"""The marker body on the flange: planar faces with dots, joined to a shallow roof. Truth, unknown to the
-service.
-"""
+"""The marker body on the flange, as ground truth: planar faces with dots, joined like a shallow roof."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated cameras: pinholes with a radially bending lens. Pixels: integer = pixel centre.
+"""Simulated cameras: pinholes with radial lens distortion. Pixels: integer = pixel centre.
 
 Ideal pixels are a pinhole's, ``K`` on rays; raw ones are those of the image, which the lens has bent.
 """
@@ -34,12 +34,14 @@ class PinholeCamera:
 
     @property
     def sees_whole_image(self) -> bool:
-        """Whether the lens's image reaches into every corner; with a strong negative ``k1`` it ends before."""
+        """Whether the lens's image reaches every corner; with a strong negative ``k1`` it ends before."""
         return self.k1 > self.least_k1
 
     @property
     def least_k1(self) -> float:
-        """The ``k1`` of which the image ends in the farthest corner: there 27/4 |k| s² = 1, s the raw radius."""
+        """The ``k1`` with which the lens's image just reaches the farthest corner: there 27/4 |k| s² = 1, s the raw
+        radius.
+        """
         right, bottom = self.width - 0.5, self.height - 0.5
         corners = np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)])
         farthest = ((corners - self.K[:2, 2]) ** 2).sum(axis=1).max() / (self.K[0, 0] * self.K[1, 1])
@@ -51,7 +53,7 @@ class PinholeCamera:
         return (distort(self.lens, ideal) if self.k1 != 0.0 else ideal), depths
 
     def moved(self, pose: FloatArray) -> PinholeCamera:
-        """This camera, mounted in a frame of ``pose`` (4, 4) in the world, as it stands in the world."""
+        """This camera, mounted in a frame of ``pose`` (4, 4) in the world, as a camera in the world."""
         return replace(self, world_to_camera=self.world_to_camera @ inverse_pose(pose))
 
     def moved_by(self, displacement: FloatArray) -> PinholeCamera:
@@ -105,9 +107,7 @@ def project(P: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def look_at(eye: FloatArray, target: FloatArray, up: FloatArray) -> FloatArray:
-    """World-to-camera pose (4, 4) of a camera at ``eye`` that looks at ``target``; image y points against
-    ``up``.
-    """
+    """World-to-camera pose (4, 4) of a camera at ``eye`` aimed at ``target``; image y points against ``up``."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -127,7 +127,7 @@ def stereo_rig(
     size: tuple[int, int] = (640, 480),
     names: tuple[str, str] = ("left", "right"),
 ) -> StereoRig:
-    """Two equal cameras turned inwards by half of ``vergence`` [rad] each, ``baseline`` [m] apart."""
+    """Rig of two equal cameras, each rotated inwards by half of ``vergence`` [rad], ``baseline`` [m] apart."""
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
     cameras = []
     for name, side in zip(names, (-1.0, 1.0), strict=True):

@@ -1,4 +1,4 @@
-"""The model that a calibration without noise would find of a synthetic cell."""
+"""Exact model of a synthetic cell: the result of a calibration without noise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereoservo_sim.world.synthetic import SyntheticCell
 
 
 def twists(cell: SyntheticCell, zero: FloatArray) -> FloatArray:
-    """How each joint moves the markers in the rig's frame at ``zero`` (n,): twists (n, 4, 4), base first."""
+    """Twists (n, 4, 4) of the joints in the rig's frame at ``zero`` (n,), base first."""
     points, directions = cell.axes(zero)
     if cell.mount == "eye_in_hand":
         to_rig = np.linalg.inv(cell.flange(zero))
@@ -34,10 +34,11 @@ def exact_model(
     stratum: Stratum = "metric",
     plane: tuple[float, float, float, float] = (0.05, -0.03, 0.4, 0.3),
 ) -> CellModel:
-    """``cell`` in the canonical projective frame with ``plane`` as its plane at infinity; ``zero``: home if None.
+    """Model of ``cell`` in the canonical projective frame with ``plane`` as its plane at infinity; ``zero``: home
+    if None.
 
     ``plane`` must not pass between the markers as seen from the left camera; the default stays clear of them for
-    cameras of ordinary focal lengths. ``stratum`` says how much of it the model tells.
+    cameras of ordinary focal lengths. ``stratum`` of the model.
     """
     zero = cell.home if zero is None else zero
     normaliser = pixel_normaliser(cell.width, cell.height)

@@ -1,4 +1,4 @@
-"""The true joint positions over time, written by the simulated arm, read by simulated cameras and by judges.
+"""History of the true joint positions, written by the simulated arm, read by simulated cameras and for evaluation.
 
 A ring of samples in a memory-mapped file, so that a camera in another process can show the arm exactly at
 its shutter time, and so that a demonstration can be judged against what the arm really did. One writer,
@@ -27,11 +27,11 @@ _COUNT_AT = 16
 
 
 class HistoryError(Exception):
-    """A history file cannot be used: names the file and what is wrong with it."""
+    """A history file cannot be used; the text names the file and the cause."""
 
 
 class TrueJointHistory:
-    """A ring of (t_ns, positions, velocities); times strictly increasing.
+    """Ring buffer of (t_ns, positions, velocities); times strictly increasing.
 
     Create one with :meth:`create`, :meth:`open` or :meth:`in_memory`.
     """
@@ -65,8 +65,7 @@ class TrueJointHistory:
 
     @classmethod
     def create(cls, path: Path, joints: int, *, now_ns: int, capacity: int = CAPACITY) -> TrueJointHistory:
-        """The writer's end. Goes on with an existing file of this layout whose samples are not from the
-        future.
+        """Open for writing. Continues an existing file of this layout whose samples are not from the future.
 
         Raises:
             HistoryError: the file cannot be created.
@@ -96,8 +95,8 @@ class TrueJointHistory:
 
     @classmethod
     def open(cls, path: Path) -> TrueJointHistory:
-        """A reader's end (or the writer's, where the file exists). Raises HistoryError: no or no such
-        file.
+        """Open for reading (or for the writer, where the file exists). Raises HistoryError where the file is
+        missing or invalid.
         """
         try:
             with path.open("r+b") as file:
@@ -120,7 +119,7 @@ class TrueJointHistory:
         return int(struct.unpack_from("<Q", self._buffer, _COUNT_AT)[0])
 
     def append(self, t_ns: int, positions: FloatArray, velocities: FloatArray) -> None:
-        """Write one sample (n,), (n,); one that is not newer than the last is left out."""
+        """Write one sample (n,), (n,); a sample that is not newer than the last is ignored."""
         if t_ns <= self._last_ns:
             return
         index = self.count

@@ -1,4 +1,4 @@
-"""What a bending lens does to a picture: outlines and whole images from ideal to raw pixels."""
+"""Lens distortion of simulated images: outlines and whole images from ideal to raw pixels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo_sim.world.camera_rig import PinholeCamera
 
 CIRCLE_POINTS = 40
-"""Corners of the polygon that stands for a dot: with its area, the centre of its image is right to 1e-4 px."""
+"""Corners of the polygon that represents a dot: with its area, the centre of its image is right to 1e-4 px."""
 PIECE_PX = 20.0
 """Length up to which a piece of an outline's edge stays straight."""
 MOST_PIECES = 64
@@ -28,7 +28,7 @@ def unit_circle() -> FloatArray:
 
 
 def bend_outline(camera: PinholeCamera, outline: FloatArray) -> FloatArray:
-    """A polygon (k, 2) in ideal pixels as ``camera`` shows it, its edges finely divided.
+    """A polygon (k, 2) in ideal pixels, distorted by the lens of ``camera``, its edges finely divided.
 
     Corners beyond the lens's fold stay at the rim of what it images: outside of the picture, whose corners it reaches.
     """
@@ -46,10 +46,10 @@ def bend_outline(camera: PinholeCamera, outline: FloatArray) -> FloatArray:
 
 
 class BentImage:
-    """Makes a camera's image from that of ``pinhole``, a larger one without distortion in the same place."""
+    """Distorts the image of ``pinhole``, a larger one without distortion at the same pose, into a camera's image."""
 
     def __init__(self, camera: PinholeCamera) -> None:
-        """Raises ValueError where the lens's image ends inside the picture."""
+        """Raises ValueError where the lens's image ends inside the image."""
         if not camera.sees_whole_image:
             raise ValueError(f"camera {camera.name!r}: k1 = {camera.k1:g} leaves the image's corners dark")
         self.camera = camera
@@ -70,7 +70,7 @@ class BentImage:
         self._map = cv2.convertMaps((ideal - self.origin).astype(np.float32), None, cv2.CV_16SC2)
 
     def image(self, source: ImageArray) -> ImageArray:
-        """The camera's image of the pinhole's; one that was bent last is not bent again."""
+        """Distort the pinhole's image; the last result is cached."""
         if not self.bends:
             return source
         if self._bent is None or source is not self._source:
@@ -79,5 +79,5 @@ class BentImage:
         return self._bent
 
     def outline(self, corners: FloatArray) -> FloatArray:
-        """A polygon (k, 2) of the pinhole's image in the camera's."""
+        """Distort a polygon (k, 2) of the pinhole's image."""
         return bend_outline(self.camera, corners + self.origin) if self.bends else corners

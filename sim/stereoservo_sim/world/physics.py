@@ -1,4 +1,4 @@
-"""The simulated arm's joints in pybullet, without a window."""
+"""Joint simulation of the arm in pybullet, without a window."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ POSITION_GAIN = 0.2
 
 
 class PhysicsError(Exception):
-    """pybullet cannot be used; the message says why."""
+    """pybullet cannot be used; the message holds the cause."""
 
 
 def import_pybullet() -> Any:
-    """pybullet, without the greeting that its C code prints on import. Raises PhysicsError."""
+    """Import pybullet without the message that its C code prints. Raises PhysicsError."""
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
     sys.stdout.flush()
@@ -46,7 +46,7 @@ def import_pybullet() -> Any:
 
 
 def load_robot(bullet: Any, client: int, robot: Robot) -> int:
-    """Load an arm into a simulation; its body number."""
+    """Load an arm into a simulation; returns its body number."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{robot.name}.urdf"
         path.write_text(urdf(robot))
@@ -54,8 +54,8 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> int:
 
 
 class PybulletPlant:
-    """The arm as rigid bodies under gravity. Drives follow their set-points by position and velocity, so
-    nothing sags. ``efforts`` (n,) [N m]: what the motors gave in the last step; at rest, what gravity asks for.
+    """The arm as rigid bodies under gravity. Drives follow their set-points by position and velocity, so nothing
+    sags. ``efforts`` (n,) [N m]: motor torques of the last step; at rest, those that balance gravity.
     """
 
     def __init__(self, robot: Robot, positions: FloatArray, step_s: float) -> None:
@@ -97,7 +97,7 @@ class PybulletPlant:
         )
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
-        """Move on by ``h`` [s], one step of the engine, towards set-points (n,), (n,)."""
+        """Advance by ``h`` [s], one step of the engine, towards set-points (n,), (n,)."""
         self._bullet.setJointMotorControlArray(
             self._arm,
             self._joints,

@@ -1,4 +1,4 @@
-"""Random cells, each from one seed: rigs, arms, marker bodies and noise; and the judge of what a fit says of them.
+"""Random cells, each from one seed: rigs, arms, marker bodies and noise; evaluation of a fit's stated accuracy.
 
 What is drawn: baseline 0.08 to 0.5 m, vergence 0 to 60°, focal lengths 450 to 1600 px on 640x480 (the two cameras
 within 10 % of each other), principal points off by up to 30 px, roll up to 10° between the cameras; four families
@@ -71,7 +71,9 @@ UR_ROWS: tuple[Row, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class RandomCase:
-    """A cell with its noise [px], stops a joint, and what it was made of; ``redraws``: homes and rigs given up."""
+    """A random cell with its noise [px], number of stops a joint, and parameters; ``redraws``: homes and rigs
+    rejected.
+    """
 
     seed: int
     cell: SyntheticCell
@@ -103,7 +105,7 @@ def hidden_out_of_view(cell: SyntheticCell, trials: TrialData) -> TrialData:
 
 
 def random_case(seed: int) -> RandomCase:
-    """The cell of ``seed``: the same seed, the same case, to the last bit."""
+    """Random cell of ``seed``, reproducible bit for bit."""
     rng = np.random.default_rng([seed, 0])
     body_name = str(rng.choice(list(BODIES), p=SHARES))
     arm = str(rng.choice(list(ARMS)))
@@ -118,7 +120,7 @@ def random_case(seed: int) -> RandomCase:
 
 
 def random_pair(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Intrinsics (2, 3, 3) and poses (2, 4, 4) of two cameras that look along the rig's z."""
+    """Intrinsics (2, 3, 3) and poses (2, 4, 4) of two cameras aimed along the rig's z."""
     baseline, vergence = rng.uniform(*BASELINES), rng.uniform(*VERGENCES)
     focal = rng.uniform(*FOCALS)
     intrinsics, poses = [], []
@@ -155,7 +157,7 @@ def visible_ranges(cell: SyntheticCell) -> FloatArray:
 
 
 def _drawn(rng: np.random.Generator, arm: str, body: FloatArray) -> SyntheticCell | None:
-    """A cell, or None where this draw does not show the body or lets some joint move too little."""
+    """A random cell, or None where the body is not visible or some joint can move too little."""
     rows, home = ARMS[arm](rng)
     intrinsics, poses = random_pair(rng)
     tilt_axis = rng.uniform(0.0, 360.0)

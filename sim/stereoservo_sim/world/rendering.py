@@ -1,4 +1,4 @@
-"""What a simulated camera sees, as grey levels: background, arm, marker body, lens blur, sensor noise.
+"""Renderer of simulated camera images: background, arm, marker body, lens blur, sensor noise.
 
 The marker body is drawn by area coverage: spans of every dot and plate are found exactly on sixteen lines
 a pixel row, so that centroids are true to a few thousandths of a pixel. (A rasteriser's images are biased
@@ -50,7 +50,7 @@ class RenderSettings:
 
 
 class Renderer:
-    """Images of the simulated cell in one camera of its rig. Keeps the background and a field of noise.
+    """Renders the simulated cell in one camera of its rig. Caches the background and a field of noise.
 
     Raises ValueError where the camera's lens leaves the image's corners dark.
     """
@@ -111,7 +111,7 @@ class Renderer:
         blend_polygon(image, self._bending.outline(outline), level)
 
     def _draw_arm(self, image: ImageArray, q: FloatArray) -> list[Link]:
-        """Links behind the body are drawn, those in front of it returned as (outline (k, 2), grey level, depth).
+        """Draw links behind the body; return those in front of it as (outline (k, 2), grey level, depth).
 
         ``image`` and outlines are those of the pinhole, before the lens bends them.
         """
@@ -205,7 +205,7 @@ def _draw_dot(
     radius: float,
     level: float,
 ) -> None:
-    """A disc at ``centre`` (2,) [m] of the plane that ``H`` (3, 3) takes to ideal pixels."""
+    """Draw a disc at ``centre`` (2,) [m] of the plane that ``H`` (3, 3) maps to ideal pixels."""
     if camera.k1 == 0.0:
         blend_ellipse(image, circle_image(H, centre, radius), level)
         return
@@ -235,7 +235,7 @@ def _region(boxes: list[tuple[FloatArray, FloatArray]], camera: PinholeCamera) -
 
 
 def _apart(regions: list[Region]) -> list[Region]:
-    """The same regions; where two overlap, the one around both, so that nothing is blurred twice."""
+    """Disjoint regions: overlapping ones are replaced by the one around both, so that nothing is blurred twice."""
     if len(regions) == 2:
         (l0, t0, r0, b0), (l1, t1, r1, b1) = regions
         if l0 < r1 and l1 < r0 and t0 < b1 and t1 < b0:

@@ -1,4 +1,4 @@
-"""Serial arms from classic Denavit-Hartenberg rows: forward kinematics, shapes, and the same arm as URDF.
+"""Serial arms from classic Denavit-Hartenberg rows: forward kinematics, shapes, and URDF.
 
 This is the simulation's truth. Nothing of it reaches the service, which learns the arm from images.
 """
@@ -43,7 +43,7 @@ class Robot:
 
 
 def _tail(a: float, alpha: float, d: float) -> FloatArray:
-    """What follows the joint's rotation in a classic row: Tz(d) Tx(a) Rx(alpha), (4, 4)."""
+    """Transform (4, 4) after the joint's rotation in a classic row: Tz(d) Tx(a) Rx(alpha)."""
     c, s = np.cos(alpha), np.sin(alpha)
     return np.array([[1, 0, 0, a], [0, c, -s, 0], [0, s, c, d], [0, 0, 0, 1.0]])
 
@@ -143,7 +143,9 @@ def _origin(pose: FloatArray) -> str:
 
 
 def _inertial(mass: float, shapes: list[Capsule]) -> list[str]:
-    """Mass in the middle of the shapes, inertia of a solid box around them: sensible, not identified."""
+    """URDF inertial element: mass at the centre of the shapes, inertia of a solid box around them; plausible, not
+    identified.
+    """
     points = np.array([p for s in shapes for p in (s.start, s.end)]) if shapes else np.zeros((1, 3))
     radius = max((s.radius for s in shapes), default=0.02)
     size = points.max(axis=0) - points.min(axis=0) + 2 * radius

@@ -1,4 +1,4 @@
-"""The simulated cell's truth: arm, marker body and cameras in one world, and noise-free images of the
+"""Ground truth of the simulated cell: arm, marker body and cameras in one world, and noise-free images of the
 markers.
 """
 
@@ -51,7 +51,7 @@ class SimulatedCell:
         return self.flange(q) if self.stand is None else self.stand
 
     def in_world(self, camera: PinholeCamera, q: FloatArray) -> PinholeCamera:
-        """A camera of the rig as it stands in the world at ``q`` (n,)."""
+        """A camera of the rig at its pose in the world at ``q`` (n,)."""
         return camera if self.stand is None else camera.moved(self.flange(q))
 
     def marker_positions(self, q: FloatArray) -> FloatArray:
@@ -60,7 +60,7 @@ class SimulatedCell:
         return self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
 
     def marker_positions_rig(self, q: FloatArray) -> FloatArray:
-        """Markers in the rig's frame at ``q`` (n,), (m, 3) [m]: what errors in millimetres are judged by."""
+        """Markers in the rig's frame at ``q`` (n,), (m, 3) [m], for errors in millimetres."""
         frame = self.rig.world_to_rig
         if self.stand is not None:
             frame = frame @ inverse_pose(self.flange(q))
@@ -164,7 +164,7 @@ def demo_cell() -> SimulatedCell:
 
 @lru_cache(maxsize=1)
 def workpiece_cell() -> SimulatedCell:
-    """The same cell with a workpiece that stands nearer to the cameras, at the upper left of both images: on no way
+    """The same cell with a workpiece that stands nearer to the cameras, at the upper left of both images: on no path
     between the base and DEMO_GOALS, and at no calibration stop, does it hide the body.
     """
     cell = demo_cell()
@@ -212,10 +212,10 @@ HAND_GOALS: dict[str, FloatArray] = {
 
 
 def simulated_cell(mount: Mount) -> SimulatedCell:
-    """The embedded cell whose cameras are mounted so."""
+    """The embedded cell with cameras on the given mount."""
     return hand_cell() if mount == "eye_in_hand" else demo_cell()
 
 
 def goals_of(mount: Mount) -> dict[str, FloatArray]:
-    """Configurations (n,) [rad] by name that :func:`simulated_cell` is worth driving to."""
+    """Goal configurations (n,) [rad] of :func:`simulated_cell`, by name."""
     return HAND_GOALS if mount == "eye_in_hand" else DEMO_GOALS

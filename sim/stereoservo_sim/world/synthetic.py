@@ -1,7 +1,7 @@
-"""Cells of numbers only: an arm, cameras and markers, and the pixels of exact projections with noise. No images.
+"""Synthetic cells: an arm, cameras and markers, with pixels from exact projections and noise; no images.
 
-The common truth of experiments, benchmarks, campaigns and tests: Euclidean, known to the last digit, and told to
-nobody but the judge.
+The common truth of experiments, benchmarks, campaigns and tests: Euclidean, known to the last digit, and used
+for evaluation only.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ FIRST_MARKER = 10
 
 
 def translation(x: float, y: float, z: float) -> FloatArray:
-    """(4, 4) [m]."""
+    """Translation (4, 4) [m]."""
     T = np.eye(4)
     T[:3, 3] = x, y, z
     return T
 
 
 def rotation(axis: Literal["x", "y", "z"], degrees: float) -> FloatArray:
-    """(4, 4) about an axis of the frame."""
+    """Rotation (4, 4) about an axis of the frame."""
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     T = np.eye(4)
@@ -41,13 +41,13 @@ def rotation(axis: Literal["x", "y", "z"], degrees: float) -> FloatArray:
 
 
 def dh_link(a: float, alpha: float, d: float) -> FloatArray:
-    """What follows the joint of a Denavit-Hartenberg row (5.1): Tz(d) Tx(a) Rx(alpha); [m], [°]."""
+    """Transform after the joint of a Denavit-Hartenberg row (5.1): Tz(d) Tx(a) Rx(alpha); [m], [°]."""
     return translation(0, 0, d) @ translation(a, 0, 0) @ rotation("x", alpha)
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticCell:
-    """An arm before cameras.
+    """A synthetic arm before cameras.
 
     ``base`` (4, 4): the arm's base in the rig's frame, or with ``mount`` eye-in-hand the base in the frame of the
     markers. ``links`` (4, 4) each, fixed, after the joint about or along its z. ``body`` (m, 3): markers in the
@@ -70,12 +70,12 @@ class SyntheticCell:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """j1 … jn, base first."""
+        """Joint names j1 … jn, base first."""
         return tuple(f"j{j + 1}" for j in range(len(self.kinds)))
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
-        """From ``FIRST_MARKER`` on."""
+        """Marker ids from ``FIRST_MARKER`` on."""
         return tuple(range(FIRST_MARKER, FIRST_MARKER + len(self.body)))
 
     def frames(self, q: FloatArray) -> FloatArray:
@@ -117,7 +117,7 @@ class SyntheticCell:
         return np.array([distort(lens, pixels) for lens, pixels in zip(self.lenses, ideal, strict=True)])
 
     def in_view(self, positions: FloatArray, margin: float = 0.0) -> npt.NDArray[np.bool_]:
-        """(c, s, m): inside the image by ``margin`` [px] and before the camera."""
+        """Mask (c, s, m): inside the image by ``margin`` [px] and in front of the camera."""
         with np.errstate(invalid="ignore", divide="ignore"):
             seen = np.einsum("cij,cjk,smk->csmi", self.intrinsics, self.poses[:, :3], self.markers(positions))
             ideal = seen[..., :2] / seen[..., 2:]
@@ -149,7 +149,7 @@ class SyntheticCell:
         positions: tuple[FloatArray, IntArray] | None = None,
         stated: float | None = None,
     ) -> TrialData:
-        """Trial data with Gaussian noise of ``sigma`` [px] an axis; ``stated``: what the detector says of it.
+        """Trial data with Gaussian noise of ``sigma`` [px] an axis; ``stated``: the sigma reported by the detector.
 
         Every marker is seen at every stop; ask ``in_view`` where that matters.
         """
@@ -196,7 +196,7 @@ def flat_plate() -> FloatArray:
 def stereo_pair(count: int = 2) -> tuple[FloatArray, FloatArray]:
     """Intrinsics (c, 3, 3) and poses (c, 4, 4): f = 800 px, 640x480, baseline 20 cm, vergence 20°, looking along z.
 
-    A third camera stands above.
+    Cell with a third camera above.
     """
     K = np.array([[800, 0, 322.0], [0, 795, 238.5], [0, 0, 1]])
     K2 = np.array([[812, 0, 315.0], [0, 806, 243.0], [0, 0, 1]])
@@ -220,7 +220,7 @@ def placed(
     distance: float = 1.3,
     mount: Mount = "eye_to_hand",
 ) -> SyntheticCell:
-    """The cell with the body's middle ``distance`` [m] before the rig at home.
+    """The cell with the body's centre ``distance`` [m] before the rig at home.
 
     ``facing`` (4, 4) turns the flange in the rig's frame, or with eye-in-hand the markers as they stand.
     """
@@ -273,25 +273,25 @@ def _revolute_arm(
 
 
 def rx90(body: FloatArray | None = None, cameras: int = 2, distance: float = 1.3) -> SyntheticCell:
-    """6R with a spherical wrist."""
+    """Cell of a 6R arm with a spherical wrist."""
     ranges = (15, 15, 15, 30, 30, 40)
     return _revolute_arm(RX90_ROWS, (10, -60, 120, 20, 40, 15), ranges, body, cameras, distance)
 
 
 def offset_wrist(body: FloatArray | None = None) -> SyntheticCell:
-    """6R with an offset wrist."""
+    """Cell of a 6R arm with an offset wrist."""
     ranges = (12, 12, 15, 25, 30, 40)
     return _revolute_arm(OFFSET_ROWS, (10, -60, 100, -30, 50, 15), ranges, body, 2, 1.3)
 
 
 def seven(body: FloatArray | None = None) -> SyntheticCell:
-    """7R."""
+    """Cell of a 7R arm."""
     ranges = (10, 10, 15, 15, 25, 25, 40)
     return _revolute_arm(SEVEN_ROWS, (10, 30, 10, -70, 20, 50, 15), ranges, body, 2, 1.3)
 
 
 def gantry() -> SyntheticCell:
-    """3P: along x, y, z."""
+    """Cell of a 3P arm: along x, y, z."""
     links = (rotation("x", -90), rotation("y", 90), np.eye(4))
     return placed(
         ("prismatic",) * 3, links, two_faces(), np.zeros(3), (0.2, 0.15, 0.2), _facing(("x", 160), ("y", 20))
@@ -299,7 +299,7 @@ def gantry() -> SyntheticCell:
 
 
 def gantry_with_wrist() -> SyntheticCell:
-    """3P3R."""
+    """Cell of a 3P3R arm."""
     links = (
         rotation("x", -90),
         rotation("y", 90),
@@ -315,7 +315,7 @@ def gantry_with_wrist() -> SyntheticCell:
 
 
 def scara(body: FloatArray | None = None) -> SyntheticCell:
-    """R, R, P, R with all axes parallel."""
+    """Cell of a SCARA: R, R, P, R with all axes parallel."""
     links = (translation(0.35, 0, 0.2), translation(0.3, 0, 0), np.eye(4), translation(0, 0, 0.03))
     return placed(
         ("revolute", "revolute", "prismatic", "revolute"),
@@ -328,7 +328,7 @@ def scara(body: FloatArray | None = None) -> SyntheticCell:
 
 
 def mixed() -> SyntheticCell:
-    """A linear axis under a wrist: P, R, R, R with different directions."""
+    """Cell of a linear axis under a wrist: P, R, R, R with different directions."""
     links = (
         rotation("x", 90),
         translation(0.2, 0, 0) @ rotation("x", 90),
@@ -346,7 +346,7 @@ def mixed() -> SyntheticCell:
 
 
 def parallel(body: FloatArray | None = None) -> SyntheticCell:
-    """Three parallel revolute axes: no plane at infinity."""
+    """Cell of three parallel revolute axes, which determine no plane at infinity."""
     links = (translation(0.3, 0, 0), translation(0.25, 0, 0), translation(0.05, 0, 0))
     return placed(
         ("revolute",) * 3,
@@ -359,7 +359,7 @@ def parallel(body: FloatArray | None = None) -> SyntheticCell:
 
 
 def pan_tilt(body: FloatArray | None = None, distance: float = 2.0) -> SyntheticCell:
-    """2R with the cameras on it (eye-in-hand), before markers that stand still."""
+    """Cell of a pan-tilt head: 2R with the cameras on it (eye-in-hand), before static markers."""
     # Pan about the vertical, tilt about the horizontal; the flange is the rig: x right, y down, z ahead.
     links = (dh_link(0, 90, 0.1), rotation("y", 90) @ rotation("z", 180) @ translation(0.03, -0.08, 0.05))
     return placed(

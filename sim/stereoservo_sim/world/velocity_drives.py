@@ -1,4 +1,4 @@
-"""Simulated velocity drives: ramps, limits, the command time-out, and what moves the joints."""
+"""Simulated velocity drives: ramps, limits, command time-out; interface of the plant that they move."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from stereoservo.ports.devices import JointSpec
 STIFFNESS = 500.0
 """Of an ideal joint's drive at a wall [N m/rad or N/m]."""
 REST_VELOCITY = 1e-9
-"""Below this [rad/s or m/s] a physics engine's joint stands still."""
+"""Below this [rad/s or m/s] a physics engine's joint is at rest."""
 
 
 class Plant(Protocol):
-    """What the drives move. ``positions``, ``velocities``, ``efforts`` of the motors [N m or N], (n,): the truth."""
+    """Protocol of what the drives move. ``positions``, ``velocities``, ``efforts`` of the motors [N m or N], (n,):
+    the truth.
+    """
 
     positions: FloatArray
     velocities: FloatArray
     efforts: FloatArray
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
-        """Move on by ``h`` [s] towards the drives' set-points at its end, (n,), (n,)."""
+        """Advance by ``h`` [s] towards the drives' set-points at its end, (n,), (n,)."""
         ...
 
     def close(self) -> None:
-        """Release what it holds."""
+        """Release resources."""
         ...
 
 
 class IdealPlant:
-    """Joints that are where their drives want them, without mass; effort comes of walls alone.
+    """Massless joints that follow their set-points exactly; efforts come from walls alone.
 
     ``walls`` (2, n): no joint goes below the first or above the second; its drive then pushes with ``STIFFNESS``.
     """
@@ -44,14 +46,14 @@ class IdealPlant:
         self.walls = np.array([np.full_like(positions, -np.inf), np.full_like(positions, np.inf)])
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
-        """Take the set-points, as far as the walls let."""
+        """Adopt the set-points, as far as walls permit."""
         self.positions = np.clip(set_positions, self.walls[0], self.walls[1])
         beyond = set_positions - self.positions
         self.velocities = np.where(beyond != 0.0, 0.0, set_velocities)
         self.efforts = STIFFNESS * beyond
 
     def close(self) -> None:
-        """Nothing to release."""
+        """No effect."""
 
 
 def ramp(
@@ -92,16 +94,14 @@ class DriveBank:
 
     @property
     def set_positions(self) -> FloatArray:
-        """Where the drives want the joints (n,)."""
+        """Set the drives' set-points (n,)."""
         return self._q
 
     def _plant_rests(self) -> bool:
         return bool(np.all(np.abs(self.plant.velocities) < REST_VELOCITY))
 
     def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """Take a velocity command (n,) given at ``t_ns``; gives what is sent to the drives, and why it
-        differs.
-        """
+        """Apply a velocity command (n,) given at ``t_ns``; returns what is sent to the drives, and why it differs."""
         self.advance(t_ns)
         sent = np.clip(velocities, -self._velocity, self._velocity)
         reasons = () if np.array_equal(sent, velocities) else ("drive_velocity_limit",)
@@ -116,7 +116,7 @@ class DriveBank:
         self._target = np.zeros_like(self._target)
 
     def advance(self, now_ns: int) -> None:
-        """Move on to the last grid point not after ``now_ns``."""
+        """Advance to the last grid point not after ``now_ns``."""
         while now_ns - self.t_ns >= self._step_ns:
             if self.t_ns >= self._deadline_ns and np.any(self._target):
                 self._target = np.zeros_like(self._target)

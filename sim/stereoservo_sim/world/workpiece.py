@@ -1,6 +1,6 @@
-"""The simulated workpiece: a plate of two small faces that stands beside the moving body until somebody moves it.
+"""The simulated workpiece: a plate of two small faces beside the marker body, static until it is moved on request.
 
-Where it stands now is told by a file in the cell's runtime directory, so that a shell, a test or a demonstration can
+Its present pose is in a file in the cell's runtime directory, so that a shell, a test or a demonstration can
 move it while the cell runs, whichever processes its cameras live in.
 """
 
@@ -27,18 +27,18 @@ TILT = float(np.deg2rad(25.0))
 
 
 class MovedFileError(Exception):
-    """The file that moves a thing says nothing sensible: names the file and what would be valid."""
+    """Invalid content of the file that moves a thing; the text names the file and what would be valid."""
 
 
 class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How far something was moved: ``shift_m`` [m] and the rotation vector ``turn_deg`` [degrees]."""
+    """A displacement: ``shift_m`` [m] and the rotation vector ``turn_deg`` [degrees]."""
 
     shift_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     turn_deg: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
 
     @property
     def matrix(self) -> FloatArray:
-        """The displacement (4, 4): turned about the origin, then shifted. Raises ValueError where not finite."""
+        """Displacement (4, 4): rotation about the origin, then translation. Raises ValueError where not finite."""
         if not np.isfinite([*self.shift_m, *self.turn_deg]).all():
             raise ValueError(f"shift_m {self.shift_m} and turn_deg {self.turn_deg} must be finite numbers")
         pose = np.eye(4)
@@ -54,13 +54,13 @@ class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Workpiece:
-    """``body``: its faces in its own frame; ``stand`` (4, 4): where it stands in the world at first."""
+    """The workpiece. ``body``: its faces in its own frame; ``stand`` (4, 4): its initial pose in the world."""
 
     body: MarkerBody
     stand: FloatArray
 
     def pose(self, moved: Moved) -> FloatArray:
-        """Pose (4, 4) in the world, turned about its own middle by world axes and shifted."""
+        """Pose (4, 4) in the world, rotated about its own centre by world axes and translated."""
         displacement = moved.matrix
         pose = self.stand.copy()
         pose[:3, :3] = displacement[:3, :3] @ self.stand[:3, :3]
@@ -87,7 +87,7 @@ def plate_body(tilt: float = TILT) -> MarkerBody:
 
 
 class MovedFile:
-    """How far a thing of the cell whose runtime directory this is stands from its place now; read anew when changed.
+    """File with the present displacement of a thing in the cell's runtime directory; read again when changed.
 
     ``name``: of the file; by default the workpiece's.
     """
@@ -98,7 +98,7 @@ class MovedFile:
         self._moved = Moved()
 
     def write(self, moved: Moved) -> None:
-        """Move it: atomically, from the next shutter on. Raises OSError, ValueError."""
+        """Write a displacement atomically; it acts from the next shutter on. Raises OSError, ValueError."""
         if not np.isfinite(moved.matrix).all():
             raise ValueError(f"{moved} is no displacement")
         fresh = self.path.with_name(f"{self.path.name}.{os.getpid()}")
@@ -106,7 +106,7 @@ class MovedFile:
         fresh.replace(self.path)
 
     def now(self, otherwise: Moved = Moved()) -> Moved:  # noqa: B008 - frozen
-        """How far it was moved; ``otherwise`` where there is no file. Raises MovedFileError."""
+        """Present displacement; ``otherwise`` where there is no file. Raises MovedFileError."""
         try:
             status = self.path.stat()
             seen = (status.st_ino, status.st_mtime_ns, status.st_size)

@@ -19,7 +19,7 @@ from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
 from stereoservo_sim.emulators.nodes.cia402_node import Cia402Node
 
@@ -42,8 +42,8 @@ class Host(VirtualHost):
         kept = [frame for frame in frames if not self._swallowed(frame)]
         super().send(kept)
         if self.after_reset and any(frame.data == FAULT_RESET for frame in frames):
-            at_us = (self.t_ns - self.rack.start_ns) // 1000 + 15_000
-            self.rack.order(f"{self.after_reset} @ {at_us}us", self.t_ns)
+            at_us = (self.t_ns - self.emulator.start_ns) // 1000 + 15_000
+            self.emulator.order(f"{self.after_reset} @ {at_us}us", self.t_ns)
 
     def _swallowed(self, frame: CanFrame) -> bool:
         if self.swallow is None or frame.id & ~0x7F != 0x600:
@@ -53,10 +53,10 @@ class Host(VirtualHost):
 
 @dataclass
 class Bench:
-    """A rack and a host that is not connected yet."""
+    """An emulated bus and a host that is not connected yet."""
 
     options: CanOptions
-    rack: BusEmulator
+    emulator: BusEmulator
     cell_dir: Path
 
     def __post_init__(self) -> None:
@@ -67,10 +67,10 @@ class Bench:
         self.codec = Cia402Codec(options)
         self.bringup = Cia402Bringup(options, self.codec, self.cell_dir)
         self.master = Master(self.codec, MasterSettings.of(options))
-        self.host = Host(self.rack, self.master)
+        self.host = Host(self.emulator, self.master)
 
     def node(self, number: int) -> Cia402Node:
-        node = self.rack.slot(number).node
+        node = self.emulator.slot(number).node
         assert isinstance(node, Cia402Node)
         return node
 
@@ -90,7 +90,7 @@ class Bench:
         return str(refusal.value)
 
     def order(self, text: str) -> None:
-        self.rack.order(text, self.rack.t_ns)
+        self.emulator.order(text, self.emulator.t_ns)
 
     def cycle(self, seconds: float, *velocities: float) -> None:
         self.host.velocities = np.array(velocities) if velocities else np.zeros(len(self.options.joint))
@@ -115,7 +115,7 @@ class Bench:
         self.cycle(0.05)
 
     def events(self, kind: str) -> list[int]:
-        return [event.node for event in self.rack.events if event.kind == kind]
+        return [event.node for event in self.emulator.events if event.kind == kind]
 
 
 def watch_nobody(bench: Bench) -> None:
@@ -150,9 +150,9 @@ def make_bench(tmp_path: Path) -> Make:
     def make(options: CanOptions | None = None, on_bus: CanOptions | None = None) -> Bench:
         options = options or make_options()
         settings = DrivesSettings(plant="ideal", bit_time=True, brake_ms=5.0, eds=str(SHIPPED_EDS))
-        rack = make_rack(on_bus or options, settings, t_ns=0)
-        rack.run_until(10_000_000)
-        return Bench(options, rack, tmp_path)
+        emulator = make_bus_emulator(on_bus or options, settings, t_ns=0)
+        emulator.run_until(10_000_000)
+        return Bench(options, emulator, tmp_path)
 
     return make
 
@@ -167,9 +167,9 @@ def bench(make_bench: Make) -> Bench:
 
 
 def test_drives_are_configured_as_the_options_say(bench: Bench) -> None:
-    start_ns = bench.rack.t_ns
+    start_ns = bench.emulator.t_ns
     bench.connect()
-    assert bench.rack.t_ns - start_ns < 500_000_000
+    assert bench.emulator.t_ns - start_ns < 500_000_000
     for node in (1, 2, 3):
         expected = {
             (0x1005, 0): 0x80,
@@ -276,7 +276,7 @@ def test_a_drive_that_was_left_moving_is_brought_to_rest_and_switched_off(
     assert not node.axis.powered
     assert bench.codec.status_words()[0].startswith("switch on disabled")
     # it came to rest on its ramp and was switched off then
-    ends = [event.kind for event in bench.rack.events if event.kind in ("rest", "power_off")]
+    ends = [event.kind for event in bench.emulator.events if event.kind in ("rest", "power_off")]
     assert ends[-2:] == ["rest", "power_off"]
 
 
@@ -477,7 +477,7 @@ def test_reset_after_a_lost_heartbeat(make_bench: Make, abort_option: int, stubb
     bench.run()
     bench.host.cycling = False
     bench.cycle(0.3)
-    assert bench.rack.at_rest()
+    assert bench.emulator.at_rest()
     bench.host.cycling = True
     bench.cycle(0.05)
     assert bench.master.mode is Mode.LATCHED
@@ -557,7 +557,7 @@ def test_released_drives_do_not_miss_the_master(make_bench: Make, abort_option: 
     bench.host.end_cycle()
     bench.bringup.release(bench.host)
     bench.host.cycling = False
-    bench.rack.run_until(bench.rack.t_ns + 2_000_000_000)
+    bench.emulator.run_until(bench.emulator.t_ns + 2_000_000_000)
     for node in (1, 2, 3):
         assert bench.object(node, 0x6007) == (0 if abort_option == 1 else abort_option)
         assert bench.node(node).emergencies.active == []
@@ -589,7 +589,7 @@ def test_a_drive_that_is_still_enabled_is_stopped_before_it_is_left(make_bench: 
         assert (bench.node(node).axis.velocity, bench.node(node).axis.powered) == (0.0, False)
         ends = [
             event.kind
-            for event in bench.rack.events
+            for event in bench.emulator.events
             if event.node == node and event.kind in ("rest", "power_off")
         ]
         assert ends[-2:] == ["rest", "power_off"]
@@ -631,8 +631,8 @@ def test_a_moving_arm_is_stopped_though_another_of_its_drives_is_missing(make_be
 def test_a_drive_that_boots_while_it_is_configured_is_refused(bench: Bench, at_ms: int) -> None:
     bench.connect()
     bench.plug_in(bench.options)
-    at_us = (bench.rack.t_ns - bench.rack.start_ns) // 1000 + at_ms * 1000
-    bench.rack.order(f"reboot 1 @ {at_us}us", bench.rack.t_ns)
+    at_us = (bench.emulator.t_ns - bench.emulator.start_ns) // 1000 + at_ms * 1000
+    bench.emulator.order(f"reboot 1 @ {at_us}us", bench.emulator.t_ns)
     with pytest.raises(DriverError) as refusal:
         bench.connect()
     assert refusal.value.code == "rebooted"

@@ -18,9 +18,9 @@ from stereoservo.ports.devices import Clock, DriverContext, DriverError, Examina
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.emulators.bus.bus_server import RackServer
+from stereoservo_sim.emulators.bus.bus_server import BusServer
 from stereoservo_sim.emulators.bus.endpoints import SlcanTcp
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 
 OPTIONS: dict[str, Any] = {
     "interface": "stereoservo_slcan",
@@ -43,7 +43,7 @@ ASK = np.array([0.1, -0.1])
 class Arm:
     """A driver and the drives that it drives."""
 
-    def __init__(self, options: dict[str, Any], server: RackServer, tmp_path: Path) -> None:
+    def __init__(self, options: dict[str, Any], server: BusServer, tmp_path: Path) -> None:
         self.server = server
         self.options = options
         self.context = context(tmp_path, MonotonicClock())
@@ -71,7 +71,7 @@ class Arm:
         raise AssertionError(f"no fault within {limit_s} s")
 
     def axes(self) -> list[Any]:
-        return [node.axis for node in self.server.rack.nodes]
+        return [node.axis for node in self.server.emulator.nodes]
 
     def rests(self, limit_s: float = 3.0) -> bool:
         """Whether all axes truly come to rest, nobody calling the driver."""
@@ -90,17 +90,17 @@ def context(tmp_path: Path, clock: Clock) -> DriverContext:
 @pytest.fixture
 def make_arm(tmp_path: Path) -> Iterator[Callable[..., Arm]]:
     """``make_arm(option=…)``; ended after the test."""
-    opened: list[tuple[Arm, RackServer]] = []
+    opened: list[tuple[Arm, BusServer]] = []
 
     def make(**changes: Any) -> Arm:
         endpoint = SlcanTcp(0, 1_000_000)
         options = OPTIONS | {"channel": endpoint.channel} | changes
-        rack = make_rack(
+        emulator = make_bus_emulator(
             decode_options(CanOptions, options, "canopen"),
             DrivesSettings(plant="ideal", brake_ms=5.0),
             t_ns=time.monotonic_ns(),
         )
-        server = RackServer(rack, endpoint)
+        server = BusServer(emulator, endpoint)
         server.__enter__()
         arm = Arm(options, server, tmp_path)
         opened.append((arm, server))

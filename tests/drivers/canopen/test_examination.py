@@ -23,9 +23,9 @@ from stereoservo_drivers.canopen.examination import (
 )
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.emulators.bus.bus_server import RackServer
+from stereoservo_sim.emulators.bus.bus_server import BusServer
 from stereoservo_sim.emulators.bus.endpoints import SlcanTcp
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 
 OPTIONS: dict[str, Any] = {
     "interface": "stereoservo_slcan",
@@ -54,10 +54,10 @@ def changed(**of_joint_1: Any) -> dict[str, Any]:
 
 @pytest.fixture
 def examine(tmp_path: Path) -> Iterator[Examine]:
-    """Examine with ``options`` a rack that was built for ``drives`` (default: the same) after ``orders``; findings by
-    their names.
+    """Examine with ``options`` an emulated bus that was built for ``drives`` (default: the same) after
+    ``orders``; findings by their names.
     """
-    servers: list[RackServer] = []
+    servers: list[BusServer] = []
 
     def run(
         options: dict[str, Any] = OPTIONS,
@@ -66,11 +66,11 @@ def examine(tmp_path: Path) -> Iterator[Examine]:
         allow: bool = False,
     ) -> dict[str, ExaminationFinding]:
         built = {**(drives or options), "channel": "socket://127.0.0.1:1"}
-        rack = make_rack(
+        emulator = make_bus_emulator(
             decode_options(CanOptions, built, "canopen"), DrivesSettings(plant="ideal", brake_ms=10.0),
             t_ns=time.monotonic_ns(),
         )  # fmt: skip
-        server = RackServer(rack, SlcanTcp(0, 1_000_000))
+        server = BusServer(emulator, SlcanTcp(0, 1_000_000))
         server.__enter__()
         servers.append(server)
         for order in orders:

@@ -11,7 +11,7 @@ from stereoservo.kinematics.inverse.closed_forms import (
     axis_points,
     circle_meets_plane,
     common_point,
-    plane_across,
+    normal_plane,
     prismatic_joints,
     turn_between,
     two_general,
@@ -115,7 +115,7 @@ def test_planes_across_and_points_on_an_axis(seed):
     on_axis = axis_points(G).T @ rng.normal(size=2)
     assert np.abs(G @ on_axis).max() < 1e-12
     for A in (arm_.frame @ np.append(rng.uniform(-1, 1, 3), 1), on_axis):
-        a = plane_across(G, A)
+        a = normal_plane(G, A)
         assert np.linalg.norm(a) > 1e-3 * np.linalg.norm(A)
         for angle in (0.0, 1.0, 2.5):
             assert abs(a @ exp_rotation(G, angle) @ A) < 1e-12

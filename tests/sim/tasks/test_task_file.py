@@ -7,7 +7,7 @@ import pytest
 
 from stereoservo_sim.tasks import task_file
 from stereoservo_sim.tasks.ground_truth import sight
-from stereoservo_sim.tasks.hard_tasks import hard_tasks, shipped_tasks_path, straight_way
+from stereoservo_sim.tasks.hard_tasks import hard_tasks, shipped_tasks_path, straight_path_margins
 from stereoservo_sim.tasks.task_file import COLUMNS, TaskFileError, read_tasks, tasks_text
 
 HEADER_LINE = 9
@@ -172,7 +172,7 @@ def test_the_shipped_hard_tasks_are_what_their_generator_writes():
             assert seen.in_view
             assert seen.margin_px > 5.9
             assert seen.facing > 0.2
-    ways = np.array([straight_way(task.start, task.goal) for task in shipped])
+    ways = np.array([straight_path_margins(task.start, task.goal) for task in shipped])
     assert (ways[:, 0] < 0).sum() >= 30
     assert (ways[:, 1] <= 0).sum() >= 30
     assert max(task.angle_deg for task in shipped) == 180.0

@@ -1,4 +1,5 @@
-"""Detection of a changed camera, marker or joint zero from the innovations of one moment; the core's interface to it.
+"""Detection of a changed camera, marker or joint zero from one set of innovations; interface to the compiled
+kernel.
 
 Innovations are observed less predicted pixels. Hypotheses, each a change of few parameters:
 
@@ -49,8 +50,8 @@ class IsolatedChange:
 
 @dataclass(frozen=True)
 class ChangeDiagnosis:
-    """The change that explains the innovations of one moment. ``measurements``: coordinates seen; ``chi2`` of nothing
-    changed.
+    """The change that best explains one set of innovations. ``measurements``: number of coordinates; ``chi2`` if
+    nothing has changed.
 
     ``kind`` ``unexplained``: no noise, and no single hypothesis explains it; ``cause`` is then the best, or None.
     ``runner_up``: a cause that explains nearly as well, so that the two are indistinguishable; else None.
@@ -64,7 +65,7 @@ class ChangeDiagnosis:
 
     @property
     def clear(self) -> bool:
-        """Whether one cause, and no other, explains what is seen."""
+        """Whether exactly one cause explains the innovations."""
         return self.kind not in ("nothing", "unexplained") and self.runner_up is None
 
 
@@ -80,7 +81,7 @@ def diagnose(
     static_innovations: FloatArray | None = None,
     static_weights: FloatArray | None = None,
 ) -> ChangeDiagnosis:
-    """Diagnosis of one moment, by the compiled kernel: deterministic.
+    """Diagnose one set of innovations with the compiled kernel; deterministic.
 
     ``matrices`` (c, 3, 4); ``points`` (m, 4) as predicted; ``innovations`` (c, m, 2) of ideal pixels [px] and
     ``weights`` (c, m) = 1/sigma [1/px], 0 where not seen; ``operators`` (n, 4, 4) at the current joints (5.21);

@@ -1,4 +1,4 @@
-"""Statistical decision which of several hypothetical changes explains residuals; one for every test of a model.
+"""Statistical test of which of several hypothetical changes explains the residuals; shared by all tests of a model.
 
 Used on-line, for the innovations of one moment (`change_detection_kernel`), and off-line, for the pixels of a check
 motion (`model_check`). Each hypothesis is a change of ``size`` parameters. Those of the largest first-order gain are
@@ -98,8 +98,8 @@ def chi2_quantile(tail: float, freedom: int) -> float:
     while chi2_tail(high, freedom) > tail:
         high *= 2.0
     for _ in range(80):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if chi2_tail(middle, freedom) > tail else (low, middle)
+        midpoint = 0.5 * (low + high)
+        low, high = (midpoint, high) if chi2_tail(midpoint, freedom) > tail else (low, midpoint)
     return high
 
 

@@ -67,7 +67,9 @@ class LinearisedProblem:
         return residuals(rig, replace(self.data, offsets=self.data.offsets + drift))
 
     def whitened(self, rows: FloatArray) -> FloatArray:
-        """``W rows`` with ``W = (I + A Aᵀ)⁻¹``, ``A`` the model's own uncertainty; ``rows`` (2 k,) or (2 k, q)."""
+        """Rows whitened by the model's own uncertainty A: ``W rows`` with ``W = (I + A Aᵀ)⁻¹``; ``rows`` (2 k,) or
+        (2 k, q).
+        """
         found: FloatArray = rows - self.uncertainty @ (self.uncertainty.T @ rows)
         return found
 
@@ -78,7 +80,7 @@ class LinearisedProblem:
 
 
 def _bound(A: FloatArray) -> FloatArray:
-    """``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``."""
+    """Matrix ``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``: an uncertainty ``A`` of any size as one of norm below 1."""
     if not A.shape[1]:
         return A
     triangle = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
@@ -157,7 +159,7 @@ def with_corrected_zeros(
 def _stated_uncertainty(
     model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
 ) -> FloatArray:
-    """Root (2 k, p) of what the model's covariance does to the pixels of ``data`` [sigmas²]."""
+    """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` by the model's stated covariance."""
     slopes, columns = covariance_jacobian(model, stated, data, order)
     values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
     root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -188,7 +190,7 @@ def covariance_jacobian(
 def _curvature_uncertainty(
     model: CellModel, rig: RigModel, past: Measurements, data: Measurements
 ) -> FloatArray:
-    """The same from the curvature of the calibration's own least squares at the model."""
+    """Like `_stated_uncertainty`, from the curvature of the calibration's own least squares at the model."""
     bent = bool((rig.lenses[:, 0] != 0.0).any())
     charts = full_charts(rig, model.stratum, lenses="radial_centre" if bent else "none")
     triangle = triangle_of(rig, charts, past)[:-1, :-1]
@@ -205,7 +207,7 @@ def _curvature_uncertainty(
 
 
 def possible_changes(model: CellModel, problem: LinearisedProblem) -> list[ModelChange]:
-    """All changes that are tested: rigid motions in a Euclidean frame, free camera matrices without one."""
+    """All changes to test: rigid motions in a Euclidean frame, free camera matrices without one."""
     rig = problem.rig
     metric = model.stratum == "metric"
     found: list[ModelChange] = []
@@ -237,12 +239,12 @@ def rigid_motion(x: FloatArray, centre: FloatArray, scale: float) -> FloatArray:
 
 
 def _scene(rig: RigModel) -> tuple[FloatArray, float]:
-    middle = rig.points[:, :3].mean(axis=0)
-    return middle, float(np.linalg.norm(middle)) or 1.0
+    centroid = rig.points[:, :3].mean(axis=0)
+    return centroid, float(np.linalg.norm(centroid)) or 1.0
 
 
 def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[State, FloatArray], State]:
-    middle, scale = _scene(rig)
+    centroid, scale = _scene(rig)
     bases = {}
     for c in which:
         matrix = rig.cameras[c].ravel() / np.linalg.norm(rig.cameras[c])
@@ -252,7 +254,7 @@ def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[St
         cameras = state[0].cameras.copy()
         for c in which:
             if metric:
-                cameras[c] = cameras[c] @ rigid_motion(x, middle, scale)
+                cameras[c] = cameras[c] @ rigid_motion(x, centroid, scale)
             else:
                 cameras[c] = cameras[c] + np.einsum("p,pij->ij", x, bases[c])
         return replace(state[0], cameras=cameras), state[1]
@@ -261,10 +263,10 @@ def _camera(rig: RigModel, which: tuple[int, ...], metric: bool) -> Callable[[St
 
 
 def _body(rig: RigModel) -> Callable[[State, FloatArray], State]:
-    middle, scale = _scene(rig)
+    centroid, scale = _scene(rig)
 
     def apply(state: State, x: FloatArray) -> State:
-        return replace(state[0], points=state[0].points @ rigid_motion(x, middle, scale).T), state[1]
+        return replace(state[0], points=state[0].points @ rigid_motion(x, centroid, scale).T), state[1]
 
     return apply
 
@@ -306,12 +308,12 @@ class ChangeEstimate:
 
 
 def start_state(problem: LinearisedProblem) -> State:
-    """The unchanged model."""
+    """The state of the unchanged model."""
     return problem.rig, np.zeros(len(problem.order))
 
 
 def changed_state(problem: LinearisedProblem, found: tuple[ModelChange, ...], x: FloatArray) -> State:
-    """The model with changes ``found`` at parameters ``x`` (q,)."""
+    """The state of a model with changes ``found`` at parameters ``x`` (q,)."""
     state, at = start_state(problem), 0
     for cause in found:
         state = cause.apply(state, x[at : at + cause.size])

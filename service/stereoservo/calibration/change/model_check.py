@@ -1,4 +1,4 @@
-"""Chi-square test of a model against a short check motion; names and measures what has changed.
+"""Chi-square test of a model against a short check motion; identifies and estimates what has changed.
 
 Under a valid model the residuals are Gaussian with the stated noise and the model's own uncertainty. A chi-square test
 rejects the model; likelihood ratios, by the decision that the on-line monitor uses too (`hypothesis_test`), name what
@@ -126,7 +126,7 @@ def _explains(problem: LinearisedProblem, found: ChangeEstimate) -> bool:
 
 
 def _schwarz(problem: LinearisedProblem, found: ChangeEstimate, other: ChangeEstimate) -> float:
-    """Penalised chi-square of an explanation, in the noise that the better one of two leaves."""
+    """Schwarz's criterion (penalised chi-square) of an explanation, in the noise that the better one of two leaves."""
     count = 2 * len(problem.data.camera)
     both = np.array([found.chi2, other.chi2])
     sizes = np.array([found.x.size, other.x.size], dtype=np.int64)
@@ -137,8 +137,8 @@ def _schwarz(problem: LinearisedProblem, found: ChangeEstimate, other: ChangeEst
 def estimate_joint_zeros(
     model: CellModel, problem: LinearisedProblem, hypotheses: list[ModelChange]
 ) -> ChangeEstimate | None:
-    """Drifts of all joints' zeros estimated at once, insignificant ones left out: an arm that was switched on again, or
-    whose encoders were replaced, may have lost several by far.
+    """Drifts of all joints' zeros estimated jointly, without the insignificant ones; for an arm that was switched
+    on again, or got new encoders, where several zeros may be far off.
 
     None where the images do not determine the joints, or no drift is significant.
     """
@@ -146,7 +146,7 @@ def estimate_joint_zeros(
     named = tuple(by_name[name] for name in model.joint_names)
     found = estimate_changes(problem, named)
     if not _explains(problem, found):
-        start = _zeros_anywhere(model, problem)
+        start = _search_zeros(model, problem)
         if start is None:
             return None
         found = estimate_changes(problem, named, start=start)
@@ -169,8 +169,8 @@ def _best_subset(found: ChangeEstimate, price: float) -> list[int]:
     return best[1]
 
 
-def _zeros_anywhere(model: CellModel, problem: LinearisedProblem) -> FloatArray | None:
-    """Drifts (n,) of all joints' zeros by a search without a start (4.45) over a few stops; None where those do not
+def _search_zeros(model: CellModel, problem: LinearisedProblem) -> FloatArray | None:
+    """Drifts (n,) of all joints' zeros by a global search (4.45) over a few stops; None where those do not
     determine them.
     """
     data = problem.data
@@ -194,7 +194,7 @@ def _thresholds(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> Th
 
 
 def explain_residuals(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> ChangeEstimate:
-    """The changes that explain the pixels, the most significant first; none where none is significant.
+    """Changes that explain the pixels, the most significant first; empty where none is significant.
 
     One after the other, each beside those found before, by the decision of `hypothesis_test`: Schwarz's penalty keeps a
     drifted joint from being taken for a moved camera, which could do the same and more.
@@ -202,7 +202,7 @@ def explain_residuals(problem: LinearisedProblem, hypotheses: list[ModelChange])
     found = estimate_changes(problem, ())
     thresholds = _thresholds(problem, hypotheses)
     while len(found.changes) < MAX_CHANGES:
-        more = _with_one_more(
+        more = _add_best_cause(
             problem, found, [cause for cause in hypotheses if cause not in found.changes], thresholds
         )
         if more is None:
@@ -211,10 +211,10 @@ def explain_residuals(problem: LinearisedProblem, hypotheses: list[ModelChange])
     return found
 
 
-def _with_one_more(
+def _add_best_cause(
     problem: LinearisedProblem, found: ChangeEstimate, others: list[ModelChange], thresholds: Thresholds
 ) -> ChangeEstimate | None:
-    """The estimate with that one of ``others`` added which explains best; None where none is significant."""
+    """The estimate extended by the one of ``others`` that explains best; None where none is significant."""
     count = 2 * len(problem.data.camera)
     penalty = math.log(count)
     sizes = np.array([cause.size for cause in others], dtype=np.int64)
@@ -266,7 +266,7 @@ def make_check_report(
     count = here.size
     squares = (here.reshape(-1, 2) ** 2).sum(axis=1) / 2.0
     # The model's own uncertainty widens what is expected of a pixel.
-    expected = 1.0 + _widening(problem)
+    expected = 1.0 + _model_variance(problem)
     named = [_found_cause(model, problem, found, i) for i in range(len(found.changes))]
     freedom = max(1, count - found.x.size)
     left = float(np.sqrt(found.chi2 / freedom))
@@ -304,7 +304,7 @@ def make_check_report(
     )
 
 
-def _widening(problem: LinearisedProblem) -> FloatArray:
+def _model_variance(problem: LinearisedProblem) -> FloatArray:
     """Variance (k,) that the model's uncertainty adds to each pixel, in units of the pixel's own."""
     if not problem.uncertainty.shape[1]:
         return np.zeros(len(problem.data.camera))
@@ -402,13 +402,14 @@ def _unexplained(
         "unexplained", model.cameras[c].name, found.chi2, found.left.size - found.x.size, rms_px,
         f"{what} {left:.3g} times the expected noise and no single cause explains it: most in camera "
         f"{model.cameras[c].name} ({by_camera[c]:.3g} times), at marker {worst} ({by_marker[worst]:.3g} times) and "
-        f"{_where(model, problem, stop)} ({by_stop[stop]:.3g} times). Noise of the images (light, focus, dirt), play "
-        "in a joint, joints listed in another order than they follow each other, or several changes at once",
+        f"{_describe_stop(model, problem, stop)} ({by_stop[stop]:.3g} times). Noise of the images (light, focus, "
+        "dirt), play in a joint, joints listed in another order than they follow each other, or several "
+        "changes at once",
     )  # fmt: skip
 
 
-def _where(model: CellModel, problem: LinearisedProblem, stop: int) -> str:
-    """Words for a stop: the joints that are away from the base there."""
+def _describe_stop(model: CellModel, problem: LinearisedProblem, stop: int) -> str:
+    """Description of a stop: the joints that are away from the base there."""
     offsets = problem.data.offsets - np.median(problem.data.offsets, axis=0)
     away = np.abs(offsets[stop]) > 0.2 * np.abs(offsets).max(axis=0)
     names = sorted(model.joint_names[problem.order[k]] for k in np.flatnonzero(away))

@@ -171,6 +171,6 @@ def _with_zeros(
         widened(basis, [(k, model.generators[j] @ point) for k, j in enumerate(at)])
         for basis, point in zip(stated.markers, model.marker_points, strict=True)
     )
-    spread = np.array(rows)
+    jacobian = np.array(rows)
     whole = np.block([[stated.covariance, across.T], [across, own]])
-    return ModelCovariance(generators, cameras, lenses, markers, spread @ whole @ spread.T)
+    return ModelCovariance(generators, cameras, lenses, markers, jacobian @ whole @ jacobian.T)

@@ -1,4 +1,6 @@
-"""Faults in the epipolar geometry of trials: exchanged views, exchanged marker ids, planar scenes, no baseline."""
+"""Input faults that show in the epipolar geometry of trials: exchanged views or marker ids, planar scenes, no
+baseline.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ ROUNDS = 6
 
 
 def exchanged_views(trials: TrialData, k: int) -> IntArray:
-    """Stops at which the images of cameras 0 and ``k`` are exchanged: never more than half:
-    the rest is a naming.
+    """Stops at which the images of cameras 0 and ``k`` are exchanged: at most half of them, since exchanging all
+    only renames the cameras.
     """
     exchanged = np.zeros(len(trials.positions), dtype=bool)
     for _ in range(ROUNDS):
@@ -55,7 +57,7 @@ def with_views_exchanged(trials: TrialData, k: int, stops: IntArray | BoolArray)
 
 
 def exchanged_ids(trials: TrialData, k: int) -> tuple[int, int] | None:
-    """Two markers whose ids are exchanged between cameras 0 and ``k`` throughout (indices); None where none fit."""
+    """Two markers (indices) whose ids are exchanged between cameras 0 and ``k`` at all stops; None where none fit."""
     m = len(trials.marker_ids)
     F = robust_fundamental(trials, k)
     shares = np.zeros(m) if F is None else _marker_shares(trials, F, k)
@@ -89,7 +91,9 @@ def with_ids_exchanged(
 
 
 def views_unrelated(trials: TrialData, k: int) -> bool:
-    """Whether cameras 0 and ``k`` agree on no epipolar geometry in most single trials: not the same points at all."""
+    """Whether cameras 0 and ``k`` share no epipolar geometry in most single trials, so that they cannot see the
+    same points.
+    """
     verdicts = []
     for joint in range(len(trials.joint_names)):
         own = trials.trials == joint
@@ -106,7 +110,7 @@ def views_unrelated(trials: TrialData, k: int) -> bool:
 
 
 def robust_fundamental(trials: TrialData, k: int) -> FloatArray | None:
-    """F (3, 3) of cameras 0 and ``k`` that most of their matches fit; None where there is none."""
+    """Robust F (3, 3) of cameras 0 and ``k``, which most of their matches fit; None where there is none."""
     left, right, sigma = _matches(trials, k)
     best, most = None, 0.0
     if len(left) < MIN_MATCHES:
@@ -145,7 +149,7 @@ def _stop_costs(trials: TrialData, F: FloatArray, k: int, crossed: bool) -> Floa
 
 
 def _marker_shares(trials: TrialData, F: FloatArray, k: int) -> FloatArray:
-    """Share of each marker's matches (m,) that fit F; NaN where a marker has none."""
+    """Inlier ratio (m,) of each marker's matches with F; NaN where a marker has none."""
     distances = _distances(trials, F, k, False)
     count = np.isfinite(distances).sum(axis=0)
     inside = (distances <= 2.0 * INLIER_SIGMAS).sum(axis=0)
@@ -157,28 +161,30 @@ PLANAR_MODULI = 0.1
 
 
 def plane_or_baseline(trials: TrialData, error: CalibrationError) -> CalibrationError:
-    """The error that names why epipolar geometry is undetermined: markers in one plane, or one centre of projection."""
-    out_of_plane = _leaves_its_plane(trials)
+    """Error that states why the epipolar geometry is undetermined: coplanar markers, or a single centre of
+    projection.
+    """
+    out_of_plane = _excludes_plane(trials)
     rms, sigma = error.data["rms_px"], error.data.get("sigma_px", float("nan"))
-    told = f"what two cameras see in common is one homography to {rms:.3g} px, at sigmas of {sigma:.3g} px"
+    summary = f"what two cameras see in common is one homography to {rms:.3g} px, at sigmas of {sigma:.3g} px"
     if out_of_plane:
         return CalibrationError(
             "no_baseline",
-            f"{told}, though the markers do not stay in one plane: the cameras have (nearly) one centre. Their "
+            f"{summary}, though the markers do not stay in one plane: the cameras have (nearly) one centre. Their "
             f"parallax is at most {rms:.3g} px, {rms / sigma:.2g} sigmas. Move them apart",
             parallax_px=rms,
             parallax_sigmas=rms / sigma,
         )
     return CalibrationError(
         "views_degenerate",
-        f"{told}: all markers stay in one plane in all trials, or the cameras have (nearly) one centre (parallax at "
+        f"{summary}: all markers stay in one plane in all trials, or the cameras have (nearly) one centre (parallax at "
         f"most {rms / sigma:.2g} sigmas). Add markers off the plane, or move the cameras apart",
         **error.data,
     )
 
 
-def _leaves_its_plane(trials: TrialData) -> bool:
-    """Whether the markers in the first camera move as points of one plane that stays in itself never do.
+def _excludes_plane(trials: TrialData) -> bool:
+    """Whether the first camera's tracks exclude coplanar markers that only move within their own plane.
 
     A motion of a plane in itself has, in the image too, eigenvalues of one modulus; markers off one plane have no
     homography from stop to stop at all.
@@ -198,9 +204,10 @@ def _leaves_its_plane(trials: TrialData) -> bool:
         if H is None or not np.linalg.det(H) > 0.0:
             continue  # markers on a line at one of the two stops
         mapped = np.hstack([before, np.ones((len(before), 1))]) @ H.T
-        misfit = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - after, axis=1) / sigmas[last, both]
+        residuals_px = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - after, axis=1) / sigmas[last, both]
         moduli = np.abs(np.linalg.eigvals(H / np.cbrt(np.linalg.det(H))))
         signs.append(
-            float(np.median(misfit)) > 10.0 or float(np.ptp(moduli)) > PLANAR_MODULI * float(moduli.max())
+            float(np.median(residuals_px)) > 10.0
+            or float(np.ptp(moduli)) > PLANAR_MODULI * float(moduli.max())
         )
     return bool(signs) and float(np.mean(signs)) >= 0.5

@@ -1,5 +1,4 @@
-"""Diagnosis of a failed calibration: the cause where it can be identified, instead of the stage at which the fit
-failed.
+"""Diagnosis of a failed calibration: names the cause where it can be identified, not the stage that failed.
 
 Each cause is a correction of the trials: with the views of some stops exchanged back, two ids exchanged, an angle
 divided by a factor, the fit must succeed, or the cause is not reported.
@@ -70,7 +69,7 @@ LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 def diagnose_failure(
     trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
 ) -> CalibrationError:
-    """The error that names the cause of ``error``, or ``error`` with what is possible.
+    """Error that names the cause of ``error``; else ``error`` itself with a list of possible causes.
 
     ``refit`` fits trial data again. Tries hypotheses until one makes the data fit; costs some fits.
     """
@@ -79,7 +78,7 @@ def diagnose_failure(
     if error.code == "views_degenerate" and "rms_px" in error.data:
         return plane_or_baseline(trials, error)
     try:
-        named = _named(trials, refit, options)
+        named = _first_cause(trials, refit, options)
     except (GeometryError, np.linalg.LinAlgError):
         named = None  # data on which the search for a cause breaks down, too: the first error is returned
     if named is not None and named.code == "noise_understated":
@@ -88,18 +87,18 @@ def diagnose_failure(
     if named is not None:
         return named
     if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
-        return _contradicting(trials, error)
-    return _explained(trials, error, refit, options) if error.code in MISFITS else error
+        return _contradiction_error(trials, error)
+    return _outlier_error(trials, error, refit, options) if error.code in MISFITS else error
 
 
-def _named(
+def _first_cause(
     trials: TrialData, refit: Refit, options: FitOptions, left: TrialData | None = None
 ) -> CalibrationError | None:
-    """The error of the first cause that holds, cheap ones first. ``left``: what a model leaves of the trials."""
+    """Error of the first cause that holds, cheap tests first. ``left``: the model's residuals of the trials."""
     for hypothesis in exchange_hypotheses(trials):
         if fit_of_correction(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
-    stepped = _stepped(trials if left is None else left)
+    stepped = _step_error(trials if left is None else left)
     if stepped is not None:
         return stepped
     noisier = underestimated_noise(trials, refit, options)
@@ -127,8 +126,8 @@ def _named(
     return None
 
 
-def _stepped(trials: TrialData) -> CalibrationError | None:
-    """The error of a step in the markers' paths, if there is one."""
+def _step_error(trials: TrialData) -> CalibrationError | None:
+    """Error of a step in the markers' tracks; None where there is none."""
     step = find_step(trials)
     if step is None:
         return None
@@ -139,10 +138,10 @@ def _stepped(trials: TrialData) -> CalibrationError | None:
     return moved_together(step.stop)
 
 
-def _explained(
+def _outlier_error(
     trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
 ) -> CalibrationError:
-    """The error with what the outliers of a lenient fit have in common, or with what is possible."""
+    """Error with what the outliers of a lenient fit have in common, or with a list of possible causes."""
     lenient = replace(options, max_outliers=LENIENT_OUTLIERS, max_trial_outliers=LENIENT_TRIAL_OUTLIERS)
     try:
         result = refit(trials, lenient)
@@ -175,8 +174,10 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
     )
 
 
-def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationError:
-    """The error of a joint whose stops are lost because cameras contradict each other, not because they see nothing."""
+def _contradiction_error(trials: TrialData, error: CalibrationError) -> CalibrationError:
+    """Error of a joint whose stops are lost because the cameras contradict each other, not because they see
+    nothing.
+    """
     own = trials.trials == trials.joint_names.index(error.data["joint"])
     seen = int(((trials.visible[:, own].sum(axis=0) >= 2).sum(axis=1) >= MIN_SHOWN).sum())
     if seen < error.data["minimum"]:
@@ -193,7 +194,7 @@ def _contradicting(trials: TrialData, error: CalibrationError) -> CalibrationErr
 def review_notes(
     trials: TrialData, result: CalibrationFit, refit: Refit, options: FitOptions
 ) -> tuple[str, ...]:
-    """What is to be said of a fit that succeeded: its outliers' causes, scales of prismatic joints that disagree.
+    """Notes on a fit that succeeded: causes of its outliers, prismatic joints whose scales disagree.
 
     Raises CalibrationError where the model is of a cell that is no more (a camera or marker moved), where two ids are
     exchanged throughout, or where revolute joints report wrong scales.
@@ -211,7 +212,7 @@ def review_notes(
     if not statistics.chi2_ok:
         suspicious = float(outliers.mean()) > SUSPICIOUS_OUTLIERS
         left = residual_trials(trials, result)
-        named = _named(trials, refit, options, left) if suspicious else _stepped(left)
+        named = _first_cause(trials, refit, options, left) if suspicious else _step_error(left)
         if named is not None:
             raise named
     nearly = not statistics.chi2_ok or any("follow" in note for note in result.report.notes)
@@ -233,7 +234,9 @@ def review_notes(
 
 
 def untested(trials: TrialData) -> tuple[str, ...]:
-    """What the trials do not determine: the order of joints that only ever move alone, from one configuration."""
+    """Notes on what the trials do not determine: the order of joints that only ever move alone, from one
+    configuration.
+    """
     n = len(trials.joint_names)
     free = bool((trials.trials < 0).any())
     bases = [

@@ -1,4 +1,4 @@
-"""Consistency of stated numbers with the trials: the noise of detectors, the scales of joints."""
+"""Consistency checks of the stated detector noise and of the joints' scales with the trials."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from stereoservo.numerics.arrays import FloatArray
 SUSPICIOUS_OUTLIERS = 0.01
 """Share of outliers from which a fit above the noise floor is looked into."""
 DEGREES, ABOUT = float(np.degrees(1.0)), 2.0
-"""Factor of a joint that reports degrees, and how many times, either way, a coarse factor may be off a true one."""
+"""Factor of a joint that reports degrees, and by what factor, up or down, a coarse factor may be off a true one."""
 UNDERSTATED = 1.5
 """How many times the stated sigmas paths must scatter for the detector to be looked into."""
 UNEVEN = 1.5
@@ -37,8 +37,8 @@ WHITE = 0.8
 
 
 def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -> CalibrationError | None:
-    """The error of sigmas stated too small, if the trials fit with those that the markers' paths show, and what the
-    model leaves then is noise.
+    """Error of sigmas that are stated too small; None unless the trials fit with the sigmas that the markers'
+    tracks show, and only noise is left.
     """
     scatter = path_noise(trials)
     if not float(scatter.max()) > UNDERSTATED:
@@ -74,7 +74,7 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
 
 
 def residual_trials(trials: TrialData, result: CalibrationFit) -> TrialData:
-    """The trials with what the model leaves of their pixels: a step stays one, and smooth paths leave noise."""
+    """The trials with the model's residuals in place of the pixels, in which steps stay and smooth tracks vanish."""
     found = predictions(trials, result)
     return msgspec.structs.replace(
         trials,
@@ -87,7 +87,7 @@ def residual_trials(trials: TrialData, result: CalibrationFit) -> TrialData:
 def scaled_positions(
     trials: TrialData, views: InitialViews, refit: Refit, options: FitOptions
 ) -> CalibrationError | None:
-    """The error of revolute joints whose positions are off by factors, if the trials fit without them."""
+    """Error of revolute joints whose positions have a wrong scale, if the trials fit without it; else None."""
     factors = trial_scales(trials, *views)
     if (factors == 1.0).all():
         return None
@@ -100,8 +100,8 @@ def scaled_positions(
 
 
 def _likely_factors(trials: TrialData, factors: FloatArray) -> list[FloatArray]:
-    """Factors (n,) to try for those that the joints' own trials estimate coarsely, likeliest first: a unit that most
-    revolute joints share, and so perhaps all; degrees; their own.
+    """Factors (n,) to try, likeliest first: a unit that most revolute joints share, and so perhaps all; degrees;
+    the joints' own coarse estimates.
     """
     revolute = np.array([kind == "revolute" for kind in trials.joint_kinds])
     found = []
@@ -117,8 +117,8 @@ def _likely_factors(trials: TrialData, factors: FloatArray) -> list[FloatArray]:
 def scale_error(
     trials: TrialData, mended: TrialData, result: CalibrationFit, factors: FloatArray
 ) -> CalibrationError | None:
-    """The error of wrong scales: ``factors`` (n,) that were divided out, refined with the model of the ``mended``
-    trials; None where none is left.
+    """Error that states wrong scales: ``factors`` (n,) that were divided out, refined with the model of the
+    ``mended`` trials; None where none is left.
     """
     found = {}
     for scale in model_scales(solution_of(mended, result)):
@@ -129,14 +129,14 @@ def scale_error(
             found[trials.joint_names[scale.joint]] = whole
     if not found:
         return None
-    told = ", ".join(
+    listed = ", ".join(
         f"{name!r} reports {scale.factor:.5g} ± {scale.deviation:.1g} times its motion"
         + (" (degrees, not radians)" if abs(np.degrees(1.0) / scale.factor - 1.0) < 0.02 else "")
         for name, scale in found.items()
     )
     return CalibrationError(
         "wrong_scale",
-        f"joint {told}. Revolute joints must report radians: correct the drive's scale",
+        f"joint {listed}. Revolute joints must report radians: correct the drive's scale",
         joints={
             name: {"factor": scale.factor, "deviation": scale.deviation} for name, scale in found.items()
         },

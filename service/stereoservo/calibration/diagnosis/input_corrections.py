@@ -1,4 +1,6 @@
-"""Corrections of the trials that may make them fit: views, ids, joint kinds or the order of joints exchanged back."""
+"""Hypothetical corrections of the trials that may make them fit: views, ids, joint kinds or joint order exchanged
+back.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ KIND_BETTER = 1.25
 
 @dataclass(frozen=True)
 class InputCorrection:
-    """A possible fault of the input, and the corrected ``trials``."""
+    """A hypothetical fault of the input, and the trials corrected for it."""
 
     code: str
     message: str
@@ -45,7 +47,7 @@ class InputCorrection:
 
 
 def exchange_hypotheses(trials: TrialData) -> Iterator[InputCorrection]:
-    """Views exchanged at some stops, ids exchanged throughout."""
+    """Corrections of views exchanged at some stops, and of ids exchanged at all stops."""
     for k in range(1, len(trials.cameras)):
         names = [trials.cameras[0].name, trials.cameras[k].name]
         stops = exchanged_views(trials, k)
@@ -63,8 +65,8 @@ def exchange_hypotheses(trials: TrialData) -> Iterator[InputCorrection]:
 
 
 def ids_exchanged(trials: TrialData, k: int, pair: tuple[int, int]) -> InputCorrection:
-    """Two markers (indices) exchanged throughout in camera ``k`` or in the first one: with two cameras that is a
-    naming.
+    """Correction of two markers (indices) exchanged at all stops in camera ``k`` or in the first one, which two
+    cameras cannot distinguish.
     """
     a, b = (trials.marker_ids[i] for i in pair)
     names = [trials.cameras[0].name, trials.cameras[k].name]
@@ -79,17 +81,18 @@ def ids_exchanged(trials: TrialData, k: int, pair: tuple[int, int]) -> InputCorr
 
 
 def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCorrection]:
-    """The other kind for a joint whose own trial fits it much better."""
+    """Corrections of a joint's kind where its own trial fits the other kind much better."""
     cameras, points, usable = views
     residuals_by_kind: dict[int, tuple[float, float, Kind]] = {}
-    for joint, sights, way in own_trials(trials, points, usable):
-        said = trials.joint_kinds[joint]
-        other: Kind = "prismatic" if said == "revolute" else "revolute"
-        as_said, as_other = (
-            best_single_joint(kind, cameras, sights, way, thorough=True)[1] for kind in (said, other)
+    for joint, observations, displacement in own_trials(trials, points, usable):
+        stated = trials.joint_kinds[joint]
+        other: Kind = "prismatic" if stated == "revolute" else "revolute"
+        as_stated, as_other = (
+            best_single_joint(kind, cameras, observations, displacement, thorough=True)[1]
+            for kind in (stated, other)
         )
-        residuals_by_kind[joint] = as_said, as_other, other
-    # The other kind must reach what the other joints do; a joint that fits neither way is no case of this.
+        residuals_by_kind[joint] = as_stated, as_other, other
+    # The other kind must reach what the other joints do; a joint that fits neither kind has another fault.
     floor = (
         float(np.median([min(least, instead) for least, instead, _ in residuals_by_kind.values()]))
         if residuals_by_kind
@@ -98,19 +101,21 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
     for joint, (least, instead, other) in residuals_by_kind.items():
         if not instead < min(KIND_BETTER * floor, least / KIND_BETTER):
             continue
-        name, said = trials.joint_names[joint], trials.joint_kinds[joint]
+        name, stated = trials.joint_names[joint], trials.joint_kinds[joint]
         kinds = tuple(other if j == joint else kind for j, kind in enumerate(trials.joint_kinds))
         yield InputCorrection(
             "joint_kind",
-            f"joint {name!r} is said to be {said}, but is {other}: as such its trial fits to {instead:.3g} sigmas, as "
-            f"stated to {least:.3g}",
+            f"joint {name!r} is said to be {stated}, but is {other}: as such its trial fits to {instead:.3g} sigmas, "
+            f"as stated to {least:.3g}",
             {"joint": name, "kind": other},
             msgspec.structs.replace(trials, joint_kinds=kinds),
         )
 
 
 def order_hypotheses(trials: TrialData, refit: Refit, options: FitOptions) -> Iterator[InputCorrection]:
-    """Two joints exchanged, or all reversed, where free poses contradict the order that the joint trials leave open."""
+    """Corrections of the joints' order (two exchanged, or all reversed) where free poses contradict the order
+    stated.
+    """
     free = trials.trials < 0
     n = len(trials.joint_names)
     if not free.any() or n < 2:
@@ -184,12 +189,14 @@ def fit_of_correction(trials: TrialData, refit: Refit, options: FitOptions) -> C
 
 
 def pinhole_reconstruction(trials: TrialData) -> InitialViews:
-    """Cameras, points and usable pixels, as pinholes see them."""
+    """Projective cameras, points and usable pixels by `initial_reconstruction`, with lens distortion removed."""
     return initial_reconstruction(undistorted(trials, straight_lenses(trials)))
 
 
 def solution_of(trials: TrialData, result: CalibrationFit) -> Solution:
-    """The final bundle of a fit again, from its model: linearised in the frame of its stratum, not moved."""
+    """The final bundle of a fit, reconstructed from its model: linearised in the frame of its stratum, without a
+    step.
+    """
     model = result.model
     kept = [trials.marker_ids.index(i) for i in model.marker_ids]
     used = trials.visible[:, :, kept]

@@ -42,7 +42,7 @@ LEAST_FACTOR = 2e-3
 
 @dataclass(frozen=True)
 class JointScaleEstimate:
-    """Reported over true motion of a joint, and its standard deviation."""
+    """Estimated scale factor of a joint's reading, reported over true motion, and its standard deviation."""
 
     joint: int
     factor: float
@@ -50,7 +50,7 @@ class JointScaleEstimate:
 
     @property
     def wrong(self) -> bool:
-        """Whether the factor is not 1, by its own deviation."""
+        """Whether the factor differs significantly from 1."""
         off = abs(self.factor - 1.0)
         return off > SIGNIFICANT * self.deviation and off > LEAST_FACTOR
 
@@ -58,17 +58,17 @@ class JointScaleEstimate:
 def trial_scales(
     trials: TrialData, cameras: FloatArray, points: FloatArray, usable: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where the trial
-    shows no other, for prismatic joints, where the trial is of no use, and where it does not reach with its factor
-    what the other joints' trials do: something else is wrong then.
+    """Scale factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where no
+    other is significant, for prismatic joints, for trials of no use, and where the factor does not bring the
+    trial to the residuals of the other joints' trials (another fault is present then).
     """
     factors, residual = np.ones(len(trials.joint_names)), np.full(len(trials.joint_names), np.nan)
-    for joint, sights, way in own_trials(trials, points, usable):
+    for joint, observations, displacement in own_trials(trials, points, usable):
         kind = trials.joint_kinds[joint]
         if kind == "revolute":
-            factors[joint], residual[joint] = _best_factor(cameras, sights, way)
+            factors[joint], residual[joint] = _best_factor(cameras, observations, displacement)
         else:
-            residual[joint] = best_single_joint(kind, cameras, sights, way)[1]
+            residual[joint] = best_single_joint(kind, cameras, observations, displacement)[1]
     known = np.isfinite(residual)
     if known.any():
         factors[known & (residual > ABOVE_FLOOR * np.median(residual[known]))] = 1.0
@@ -77,29 +77,29 @@ def trial_scales(
 
 def with_scales_removed(trials: TrialData, factors: FloatArray) -> TrialData:
     """The trials with positions divided by ``factors`` (n,) about their medians."""
-    middle = np.median(trials.positions, axis=0)
-    return msgspec.structs.replace(trials, positions=middle + (trials.positions - middle) / factors)
+    centre = np.median(trials.positions, axis=0)
+    return msgspec.structs.replace(trials, positions=centre + (trials.positions - centre) / factors)
 
 
 def _best_factor(
-    cameras: FloatArray, sights: VirtualObservations, reported: FloatArray
+    cameras: FloatArray, observations: VirtualObservations, reported: FloatArray
 ) -> tuple[float, float]:
-    """The factor of one joint's ``reported`` angles (k,), 1 where none is worth more, and the median residual
-    [sigmas] with it; NaN where no joint fits at all.
+    """Scale factor of one joint's ``reported`` angles (k,), 1 where no other gains enough, and the median residual
+    [sigmas] with it; NaN where the joint fits with none.
     """
-    rough = _rigid_factor(sights, reported)
+    rough = _rigid_factor(observations, reported)
     rigs: dict[float, tuple[RigModel, float]] = {}
     for factor in {1.0, *(rough * step for step in COARSE)}:
         # As reported, the joint must have had every chance before another factor is believed.
         rig, typical = best_single_joint(
-            "revolute", cameras, sights, reported / factor, thorough=factor == 1.0
+            "revolute", cameras, observations, reported / factor, thorough=factor == 1.0
         )
         if rig is not None and np.isfinite(typical):
             rigs[factor] = rig, typical
     if not rigs:
         return 1.0, np.nan
     start = min(rigs, key=lambda factor: rigs[factor][1])
-    camera, stop, marker = np.nonzero(sights.usable)
+    camera, stop, marker = np.nonzero(observations.usable)
     noise = max(1.0, min(typical for _, typical in rigs.values()))
 
     def solved(log_factor: float, rig: RigModel) -> FloatArray:
@@ -109,8 +109,8 @@ def _best_factor(
             camera,
             stop,
             marker,
-            sights.pixels[sights.usable].reshape(-1, 2),
-            noise * sights.sigmas[sights.usable].ravel(),
+            observations.pixels[observations.usable].reshape(-1, 2),
+            noise * observations.sigmas[observations.usable].ravel(),
         )
         return solve(
             rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, max_evaluations=40
@@ -134,11 +134,11 @@ def _best_factor(
     return float(np.exp(found.x)), noise * float(np.sqrt(np.median(squares) / np.log(4.0)))
 
 
-def _rigid_factor(sights: VirtualObservations, reported: FloatArray) -> float:
-    """Reported over turned angle between stops far apart, as if the cameras were nominal ones: coarse."""
+def _rigid_factor(observations: VirtualObservations, reported: FloatArray) -> float:
+    """Coarse scale factor: reported over rotated angle between distant stops, as if the cameras were nominal ones."""
     scale = np.array([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        euclidean = sights.points[..., :3] * scale / sights.points[..., 3:]
+        euclidean = observations.points[..., :3] * scale / observations.points[..., 3:]
     valid = finite_rows(euclidean)
     far = np.abs(reported[:, None] - reported[None, :]) > 0.4 * np.ptp(reported)
     ratios = []
@@ -155,7 +155,7 @@ def _rigid_factor(sights: VirtualObservations, reported: FloatArray) -> float:
 
 
 def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
-    """Factors of all revolute joints' positions and their deviations, estimated together with everything else.
+    """Scale factors of all revolute joints' positions and their deviations, estimated jointly with the model.
 
     One Gauss-Newton step from a converged bundle: exact for factors near 1.
     """
@@ -189,8 +189,8 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
 
 
 def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointScaleEstimate, ...]:
-    """Reported motion per length of each prismatic joint over that of the first one, with deviations; () below the
-    metric stratum and with fewer than two.
+    """Scale of each prismatic joint (reported motion per length) over that of the first one, with deviations; ()
+    below the metric stratum and with fewer than two.
 
     One scale for all of them is gauge; their ratios are not, and are 1 where every drive states the truth.
     """

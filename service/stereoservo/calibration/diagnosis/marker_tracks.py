@@ -1,4 +1,4 @@
-"""Faults of the input that the markers' tracks show without a model: markers on a line, frozen encoders, steps.
+"""Input faults that the markers' tracks show without a model: collinear markers, frozen encoders, steps.
 
 Markers of a moving joint draw smooth tracks, and equal positions give equal images.
 """
@@ -31,7 +31,9 @@ STEP_SHARE = 0.75
 
 
 def off_line_sigmas(trials: TrialData) -> float:
-    """Rms distance [sigmas] of the markers from their common line in each image; infinite without three."""
+    """Rms distance [sigmas] of the markers from their best common line in each image; infinite with fewer than
+    three.
+    """
     squares, freedom = 0.0, 0
     for pixels, sigmas in zip(trials.pixels, trials.sigmas, strict=True):
         for dots, noise in zip(pixels, sigmas, strict=True):
@@ -54,7 +56,7 @@ def image_motion(trials: TrialData, first: int, second: int) -> float:
 
 
 def frozen_stops(trials: TrialData, joint: int) -> IntArray:
-    """The longest run of a joint's trial stops (k,) at which all positions are reported the same and images move."""
+    """Longest run of a joint's trial stops (k,) with equal reported positions and moving images: a frozen encoder."""
     own = np.flatnonzero(trials.trials == joint)
     longest: list[int] = []
     run: list[int] = own[:1].tolist()
@@ -69,7 +71,7 @@ def frozen_stops(trials: TrialData, joint: int) -> IntArray:
 
 
 def check_motions(trials: TrialData) -> None:
-    """Raise CalibrationError for faults that images and positions show before any fit.
+    """Check images and positions for faults that show before any fit. Raises CalibrationError.
 
     ``too_few_markers``, ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``.
     """
@@ -135,7 +137,7 @@ def _refuse_exchanged(trials: TrialData, joint: int, name: str) -> None:
 
 @dataclass(frozen=True)
 class TrackStep:
-    """Paths that jump between two stops and stay there: from ``stop`` on. ``cameras``, ``markers``: indices of those
+    """A step in the tracks: they jump before ``stop`` and stay there. ``cameras``, ``markers``: indices of those
     that do, all of them where they moved together; ``pixels``: median size [px].
     """
 
@@ -146,8 +148,8 @@ class TrackStep:
 
 
 def path_noise(trials: TrialData) -> FloatArray:
-    """How far pixels are from smooth paths [sigmas], for each path (c, m): their noise over the stated one, where
-    polynomials follow the paths; 1 where too few stops show a marker.
+    """Noise of each track (c, m), estimated over stated, from its distance to a smooth polynomial; 1 where too few
+    stops show a marker.
     """
     basis = path_basis(trials)
     used = basis.any(axis=1)
@@ -166,12 +168,13 @@ def path_noise(trials: TrialData) -> FloatArray:
 
 
 def paths_are_smooth(trials: TrialData) -> bool:
-    """Whether the markers' paths are what moving joints make of them, but for noise: no wrong detections."""
+    """Whether the tracks are smooth but for noise, as moving joints make them: without wrong detections."""
     return float(np.median(path_noise(trials))) < SMOOTH
 
 
 def find_step(trials: TrialData) -> TrackStep | None:
-    """The step that all markers in one camera, one marker in all cameras, or all in all take at one stop.
+    """A step at one stop of all markers in one camera, of one marker in all cameras, or of all in all; None if
+    there is none.
 
     Stops are in order of time. Each path is compared with polynomials in the moving joint about the common
     base, one for each trial; None where no step explains what they leave.
@@ -197,8 +200,8 @@ def find_step(trials: TrialData) -> TrackStep | None:
 
 
 def path_basis(trials: TrialData) -> FloatArray:
-    """Columns (s, p) that smooth paths of markers are combinations of: a constant for each base that trials start
-    from, and powers of the moving joint's way from it; zero for stops of no trial, no columns without any.
+    """Basis columns (s, p) of smooth tracks: a constant for each base that trials start from, and powers of the
+    moving joint's displacement from it; zero for stops of no trial, no columns without any.
     """
     positions, columns = trials.positions, []
     bases: dict[tuple[int, ...], FloatArray] = {}
@@ -215,16 +218,16 @@ def path_basis(trials: TrialData) -> FloatArray:
             base[joint] = middle
             name = tuple(np.round(base / (10 * LOCKED_RANGE)).astype(np.int64).tolist())
             bases.setdefault(name, np.zeros(len(positions)))[group] = 1.0
-            way = np.zeros(len(positions))
+            displacement = np.zeros(len(positions))
             span = max(float(np.ptp(positions[group, joint])), MIN_RANGE)
-            way[group] = 2.0 * (positions[group, joint] - middle) / span
+            displacement[group] = 2.0 * (positions[group, joint] - middle) / span
             degree = min(PATH_DEGREE, (len(group) - 1) // 2)
-            columns += [way**power for power in range(1, degree + 1)]
+            columns += [displacement**power for power in range(1, degree + 1)]
     return np.stack([*bases.values(), *columns], axis=1) if bases else np.zeros((len(positions), 0))
 
 
 def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray]:
-    """Chi-square that a step before each stop gains each path (c, m, s), and the step's size [px]."""
+    """Reduction of chi-square by a step before each stop in each track (c, m, s), and the step's size [px]."""
     c, s, m = trials.sigmas.shape
     basis = path_basis(trials)
     used = basis.any(axis=1)
@@ -260,7 +263,7 @@ def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray]:
 def _trial_noise(
     rest: FloatArray, steps: FloatArray, size: FloatArray, of_row: IntArray, of_stop: IntArray
 ) -> FloatArray:
-    """Mean square (s,) that is left of the path, about a stop's own trial, once it has a step there.
+    """Mean squared residual (s,) of the track in each stop's own trial, with a step at that stop.
 
     Polynomials follow a wide turn badly, and only there: what they leave is no step. ``rest`` (k, 2), ``steps``
     (k, s) [sigmas], ``size`` (s, 2); ``of_row`` (k,) and ``of_stop`` (s,) number the trials.

@@ -27,8 +27,8 @@ LASTING_STOPS = 3
 
 @dataclass(frozen=True)
 class PredictedTrials:
-    """A model beside its trials: which pixels are outliers (c, s, m), what is expected (c, s, m, 2), and the distance
-    [px] within which a pixel is where it is expected (c, s, m).
+    """Predictions of a model for its trials: which pixels are outliers (c, s, m), expected pixels (c, s, m, 2), and
+    the distance [px] within which a pixel agrees with its prediction (c, s, m).
     """
 
     rig: RigModel
@@ -41,7 +41,7 @@ class PredictedTrials:
     expected: FloatArray
 
     def near(self, pixels: FloatArray, where: FloatArray) -> BoolArray:
-        """Whether pixels (c, s, m, 2) lie where expected ones do."""
+        """Whether pixels (c, s, m, 2) agree with expected ones."""
         distance = np.linalg.norm(pixels - where, axis=-1)
         return np.asarray(np.where(np.isfinite(distance), distance, np.inf) <= NEAR * self.sigmas)
 
@@ -79,10 +79,10 @@ def predictions(trials: TrialData, result: CalibrationFit) -> PredictedTrials:
 
 
 def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ...]:
-    """What the outliers of ``result`` come from, as notes.
+    """Notes on the causes of the outliers of ``result``.
 
     Raises CalibrationError (``camera_moved``, ``marker_slipped``, ``moved_together``) for what has changed for good
-    during the trials: the model speaks of a cell that is no more.
+    during the trials: the model describes the cell before that.
     """
     found = predictions(trials, result)
     if not found.outliers.any():
@@ -108,7 +108,9 @@ def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ..
 
 
 def check_lasting_outliers(trials: TrialData, found: PredictedTrials) -> None:
-    """Raise CalibrationError where outliers begin at a stop and stay: of a camera, of a marker, or of everything."""
+    """Raise CalibrationError where outliers begin at a stop and last: of one camera, of one marker, or of
+    everything.
+    """
     c, _, m = found.seen.shape
     cameras = [_lasting(found.outliers[k], found.seen[k]) for k in range(c)]
     moved = [(k, stop) for k, stop in enumerate(cameras) if stop is not None]
@@ -135,7 +137,7 @@ def check_lasting_outliers(trials: TrialData, found: PredictedTrials) -> None:
 
 
 def camera_moved(trials: TrialData, camera: int, stop: int) -> CalibrationError:
-    """The error that a camera was moved before ``stop``."""
+    """Error that a camera was moved before ``stop``."""
     name = trials.cameras[camera].name
     return CalibrationError(
         "camera_moved",
@@ -147,7 +149,7 @@ def camera_moved(trials: TrialData, camera: int, stop: int) -> CalibrationError:
 
 
 def marker_slipped(marker: int, stop: int) -> CalibrationError:
-    """The error that a marker was moved on its body before ``stop``."""
+    """Error that a marker was moved on its body before ``stop``."""
     return CalibrationError(
         "marker_slipped",
         f"marker {marker} slipped between stops {stop - 1} and {stop}: it jumps in all cameras and stays off, the "
@@ -158,7 +160,7 @@ def marker_slipped(marker: int, stop: int) -> CalibrationError:
 
 
 def moved_together(stop: int) -> CalibrationError:
-    """The error that everything jumps in all cameras before ``stop``."""
+    """Error that everything jumps in all cameras before ``stop``."""
     return CalibrationError(
         "moved_together",
         f"all markers jump in all cameras between stops {stop - 1} and {stop} and stay off. The images from there on "
@@ -168,8 +170,8 @@ def moved_together(stop: int) -> CalibrationError:
 
 
 def _lasting(outliers: BoolArray, seen: BoolArray) -> int | None:
-    """The stop that parts pixels (s, ...) most of which are outliers from others of which few are, before it or after
-    it: the model follows the longer part. None where there is none.
+    """Stop that separates pixels (s, ...), most of which are outliers, from others of which few are, on either side
+    (the model follows the longer part); None where there is none.
     """
     after = _begun(outliers, seen)
     if after is not None:
@@ -179,7 +181,9 @@ def _lasting(outliers: BoolArray, seen: BoolArray) -> int | None:
 
 
 def _begun(outliers: BoolArray, seen: BoolArray) -> int | None:
-    """The stop from which on most of the pixels (s, ...) are outliers while few before are, or None."""
+    """First stop from which most of the pixels (s, ...) are outliers while few are before; None where there is
+    none.
+    """
     s = len(outliers)
     bad = outliers.reshape(s, -1).sum(axis=1)
     shown = seen.reshape(s, -1).sum(axis=1)
@@ -193,7 +197,7 @@ def _begun(outliers: BoolArray, seen: BoolArray) -> int | None:
 
 
 def _exchanged_stops(found: PredictedTrials) -> npt.NDArray[np.int64]:
-    """Stops at which cameras 0 and 1 show what the other one should."""
+    """Stops at which cameras 0 and 1 show each other's predictions."""
     pair = found.expected[[1, 0]]
     crossed = found.near(found.pixels, np.concatenate([pair, found.expected[2:]]))[:2]
     both = found.outliers[:2].sum(axis=(0, 2))
@@ -204,7 +208,7 @@ def _exchanged_stops(found: PredictedTrials) -> npt.NDArray[np.int64]:
 def _exchanged_ids(
     found: PredictedTrials, rest: BoolArray
 ) -> list[tuple[int, int, int, npt.NDArray[np.int64]]]:
-    """Cameras and pairs of markers that lie where the other should, with the stops (k,)."""
+    """Cameras and pairs of markers that lie at each other's prediction, with the stops (k,)."""
     pairs: dict[tuple[int, int, int], list[int]] = {}
     for camera, stop, a in np.argwhere(rest):
         distance = np.linalg.norm(found.expected[camera, stop] - found.pixels[camera, stop, a], axis=1)
@@ -218,7 +222,9 @@ def _exchanged_ids(
 
 
 def _wrong_stop(trials: TrialData, found: PredictedTrials, stop: int) -> str:
-    """What is wrong with a stop whose pixels are outliers as a whole: a neighbour's position explains them, or none."""
+    """Description of a stop whose pixels are all outliers: the positions of a neighbouring stop explain them, or
+    none do.
+    """
     joint = int(trials.trials[stop])
     prefix = f"stop {stop} does not fit in any camera and was left out"
     if joint < 0:
@@ -250,7 +256,7 @@ def _share(outliers: BoolArray, seen: BoolArray, axis: tuple[int, ...]) -> Float
 
 
 def _stops(stops: npt.NDArray[np.int64]) -> str:
-    """Stops in words."""
+    """Stop numbers as text."""
     listed = ", ".join(str(int(stop)) for stop in stops[:12])
     return f"stop{'s' if len(stops) > 1 else ''} {listed}" + (
         f" and {len(stops) - 12} more" if len(stops) > 12 else ""

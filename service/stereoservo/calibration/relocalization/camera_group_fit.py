@@ -61,8 +61,8 @@ RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
-    """Cameras that were fitted together: their new ``matrices`` (c, 3, 4), which inherit from the model's as P D by
-    ``motion`` D (4, 4) where they were displaced, and the inliers among ``views``.
+    """Cameras that were fitted together: new ``matrices`` (c, 3, 4), ``P D`` with ``motion`` D (4, 4) and the
+    model's P where they were displaced rigidly, and the inliers among ``views``.
     """
 
     cameras: tuple[int, ...]
@@ -80,7 +80,7 @@ class CameraGroup:
 def relocalize_group(
     model: CellModel, views: Correspondences, offsets: FloatArray, group: tuple[int, ...], rig: bool
 ) -> CameraGroup:
-    """Fit of the cameras ``group`` to their ``views``, as one rigid ``rig`` or each free; ``offsets`` (s, n) of the
+    """Fit the cameras ``group`` to their ``views``, as one rigid ``rig`` or each free; ``offsets`` (s, n) of the
     joints.
 
     Raises CalibrationError: ``too_few_points``, ``points_coplanar``, ``not_explained``.
@@ -125,8 +125,8 @@ def relocalize_group(
 
 
 def _refocused(displaced: CameraGroup, free: CameraGroup, noise: float) -> bool:
-    """Whether a free matrix explains what a displacement does not: by the likelihood ratio where both keep the same
-    pixels, else by chi-square alone.
+    """Whether free matrices fit significantly better than a displacement: by likelihood ratio where both keep the
+    same pixels, else by chi-square alone.
     """
     if len(displaced.views.camera) == len(free.views.camera):
         gain, freedom = displaced.chi2 - free.chi2, displaced.degrees_of_freedom - free.degrees_of_freedom
@@ -145,7 +145,7 @@ def _renumbered(views: Correspondences, group: tuple[int, ...]) -> Correspondenc
 
 
 def facing(matrices: FloatArray, views: Correspondences) -> FloatArray:
-    """Matrices (c, 3, 4) with the sign that puts the points before their cameras."""
+    """Matrices (c, 3, 4) with the sign that puts the points in front of their cameras."""
     depths = np.einsum("kj,kj->k", matrices[views.camera, 2], views.points)
     signs = [
         -1.0 if (views.camera == c).any() and np.median(depths[views.camera == c]) < 0.0 else 1.0
@@ -155,7 +155,8 @@ def facing(matrices: FloatArray, views: Correspondences) -> FloatArray:
 
 
 def _scaled_like(one: CameraGroup, old: FloatArray, ahead: FloatArray) -> CameraGroup:
-    """The group with the scales and signs of the matrices ``old`` (c, 3, 4); those ``ahead`` face the points.
+    """The group with the scales and signs of the matrices ``old`` (c, 3, 4); those ``ahead`` have the points in
+    front.
 
     They mean nothing in the images, but what is compared with a matrix of before need not know that.
     """
@@ -171,7 +172,9 @@ def _scaled_like(one: CameraGroup, old: FloatArray, ahead: FloatArray) -> Camera
 
 
 def _algebra(model: CellModel) -> FloatArray:
-    """Changes of frame (a, 4, 4) that leave the stratum invariant, without the scale: affine 12, projective 15."""
+    """Basis (a, 4, 4) of the changes of frame that leave the stratum invariant, without the scale: affine 12,
+    projective 15.
+    """
     if model.stratum == "affine":
         frame = projective_to_affine(model.plane_at_infinity)
         return np.asarray(np.linalg.inv(frame) @ np.eye(16).reshape(16, 4, 4)[:12] @ frame)
@@ -191,7 +194,7 @@ def _attempt(
     start: FloatArray,
     lenses: FloatArray,
 ) -> CameraGroup:
-    """One family fitted: robustly, then by least squares in the full covariance of pixels and model."""
+    """Fit of one class of motion: robust, then least squares in the full covariance of pixels and model."""
     _refuse_few(model, views, group, family, how)
     starts = [start]
     if isinstance(family, FreeMatrix):
@@ -220,7 +223,7 @@ def _attempt(
 
 
 def _motion(model: CellModel, old: FloatArray, new: FloatArray, family: MatrixChange) -> FloatArray | None:
-    """D (4, 4) of ``new = old D`` (c, 3, 4), from the matrices themselves; None for free ones."""
+    """Displacement D (4, 4) with ``new = old D`` (c, 3, 4), from the matrices; None for free ones."""
     if not isinstance(family, RigidMotion):
         return None
     if len(old) > 1:
@@ -244,7 +247,9 @@ def _inliers(
     views: Correspondences,
     offsets: FloatArray,
 ) -> BoolArray:
-    """Which pixels (k,) fit, each in its own noise and the model's; an id whose pixels mostly do not, does not."""
+    """Mask (k,) of pixels that fit, by their own and the model's covariance; ids with mostly outliers are outliers
+    throughout.
+    """
     covariances = views.covariances.copy()
     static = static_roots(model, matrices, lenses, views)
     covariances += static @ static.transpose(0, 2, 1)
@@ -274,7 +279,7 @@ def _least_squares(
     views: Correspondences,
     offsets: FloatArray,
 ) -> CameraGroup:
-    """Gauss and Newton in the joint covariance of all pixels, with what the model and static points add to it."""
+    """Gauss-Newton in the joint covariance of all pixels, with that of the model and of static points."""
     k = len(views.camera)
     p = parameters_of(model)
     sigma = np.zeros((0, 0)) if model.covariance is None else model.covariance.covariance
@@ -374,7 +379,7 @@ def _noise(model: CellModel) -> float:
 def _refuse_few(
     model: CellModel, views: Correspondences, group: tuple[int, ...], family: MatrixChange, how: How
 ) -> None:
-    """Raise CalibrationError where the pixels are fewer than the parameters, and some to spare."""
+    """Raise CalibrationError where the pixels are too few for the parameters."""
     count, ids = len(views.camera), len(np.unique(views.ids))
     needed, what = -(-(family.size + SPARE) // 2), "more equations than parameters"
     if how == "resected":

@@ -1,4 +1,4 @@
-"""Camera matrices from known points by robust damped least squares, over classes of permitted changes.
+"""Camera matrices from known points by robust damped least squares, over rigid motions or free matrices.
 
 A class of changes is a displacement of one camera, or of several together, that keeps the intrinsics; a change of
 frame, where the stratum has no displacements (2.19); or one whole matrix. Pixels are raw ones.
@@ -26,7 +26,7 @@ ids one in a thousand searches finds no clean start."""
 NOISY, FEW = 4.0, 0.25
 """Variance of the pixels over the stated one, and share of outliers, at which a search for better starts ends."""
 OUTSTANDING = 25.0
-"""Squared distance, in the noise of the median, above which a pixel stands out: two degrees of freedom."""
+"""Squared distance, in the noise of the median, above which a pixel is an outlier: two degrees of freedom."""
 ROBUST_SIGMAS = 3.0
 """Scale of Cauchy's loss [sigmas]."""
 
@@ -58,7 +58,7 @@ class Correspondences:
 
 
 class MatrixChange(Protocol):
-    """A class of permitted changes of camera matrices (c, 3, 4)."""
+    """Parameterization of a permitted change of camera matrices (c, 3, 4)."""
 
     @property
     def size(self) -> int:
@@ -107,7 +107,7 @@ class FreeMatrix:
 
 
 def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
-    """Raw pixels (k, 2); NaN behind a camera and beyond its lens."""
+    """Raw pixels (k, 2) of the points; NaN behind a camera and outside of its lens's image."""
     images = np.einsum("kij,kj->ki", matrices[views.camera], views.points)
     ahead = images[:, 2] > 0.0
     ideal = images[:, :2] / np.where(ahead, images[:, 2], np.nan)[:, None]
@@ -138,7 +138,7 @@ def entry_jacobian(matrices: FloatArray, lenses: FloatArray, views: Corresponden
 def parameter_jacobian(
     family: MatrixChange, matrices: FloatArray, lenses: FloatArray, views: Correspondences
 ) -> FloatArray:
-    """Derivative (k, 2, size) of the raw pixels by a family's parameters."""
+    """Derivative (k, 2, size) of the raw pixels by the parameters of a change."""
     directions = family.directions(matrices).reshape(len(matrices), family.size, 12)
     found: FloatArray = np.einsum(
         "kia,kga->kig", entry_jacobian(matrices, lenses, views), directions[views.camera], optimize=True
@@ -147,7 +147,7 @@ def parameter_jacobian(
 
 
 def whitening(covariances: FloatArray) -> FloatArray:
-    """``L⁻¹`` (k, 2, 2) of covariances ``L Lᵀ``."""
+    """Whitening matrices ``L⁻¹`` (k, 2, 2) of covariances ``L Lᵀ``."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
 
 
@@ -160,8 +160,8 @@ def fit_matrices(
     robust: bool,
     rounds: int = ROUNDS,
 ) -> tuple[FloatArray, float]:
-    """Matrices (c, 3, 4) of least squared residuals, or of least Cauchy loss, from ``start`` on by Levenberg and
-    Marquardt, and that loss; infinite where points lie behind a camera at the start.
+    """Matrices (c, 3, 4) of least squared residuals, or of least Cauchy loss, from ``start`` by
+    Levenberg-Marquardt, and that loss; infinite where points lie behind a camera at the start.
     """
     roots = whitening(views.covariances)
     matrices, damping = start, FIRST_DAMPING
@@ -214,26 +214,28 @@ def fit_with_outliers(
             found = fit_matrices(family, part, lenses, views, robust=True)
             if found[1] < best[1]:
                 best = found
-        if _settled(_whitened(best[0], lenses, views, roots)):
+        if _is_good_enough(_whitened(best[0], lenses, views, roots)):
             break
     return best
 
 
 def _clean(error: FloatArray) -> bool:
-    """Whether no pixel of whitened errors (k, 2) exceeds the noise that the median indicates."""
+    """Whether no whitened error (k, 2) exceeds the noise that their median indicates."""
     squares = (error**2).sum(axis=1)
     return bool(squares.max() <= OUTSTANDING * max(1.0, float(np.median(squares)) / np.log(4.0)))
 
 
-def _settled(error: FloatArray) -> bool:
-    """Whether most pixels of whitened errors (k, 2) fit in about the noise that is stated: no start does better."""
+def _is_good_enough(error: FloatArray) -> bool:
+    """Whether most whitened errors (k, 2) are about as large as the stated noise, so that no other start can do
+    better.
+    """
     squares = (error**2).sum(axis=1)
     factor = max(1.0, float(np.median(squares)) / np.log(4.0))
     return bool(factor < NOISY and (squares > OUTSTANDING * factor).mean() <= FEW)
 
 
 def _subsets(views: Correspondences, family: MatrixChange) -> Iterator[BoolArray]:
-    """Views of a few ids each, enough for the family's parameters; the same ones for the same views."""
+    """Subsets of the views of a few ids each, enough for the parameters; deterministic."""
     rng = np.random.default_rng(views.pixels.shape[0])
     ids = np.unique(views.ids)
     for _ in range(SUBSETS):
@@ -259,7 +261,7 @@ def _loss(error: FloatArray, robust: bool) -> float:
 
 
 def _weights(error: FloatArray, robust: bool) -> FloatArray:
-    """Roots (k,) of the weights that make least squares of a loss."""
+    """Square roots (k,) of the IRLS weights of the loss."""
     if not robust:
         return np.ones(len(error))
     return np.asarray(1.0 / np.sqrt(1.0 + (error**2).sum(axis=1) / ROBUST_SIGMAS**2))

@@ -1,6 +1,4 @@
-"""Covariance of a model after relocalization of cameras: what new matrices inherit from the model and from the
-pixels.
-"""
+"""Covariance of a model after relocalization of cameras, propagated from the model and from the pixels."""
 
 from __future__ import annotations
 
@@ -49,7 +47,8 @@ def first_parameters(stated: ModelCovariance) -> tuple[IntArray, IntArray, IntAr
 
 
 def inherited_errors(model: CellModel, group: tuple[int, ...], motion: FloatArray | None) -> FloatArray:
-    """What the model's parameters do to the entries (12 c, p) of matrices ``P D``; none of it where they are free.
+    """Derivative of the matrices' entries (12 c, p) by the model's parameters for ``P D``; zero where the matrices
+    are free.
 
     ``motion``: D (4, 4), None for free matrices.
     """
@@ -153,7 +152,7 @@ def _by_point(by_entries: FloatArray, matrix: FloatArray, point: FloatArray) -> 
 
 
 def scene_by_model(model: CellModel, i: int) -> FloatArray:
-    """What the model's parameters do to static point ``i`` (4, p): it was triangulated by cameras that they move.
+    """Derivative (4, p) of static point ``i`` by the model's parameters, through the cameras that triangulated it.
 
     Taken with equal weights, by all cameras in whose image it lies.
     """
@@ -185,7 +184,7 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
 def static_roots(
     model: CellModel, matrices: FloatArray, lenses: FloatArray, views: Correspondences
 ) -> FloatArray:
-    """Root (k, 2, 4 s) of what the covariances of the static points, given the cameras, do to the pixels."""
+    """Root (k, 2, 4 s) of the pixels' covariance by the static points' own, given the cameras."""
     count = len(model.scene_ids)
     found = np.zeros((len(views.camera), 2, 4 * count))
     rows = entry_jacobian(matrices, lenses, views)

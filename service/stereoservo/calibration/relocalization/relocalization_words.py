@@ -1,4 +1,4 @@
-"""How relocalized cameras have moved, and why cameras cannot be relocalized, in numbers and words."""
+"""Descriptions for people: how relocalized cameras have moved, and why cameras cannot be relocalized."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ REMEDY = "show more markers, move the arm to other poses, or set up static point
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """How a camera has moved.
+    """Description of a camera's motion.
 
     ``how``: ``moved`` (a displacement), ``moved_and_refocused`` (its intrinsics have changed, too), ``resected`` (the
-    stratum knows no displacements), ``moved_with_rig``. ``turned_deg`` by its own axes; ``shifted_share``:
+    stratum has no displacements), ``moved_with_rig``. ``turned_deg`` by its own axes; ``shifted_share``:
     displacement of its centre over its distance from the points; ``shifted_m`` where prismatic joints give the scale;
     None where the model is not metric. ``moved_px``: rms image motion of the points that it sees. ``text`` in words.
     """
@@ -60,7 +60,7 @@ def describe_moved_camera(
     points: FloatArray,
     moved_px: float,
 ) -> MovedCamera:
-    """A camera whose matrix (3, 4) is ``new`` instead of ``old``; it sees ``points`` (k, 4)."""
+    """Describe the motion of a camera whose matrix (3, 4) is ``new`` instead of ``old``; it sees ``points`` (k, 4)."""
     turned = share = metres = None
     words = WORDS[how]
     if model.projective_to_euclidean is not None:
@@ -75,7 +75,7 @@ def describe_moved_camera(
 def _displacement(
     model: CellModel, H: FloatArray, old: FloatArray, new: FloatArray, points: FloatArray
 ) -> tuple[float, float, float | None]:
-    """Angle [deg], way of the centre over the distance from the points, and the way [m] where a scale is known."""
+    """Angle [deg], displacement of the centre over the distance from the points, and in [m] where a scale is known."""
     back = np.linalg.inv(H)
     turns, centres = [], []
     for matrix in (old, new):
@@ -89,18 +89,18 @@ def _displacement(
     angle = float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))))
     euclidean = points @ H.T
     middle = (euclidean[:, :3] / euclidean[:, 3:]).mean(axis=0)
-    way = float(np.linalg.norm(centres[1] - centres[0]))
+    distance_moved = float(np.linalg.norm(centres[1] - centres[0]))
     metre = [
         float(np.linalg.norm((H @ generator @ back)[:3, 3]))
         for generator, kind in zip(model.generators, model.joint_kinds, strict=True)
         if kind == "prismatic"
     ]
     distance = float(np.linalg.norm(middle - centres[0]))
-    return angle, way / distance, way / float(np.median(metre)) if metre else None
+    return angle, distance_moved / distance, distance_moved / float(np.median(metre)) if metre else None
 
 
 def too_few(names: list[str], count: int, ids: int, needed: int, what: str) -> CalibrationError:
-    """Too few points to determine a camera."""
+    """Error text: too few points to determine a camera."""
     return CalibrationError(
         "too_few_points",
         f"camera {_listed(names)} sees {count} pixels of {ids} known points since it moved; at least {needed} are "
@@ -113,7 +113,7 @@ def too_few(names: list[str], count: int, ids: int, needed: int, what: str) -> C
 
 
 def points_coplanar(names: list[str], count: int, ids: int) -> CalibrationError:
-    """Points that leave a direction open."""
+    """Error text: coplanar points leave a direction open."""
     return CalibrationError(
         "points_coplanar",
         f"{count} pixels of {ids} points do not determine camera {_listed(names)}: the points lie in one plane, or on "
@@ -133,7 +133,7 @@ def not_explained(
     share: float,
     most: float,
 ) -> CalibrationError:
-    """Pixels that no motion of the cameras explains."""
+    """Error text: no motion of the cameras explains the pixels."""
     ids = f", of ids {', '.join(str(i) for i in outliers)}" if outliers else ""
     return CalibrationError(
         "not_explained",
@@ -151,7 +151,7 @@ def not_explained(
 
 
 def too_uncertain(names: list[str], predicted_px: float, limit_px: float, poses: int) -> CalibrationError:
-    """A camera that is known, but not well enough."""
+    """Error text: the camera is determined, but not accurately enough."""
     return CalibrationError(
         "too_uncertain",
         f"camera {_listed(names)} would predict markers to {predicted_px:.3g} px (one standard deviation) somewhere in "

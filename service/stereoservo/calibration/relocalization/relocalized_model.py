@@ -1,4 +1,4 @@
-"""Relocalization: a cell's model with new matrices of cameras that have moved, without calibration of the arm.
+"""Relocalization: new matrices of moved cameras in a cell's model, without recalibration of the arm.
 
 Arm and static points of the model are a known rigid structure in its projective frame: at rest poses the joints
 determine where the arm's markers are. A moved camera is resected in that frame (2.19-2.21), in the metric stratum as a
@@ -41,7 +41,7 @@ WORKSPACE = 40
 
 
 class CameraSample(Protocol):
-    """What one camera saw at rest: `stereoservo.core.cycle.Sample` is one.
+    """Protocol of one camera's observations at rest; implemented by `stereoservo.core.cycle.Sample`.
 
     ``ids`` (k,), raw ``pixels`` (k, 2) and ``covariances`` (k, 2, 2) of the mean [px²].
     """
@@ -65,7 +65,7 @@ class CameraSample(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """The arm at rest: its ``joints`` (n,) [rad or m], and what the cameras saw meanwhile."""
+    """The arm at rest: its ``joints`` (n,) [rad or m], and the cameras' observations meanwhile."""
 
     joints: FloatArray
     sights: tuple[CameraSample, ...]
@@ -73,14 +73,14 @@ class RestPose:
 
 @dataclass(frozen=True, eq=False)
 class RestObservations:
-    """Everything that was seen at rest since the cameras moved; more poses of the arm are a larger structure."""
+    """All observations at rest since the cameras moved; several poses of the arm give more points."""
 
     poses: tuple[RestPose, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class RelocalizedModel:
-    """A relocalized ``model``, what moved, how well it fits and how well it is known.
+    """A relocalized ``model`` with its report: what moved, residuals, accuracy.
 
     ``predicted_px``: largest standard deviation, an axis, of a marker's predicted pixel in the moved cameras, over the
     range of the joints, where the camera sees it; the model's own uncertainty included where it states one.
@@ -97,7 +97,7 @@ class RelocalizedModel:
 
 def relocalize(
     model: CellModel,
-    sights: RestObservations,
+    observations: RestObservations,
     moved: tuple[str, ...],
     *,
     rigid_rig: bool = False,
@@ -113,8 +113,8 @@ def relocalize(
     ``points_coplanar``, ``not_explained``, ``too_uncertain``.
     """
     which = _indices(model, moved)
-    everything = _views(model, sights, which)
-    offsets = np.array([pose.joints for pose in sights.poses]).reshape(-1, len(model.zero)) - model.zero
+    everything = _views(model, observations, which)
+    offsets = np.array([pose.joints for pose in observations.poses]).reshape(-1, len(model.zero)) - model.zero
     groups = [which] if rigid_rig and len(which) > 1 else [(c,) for c in which]
     found: list[CameraGroup] = []
     for group in groups:
@@ -129,10 +129,10 @@ def relocalize(
     new = msgspec.structs.replace(model, epoch=epoch, created=created, cameras=cameras)
     errors = [one.errors for one in found]
     new = msgspec.structs.replace(new, covariance=with_moved_cameras(model, errors, matrices))
-    joints = _workspace(model, sights, workspace)
+    joints = _workspace(model, observations, workspace)
     predicted_px = predicted_deviation(new, errors, joints, _arm_points(new, joints))
     if not predicted_px <= limit_px:
-        raise too_uncertain(list(moved), predicted_px, limit_px, len(sights.poses))
+        raise too_uncertain(list(moved), predicted_px, limit_px, len(observations.poses))
     return RelocalizedModel(
         new,
         {
@@ -161,25 +161,25 @@ def _indices(model: CellModel, moved: tuple[str, ...]) -> tuple[int, ...]:
     return tuple(names.index(name) for name in moved)
 
 
-def _views(model: CellModel, sights: RestObservations, which: tuple[int, ...]) -> Correspondences:
+def _views(model: CellModel, observations: RestObservations, which: tuple[int, ...]) -> Correspondences:
     """Observations of the model's points by the moved cameras; static points are averaged over the poses."""
     names = {model.cameras[c].name: c for c in which}
     n = len(model.joint_names)
-    for k, pose in enumerate(sights.poses):
+    for k, pose in enumerate(observations.poses):
         if pose.joints.shape != (n,) or not np.isfinite(pose.joints).all():
             raise CalibrationError(
                 "bad_data", f"pose {k} has joints {pose.joints.tolist()}; {n} finite ones are needed", pose=k
             )
-    where = _arm_points(model, np.array([pose.joints for pose in sights.poses]).reshape(-1, n))
+    where = _arm_points(model, np.array([pose.joints for pose in observations.poses]).reshape(-1, n))
     index = {marker: i for i, marker in enumerate(model.marker_ids)}
     static = {marker: i for i, marker in enumerate(model.scene_ids)}
     rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]] = []
-    for k, pose in enumerate(sights.poses):
-        for sight in pose.sights:
-            if sight.camera not in names:
+    for k, pose in enumerate(observations.poses):
+        for sample in pose.sights:
+            if sample.camera not in names:
                 continue
-            _check_sight(sight, k)
-            for marker, pixel, covariance in zip(sight.ids, sight.pixels, sight.covariances, strict=True):
+            _check_sample(sample, k)
+            for marker, pixel, covariance in zip(sample.ids, sample.pixels, sample.covariances, strict=True):
                 if not (np.isfinite(pixel).all() and np.isfinite(covariance).all()):
                     continue
                 if int(marker) in index:
@@ -188,30 +188,30 @@ def _views(model: CellModel, sights: RestObservations, which: tuple[int, ...]) -
                     point, of_pose = model.scene_points[static[int(marker)]], -1
                 else:
                     continue
-                rows.append((names[sight.camera], int(marker), of_pose, point, pixel, covariance))
+                rows.append((names[sample.camera], int(marker), of_pose, point, pixel, covariance))
     return _averaged(rows)
 
 
-def _check_sight(sight: CameraSample, pose: int) -> None:
-    k = len(sight.ids)
-    if sight.pixels.shape != (k, 2) or sight.covariances.shape != (k, 2, 2):
+def _check_sample(sample: CameraSample, pose: int) -> None:
+    k = len(sample.ids)
+    if sample.pixels.shape != (k, 2) or sample.covariances.shape != (k, 2, 2):
         raise CalibrationError(
             "bad_data",
-            f"pose {pose}: camera {sight.camera!r} has {k} ids, pixels {sight.pixels.shape} and covariances "
-            f"{sight.covariances.shape}; {(k, 2)} and {(k, 2, 2)} are needed",
+            f"pose {pose}: camera {sample.camera!r} has {k} ids, pixels {sample.pixels.shape} and covariances "
+            f"{sample.covariances.shape}; {(k, 2)} and {(k, 2, 2)} are needed",
             pose=pose,
-            camera=sight.camera,
+            camera=sample.camera,
         )
 
 
 def _averaged(rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]) -> Correspondences:
     """One row for each static point and camera: of several poses the mean, with the covariance of the best."""
     kept = [row for row in rows if row[2] >= 0]
-    standing: dict[tuple[int, int], list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]] = {}
+    by_point: dict[tuple[int, int], list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]] = {}
     for row in rows:
         if row[2] < 0:
-            standing.setdefault((row[0], row[1]), []).append(row)
-    for same in standing.values():
+            by_point.setdefault((row[0], row[1]), []).append(row)
+    for same in by_point.values():
         pixel = np.median([row[4] for row in same], axis=0)
         least = min((row[5] for row in same), key=lambda covariance: float(np.trace(covariance)))
         kept.append((*same[0][:4], pixel, least))
@@ -240,9 +240,11 @@ def _arm_points(model: CellModel, joints: FloatArray) -> FloatArray:
     return found
 
 
-def _workspace(model: CellModel, sights: RestObservations, given: FloatArray | None) -> FloatArray:
-    """Joint positions (w, n): those of the sights, and the trials' range, one joint at a time and all at random."""
-    here = np.array([pose.joints for pose in sights.poses])
+def _workspace(model: CellModel, observations: RestObservations, given: FloatArray | None) -> FloatArray:
+    """Joint positions (w, n): those of the observations, and the trials' range, one joint at a time and all at
+    random.
+    """
+    here = np.array([pose.joints for pose in observations.poses])
     if given is not None:
         return np.asarray(np.concatenate([here, given]))
     ranges = np.ptp(here, axis=0)
@@ -260,8 +262,8 @@ def _moved_camera(model: CellModel, one: CameraGroup, k: int) -> MovedCamera:
     mine = one.views.select(one.views.camera == k)
     mine = replace(mine, camera=np.zeros_like(mine.camera))
     old, lens = facing(camera.matrix[None], mine), camera.lens[None]
-    way = predicted(facing(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
-    moved_px = float(np.sqrt(np.nanmean((way**2).sum(axis=1))))
+    motion_px = predicted(facing(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
+    moved_px = float(np.sqrt(np.nanmean((motion_px**2).sum(axis=1))))
     return describe_moved_camera(
         model, camera.name, one.how, camera.matrix, one.matrices[k], mine.points, moved_px
     )

@@ -1,4 +1,6 @@
-"""``stereoservo calibrate``: by the daemon, or one started for it; a model check; a fit of stored trials."""
+"""``stereoservo calibrate``: calibration by the daemon (one is started if needed), model check, or fit of stored
+trials.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from stereoservo.cli import interruption
 from stereoservo.cli.calibrate.recorded_images import fit_images, table_of_images
-from stereoservo.cli.calibrate.stored_trials import fit_again, table, table_of_stored
+from stereoservo.cli.calibrate.stored_trials import fit_stored_trials, table, table_of_stored
 from stereoservo.cli.output import (
     EXIT_FAILED,
     CellArgument,
@@ -113,7 +115,7 @@ def calibrate(
         emit(from_images, table_of_images(from_images), json)
         return
     if trials is not None:
-        result = fit_again(cell, trials, lines, lines_sigma, output)
+        result = fit_stored_trials(cell, trials, lines, lines_sigma, output)
         emit(result, table_of_stored(result), json)
         return
     if lines is not None or output is not None:
@@ -140,7 +142,7 @@ def calibrate(
                 return
             if check:
                 report = _with_bar(client, "check motion", client.check_model)
-                _tell_check(report, client.cell, endpoint, json)
+                _print_check(report, client.cell, endpoint, json)
                 if unattended and report.status == "recalibrate":
                     raise typer.Exit(EXIT_FAILED)
                 return
@@ -155,11 +157,11 @@ def calibrate(
     emit(result, table(result), json)
 
 
-def _failure(error: FailedError, **said: Any) -> CommandError:
-    """The failure with its cause's own code and, where the motion ended early, the reasons with their values."""
+def _failure(error: FailedError, **data: Any) -> CommandError:
+    """Error with its cause's own code and, where the motion ended early, the reasons with their values."""
     if error.event.reasons:
-        said["reasons"] = msgspec.to_builtins(error.event.reasons)
-    return CommandError(error.code, str(error), **said)
+        data["reasons"] = msgspec.to_builtins(error.event.reasons)
+    return CommandError(error.code, str(error), **data)
 
 
 def _must_be_idle(client: Client) -> None:
@@ -204,8 +206,8 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
 # -- check --------------------------------------------------------------------------------------------------
 
 
-def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
-    """Print the report, with earlier checks where they are stored on this host."""
+def _print_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
+    """Print the report of a check, with earlier checks where they are stored on this host."""
     past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
     history = [
         {"created": one.created, "epoch": one.model_epoch, "status": one.status, "sigmas": one.sigmas,
@@ -231,21 +233,23 @@ def _tell_check(report: CheckReport, cell: str, endpoint: str | None, json: bool
 
 
 def _reset_zeros(client: Client, json: bool) -> None:
-    """Check, and reset joint zeros; prints the check in any case. Raises CommandError with the code of the refusal."""
+    """Check the model, and reset joint zeros; prints the check in any case. Raises CommandError with the code of
+    the refusal.
+    """
     checks: list[CheckReport] = []
 
     def reset(progress: Callable[[EventMessage], None]) -> ZeroReset:
-        def heard(event: EventMessage) -> None:
+        def on_event(event: EventMessage) -> None:
             if event.check is not None:
                 checks.append(event.check)
             progress(event)
 
-        return client.reset_zeros(heard)
+        return client.reset_zeros(on_event)
 
     try:
         done: ZeroReset = _with_bar(client, "check motion", reset)
     except FailedError as error:
-        said = {"check": msgspec.to_builtins(checks[-1])} if checks else {}
-        raise _failure(error, **said) from error
+        data = {"check": msgspec.to_builtins(checks[-1])} if checks else {}
+        raise _failure(error, **data) from error
     tree = {"check": msgspec.to_builtins(checks[-1]), "reset": msgspec.to_builtins(done)}
     emit(tree, f"{checks[-1].message}\n{done.message}\n  model {done.model}", json)

@@ -6,7 +6,12 @@ from pathlib import Path
 
 import msgspec
 
-from stereoservo.cli.calibrate.stored_trials import StoredFit, fit_again, may_fit, table_of_stored
+from stereoservo.cli.calibrate.stored_trials import (
+    StoredFit,
+    fit_stored_trials,
+    resolve_cell,
+    table_of_stored,
+)
 from stereoservo.cli.output import CommandError, note
 
 TRIALS_FILE = "trials.npz"
@@ -14,7 +19,7 @@ TELL_EVERY = 500
 
 
 class ImagesUsed(msgspec.Struct, frozen=True):
-    """The images of a calibration. ``left_out``: rests that were not used, by the reason."""
+    """Images used by a calibration. ``left_out``: rests that were not used, by the reason."""
 
     directory: str
     stops: int
@@ -42,7 +47,7 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
             "usage",
             f"--images needs the cell file, for its cameras' detectors; {cell!r} is a name. Give CELL.toml",
         )
-    may_fit(cell, output)
+    resolve_cell(cell, output)
 
     def progress(camera: str, frames: int) -> None:
         if frames % TELL_EVERY == 0:
@@ -58,12 +63,12 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
     save_trials(found.trials, path)
     note(f"{found.stops} stops, {found.frames} frames; the trial data are kept in {path}")
     used = ImagesUsed(str(images), found.stops, found.frames, found.left_out, found.standing)
-    fit = fit_again(cell, path, None, 0.3, output)
+    fit = fit_stored_trials(cell, path, None, 0.3, output)
     return ImageFit(**{**msgspec.structs.asdict(fit), "from_images": used})
 
 
 def table_of_images(result: ImageFit) -> str:
-    """The result in lines of text."""
+    """The result as lines of text."""
     used = result.from_images
     what = "" if used is None else f"\n  images {used.directory}: {used.stops} stops, {used.frames} frames"
     return table_of_stored(result) + what

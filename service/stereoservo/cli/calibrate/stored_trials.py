@@ -22,7 +22,7 @@ from stereoservo.messages.wire import CalibrationResult
 
 
 class LinesUsed(msgspec.Struct, frozen=True):
-    """Straight lines that held the lenses: names of the lines by camera, noise of their pixels [px]."""
+    """Straight lines that determined the lenses: names of the lines by camera, noise of their pixels [px]."""
 
     file: str
     sigma_px: float
@@ -30,14 +30,14 @@ class LinesUsed(msgspec.Struct, frozen=True):
 
 
 class StoredFit(CalibrationResult, frozen=True):
-    """A fit of stored trials. ``use``: from when on the cell works with it. ``lines``: None without ``--lines``."""
+    """A fit of stored trials. ``use``: when the cell starts to use it. ``lines``: None without ``--lines``."""
 
     use: str = ""
     lines: LinesUsed | None = None
 
 
 def table(result: CalibrationResult) -> str:
-    """A calibration's result in lines of text."""
+    """A calibration's result as lines of text."""
     lines = [
         f"model epoch {result.epoch} ({result.stratum}): {result.rms_px:.4f} px rms over "
         f"{result.measurements} "
@@ -53,7 +53,7 @@ def table(result: CalibrationResult) -> str:
 
 
 def table_of_stored(result: StoredFit) -> str:
-    """The same of a fit of stored trials."""
+    """The result of a fit of stored trials as lines of text."""
     lines = [table(result), f"  fitted in {result.seconds:.1f} s"]
     if result.lines is not None:
         used = "; ".join(f"{name}: {', '.join(names)}" for name, names in result.lines.cameras.items())
@@ -62,10 +62,11 @@ def table_of_stored(result: StoredFit) -> str:
     return "\n".join(lines)
 
 
-def fit_again(
+def fit_stored_trials(
     cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None
 ) -> StoredFit:
-    """Fit stored trial data in this process; the model goes beside the cell's others unless ``output`` says where.
+    """Fit stored trial data in this process; the model is stored beside the cell's others unless ``output`` is
+    given.
 
     Beside the others only while no daemon runs: that would keep its model and take this one unasked at its next start.
 
@@ -76,7 +77,7 @@ def fit_again(
     from stereoservo.calibration.trial_data import CalibrationError, load_trials
     from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
 
-    file, name, directory = may_fit(cell, output)
+    file, name, directory = resolve_cell(cell, output)
     data = load_trials(path)
     if file is not None:
         _must_fit(file, data, path)
@@ -91,18 +92,20 @@ def fit_again(
     priors, used = (None, None) if lines is None else read_lines(lines, lines_sigma, data)
     started = time.monotonic()
     try:
-        result, said = fit_trials(data, output, epoch, lens_priors=priors)
+        result, assessment = fit_trials(data, output, epoch, lens_priors=priors)
     except CalibrationError as error:
-        told = assess_failure(error.code, error.message)
-        kept = report_fit(data, path, output, None, told)
-        raise CommandError(error.code, f"{told.text} A report is in {kept}", report=str(kept)) from error
+        failure = assess_failure(error.code, error.message)
+        page_path = report_fit(data, path, output, None, failure)
+        raise CommandError(
+            error.code, f"{failure.text} A report is in {page_path}", report=str(page_path)
+        ) from error
     seconds = time.monotonic() - started
     try:
-        page: Path | None = report_fit(data, path, output, result, said)
+        page: Path | None = report_fit(data, path, output, result, assessment)
     except OSError as error:
         note(f"no report could be written into {report_folder(output)}: {error}")
         page = None
-    figures = calibration_result(result.model, output, said, page, path, seconds)
+    figures = calibration_result(result.model, output, assessment, page, path, seconds)
     use = (
         f"the daemon of cell {name!r} takes this model at its next start, where it fits the cell's joints, cameras and "
         "markers (`stereoservo doctor` tells); remove the file if it is not to"
@@ -112,8 +115,8 @@ def fit_again(
     return StoredFit(**msgspec.structs.asdict(figures), use=use, lines=used)
 
 
-def may_fit(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
-    """The cell file, where it was given, the cell's name, and where it keeps its models.
+def resolve_cell(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
+    """The cell file, where it was given, the cell's name, and its directory of models.
 
     Raises CommandError where a fit could not be kept, CellFileError.
     """
@@ -164,9 +167,9 @@ def _must_fit(file: CellFile, data: Any, path: Path) -> None:
 
 
 def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], LinesUsed]:
-    """The lens of each camera, and the lines that it comes from: a table ``camera,line,u,v``, with this header.
+    """Lens of each camera, and the lines it was estimated from: a table ``camera,line,u,v``, with this header.
 
-    Raises CommandError naming the row, or the camera whose lines do not tell its lens.
+    Raises CommandError naming the row, or the camera whose lines do not determine its lens.
     """
     if not 0.0 < sigma < np.inf:
         raise CommandError("lines", f"--lines-sigma is {sigma:g} px; a positive finite number is needed")

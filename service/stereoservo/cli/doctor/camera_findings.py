@@ -22,7 +22,7 @@ from stereoservo.ports.devices import (
 )
 
 HELD_RATE = 0.95
-"""Share of the stated rate below which a camera is said not to hold it."""
+"""Share of the stated rate below which a camera is reported as too slow."""
 STEADY_MARKERS = 0.9
 """Share of frames that must show enough markers."""
 WINDOW_PX = 10
@@ -48,12 +48,12 @@ class CameraRecord:
     """Markers that the detector finds in the mirror image of ``frame``, asked where it finds none in it."""
     error: str = ""
     statistics: CameraStatistics | None = None
-    """Counts of the driver over ``watched_s`` [s], where it tells them."""
+    """Counts of the driver over ``watched_s`` [s], where it reports them."""
     watched_s: float = 0.0
 
     @property
     def name(self) -> str:
-        """Of the camera in the cell file."""
+        """Name of the camera in the cell file."""
         return self.description.name
 
     @property
@@ -63,7 +63,7 @@ class CameraRecord:
 
 
 def examine_record(record: CameraRecord, min_markers: int) -> Iterator[ExaminationFinding]:
-    """Findings on one camera by itself. ``min_markers``: what calibration asks of every stop."""
+    """Findings on one camera by itself. ``min_markers``: number that calibration requires at every stop."""
     what = f"camera {record.name}"
     if record.error:
         yield ExaminationFinding(what, False, record.error)
@@ -96,28 +96,28 @@ def _rate(record: CameraRecord) -> ExaminationFinding:
             for name, (want, got) in counted.settings.items()
             if want is not None and got is not None and abs(want - got) > 1e-3 * max(abs(want), 1.0)
         ]
-        extra += "".join(f", {told}" for told in differing)
-    told = (
+        extra += "".join(f", {summary}" for summary in differing)
+    summary = (
         f"{rate:.1f} Hz of {asked:g}, frames {np.median(gaps_ms):.1f} ms apart, at most {gaps_ms.max():.1f}, "
         f"{max(missing, 0)} not looked at{extra}"
     )
     if rate >= HELD_RATE * asked:
-        return ExaminationFinding(f"{record.name} rate", True, told)
+        return ExaminationFinding(f"{record.name} rate", True, summary)
     return ExaminationFinding(
-        f"{record.name} rate", None, told,
+        f"{record.name} rate", None, summary,
         f"more light for a shorter exposure, or rate_hz = {rate:.0f}, which is what it holds",
     )  # fmt: skip
 
 
 def _latency(record: CameraRecord) -> ExaminationFinding:
     ms = np.array([(o.t_received_ns - o.t_shutter_ns) * 1e-6 for o in record.seen])
-    told = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
+    summary = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
     if ms.max() <= 0.0:
         return ExaminationFinding(
-            f"{record.name} latency", None, f"{told}: none is stated",
+            f"{record.name} latency", None, f"{summary}: none is stated",
             "latency_s of its options; `stereoservo status` tells it once the arm has moved",
         )  # fmt: skip
-    return ExaminationFinding(f"{record.name} latency", True, told)
+    return ExaminationFinding(f"{record.name} latency", True, summary)
 
 
 def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
@@ -125,7 +125,7 @@ def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
     counts = np.array([o.ids.size for o in record.seen])
     known = len(record.description.marker_ids)
     steady = float((counts >= min_markers).mean())
-    told = (
+    summary = (
         f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
     )
     if counts.max() == 0 and record.flipped:
@@ -140,15 +140,17 @@ def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
         )  # fmt: skip
     if steady < STEADY_MARKERS:
         return ExaminationFinding(
-            name, False, f"{told}; enough in {100 * steady:.0f} % of the frames",
+            name, False, f"{summary}; enough in {100 * steady:.0f} % of the frames",
             "more light, a nearer or larger plate, less tilt; or calibration.min_markers",
         )  # fmt: skip
     sigma = float(np.median([np.sqrt(0.5 * np.trace(C)) for C in record.seen[-1].covariances]))
-    return ExaminationFinding(name, True, f"{told}; standard deviation {sigma:.3f} px{_scatter(record)}")
+    return ExaminationFinding(name, True, f"{summary}; standard deviation {sigma:.3f} px{_scatter(record)}")
 
 
 def _scatter(record: CameraRecord) -> str:
-    """Scatter of the markers over the frames, of an arm at rest, beside what the detector states."""
+    """Finding on the scatter of the markers over the frames, with the arm at rest, against the detector's stated
+    noise.
+    """
     seen: dict[int, list[FloatArray]] = {}
     for observation in record.seen:
         for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
@@ -185,42 +187,42 @@ def _picture_quality(
     if not len(measured):
         return
     contrast, blur, saturated = np.median(measured, axis=0)
-    told = f"contrast {contrast:.0f} grey levels (least {measured[:, 0].min():.0f})"
+    summary = f"contrast {contrast:.0f} grey levels (least {measured[:, 0].min():.0f})"
     if contrast < LOW_CONTRAST:
         yield ExaminationFinding(
             f"{name} contrast",
             None,
-            f"{told}; {LOW_CONTRAST:g} are wanted",
+            f"{summary}; {LOW_CONTRAST:g} are wanted",
             "more light, longer exposure, matt print",
         )
     else:
-        yield ExaminationFinding(f"{name} contrast", True, told)
+        yield ExaminationFinding(f"{name} contrast", True, summary)
     if saturated > MUCH_SATURATED:
         yield ExaminationFinding(
             f"{name} exposure", None,
             f"{100 * saturated:.0f} % of the pixels around the markers are white to the limit: edges are cut",
             "shorter exposure, less gain",
         )  # fmt: skip
-    told = f"edges at the markers are blurred by {blur:.1f} px"
+    summary = f"edges at the markers are blurred by {blur:.1f} px"
     sharp = bool(blur <= WIDE_EDGE_PX)
-    cure = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
-    yield ExaminationFinding(f"{name} focus", True if sharp else None, told, cure)
+    remedy = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
+    yield ExaminationFinding(f"{name} focus", True if sharp else None, summary, remedy)
 
 
 def examine_skew(records: Sequence[CameraRecord]) -> Iterator[ExaminationFinding]:
-    """ExaminationFinding on the time between the cameras' shutters. Not a fault: each image counts at its own time."""
+    """Finding on the time between the cameras' shutters; not a fault, since each image counts at its own time."""
     shown = [record for record in records if len(record.seen) >= 2]
     for first, second in pairwise(shown):
-        apart = first.shutters_ns[:, None] - second.shutters_ns[None, :]
-        nearest = apart[np.arange(len(apart)), np.abs(apart).argmin(axis=1)] * 1e-6
+        intervals = first.shutters_ns[:, None] - second.shutters_ns[None, :]
+        nearest = intervals[np.arange(len(intervals)), np.abs(intervals).argmin(axis=1)] * 1e-6
         yield ExaminationFinding(
             f"skew {first.name}-{second.name}", True,
             f"{np.median(nearest):+.1f} ms (median; {np.abs(nearest).max():.1f} at most): used, each at its own time",
         )  # fmt: skip
 
 
-def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Markers seen in most frames: ids (k,), mean raw pixels (k, 2), standard deviations (k,) of one sight."""
+def mean_observations(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+    """Markers seen in most frames: ids (k,), mean raw pixels (k, 2), standard deviations (k,) of one observation."""
     pixels: dict[int, list[FloatArray]] = {}
     variances: dict[int, list[float]] = {}
     for observation in record.seen:
@@ -229,7 +231,9 @@ def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray
         ):
             pixels.setdefault(marker, []).append(pixel)
             variances.setdefault(marker, []).append(0.5 * float(np.trace(C)))
-    kept = sorted(marker for marker, sights in pixels.items() if 2 * len(sights) >= len(record.seen))
+    kept = sorted(
+        marker for marker, observations in pixels.items() if 2 * len(observations) >= len(record.seen)
+    )
     return (
         np.array(kept, dtype=np.int64),
         np.array([np.mean(pixels[marker], axis=0) for marker in kept]).reshape(-1, 2),
@@ -238,8 +242,8 @@ def mean_sights(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray
 
 
 def near_border(record: CameraRecord) -> ExaminationFinding | None:
-    """Markers that are about to leave the picture."""
-    ids, pixels, _ = mean_sights(record)
+    """Markers that are close to the image border."""
+    ids, pixels, _ = mean_observations(record)
     size = np.array([record.description.width, record.description.height])
     close = ids[((pixels < EDGE_PX) | (pixels > size - 1 - EDGE_PX)).any(axis=1)]
     if not close.size:

@@ -39,7 +39,7 @@ GREEN, RED = (0, 200, 0), (0, 0, 230)
 
 
 class WatchedCamera:
-    """A camera that is open: what it delivers is detected in and recorded."""
+    """An open camera, whose frames are detected in and recorded."""
 
     def __init__(self, record: CameraRecord, driver: CameraDriver, detector: Detector | None) -> None:
         self.record = record
@@ -49,7 +49,7 @@ class WatchedCamera:
         self._began_s = time.monotonic()
 
     def poll(self) -> None:
-        """Take what arrived; an error ends the watch of this camera, not of the others."""
+        """Take the frames that arrived; an error ends the observation of this camera, not of the others."""
         if self.record.error:
             return
         try:
@@ -67,7 +67,9 @@ class WatchedCamera:
             self.record.error = str(error)
 
     def begin(self) -> None:
-        """Forget what came so far: first frames are late, kernels are compiled, cameras opened one after the other."""
+        """Discard the frames so far: first frames are late, kernels are compiled, cameras are opened one after the
+        other.
+        """
         self.record.seen.clear()
         self._began = self._counts()
         self._began_s = time.monotonic()
@@ -76,7 +78,7 @@ class WatchedCamera:
         return self._driver.statistics() if isinstance(self._driver, CountingCameraDriver) else None
 
     def finish(self) -> None:
-        """Counts, and, where nothing was found, a look at the mirror image. Releases the camera."""
+        """Final counts and, where nothing was found, a search in the mirror image. Releases the camera."""
         now = self._counts()
         if now is not None:
             before = self._began or CameraStatistics()
@@ -100,7 +102,9 @@ class WatchedCamera:
 def examine_cameras(
     plan: RunPlan, settings: CoreSettings, model: CellModel | None, seconds: float, pictures: Path
 ) -> Iterator[ExaminationFinding]:
-    """Findings on the cell's cameras; a picture of each goes to ``pictures``. Not while somebody else has them."""
+    """Findings on the cell's cameras; an image of each is written to ``pictures``. Skipped while another process
+    has them.
+    """
     directories = plan.directories
     pid = holder(directories.daemon_lock)
     if pid is not None:
@@ -140,7 +144,7 @@ def examine_cameras(
 
 
 def watch_cameras(plan: RunPlan, seconds: float) -> list[CameraRecord]:
-    """Open all cameras, watch them for ``seconds`` from their first frames on, release them."""
+    """Open all cameras, observe them for ``seconds`` from their first frames, release them."""
     clock = MonotonicClock()
     records, watched = [], []
     for section, description in zip(plan.cell.camera, plan.cameras, strict=True):
@@ -173,7 +177,7 @@ def watch_cameras(plan: RunPlan, seconds: float) -> list[CameraRecord]:
 
 
 def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
-    """The picture in colour with what the detector found in it: circles, ids, standard deviations a hundredfold."""
+    """The image in colour with the detected markers: circles, ids, standard deviations a hundredfold."""
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     for marker, (u, v), C in zip(
         observation.ids.tolist(), observation.pixels, observation.covariances, strict=True
@@ -185,8 +189,8 @@ def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
         cv2.putText(
             picture, str(marker), (round(u) + 10, round(v) - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, GREEN, 1, cv2.LINE_AA
         )  # fmt: skip
-    told = f"{observation.camera}: {observation.ids.size} markers; red: 100 standard deviations"
-    cv2.putText(picture, told, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, GREEN, 1, cv2.LINE_AA)
+    caption = f"{observation.camera}: {observation.ids.size} markers; red: 100 standard deviations"
+    cv2.putText(picture, caption, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, GREEN, 1, cv2.LINE_AA)
     return np.asarray(picture, dtype=np.uint8)
 
 

@@ -108,13 +108,13 @@ def _daemon(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
 
 def _rates(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     servo, joints = plan.cell.servo.rate_hz, plan.joints.rate_hz
-    told = f"loop {servo:g} Hz, joints {joints:g} Hz"
+    summary = f"loop {servo:g} Hz, joints {joints:g} Hz"
     if servo <= joints:
-        return ExaminationFinding("rates", True, told)
+        return ExaminationFinding("rates", True, summary)
     return ExaminationFinding(
         "rates",
         None,
-        f"{told}: some cycles see no new sample, and their command waits for the next",
+        f"{summary}: some cycles see no new sample, and their command waits for the next",
         f"servo.rate_hz = {joints:g}",
     )
 
@@ -151,18 +151,18 @@ def _taught(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
 
 
 def _scheduling(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
-    wanted = plan.cell.servo.priority
+    requested = plan.cell.servo.priority
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    if wanted == 0 or soft >= wanted or soft == resource.RLIM_INFINITY or _is_root():
+    if requested == 0 or soft >= requested or soft == resource.RLIM_INFINITY or _is_root():
         return ExaminationFinding(
             "scheduling",
             True,
-            f"SCHED_FIFO priority {wanted}" if wanted else "ordinary scheduling was asked for",
+            f"SCHED_FIFO priority {requested}" if requested else "ordinary scheduling was asked for",
         )
     return ExaminationFinding(
         "scheduling",
         None,
-        f"SCHED_FIFO priority {wanted} is not allowed here (limit {soft}): `ulimit -r {wanted}`",
+        f"SCHED_FIFO priority {requested} is not allowed here (limit {soft}): `ulimit -r {requested}`",
     )
 
 

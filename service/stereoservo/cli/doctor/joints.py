@@ -20,9 +20,9 @@ MayMove = Callable[[str], bool]
 
 
 def permission(jog: bool, yes: bool) -> MayMove:
-    """The function that allows the examination to move a joint: never, always (``--yes``), or as a person answers.
+    """Function that permits the examination to move a joint: never, always (``--yes``), or as the user answers.
 
-    Raises CommandError: there is nobody to ask.
+    Raises CommandError without a terminal to ask on.
     """
     if yes and not jog:
         raise CommandError("argument", "--yes answers what --jog asks; give both")
@@ -39,8 +39,8 @@ def permission(jog: bool, yes: bool) -> MayMove:
 
 
 def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFinding]:
-    """Findings on the cell's arm; none where its driver cannot examine it. Nothing is touched while somebody else has
-    the machine.
+    """Findings on the cell's arm; none where its driver cannot examine it. Nothing is accessed while another
+    process has the hardware.
     """
     driver = make_driver(plan, MonotonicClock())
     if not isinstance(driver, ExaminableJointDriver):

@@ -7,7 +7,7 @@ from itertools import pairwise, permutations, product
 
 import numpy as np
 
-from stereoservo.cli.doctor.camera_findings import CameraRecord, mean_sights
+from stereoservo.cli.doctor.camera_findings import CameraRecord, mean_observations
 from stereoservo.core.settings import TrialSettings
 from stereoservo.geometry.cameras import project_many, triangulate
 from stereoservo.geometry.distortion import distort, undistort
@@ -19,14 +19,14 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import ExaminationFinding
 
 FITS_PX = 0.5
-"""Root mean square that views of one point may leave before the cameras are said not to stand where they stood."""
+"""Root mean square that views of one point may leave before the cameras are reported as moved."""
 MATCHES = 10
-"""Markers seen by two cameras from which the epipolar constraint says anything: 7 are used up."""
+"""Markers seen by two cameras that the epipolar constraint needs for a test: 7 are used up."""
 WORKSPACE_SHARE = 0.9
 
 
 def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[ExaminationFinding]:
-    """Findings on what pairs of cameras see at once."""
+    """Findings on the simultaneous observations of pairs of cameras."""
     seen = [record for record in records if len(record.seen) >= 2]
     if len(seen) < 2:
         return
@@ -39,17 +39,19 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
 
 
 def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
-    """Markers that all see, and their raw pixels (c, k, 2)."""
-    sights = [mean_sights(record) for record in records]
-    ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in sights)))
+    """Markers seen by all cameras, and their raw pixels (c, k, 2)."""
+    means = [mean_observations(record) for record in records]
+    ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in means)))
     pixels = [
-        np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in sights
+        np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in means
     ]
     return ids, np.array(pixels)
 
 
 def reprojection_rms(cameras: Sequence[CameraModel], pixels: FloatArray) -> float:
-    """Root mean square [px] a coordinate that triangulated points leave in raw pixels (c, k, 2); NaN without points."""
+    """Rms reprojection error [px] per coordinate of triangulated points in raw pixels (c, k, 2); NaN without
+    points.
+    """
     Ps = np.array([camera.matrix for camera in cameras])
     ideal = np.array([undistort(camera.lens, p) for camera, p in zip(cameras, pixels, strict=True)])
     points = triangulate(Ps, ideal)
@@ -67,9 +69,9 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
     if not ids:
         return ExaminationFinding(name, None, "no marker is seen by all of them at once: nothing to compare")
     rms = reprojection_rms(cameras, pixels)
-    told = f"{len(ids)} markers seen by all leave {rms:.3f} px by the model's cameras"
+    summary = f"{len(ids)} markers seen by all leave {rms:.3f} px by the model's cameras"
     if rms <= FITS_PX:
-        return ExaminationFinding(name, True, told)
+        return ExaminationFinding(name, True, summary)
     for order in permutations(range(len(cameras))):
         if order == tuple(range(len(cameras))):
             continue
@@ -80,11 +82,14 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
                 if r.name != cameras[k].name
             )
             return ExaminationFinding(
-                name, False, f"{told}: {swapped}", "exchange their sources, or their cables; none has moved"
+                name,
+                False,
+                f"{summary}: {swapped}",
+                "exchange their sources, or their cables; none has moved",
             )
     return ExaminationFinding(
         name, False,
-        f"{told}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
+        f"{summary}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
         "re-anchor it (the running daemon does, once it sees enough), or `stereoservo calibrate`",
     )  # fmt: skip
 
@@ -98,19 +103,19 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFindin
             None,
             f"{len(ids)} markers are seen by both; the epipolar constraint needs {MATCHES} to say anything",
         )
-    sigma = float(np.median(np.concatenate([mean_sights(first)[2], mean_sights(second)[2]])))
+    sigma = float(np.median(np.concatenate([mean_observations(first)[2], mean_observations(second)[2]])))
     try:
         F, inliers = fundamental_robust(pixels[0], pixels[1], max(sigma, 0.05))
     except GeometryError as error:
         return ExaminationFinding(name, None, f"no epipolar constraint yet: {error}")
     distances = epipolar_distances(F, pixels[0], pixels[1])
     rms = float(np.sqrt(np.mean(distances[inliers] ** 2)))
-    told = f"{int(inliers.sum())} of {len(ids)} markers agree on one epipolar geometry, {rms:.3f} px"
+    summary = f"{int(inliers.sum())} of {len(ids)} markers agree on one epipolar geometry, {rms:.3f} px"
     if inliers.all():
-        return ExaminationFinding(name, True, told)
+        return ExaminationFinding(name, True, summary)
     off = [marker for marker, inside in zip(ids, inliers, strict=True) if not inside]
     return ExaminationFinding(
-        name, False, f"{told}; markers {off} do not",
+        name, False, f"{summary}; markers {off} do not",
         "are they mistaken for others, or is there a second plate in view?",
     )  # fmt: skip
 
@@ -118,7 +123,9 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFindin
 def examine_coverage(
     model: CellModel, trials: TrialSettings, records: Sequence[CameraRecord]
 ) -> Iterator[ExaminationFinding]:
-    """Findings on the share of the trial motions in each camera's image, by the model, at all corners of two joints."""
+    """Findings on the share of the trial motions inside each camera's image, by the model, at all corners of two
+    joints.
+    """
     configurations = _corners(trials)
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
     points = np.array([model.marker_points @ chain.displacement(q).T for q in configurations])
@@ -130,10 +137,10 @@ def examine_coverage(
         raw = distort(camera.lens, m[:, :2] / m[:, 2:])
         inside = (raw >= 0).all(axis=1) & (raw[:, 0] <= camera.width - 1) & (raw[:, 1] <= camera.height - 1)
         share = float(inside.mean())
-        told = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
+        summary = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
         wide = share >= WORKSPACE_SHARE
         yield ExaminationFinding(
-            f"{record.name} coverage", True if wide else None, told,
+            f"{record.name} coverage", True if wide else None, summary,
             "" if wide else "a shorter lens, more distance, or goals that keep to the middle",
         )  # fmt: skip
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
-"""Who waits for a goal stands behind it: when that process dies, the arm stops."""
+"""The process that waits for a goal holds its lease: when it dies, the arm stops."""
 
 NameArgument = Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")]
 RelativeToOption = Annotated[
@@ -207,28 +207,28 @@ def goal(
         files = {"points": points, "displacement": displacement, "incidence": incidence}
         target = target_tree(name, joint, set_points, files, relative_to, common)
     if file is not None:
-        wanted = decode(read_file(file), Goal)
+        requested = decode(read_file(file), Goal)
     else:
-        wanted = make_goal(
+        requested = make_goal(
             target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
             cameras=camera or None, profile=profile, gain=gain if adaptive_gain is None else adaptive(adaptive_gain),
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
         )  # fmt: skip
-    if wait and wanted.lease_s is None:
-        wanted = msgspec.structs.replace(wanted, lease_s=WAITING_LEASE_S)
+    if wait and requested.lease_s is None:
+        requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
     with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
         require_cameras(client, found)
-        if check or wanted.check:
-            reply = client.check(wanted)
+        if check or requested.check:
+            reply = client.check(requested)
             emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)
         else:
-            _run(client, wanted, stream, wait, json)
+            _run(client, requested, stream, wait, json)
 
 
 def _followed(source: str) -> tuple[dict[str, Any], Stream]:
-    """The target at which a stream begins, as on the wire, and the stream. Raises CommandError for an empty one."""
+    """First target of a stream, as on the wire, and the stream. Raises CommandError for an empty one."""
     stream = stream_lines(source)
     first = next(stream, None)
     if first is None:
@@ -239,25 +239,25 @@ def _followed(source: str) -> tuple[dict[str, Any], Stream]:
 
 def _run(
     client: Client,
-    wanted: Goal,
+    requested: Goal,
     stream: Stream | None,
     wait: bool,
     as_json: bool,
 ) -> None:
     try:
-        handle = client.send(wanted)
+        handle = client.send(requested)
         note(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
         if stream is not None:
             note(f"{handle.stream(stream)} set-points followed")
         if wait:
             follow(handle, as_json)
-            if wanted.acknowledge_s is not None:
+            if requested.acknowledge_s is not None:
                 note(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
         else:
             emit({"id": handle.id, "accepted": True}, handle.id, as_json)
     except KeyboardInterrupt:
         with suppress(ClientError):  # not accepted yet, or ended already
-            client.cancel(wanted.id)
+            client.cancel(requested.id)
         raise
 
 
@@ -272,11 +272,11 @@ def follow(handle: GoalHandle, as_json: bool) -> None:
 
 
 def plan_table(plan: PlanReport) -> str:
-    """Way, time, and the closest approach to every limit."""
-    lines = [f"law {plan.law}, way {plan.way}, {plan.seconds:.2f} s"]
+    """Path, duration, and the closest approach to every limit, as text."""
+    lines = [f"law {plan.law}, path {plan.way}, {plan.seconds:.2f} s"]
     if not plan.approaches:
         return lines[0]
-    rows: list[tuple[str, ...]] = [("limit", "of", "nearest", "limit at", "room", "on the way")]
+    rows: list[tuple[str, ...]] = [("limit", "of", "nearest", "limit at", "clearance", "at path")]
     rows += [_row(approach) for approach in plan.approaches]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines += [

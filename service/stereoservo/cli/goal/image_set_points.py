@@ -18,7 +18,7 @@ FRAMES = 20
 def read_images(
     cell: str, endpoint: str | None, images: Path, at_s: float, frames: int
 ) -> tuple[SetPoints, ...]:
-    """Set-points of every recorded camera, told on stderr.
+    """Set-points of every recorded camera; reports them on stderr.
 
     Raises CommandError, SetPointError, ImageFileError, DriverError, PluginError, CellFileError, NotRunningError.
     """
@@ -50,16 +50,16 @@ def feature_tree(found: tuple[SetPoints, ...]) -> dict[str, Any]:
 
 
 def require_cameras(client: Client, found: tuple[SetPoints, ...]) -> None:
-    """Raise CommandError where a recording is not of a camera of the live cell, as it is now."""
+    """Raise CommandError where a recording does not match a camera of the live cell in its present setup."""
     if not found:
         return
     cameras = {camera.name: (camera.width, camera.height) for camera in client.info().cameras}
     for one in found:
         if cameras.get(one.camera) != one.size:
             has = cameras.get(one.camera)
-            told = "has no such camera" if has is None else f"has it with {has[0]}x{has[1]} px"
+            live = "has no such camera" if has is None else f"has it with {has[0]}x{has[1]} px"
             raise CommandError(
                 "other_cell",
-                f"camera {one.camera!r} is recorded with pictures of {one.size[0]}x{one.size[1]} px; the cell {told}",
+                f"camera {one.camera!r} is recorded with pictures of {one.size[0]}x{one.size[1]} px; the cell {live}",
                 camera=one.camera,
             )

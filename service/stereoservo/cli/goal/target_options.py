@@ -1,4 +1,4 @@
-"""A goal made from the options of ``stereoservo goal``. Raises CommandError, MessageError."""
+"""Conversion of the options of ``stereoservo goal`` to a goal. Raises CommandError, MessageError."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ SOURCES = ("triangulated", "predicted")
 
 
 class StreamLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One line of a stream: set-points, or points with the epoch of their model; ``stamp_s``: when they hold."""
+    """One line of a stream: set-points, or points with the epoch of their model; ``stamp_s``: time at which they
+    hold.
+    """
 
     stamp_s: float | None = None
     set_points: dict[str, dict[int, tuple[float, float]]] | None = None
@@ -81,7 +83,7 @@ def _object(path: Path) -> dict[str, Any]:
 
 
 def adaptive(text: str) -> dict[str, float]:
-    """``NEAR:FAR[:SLOPE]`` as an adaptive gain."""
+    """Parse ``NEAR:FAR[:SLOPE]`` as an adaptive gain."""
     try:
         values = [float(part) for part in text.split(":")]
     except ValueError:

@@ -1,4 +1,4 @@
-"""Report of a calibration as one self-contained page: measurements, fit, and assessment.
+"""Report of a calibration as one self-contained HTML page: measurements, fit, and assessment.
 
 A folder beside the model file, written whole or not at all, by the fit process once the model is safe.
 """
@@ -51,8 +51,8 @@ td:first-child, th:first-child { text-align: left } img { max-width: 100% }
 
 @dataclass(frozen=True)
 class Residuals:
-    """What a model leaves of the trials: ``pixels`` (k, 2) measured less predicted [px], in ``sigmas`` (k, 2); the
-    camera and the trial's joint (-1: the base) of each, and whether the fit left it out.
+    """Residuals of the trials: ``pixels`` (k, 2) measured less predicted [px], in ``sigmas`` (k, 2); the camera and
+    the trial's joint (-1: the base) of each, and whether the fit left it out.
     """
 
     data: Measurements
@@ -88,7 +88,8 @@ def write_report(
     report: CalibrationReport | None = None,
     trials_path: Path | None = None,
 ) -> Path:
-    """Write ``folder/index.html``, in place of an older one; gives its path. Without a model: the report of a failure.
+    """Write ``folder/index.html``, replacing an older one; returns its path. Without a model: the report of a
+    failure.
 
     Raises OSError.
     """
@@ -227,7 +228,9 @@ def _joints(model: CellModel, rest: Residuals) -> str:
 
 
 def _quantities(model: CellModel) -> str:
-    """What no frame changes, with deviations; what only the images show is folded away, what is open is named."""
+    """Section of gauge-invariant quantities with deviations; those of the images are folded, undetermined ones are
+    named.
+    """
     inner: list[tuple[object, ...]] = []
     seen: list[tuple[object, ...]] = []
     unknown: list[str] = []
@@ -252,7 +255,7 @@ def _quantities(model: CellModel) -> str:
 
 
 def _to_deviation(value: float, std: float | None) -> str:
-    """``value`` with the digits that its deviation leaves meaning."""
+    """``value`` rounded to the digits that are significant for its deviation."""
     if not std:
         return f"{value:.6g}"
     return f"{value:.{max(0, 1 - math.floor(math.log10(std)))}f}"
@@ -326,7 +329,7 @@ def _view(axes: Any, name: str, width: int, height: int) -> None:
 
 
 def draw_tracks(trials: TrialData) -> Figure:
-    """All markers in each camera, the trials of the joints in their colours."""
+    """Figure of all markers in each camera, the joints' trials in their colours."""
     c = len(trials.cameras)
     figure = Figure(figsize=(5.8 * c, 5.0), layout="constrained")
     colours = matplotlib.colormaps["tab10"]
@@ -345,7 +348,7 @@ def draw_tracks(trials: TrialData) -> Figure:
 
 
 def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) -> Figure:
-    """Residual rms of each joint beside its floor, and of each camera."""
+    """Figure of the residual rms of each joint beside the expected one, and of each camera."""
     figure = Figure(figsize=(11.0, 3.4), layout="constrained")
     left, right = _axes(figure, 1, 2)
     kept = ~rest.left_out
@@ -371,7 +374,7 @@ def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) ->
 
 
 def draw_histograms(model: CellModel, rest: Residuals) -> Figure:
-    """Residuals in sigmas, of each joint's trial and of each camera, against the standard Gaussian."""
+    """Figure of the residuals in sigmas, of each joint's trial and of each camera, against the standard Gaussian."""
     kept = ~rest.left_out
     groups = [(name, rest.joint == j) for j, name in enumerate(model.joint_names)]
     groups += [(f"camera {camera.name}", rest.data.camera == c) for c, camera in enumerate(model.cameras)]
@@ -385,8 +388,8 @@ def draw_histograms(model: CellModel, rest: Residuals) -> Figure:
         if values.size:
             axes.hist(np.clip(values, -5.0, 5.0), HISTOGRAM, density=True, color="0.75")
         axes.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), "C3", lw=1.0)
-        spread = float(np.sqrt((values**2).mean())) if values.size else 0.0
-        axes.set(title=f"{name}: {spread:.2f} sigmas", yticks=[])
+        rms_sigmas = float(np.sqrt((values**2).mean())) if values.size else 0.0
+        axes.set(title=f"{name}: {rms_sigmas:.2f} sigmas", yticks=[])
         axes.title.set_size("small")
     for axes in panels[len(groups) :]:
         axes.axis("off")
@@ -394,7 +397,7 @@ def draw_histograms(model: CellModel, rest: Residuals) -> Figure:
 
 
 def draw_vectors(model: CellModel, rest: Residuals) -> Figure:
-    """Residual vectors over each image, magnified so that the rms is a thirtieth of the width."""
+    """Figure of the residual vectors over each image, magnified such that the rms is a thirtieth of the width."""
     c = len(model.cameras)
     figure = Figure(figsize=(5.8 * c, 4.8), layout="constrained")
     kept = ~rest.left_out

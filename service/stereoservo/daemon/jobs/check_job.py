@@ -1,4 +1,4 @@
-"""Check process: pixels of a check motion in, report on the model out; short-lived and niced like a fit.
+"""Check process: evaluates the pixels of a check motion and reports on the model; short-lived and niced like a fit.
 
 ``python -m stereoservo.daemon.jobs.check_job CHECK.npz MODEL.json HISTORY.jsonl --limit-px X`` prints one JSON object:
 ``{"check": …}`` with the report, or ``{"error": …}`` with exit code 1. The report is added to the history. With
@@ -27,7 +27,7 @@ from stereoservo.messages.check_report import CheckReport, ZeroReset
 def check_and_remember(
     check: TrialData, model_path: Path, history_path: Path, limit_px: float
 ) -> tuple[ModelExamination, CheckReport]:
-    """Examine a model, find trends over earlier checks, add the report to the history.
+    """Examine a model, find trends over earlier checks, append the report to the history.
 
     Raises CalibrationError, ModelFileError, OSError.
     """
@@ -83,8 +83,8 @@ KEPT_CHECKS = 200
 
 
 def load_checks(path: Path) -> tuple[list[CheckReport], int]:
-    """The checks kept in ``path`` (none where there is no file), and how many lines could not be read. Raises
-    OSError.
+    """Reports of the checks stored in ``path`` (none where there is no file), and the number of unreadable lines.
+    Raises OSError.
     """
     try:
         lines = path.read_bytes().splitlines()

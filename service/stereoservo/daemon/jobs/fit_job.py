@@ -1,4 +1,5 @@
-"""Fit process: trial data in, model file and report out; short-lived and niced, so that the loop is not disturbed.
+"""Fit process: fits trial data and writes model and report; short-lived and niced, so that the loop is not
+disturbed.
 
 ``python -m stereoservo.daemon.jobs.fit_job TRIALS.npz MODEL.json --epoch N`` prints one JSON object a line:
 ``{"progress": …, "message": …}``, then ``{"model": …, "verdict": …}`` or ``{"error": …}``, and last ``{"report": …}``
@@ -37,14 +38,14 @@ def print_line(line: dict[str, Any]) -> None:
 
 
 def error_line(error: Exception) -> dict[str, Any]:
-    """An error as a line: its code, its text and the values that it speaks of."""
+    """An error as a JSON line: its code, its text and its data."""
     if isinstance(error, CalibrationError):
         return {"error": {"code": error.code, "message": str(error), "data": error.data}}
     return {"error": {"code": type(error).__name__, "message": str(error), "data": {}}}
 
 
 def become_child(parent: int) -> None:
-    """Nice, and gone with ``parent`` where there is one."""
+    """Lower this process's priority, and let it die with ``parent``, where there is one."""
     if parent:
         die_with_parent(parent, signal.SIGKILL)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -82,14 +83,18 @@ def fit_trials(
 
 
 def report_fit(
-    trials: TrialData, trials_path: Path, model_path: Path, result: CalibrationFit | None, said: Acceptance
+    trials: TrialData,
+    trials_path: Path,
+    model_path: Path,
+    result: CalibrationFit | None,
+    assessment: Acceptance,
 ) -> Path:
     """Write the report of a fit, or of a failure (``result`` None), beside the model. Raises OSError."""
     # matplotlib is slow to import; the model must not wait for it.
     from stereoservo.daemon.jobs.calibration_report import write_report
 
     return write_report(
-        report_folder(model_path), trials, said, trials_path=trials_path,
+        report_folder(model_path), trials, assessment, trials_path=trials_path,
         model=None if result is None else result.model, report=None if result is None else result.report,
     )  # fmt: skip
 
@@ -110,35 +115,39 @@ def main() -> int:
         print_line(error_line(error))
         return 1
     try:
-        result, said = fit_trials(trials, arguments.model, arguments.epoch, progress=_progress)
+        result, assessment = fit_trials(trials, arguments.model, arguments.epoch, progress=_progress)
         print_line(
-            {"model": str(arguments.model), "epoch": arguments.epoch, "verdict": msgspec.to_builtins(said)}
+            {
+                "model": str(arguments.model),
+                "epoch": arguments.epoch,
+                "verdict": msgspec.to_builtins(assessment),
+            }
         )
     except CalibrationError as error:
         print_line(error_line(error))
-        said = assess_failure(error.code, error.message)
+        assessment = assess_failure(error.code, error.message)
     except (ModelFileError, OSError) as error:
         print_line(error_line(error))
         return 1
     try:
-        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, said))})
+        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, assessment))})
     except OSError as error:
         print_line({"report_error": str(error)})
     return 0 if result is not None else 1
 
 
 def trials_file(model_path: Path, epoch: int) -> Path:
-    """The trial data of the calibration with this epoch."""
+    """File of the trial data of the calibration with this epoch."""
     return model_path.with_name(f"trials-{epoch:06d}.npz")
 
 
 def report_folder(model_path: Path) -> Path:
-    """The folder of a model's report; its page is ``index.html``."""
+    """Folder of a model's report; its page is ``index.html``."""
     return model_path.with_name(f"{model_path.stem}-report")
 
 
 def figures_file(model_path: Path) -> Path:
-    """The figures of a model's fit, for programs."""
+    """File of the figures of a model's fit, for programs."""
     return model_path.with_name(f"{model_path.stem}-report.json")
 
 

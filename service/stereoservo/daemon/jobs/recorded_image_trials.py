@@ -1,4 +1,4 @@
-"""Trial data from a recording with images: the cell's detectors run on the pictures taken while the arm rested."""
+"""Trial data from a recording with images: the cell's detectors run on the frames taken while the arm was at rest."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class RecordedTrials:
-    """Trial data out of recorded images; ``left_out``: why rests were not used, with their number; ``frames`` averaged;
-    ``standing``: static markers.
+    """Trial data from recorded images; ``left_out``: why rests were not used, with their number; ``frames``
+    averaged; ``standing``: static markers.
     """
 
     trials: TrialData
@@ -46,13 +46,13 @@ class RecordedTrials:
     standing: tuple[int, ...]
 
 
-def flight_of(images: Path) -> Path:
-    """The flight recording that a directory of images belongs to: ``NAME.mcap`` beside ``NAME.images``."""
+def flight_recording_of(images: Path) -> Path:
+    """Flight recording that a directory of images belongs to: ``NAME.mcap`` beside ``NAME.images``."""
     return images.absolute().with_suffix(".mcap")
 
 
 def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Progress) -> RecordedTrials:
-    """Run the cell's detectors over the recorded cameras and average as the trial motions do.
+    """Run the cell's detectors on the recorded cameras and average as the trial motions do.
 
     ``progress`` hears the camera and the number of its frame. Raises CalibrationError (``bad_data``,
     ``too_few_stops``), RecordingError, ImageFileError, PluginError, DriverError, CellFileError.
@@ -64,18 +64,18 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
             f"{images} is no directory of recorded images; `stereoservo record CELL --images` makes one, "
             f"NAME{IMAGES_SUFFIX} beside NAME.mcap",
         )
-    flight = read_motion(flight_of(images))
+    motion = read_motion(flight_recording_of(images))
     cameras = [
         recorded_camera(cell, cell_path, section.name, video_of(images, section.name))
         for section in cell.camera
     ]
-    settings = _settings(cell, cell_path, flight, cameras)
+    settings = _settings(cell, cell_path, motion, cameras)
     if settings.trials is None:
         raise CalibrationError(
             "bad_data",
             f"{cell_path} has no [calibration] section; base, frames and settle_s of the trial motions are needed",
         )
-    gathered = RecordedTrialCollector(flight, settings, settings.trials)
+    gathered = RecordedTrialCollector(motion, settings, settings.trials)
     for camera in cameras:
         gathered.add(_observations(camera, gathered, note, progress))
     job = TrialCollector(settings)
@@ -91,20 +91,20 @@ def _observations(
 ) -> Iterator[CameraObservation]:
     name, frames = camera.description.name, 0
 
-    def wanted(t_shutter_ns: int) -> bool:
+    def is_usable(t_shutter_ns: int) -> bool:
         nonlocal frames
         frames += 1
         progress(name, frames)
         return gathered.wants(name, t_shutter_ns)
 
-    return camera.observations(note, wanted)
+    return camera.observations(note, is_usable)
 
 
 def _settings(
-    cell: CellFile, cell_path: Path, flight: RecordedMotion, cameras: list[RecordedCamera]
+    cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]
 ) -> CoreSettings:
     """The core's settings for the current cell file, the recorded joints, and the detectors on the recorded cameras."""
-    recorded = flight.settings
+    recorded = motion.settings
     limits = {limit.joint: limit for limit in cell.safety.limit}
     if set(limits) != set(recorded.joint_names):
         raise CalibrationError(
@@ -116,11 +116,11 @@ def _settings(
         was = next((one for one in recorded.cameras if one.name == camera.description.name), None)
         size = camera.description.width, camera.description.height
         if was is None or (was.width, was.height) != size:
-            told = "has no such camera" if was is None else f"has it with {was.width}x{was.height} px"
+            stated = "has no such camera" if was is None else f"has it with {was.width}x{was.height} px"
             raise CalibrationError(
                 "bad_data",
                 f"{camera.file} holds pictures of {size[0]}x{size[1]} px of camera {camera.description.name!r}; the "
-                f"flight recording {told}: do they belong together?",
+                f"flight recording {stated}: do they belong together?",
             )
     joints = JointDriverDescription(
         driver=cell.joints.driver,
@@ -142,7 +142,7 @@ BEFORE_NS = 500_000_000
 
 @dataclass
 class _Stop:
-    """A rest while its frames are gathered."""
+    """A rest whose frames are being collected."""
 
     rest: RestInterval
     sums: ObservationStatistics
@@ -152,29 +152,29 @@ class _Stop:
 
 @dataclass
 class RecordedTrialCollector:
-    """Gathers observations of all cameras, in any order of cameras, into the stops of the trial motions.
+    """Collects the observations of all cameras, in any order of cameras, into the stops of the trial motions.
 
     ``settings``: of the flight, with the cameras and markers of the detectors that are used now. ``left_out``: why
     rests were not used, with their number.
     """
 
-    flight: RecordedMotion
+    motion: RecordedMotion
     settings: CoreSettings
     trial: TrialSettings
     left_out: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n = len(self.flight.settings.joint_names)
+        n = len(self.motion.settings.joint_names)
         self._stops = [
             _Stop(rest, ObservationStatistics(**measurement_buffers(self.settings)), np.zeros(n))
-            for rest in rest_intervals(self.flight, self.trial.settle_s)
+            for rest in rest_intervals(self.motion, self.trial.settle_s)
         ]
         self._settled = [stop.rest.settled_ns for stop in self._stops]
         self.used = 0
 
     def wants(self, camera: str, t_ns: int) -> bool:
-        """Whether a frame of this time may count, or comes so little before one that does that a tracking
-        detector must see it.
+        """Whether a frame of this time may be used, or shortly precedes one that is, so that a tracking detector
+        must see it.
         """
         column = next(k for k, one in enumerate(self.settings.cameras) if one.name == camera)
         newest = bisect_right(self._settled, t_ns + BEFORE_NS) - 1
@@ -184,13 +184,13 @@ class RecordedTrialCollector:
         )
 
     def add(self, observations: Iterable[CameraObservation]) -> None:
-        """Take one camera's observations in the order of time; what was seen in motion is passed over."""
+        """Add one camera's observations in the order of time; those made in motion are skipped."""
         for observation in observations:
             number = bisect_right(self._settled, observation.t_shutter_ns - 1) - 1
             if number < 0:
                 continue
             stop = self._stops[number]
-            joints = self.flight.joints_at(observation.t_shutter_ns)
+            joints = self.motion.joints_at(observation.t_shutter_ns)
             if observation.t_shutter_ns > stop.rest.end_ns or joints is None:
                 continue
             if add_observation(
@@ -244,8 +244,8 @@ class RecordedTrialCollector:
         self.left_out[why] = self.left_out.get(why, 0) + 1
 
     def _base(self, places: list[FloatArray]) -> FloatArray:
-        """Positions (n,) of the joints that do not move: the cell file's base, or, where most of ``places`` (n,) are
-        more than one joint away from that, the place that the most others are one joint away from.
+        """Positions (n,) of the joints that do not move: the cell file's base, or, where most of ``places`` (n,)
+        differ from that in more than one joint, the configuration from which most others differ in one joint.
         """
         candidates = np.array([self.trial.base, *places])
         away = np.abs(candidates[:, None] - np.array(places)) > SAME_POSITION_TOLERANCE

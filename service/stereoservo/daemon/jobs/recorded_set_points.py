@@ -1,4 +1,4 @@
-"""Set-points from recorded pictures: means over a few frames of each camera, at rest."""
+"""Set-points from recorded images: means over a few frames of each camera, at rest."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ APART_PX = 0.2
 
 
 class SetPointError(Exception):
-    """Raised where recorded pictures give no set-points; the text names camera, marker or frame, and a remedy.
+    """Recorded images give no set-points; the text names camera, marker or frame, and a remedy.
 
     ``code``: ``no_recording``, ``too_few_frames``, ``no_markers``, ``moving``, ``disagree``.
     """
@@ -35,7 +35,7 @@ class SetPointError(Exception):
 
 @dataclass(frozen=True)
 class SetPoints:
-    """Mean pixels of one camera by marker, raw, with their standard deviations [px]; ``left_out``: markers that were in
+    """Mean pixels of one camera by marker, raw, with their standard deviations [px]; ``left_out``: markers seen in
     fewer than half of the frames. ``at_s``: from the beginning of the recording to the first frame.
     """
 
@@ -49,8 +49,8 @@ class SetPoints:
 
 
 def set_points_from_images(cell_path: Path, images: Path, at_s: float, frames: int) -> tuple[SetPoints, ...]:
-    """Set-points of every camera of the cell that has a recording in ``images``: its first ``frames`` frames from
-    ``at_s`` after the earliest frame of all, seen by the cell's detector.
+    """Set-points of every camera of the cell that has a recording in ``images``: from its first ``frames`` frames
+    at or after ``at_s`` from the earliest frame of all, by the cell's detector.
 
     Raises SetPointError, ImageFileError, DriverError, PluginError, CellFileError.
     """
@@ -99,7 +99,7 @@ def _camera_set_points(
 
 
 def averaged(camera: str, seen: list[CameraObservation], at_s: float, size: tuple[int, int]) -> SetPoints:
-    """The mean of frames at rest. Raises SetPointError: no markers, a marker that moves, a frame that disagrees."""
+    """Mean of frames at rest. Raises SetPointError: no markers, a marker that moves, an inconsistent frame."""
     times = np.array([observation.t_shutter_ns - seen[0].t_shutter_ns for observation in seen]) * 1e-9
     ids = sorted({int(marker) for observation in seen for marker in observation.ids})
     pixels: dict[int, tuple[float, float]] = {}
@@ -127,8 +127,8 @@ def averaged(camera: str, seen: list[CameraObservation], at_s: float, size: tupl
 
 
 def _require_rest(camera: str, marker: int, t: FloatArray, pixels: FloatArray, variances: FloatArray) -> None:
-    """Raise SetPointError where a marker (n, 2) drifts over times (n,) [s], or one frame is off the others, beyond
-    what the variances (n,) [px²] explain.
+    """Raise SetPointError where a marker (n, 2) drifts over times (n,) [s], or one frame deviates from the others,
+    by more than the variances (n,) [px²] explain.
     """
     off = np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)
     beyond = off > np.maximum(GATE_SIGMAS * np.sqrt(variances), APART_PX)

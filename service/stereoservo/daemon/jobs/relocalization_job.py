@@ -1,4 +1,5 @@
-"""Relocalization process: observations at rest in, a model with relocalized cameras out; short-lived and niced.
+"""Relocalization process: computes a model with relocalized cameras from observations at rest; short-lived and
+niced.
 
 ``python -m stereoservo.daemon.jobs.relocalization_job SIGHTS.msgpack MODEL.json NEW.json --epoch N`` prints one JSON
 object: ``{"reanchored": …}`` once the new model is saved, or ``{"error": …}`` with exit code 1.
@@ -40,9 +41,9 @@ class RelocalizationReport(msgspec.Struct, frozen=True):
 
     @property
     def message(self) -> str:
-        """In words."""
-        said = "; ".join([*self.cameras.values(), *self.notes])
-        return f"model epoch {self.epoch}: {said}; predictions are good to {self.predicted_px:.2g} px"
+        """The result as text."""
+        described = "; ".join([*self.cameras.values(), *self.notes])
+        return f"model epoch {self.epoch}: {described}; predictions are good to {self.predicted_px:.2g} px"
 
 
 def main() -> int:
@@ -83,13 +84,13 @@ MOST_POSES = 12
 
 
 class RelocalizationPoses:
-    """Observations at rest poses since the cameras moved last; an event with ``trial`` 0 starts again."""
+    """Observations at rest poses since the cameras last moved; an event with ``trial`` 0 starts a new set."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
 
     def add(self, event: Event) -> None:
-        """Take an event ``reanchor``."""
+        """Add an event ``reanchor``."""
         if event.trial <= 0:
             self.events.clear()
         self.events = [*self.events, event][-MOST_POSES:]
@@ -110,7 +111,7 @@ def relocalize_from_events(
 
 
 def save_events(path: Path, events: list[Event]) -> None:
-    """Keep events for the process that fits. Raises OSError."""
+    """Save events for the process that fits. Raises OSError."""
     write_atomically(path, msgspec.msgpack.encode(events, enc_hook=encode_array))
 
 

@@ -33,7 +33,7 @@ class TrialCollector:
         return len(self._stops)
 
     def add(self, event: Event) -> None:
-        """Take an event: ``calibration_sample``, or ``calibration_finished`` with the joints' loads."""
+        """Add an event: ``calibration_sample``, or ``calibration_finished`` with the joints' loads."""
         if event.kind == "calibration_finished" and event.id == self.id:
             self._loads = event.loads
         if event.kind != "calibration_sample":
@@ -107,8 +107,8 @@ class TrialCollector:
         )
 
     def _noise_factor(self, camera: CameraSettings) -> float:
-        """Variance of the pixels over the frames of a stop, over what the detector states: the most likely one of all
-        stops, the mean of the ratios by degrees of freedom.
+        """Variance of the pixels over the frames of a stop, relative to the detector's stated one: maximum
+        likelihood over all stops, the mean of the ratios by degrees of freedom.
 
         Not a ratio of sums, which few markers of great variance would rule: one of 0.16 px among thousands of 0.005 px
         changes it by a sixth. Markers beyond MOST_NOISE do not count at all: what is stated of them is doubt (dots
@@ -120,16 +120,16 @@ class TrialCollector:
         ]
         if not samples:
             return 1.0
-        sights = np.concatenate([sample.sights for sample in samples])
+        frame_counts = np.concatenate([sample.sights for sample in samples])
         scatter = np.concatenate([sample.scatter for sample in samples])
         variance = np.concatenate([0.5 * np.trace(s.covariances, axis1=1, axis2=2) for s in samples])
         noise = variance - camera.systematic_px**2
-        single = noise * sights
-        known = (noise > LEAST_NOISE * variance) & (sights > 1.0)
+        single = noise * frame_counts
+        known = (noise > LEAST_NOISE * variance) & (frame_counts > 1.0)
         if not known.any():
             return 1.0
         known &= single <= MOST_NOISE * np.median(single[known])
-        factor = float(np.average(scatter[known] / single[known], weights=sights[known] - 1.0))
+        factor = float(np.average(scatter[known] / single[known], weights=frame_counts[known] - 1.0))
         return factor if factor > 0.0 else 1.0
 
 

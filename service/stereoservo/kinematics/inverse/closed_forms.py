@@ -1,4 +1,6 @@
-"""What a subproblem in closed form answers: candidates, joint by joint, not yet checked against the whole chain."""
+"""Closed-form solutions of inverse kinematics subproblems: candidates per joint, not yet checked against the whole
+chain.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ FREE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Branches:
-    """k candidates for n joints, as motions from the zero.
+    """k candidate solutions of n joints, as displacements from the zero.
 
     ``steps`` (k, n) [rad or m]. ``excess`` (k, n): by how much a joint's equation fails to have a root, as a share of
     its amplitude; 0 where it has one, infinite where the joint moves nothing that matters. The step is then that of
@@ -30,12 +32,12 @@ class Branches:
 
 
 def single(step: float, excess: float = 0.0, free: bool = False) -> Branches:
-    """One candidate of one joint."""
+    """One candidate of one joint as branches."""
     return Branches(np.array([[step]]), np.array([[excess]]), np.array([[free]]))
 
 
 def beside(first: Branches, second: Branches) -> Branches:
-    """Joints of ``second`` after those of ``first``; the one with a single candidate goes with all of the other."""
+    """Joints of ``second`` appended to those of ``first``; a single candidate is repeated for all of the other."""
     k = max(len(first.steps), len(second.steps))
 
     def wide(left: npt.NDArray, right: npt.NDArray) -> npt.NDArray:  # type: ignore[type-arg]
@@ -48,7 +50,7 @@ def beside(first: Branches, second: Branches) -> Branches:
 
 
 def together(several: list[Branches]) -> Branches:
-    """All candidates of ``several``, one list."""
+    """Concatenation of the candidates of ``several``."""
     return Branches(
         np.concatenate([branches.steps for branches in several]),
         np.concatenate([branches.excess for branches in several]),
@@ -57,7 +59,7 @@ def together(several: list[Branches]) -> Branches:
 
 
 def one_of(branches: Branches, i: int) -> Branches:
-    """Candidate ``i`` alone."""
+    """Candidate ``i`` as branches."""
     part = slice(i, i + 1)
     return Branches(branches.steps[part], branches.excess[part], branches.free[part])
 
@@ -90,8 +92,8 @@ def prismatic_joints(operators: FloatArray, A: FloatArray, target: FloatArray) -
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one where it only comes near, or the seed
-    where it lies there all the time. ``excess`` and ``free`` as in `Branches`.
+    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one at the closest approach where they
+    do not meet, or the seed where the whole circle lies in the plane. ``excess`` and ``free`` as in `Branches`.
     """
 
     angles: FloatArray
@@ -112,17 +114,18 @@ def circle_meets_plane(G: FloatArray, A: FloatArray, plane: FloatArray, seed: fl
     if amplitude <= FREE * scale:
         held = abs(p_0) <= FREE * scale
         return Crossing(np.array([seed]), 0.0 if held else np.inf, held)
-    middle = -np.arctan2(p_s, p_c)
-    room = (amplitude - p_0) * (amplitude + p_0)
-    if room <= 0.0:
-        nearest = middle if p_0 > 0.0 else middle + np.pi
+    central = -np.arctan2(p_s, p_c)
+    discriminant = (amplitude - p_0) * (amplitude + p_0)
+    if discriminant <= 0.0:
+        nearest = central if p_0 > 0.0 else central + np.pi
         return Crossing(np.array([nearest]), abs(p_0) / amplitude - 1.0, False)
-    half = np.arctan2(np.sqrt(room), p_0)
-    return Crossing(np.array([middle + half, middle - half]), 0.0, False)
+    half = np.arctan2(np.sqrt(discriminant), p_0)
+    return Crossing(np.array([central + half, central - half]), 0.0, False)
 
 
 def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float = 0.0) -> Branches:
-    """The angle [rad] about a revolute operator ``G`` (4, 4) that takes points ``A`` (..., 4) nearest to ``target``.
+    """Rotation angle [rad] about a revolute operator ``G`` (4, 4) that moves points ``A`` (..., 4) closest to
+    ``target``.
 
     Points and targets of equal heights. The radial part of the target, ``-Ĥ²A*``, is resolved along those of the point
     and of its motion, ``-Ĥ²A`` and ``ĤA``: the plane of (6.11) through axis and target in one linear step, with
@@ -131,17 +134,18 @@ def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float =
     """
     points, goals = np.reshape(A, (-1, 4)), np.reshape(target, (-1, 4))
     square = G @ G
-    radial, along, wanted = -points @ square.T, points @ G.T, -goals @ square.T
+    radial, along, required = -points @ square.T, points @ G.T, -goals @ square.T
     size = float(np.linalg.norm(radial))
     if size <= FREE * float(np.linalg.norm(square) * np.linalg.norm(points)):
         return single(seed, free=True)
     basis = np.stack([radial.ravel(), along.ravel()])
-    cosine, sine = np.linalg.solve(basis @ basis.T, basis @ wanted.ravel())
+    cosine, sine = np.linalg.solve(basis @ basis.T, basis @ required.ravel())
     return single(float(np.arctan2(sine, cosine)), abs(float(np.hypot(cosine, sine)) - 1.0))
 
 
-def plane_across(G: FloatArray, A: FloatArray) -> FloatArray:
-    """The plane (4,) across the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0`` that stays fixed.
+def normal_plane(G: FloatArray, A: FloatArray) -> FloatArray:
+    """Plane (4,) normal to the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0``, which is
+    invariant.
 
     Also where A lies on the axis, and spans no circle with ``ĤA`` and ``Ĥ²A``.
     """
@@ -156,7 +160,7 @@ def axis_points(G: FloatArray) -> FloatArray:
 
 
 def common_point(operators: FloatArray) -> FloatArray:
-    """The point (4,), at unit norm, nearest to all axes of revolute ``operators`` (k, 4, 4), each at unit norm."""
+    """Point (4,), of unit norm, nearest to all axes of revolute ``operators`` (k, 4, 4), each of unit norm."""
     unit = operators / np.linalg.norm(operators, axis=(1, 2), keepdims=True)
     return np.asarray(np.linalg.svd(unit.reshape(-1, 4))[2][3], dtype=np.float64)
 
@@ -164,12 +168,12 @@ def common_point(operators: FloatArray) -> FloatArray:
 def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
     """Angles of two joints ``G`` (2, 4, 4) that are not parallel, ``exp(θ₁Ĥ₁) exp(θ₂Ĥ₂) A = A*`` (6.12).
 
-    The target on its way back about joint 1 crosses the plane of the circle of ``A`` about joint 2 twice (6.16);
+    The target, rotated back about joint 1, crosses the plane of the circle of ``A`` about joint 2 twice (6.16);
     each crossing leaves one turn about joint 2. ``A``, ``target`` (4,) of equal heights; ``seed`` (2,).
     """
     if np.linalg.norm(G[1] @ A) <= FREE * np.linalg.norm(G[1]) * np.linalg.norm(A):
         return beside(turn_between(G[0], A, target, seed[0]), single(seed[1], free=True))
-    crossing = circle_meets_plane(-G[0], target, plane_across(G[1], A), seed[0])
+    crossing = circle_meets_plane(-G[0], target, normal_plane(G[1], A), seed[0])
     found = []
     for angle in crossing.angles:
         before = exp_rotation(G[0], -angle) @ target
@@ -199,26 +203,26 @@ def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatAr
     turning = -G[1] if opposite else G[1]
     radial = -turning @ (turning @ A)
     arm, between = direction(radial), direction(square @ (A - radial))
-    wanted = direction(square @ target)
-    size = max(abs(arm), abs(between), abs(wanted))
+    required = direction(square @ target)
+    size = max(abs(arm), abs(between), abs(required))
     if abs(between) <= FREE * size:
-        whole = float(np.angle(wanted / arm)) if abs(arm) > FREE * size else 0.0
+        whole = float(np.angle(required / arm)) if abs(arm) > FREE * size else 0.0
         second = single(_signed(whole - seed[0], opposite), free=True)
         return beside(single(float(seed[0]), free=True), second)
     if abs(arm) <= FREE * size:
-        return beside(single(float(np.angle(wanted / between))), single(float(seed[1]), free=True))
-    cosine = (abs(wanted) ** 2 - abs(between) ** 2 - abs(arm) ** 2) / (2.0 * abs(between) * abs(arm))
+        return beside(single(float(np.angle(required / between))), single(float(seed[1]), free=True))
+    cosine = (abs(required) ** 2 - abs(between) ** 2 - abs(arm) ** 2) / (2.0 * abs(between) * abs(arm))
     bend = np.arctan2(np.sqrt(max(0.0, (1.0 - cosine) * (1.0 + cosine))), cosine)
-    middle = np.angle(between / arm)
+    central = np.angle(between / arm)
     excess = max(0.0, abs(cosine) - 1.0)
     found = []
-    for turn in (middle + bend, middle - bend) if excess == 0.0 else (middle + bend,):
+    for turn in (central + bend, central - bend) if excess == 0.0 else (central + bend,):
         reach = between + np.exp(1j * turn) * arm
         second = single(_signed(float(turn), opposite), excess)
-        if min(abs(reach), abs(wanted)) <= FREE * size:
-            found.append(beside(single(float(seed[0]), free=abs(wanted) <= FREE * size), second))
+        if min(abs(reach), abs(required)) <= FREE * size:
+            found.append(beside(single(float(seed[0]), free=abs(required) <= FREE * size), second))
         else:
-            found.append(beside(single(float(np.angle(wanted / reach))), second))
+            found.append(beside(single(float(np.angle(required / reach))), second))
     return together(found)
 
 
@@ -232,7 +236,7 @@ def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> B
     Joints 2 and 3 keep the point in the plane across their axes (6.23), which leaves two angles of joint 1; each leaves
     a problem of two parallel joints. Equal heights; ``seed`` (3,).
     """
-    crossing = circle_meets_plane(-G[0], target, plane_across(G[1], A), seed[0])
+    crossing = circle_meets_plane(-G[0], target, normal_plane(G[1], A), seed[0])
     found = []
     for angle in crossing.angles:
         before = exp_rotation(G[0], -angle) @ target
@@ -244,8 +248,9 @@ def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> B
 def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     """Angles of three joints ``G`` (3, 4, 4) whose product is the rotation ``H`` (4, 4), up to two (6.27, 6.28).
 
-    A point of the last axis, away from the centre, tells the first two; the rest of the rotation tells the last.
-    Where the first and the last axis fall together, the first joint stays at its ``seed`` (3,) and is marked free.
+    A point of the last axis, away from the centre, determines the first two joints; the rest of the rotation
+    determines the last. Where the first and the last axis fall together, the first joint stays at its ``seed`` (3,)
+    and is marked free.
     """
     centre = common_point(G)
     ends = axis_points(G[2])
@@ -272,7 +277,9 @@ def arm_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
 
 
 def gantry_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
-    """Three prismatic joints under a spherical wrist, ``G`` (6, 4, 4): up to two ways to ``H`` (4, 4)."""
+    """Positions of three prismatic joints under a spherical wrist, ``G`` (6, 4, 4), whose product is ``H`` (4, 4),
+    up to two.
+    """
     centre = common_point(G[3:])
     place = prismatic_joints(G[:3], centre[None], (H @ centre)[None])
     return _with_wrist(G, H, seed, place, exp_translation)

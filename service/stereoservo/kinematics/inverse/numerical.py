@@ -1,4 +1,4 @@
-"""Chains without a closed form: every solution that descents from many starts find."""
+"""Numerical inverse kinematics of chains without a closed form: descent from many start configurations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ CLOSE = 1e-5
 
 
 def even_starts(chain: ProjectiveChain, limits: FloatArray | None, count: int, skip: int = 0) -> FloatArray:
-    """Starts (count, n) spread evenly over the joints: a whole turn, or limits (n, 2) for prismatic ones.
+    """Start configurations (count, n) spread evenly over the joints: a full turn, or limits (n, 2) for prismatic
+    ones.
 
     An additive recurrence, by powers of the root of ``x^(n+1) = x + 1``. Raises InverseKinematicsError, ``limits``,
     where a prismatic joint has none.
@@ -59,7 +60,7 @@ def all_solutions(
     tolerance: float,
     seed: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Isolated solutions (s, n) of ``H(q)M = M*`` with residuals (s,), and the best approach (n,) there was.
+    """Isolated solutions (s, n) of ``H(q)M = M*`` with residuals (s,), and the closest approach (n,).
 
     The search ends when every solution has been come to from ``HITS`` starts; a pair that is close to merging is
     looked for from its one half. That all are found is likely, not certain.
@@ -84,7 +85,7 @@ def all_solutions(
 
 
 class _Known:
-    """Solutions so far, and how many starts came to each."""
+    """Solutions found so far, and how many starts converged to each."""
 
     def __init__(self, chain: ProjectiveChain, tolerance: float) -> None:
         self.kinds, self.tolerance = chain.kinds, tolerance
@@ -93,7 +94,7 @@ class _Known:
         self.hits: list[int] = []
 
     def add(self, ends: FloatArray, left: FloatArray, count: int) -> list[int]:
-        """Take in those of ``ends`` (s, n) that solve the problem, each worth ``count`` hits; which are new."""
+        """Add those of ``ends`` (s, n) that solve the problem, each worth ``count`` hits; returns which are new."""
         fresh = []
         solved = left <= self.tolerance
         ends, left = ends[solved], left[solved]
@@ -116,8 +117,8 @@ class _Known:
         return fresh
 
     def _near(self, rows: FloatArray, q: FloatArray) -> npt.NDArray[np.bool_]:
-        apart = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
-        return np.asarray(np.abs(apart).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
+        difference = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
+        return np.asarray(np.abs(difference).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
 
 
 def _twins(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
@@ -136,7 +137,7 @@ def one_solution(
     seed: FloatArray,
     count: int = BATCH,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Solutions of a goal that leaves joints free, from the ``seed`` (n,) first and from ``count`` other starts.
+    """Solutions of a goal that leaves joints free, from the ``seed`` (n,) first, then from ``count`` other starts.
 
     As `all_solutions`: (s, n), residuals (s,), best approach (n,); none of them twice.
     """
@@ -312,7 +313,7 @@ def descended(
     iterations: int = ITERATIONS,
     damping: float = 1e-2,
 ) -> tuple[FloatArray, FloatArray]:
-    """`descend` on ``chain``: ends (s, n) and their residuals (s,), ``|H(q)M - M*| / |M*|`` over all points."""
+    """Run `descend` on ``chain``: ends (s, n) and their residuals (s,), ``|H(q)M - M*| / |M*|`` over all points."""
     ends, errors = descend(
         chain.generators,
         chain.kind_codes,

@@ -1,8 +1,8 @@
-"""Which case with a closed form a chain is: axes that are parallel, axes that meet in one point (thesis 6.3 to 6.7).
+"""Recognition of the structure of a chain with a closed form: parallel axes, concurrent axes (thesis 6.3 to 6.7).
 
 A calibrated chain is so only within its covariance. Each condition is a set of incidences that vanish: they are tested
-by chi-square against the covariance propagated to them. A small deviation that the calibration cannot tell from none
-costs nothing: the closed form then starts a refinement on the chain as it is.
+by chi-square against the covariance propagated to them. A small deviation that the calibration cannot distinguish
+from none costs nothing: the closed form then starts a refinement on the chain as it is.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Test = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Evidence:
-    """A condition on joints (counted from the base), and what was found.
+    """Test result of a condition on joints (counted from the base).
 
     ``deviation``: sine, in the model's frame, of how far it is from holding exactly. ``chi2`` of ``freedom``
     conditions, at most ``threshold`` where it holds. None without a covariance, where ``deviation`` is held against
@@ -53,7 +53,9 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Recognition:
-    """The ``case`` of a chain. ``inverted``: of its factors in opposite order, so for the inverse displacement."""
+    """Structure ``case`` of a chain. ``inverted``: that of its factors in reverse order, so for the inverse
+    displacement.
+    """
 
     case: Case
     inverted: bool
@@ -92,8 +94,8 @@ def common_point_incidence(operators: FloatArray) -> Test:
     return values
 
 
-class _Judge:
-    """Tests conditions on one chain, each once."""
+class _ConditionTest:
+    """Tests conditions on one chain, with cached results."""
 
     def __init__(self, chain: ProjectiveChain, model: CellModel | None) -> None:
         self.chain = chain
@@ -142,13 +144,13 @@ class _Judge:
 
 
 def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
-    """The case of a chain, or of a calibrated model, whose covariance then says what counts as exact.
+    """Structure of a chain, or of a calibrated model, whose covariance then sets the tolerance of each condition.
 
     Conditions are incidences of operators, in any stratum. ``numerical`` where no closed form fits.
     """
     model = arm if isinstance(arm, CellModel) else None
     chain = chain_of(arm)
-    judge = _Judge(chain, model)
+    judge = _ConditionTest(chain, model)
     order = chain.order
     for inverted, joints in ((False, order), (True, order[::-1])):
         case = _case(judge, chain.kinds, joints)
@@ -162,7 +164,7 @@ def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tup
     """One condition on revolute ``joints``: two ``parallel``, two or more with a ``common_point``, or prismatic ones
     that are ``independent``.
     """
-    judge = _Judge(chain_of(arm), arm if isinstance(arm, CellModel) else None)
+    judge = _ConditionTest(chain_of(arm), arm if isinstance(arm, CellModel) else None)
     {"parallel": judge.parallel, "common_point": judge.common_point, "independent": judge.independent}[
         condition
     ](*joints)
@@ -176,7 +178,7 @@ def chain_of(arm: ProjectiveChain | CellModel) -> ProjectiveChain:
     return ProjectiveChain(arm.joint_kinds, arm.generators, arm.zero, arm.tip_first)
 
 
-def _case(judge: _Judge, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Case | None:
+def _case(judge: _ConditionTest, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Case | None:
     letters = "".join(kinds[j][0] for j in joints)
     if letters in ("p", "pp", "ppp"):
         return "prismatic" if judge.independent(*joints) else None
@@ -195,6 +197,6 @@ def _case(judge: _Judge, kinds: tuple[str, ...], joints: tuple[int, ...]) -> Cas
     return None
 
 
-def _is_arm(judge: _Judge, joints: tuple[int, ...]) -> bool:
-    """The second and third axis parallel, the first across."""
+def _is_arm(judge: _ConditionTest, joints: tuple[int, ...]) -> bool:
+    """Whether the second and third axis are parallel and the first is normal to them."""
     return judge.parallel(*joints[1:]) and not judge.parallel(*joints[:2])

@@ -1,4 +1,4 @@
-"""Solutions refined on what was measured (thesis 6.8): least error in the images, over the joints alone."""
+"""Refinement of inverse kinematics solutions by the reprojection error over the joints (thesis 6.8)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def refined_on_images(
     *,
     limits: FloatArray | None = None,
 ) -> ImageSolutions:
-    """Each of the solutions ``found`` moved to the least squares of (6.8), with covariance.
+    """Solutions ``found``, each refined to the least squares of (6.8), with covariance.
 
     ``points`` (m, 4) at the chain's zero, raw set-points ``pixels`` (c, m, 2) [px] of standard deviation ``sigma``, NaN
     where a camera does not see one. Raises JointAnglesError for shapes and limits that do not fit, and for fewer

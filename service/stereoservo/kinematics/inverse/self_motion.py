@@ -1,4 +1,4 @@
-"""Motions of the joints that leave the goal reached: at singular configurations, and of arms with joints to spare."""
+"""Self-motions: joint motions that leave the goal reached, at singular configurations and of redundant arms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CORRECTIONS = 20
 
 
 def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
-    """Directions (k, n), orthonormal, that move no point of ``points`` (m, 4) to first order at ``q`` (n,).
+    """Null space (k, n), orthonormal, of the Jacobian of ``points`` (m, 4) at ``q`` (n,).
 
     Joints are weighed as they move the points, so that units do not matter.
     """
@@ -39,7 +39,7 @@ def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -
 def corrected(
     chain: ProjectiveChain, points: FloatArray, targets: FloatArray, q: FloatArray, tolerance: float
 ) -> tuple[FloatArray, float]:
-    """``q`` (n,) brought back to the goal by least motions, and the residual left."""
+    """``q`` (n,) corrected to reach the goal again by the least joint motion, and the residual left."""
     norm = float(np.linalg.norm(targets))
     residual = np.inf
     for _ in range(CORRECTIONS):
@@ -56,18 +56,18 @@ def corrected(
 def self_motions(
     chain: ProjectiveChain, points: FloatArray, targets: FloatArray, q: FloatArray, tolerance: float
 ) -> FloatArray:
-    """Directions (k, n) of motions from ``q`` (n,) that leave the goal reached over a finite way.
+    """Null-space directions (k, n) at ``q`` (n,) along which the goal stays reached over a finite distance.
 
     A direction that does so to first order only, at the rim of the workspace, is none.
     """
     kept = []
     for direction in null_directions(chain, points, q):
-        if all(_leads_on(chain, points, targets, q, probe * direction, tolerance) for probe in PROBES):
+        if all(_stays_reached(chain, points, targets, q, probe * direction, tolerance) for probe in PROBES):
             kept.append(direction)
     return np.array(kept).reshape(-1, chain.joints)
 
 
-def _leads_on(
+def _stays_reached(
     chain: ProjectiveChain,
     points: FloatArray,
     targets: FloatArray,
@@ -75,7 +75,7 @@ def _leads_on(
     step: FloatArray,
     tolerance: float,
 ) -> bool:
-    """Whether the goal is reached about ``step`` (n,) away from ``q`` (n,): to half of it, and on its way."""
+    """Whether the goal is reached about ``step`` (n,) away from ``q`` (n,), and at half of it."""
     ahead, residual = corrected(chain, points, targets, q + step, tolerance)
     share = float((ahead - q) @ step) / float(step @ step)
     return residual <= STRICTER * tolerance and 0.5 < share < 1.5
@@ -89,7 +89,7 @@ def nearest_by_self_motion(
     seed: FloatArray,
     tolerance: float,
 ) -> FloatArray:
-    """From ``q`` (n,) along self-motions to where the joints are nearest to ``seed`` (n,), the goal kept."""
+    """Configuration nearest to ``seed`` (n,) that a self-motion from ``q`` (n,) reaches with the goal kept."""
     for _ in range(200):
         kernel = null_directions(chain, points, q)
         step = kernel.T @ (kernel @ (seed - q))
@@ -113,9 +113,9 @@ def slid_inside(
     limits: FloatArray,
     tolerance: float,
 ) -> FloatArray | None:
-    """A configuration (n,) inside ``limits`` (n, 2) on the way of the single self-motion of ``q`` (n,), or None.
+    """Configuration (n,) inside ``limits`` (n, 2) along the single self-motion of ``q`` (n,), or None.
 
-    Follows the motion both ways for a whole turn, or until it comes to its end.
+    Follows the motion in both directions for a full turn, or until it comes to its end.
     """
     kernel = null_directions(chain, points, q)
     if len(kernel) != 1:

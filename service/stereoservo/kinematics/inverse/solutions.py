@@ -1,4 +1,4 @@
-"""Answers of inverse kinematics: all solutions, a continuum of them, or how far the goal is from being reached."""
+"""Results of inverse kinematics: all solutions, a continuum of them, or the distance to an unreachable goal."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Outcome = Literal["isolated", "continuum", "beyond_limits", "unreachable"]
 
 
 class InverseKinematicsError(ValueError):
-    """A goal, a seed or limits with which the question makes no sense. The text says what would be valid.
+    """Invalid goal, seed or limits of inverse kinematics; the text states what would be valid.
 
     Attributes:
         code: ``shape``, ``not_finite``, ``mirrored`` (no rigid motion takes the points there), ``not_rigid``,
             ``degenerate`` (a goal or point on the fixed plane), ``limits``.
-        data: the values that the message speaks of.
+        data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
@@ -40,7 +40,7 @@ class InverseKinematicsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Shortfall:
-    """The nearest that an arm comes to a goal out of its reach.
+    """Closest approach of an arm to a goal that is out of its reach.
 
     ``joints`` (n,) of least residual among the approaches tried, ``residual`` as in `InverseSolutions`. ``joint``:
     whose equation has no root, in closed form; ``excess``: by which share of its amplitude (1.0: twice as far as it
@@ -107,7 +107,7 @@ def within_limits(
 ) -> tuple[FloatArray, bool]:
     """Joints (n,) by whole turns inside ``limits`` (n, 2), nearest to ``seed`` (n,); whether all of them are.
 
-    A joint that no turn brings inside stands as near to its limits as turns bring it.
+    A joint that no whole turn brings inside is as near to its limits as whole turns allow.
     """
     near = nearest_turns(kinds, joints, seed)
     if limits is None:
@@ -135,7 +135,7 @@ def distinct(kinds: tuple[str, ...], joints: FloatArray, tolerance: float = SAME
     """Indices of rows (s, n) of which none equals an earlier one, up to whole turns."""
     kept: list[int] = []
     for i, row in enumerate(joints):
-        apart = nearest_turns(kinds, joints[kept] - row, np.zeros(len(row)))
-        if not len(kept) or np.abs(apart).max(axis=1).min() > tolerance:
+        difference = nearest_turns(kinds, joints[kept] - row, np.zeros(len(row)))
+        if not len(kept) or np.abs(difference).max(axis=1).min() > tolerance:
             kept.append(i)
     return kept

@@ -1,6 +1,7 @@
-"""Inverse kinematics of a projective chain: the case recognised, its candidates made, refined, checked and sorted.
+"""Inverse kinematics of a projective chain: structure recognition, closed-form or numerical candidates, refinement,
+checks.
 
-In every stratum: operators and points suffice (thesis 6). Nothing here knows a metric or the plane at infinity.
+In every stratum: operators and points suffice (thesis 6). Neither a metric nor the plane at infinity is used.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ WITNESSES = 4
 POLISH = 1e-9
 """Damping of the refinement of a candidate: next to none."""
 RIGID = 3
-"""Points from which on a goal tells whether it is a rigid motion."""
+"""Number of points from which a goal shows whether it is a rigid motion."""
 ROUNDING = 1e-9
 
 Solver = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], Branches]
@@ -64,7 +65,7 @@ WHOLE_ROTATION: dict[Case, Callable[[FloatArray, FloatArray, FloatArray], Branch
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A goal in one form: points and targets (m, 4) of equal heights; the displacement where they tell it."""
+    """A goal in normal form: points and targets (m, 4) of equal scales; the displacement where they determine it."""
 
     chain: ProjectiveChain
     points: FloatArray
@@ -86,7 +87,7 @@ def inverse_kinematics(
     tolerance: float = TOLERANCE,
     recognition: Recognition | None = None,
 ) -> InverseSolutions:
-    """All configurations that reach a goal.
+    """Inverse kinematics: all configurations that reach a goal.
 
     The goal is a ``displacement`` (4, 4) from the chain's zero, of any scale, or ``targets`` (m, 4) of ``points``
     (m, 4) at the zero, of any heights. ``seed`` (n,), default the zero, orders the solutions, and is where a joint
@@ -139,13 +140,15 @@ def _problem(
         # A displacement is what it does to the columns of the identity.
         return _Problem(chain, np.eye(4), np.ascontiguousarray(H.T), H, seed, limits, tolerance)
     if displacement is None and points is not None and targets is not None:
-        at_zero, at_goal = goals.equal_heights(chain.generators, points, targets)
+        at_zero, at_goal = goals.equal_scales(chain.generators, points, targets)
         return _Problem(chain, at_zero, at_goal, None, seed, limits, tolerance)
     raise InverseKinematicsError("shape", "give a displacement, or points and targets: one goal is needed")
 
 
 def _displacement(problem: _Problem, known: Recognition) -> FloatArray | None:
-    """What the goal's points say of the whole displacement, where the case asks for it or they are of a rigid body."""
+    """The displacement that the goal's points determine, where the closed form needs it or they are of a rigid
+    body.
+    """
     if problem.displacement is not None:
         return problem.displacement
     if len(problem.points) < RIGID and not known.inverted and known.case not in WHOLE_ROTATION:
@@ -198,7 +201,7 @@ def _candidates(
 
 
 def _searched(problem: _Problem) -> InverseSolutions:
-    """The case without a closed form: isolated solutions, or the nearest of a continuum."""
+    """Numerical solutions of a chain without closed form: isolated ones, or the nearest of a continuum."""
     chain = problem.chain
     rank = _rank(problem)
     search = numerical.all_solutions if rank == chain.joints else numerical.one_solution
@@ -220,7 +223,7 @@ def _searched(problem: _Problem) -> InverseSolutions:
 
 
 def _rank(problem: _Problem) -> int:
-    """Freedoms of the goal that the joints drive, where they drive most of them."""
+    """Number of degrees of freedom of the goal that the joints drive, where they drive most of them."""
     most = 0
     for q in numerical.even_starts(problem.chain, problem.limits, 4):
         J = linearised(problem.chain, problem.points, q)[1]
@@ -230,7 +233,7 @@ def _rank(problem: _Problem) -> int:
 
 
 def _representatives(problem: _Problem, ends: FloatArray) -> FloatArray:
-    """The one of a continuum's points (s, n) that is nearest to the seed; with limits, the first few."""
+    """Point of a continuum (s, n) nearest to the seed; with limits, the first few."""
     turned = np.array([within_limits(problem.chain.kinds, q, problem.seed, problem.limits)[0] for q in ends])
     order = np.argsort(np.linalg.norm(turned - problem.seed, axis=1), kind="stable")
     return turned[order[: 1 if problem.limits is None else 8]]
@@ -243,7 +246,7 @@ def _settled(problem: _Problem, q: FloatArray) -> FloatArray:
 
 
 def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray) -> InverseSolutions:
-    """Solutions (s, n) told apart, inside the limits, nearest to the seed first."""
+    """Distinct solutions (s, n) inside the limits, nearest to the seed first."""
     chain = problem.chain
     by_residual = np.argsort(left, kind="stable")
     joints, left = joints[by_residual], left[by_residual]
@@ -279,7 +282,9 @@ def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray)
 def _unreachable(
     problem: _Problem, known: Recognition, ends: FloatArray, left: FloatArray, branches: Branches
 ) -> InverseSolutions:
-    """The joint named is the first, in the order in which the case is solved, that fails in every branch."""
+    """Result for an unreachable goal; it names the first joint, in the order of solution, that fails in every
+    branch.
+    """
     nearest = int(np.argmin(left))
     failing = np.flatnonzero(branches.excess.min(axis=0) > problem.tolerance)
     order = problem.chain.order[::-1] if known.inverted else problem.chain.order

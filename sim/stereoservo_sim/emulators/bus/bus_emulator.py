@@ -1,4 +1,4 @@
-"""A rack of emulated drives on one bus, event by event. Sans I/O: the same in virtual and in real time."""
+"""Discrete-event emulation of drives on one bus, without I/O: identical in virtual and in real time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STUCK = 10_000
 
 
 class BusEmulatorError(Exception):
-    """The rack cannot go on: a defect of a node, named."""
+    """The emulation cannot continue: a node is defective, which the text names."""
 
 
 class BusEvent(msgspec.Struct, frozen=True):
@@ -44,12 +44,12 @@ class BusEvent(msgspec.Struct, frozen=True):
         return {"node": self.node}
 
     def where(self) -> str:
-        """The node, in words."""
+        """The node, as text."""
         return f"node {self.node}" if self.node else ""
 
 
 class Slot:
-    """A node in the rack and what the rack remembers of it."""
+    """A node on the bus with its state in the emulator."""
 
     def __init__(self, node: EmulatedNode, index: int, plant_index: int | None) -> None:
         self.node = node
@@ -63,7 +63,7 @@ class Slot:
 
 
 class BusEmulator:
-    """Nodes, wire and plant in bus time [ns].
+    """Emulated nodes, wire and plant in bus time [ns].
 
     ``plant`` moves the nodes' axes, in their order. ``bitrate`` [bit/s]: frames take their time; None: none.
     What happens at one instant happens in a fixed order (the wire, held-back frames, nodes by their place, the plant),
@@ -101,11 +101,11 @@ class BusEmulator:
 
     @property
     def nodes(self) -> tuple[EmulatedNode, ...]:
-        """All nodes, doubles last."""
+        """All nodes, duplicates last."""
         return tuple(slot.node for slot in self.slots)
 
     def inject(self, frame: CanFrame, t_ns: int) -> None:
-        """The master hands ``frame`` to its controller at ``t_ns`` (not before what was already run)."""
+        """Queue ``frame`` of the master at ``t_ns`` (not before the time already run)."""
         self.run_until(t_ns)
         if not self.disturbances.master_passes(frame):
             return
@@ -113,7 +113,7 @@ class BusEmulator:
         self._launch()
 
     def run_until(self, t_ns: int) -> None:
-        """Everything that happens up to ``t_ns``, included. Raises RackError."""
+        """Process all events up to ``t_ns``, included. Raises BusEmulatorError."""
         instant, events = -1, 0
         while (due := self.due_ns()) <= t_ns:
             events = events + 1 if due <= instant else 0
@@ -125,7 +125,7 @@ class BusEmulator:
         self.t_ns = max(self.t_ns, t_ns)
 
     def due_ns(self) -> int:
-        """When something happens next, nothing further being sent by the master."""
+        """Time of the next event, if the master sends nothing."""
         due = min(self.wire.end_ns, self.plant.due_ns(self.t_ns))
         for slot in self.slots:
             due = min(due, slot.due_ns)
@@ -147,7 +147,7 @@ class BusEmulator:
         return news
 
     def order(self, text: str, t_ns: int) -> str:
-        """Do the fault command ``text``, at ``t_ns`` or at its own time after the start; the answer.
+        """Execute the fault command ``text``, at ``t_ns`` or at its own time after the start; returns the reply.
 
         Raises FaultCommandError.
         """
@@ -168,15 +168,15 @@ class BusEmulator:
         self.tell(kind, command.node, text)
 
     def slot(self, node_id: int) -> Slot:
-        """The place of a node. Raises FaultCommandError, listing the nodes there are."""
+        """Slot of a node. Raises FaultCommandError, which lists the nodes."""
         for slot in self.slots:
             if slot.node.node_id == node_id:
                 return slot
         there = ", ".join(str(slot.node.node_id) for slot in self.slots)
-        raise FaultCommandError(f"no node {node_id} in this rack; nodes: {there}")
+        raise FaultCommandError(f"no node {node_id} on this bus; nodes: {there}")
 
     def add(self, node: EmulatedNode, *, boots: bool) -> None:
-        """Put a further node on the bus; its axis moves nothing."""
+        """Add a node to the bus, whose axis moves nothing."""
         if boots:
             node.power_up(self.t_ns)
         slot = Slot(node, self._next_index(), None)
@@ -187,11 +187,11 @@ class BusEmulator:
         return max(slot.index for slot in self.slots) + 1
 
     def at_rest(self) -> bool:
-        """Whether all axes stand."""
+        """Whether all axes are at rest."""
         return self.plant.at_rest()
 
     def power_off(self, t_ns: int) -> None:
-        """The supply of all drives fails: nothing is heard of them, the arm stands by brakes and friction."""
+        """Switch off the supply of all drives: they are silent, and brakes and friction stop the arm."""
         self.run_until(t_ns)
         self.disturbances.master_connected = False
         for slot in self.slots:
@@ -199,7 +199,7 @@ class BusEmulator:
             self.look(slot)
 
     def status(self) -> list[str]:
-        """One line a node."""
+        """Status, one line a node."""
         return [
             f"node {slot.node.node_id} {slot.node.axis.joint.name}: {slot.node.state()}, "
             f"{'powered' if slot.node.axis.powered else 'off'}, at {slot.node.axis.position:.4f}, "
@@ -259,11 +259,11 @@ class BusEmulator:
             self.look(slot)
 
     def remove(self, slots: list[Slot]) -> None:
-        """Take nodes that ``add`` put there off the bus."""
+        """Remove nodes that ``add`` added."""
         self.slots = [slot for slot in self.slots if slot not in slots]
 
     def look(self, slot: Slot, keep: int = -1) -> list[CanFrame]:
-        """What a node wants to send, when it is next due, and what has become of it.
+        """Collect a node's frames to send, its next due time, and its state changes.
 
         Frames of id ``keep`` are given back instead of sent.
         """
@@ -292,7 +292,7 @@ class BusEmulator:
         return kept
 
     def _stick(self, slot: Slot) -> None:
-        """A cause that stays trips the drive again as soon as its fault has been reset."""
+        """Trip the drive again, for a persistent cause, as soon as its fault has been reset."""
         code = self.disturbances.sticky.get(slot.node.node_id)
         if code is None or slot.plant_index is None or "fault" in slot.state or "error" in slot.state:
             return

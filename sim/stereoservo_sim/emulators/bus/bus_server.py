@@ -1,4 +1,4 @@
-"""A rack in real time: bus time is CLOCK_MONOTONIC, the master sits behind an endpoint."""
+"""Real-time server of emulated drives: bus time is CLOCK_MONOTONIC, the master is connected by an endpoint."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ STALL_NS = 2_000_000
 """A loop that wakes later than this was stalled."""
 LATE_FRAME_NS = 500_000
 ENDING_NS = 500_000_000
-"""How long after power off the arm is followed until it stands."""
+"""Time limit after power off until the arm must be at rest."""
 
 
 class Stalls(msgspec.Struct):
-    """How late the serving loop came: the largest lateness and gap, how often it was later than STALL_NS, and how many
-    frames left more than LATE_FRAME_NS after their end on the bus.
+    """Lateness of the serving loop: the largest lateness and gap, how often it was later than STALL_NS, and how
+    many frames left more than LATE_FRAME_NS after their end on the bus.
     """
 
     turns: int = 0
@@ -49,7 +49,7 @@ class Stalls(msgspec.Struct):
     longest_gap_ns: int = 0
 
     def words(self) -> str:
-        """For people."""
+        """The statistics as text."""
         return (
             f"server loop: {self.turns} turns, latest {self.latest_ns * 1e-6:.2f} ms, longest gap "
             f"{self.longest_gap_ns * 1e-6:.2f} ms, {self.stalls} stalls over {STALL_NS * 1e-6:g} ms; "
@@ -58,7 +58,7 @@ class Stalls(msgspec.Struct):
 
 
 class _Request:
-    """An order of another thread, and its answer."""
+    """A fault command of another thread, and its reply."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -67,21 +67,21 @@ class _Request:
         self.error: Exception | None = None
 
 
-class RackServer:
-    """Serves ``rack`` at ``endpoint`` until told to end.
+class BusServer:
+    """Serves the emulated bus ``emulator`` at ``endpoint`` until terminated.
 
-    ``on_event`` gets every event of the rack, in the serving thread. ``run`` serves in the calling thread; as a context
-    manager the server runs in a thread of its own, and what failed there is raised at the end.
+    ``on_event`` gets every event of the emulated bus, in the serving thread. ``run`` serves in the calling
+    thread; as a context manager the server runs in a thread of its own, and what failed there is raised at the end.
     """
 
     def __init__(
         self,
-        rack: BusEmulator,
+        emulator: BusEmulator,
         endpoint: Endpoint,
         *,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.rack = rack
+        self.emulator = emulator
         self.endpoint = endpoint
         self.stalls = Stalls()
         self.on_event: Callable[[BusEvent], None] | None = None
@@ -96,16 +96,16 @@ class RackServer:
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
         self._turned_ns = clock_ns()
-        rack.on_adapter = endpoint.plug
+        emulator.on_adapter = endpoint.plug
 
     @property
     def start_ns(self) -> int:
-        """When the drives were switched on."""
-        return self.rack.start_ns
+        """Time at which the drives were switched on."""
+        return self.emulator.start_ns
 
     @property
     def channel(self) -> str:
-        """How a master reaches the drives."""
+        """Channel by which a master connects to the drives."""
         return self.endpoint.channel
 
     def watch(self, descriptor: int, act: Callable[[], None]) -> None:
@@ -113,16 +113,16 @@ class RackServer:
         self._watched[descriptor] = act
 
     def unwatch(self, descriptor: int) -> None:
-        """End it."""
+        """Stop watching a descriptor."""
         self._watched.pop(descriptor, None)
 
     def obey(self, text: str) -> str:
-        """An order, from the serving thread itself. Raises FaultCommandError."""
-        answer = self.rack.order(text, self._clock_ns())
+        """Execute a fault command, from the serving thread itself. Raises FaultCommandError."""
+        answer = self.emulator.order(text, self._clock_ns())
         return f"{answer}\n{self.stalls.words()}" if text.split()[:1] == ["status"] else answer
 
     def order(self, text: str, timeout_s: float = 10.0) -> str:
-        """An order, from any other thread. Raises FaultCommandError."""
+        """Execute a fault command, from any other thread. Raises FaultCommandError."""
         request = _Request(text)
         with self._lock:
             if self._over:
@@ -136,22 +136,22 @@ class RackServer:
         return request.answer
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until ``ended``; then power off, and the arm comes to rest. Closes endpoint and rack."""
+        """Serve until ``ended``; then power off, and let the arm come to rest. Closes endpoint and emulator."""
         try:
             self._turned_ns = self._clock_ns()
-            self.rack.run_until(self._turned_ns)
+            self.emulator.run_until(self._turned_ns)
             while not ended():
                 self.turn()
             now = self._clock_ns()
             self.endpoint.close()
-            self.rack.power_off(now)
-            while not self.rack.at_rest() and self._clock_ns() < now + ENDING_NS:
-                self._sleep([], self.rack.due_ns())
-                self.rack.run_until(self._clock_ns())
+            self.emulator.power_off(now)
+            while not self.emulator.at_rest() and self._clock_ns() < now + ENDING_NS:
+                self._sleep([], self.emulator.due_ns())
+                self.emulator.run_until(self._clock_ns())
             self._pass_events()
         finally:
             self.endpoint.close()
-            self.rack.close()
+            self.emulator.close()
             self._end_requests()
 
     def _end_requests(self) -> None:
@@ -165,9 +165,9 @@ class RackServer:
                 request.done.set()
 
     def turn(self) -> None:
-        """Wait for the next event or input, and let the bus go on to the present."""
+        """Wait for the next event or input, and advance the bus to the present."""
         descriptors = self.endpoint.descriptors()
-        wanted = self.rack.due_ns()
+        wanted = self.emulator.due_ns()
         if not descriptors:
             wanted = min(wanted, self._clock_ns() + ASKING_NS)
         ready = self._sleep([*descriptors, self._wake_read, *self._watched], wanted)
@@ -176,7 +176,7 @@ class RackServer:
         come = not descriptors or not set(ready).isdisjoint(descriptors)
         frames = self.endpoint.take() if come else []
         for t_ns, frame in self._stamped(frames, wanted, now):
-            self.rack.inject(frame, t_ns)
+            self.emulator.inject(frame, t_ns)
         self._catch_up(now)
         if self._wake_read in ready:
             self._answer()
@@ -186,13 +186,16 @@ class RackServer:
         self._turned_ns = now
 
     def _sleep(self, descriptors: list[int], until_ns: int) -> list[int]:
-        """Wait for input or for ``until_ns``; what is readable. With bit times the end is waited for awake."""
-        spin = SPIN_NS if self.rack.wire.bitrate is not None else 0
+        """Wait for input or for ``until_ns``; returns what is readable. With bit times the end is waited for by
+        polling.
+        """
+        spin = SPIN_NS if self.emulator.wire.bitrate is not None else 0
         left_ns = until_ns - self._clock_ns() - spin
         return select.select(descriptors, [], [], max(left_ns, 0) * 1e-9)[0]
 
     def _stamped(self, frames: list[CanFrame], wanted: int, now: int) -> list[tuple[int, CanFrame]]:
-        """When the master sent its frames: now; those that came while the loop was stalled, evenly since then.
+        """Send times of the master's frames: now; those that arrived while the loop was stalled are spread evenly
+        over that time.
 
         Otherwise the drives would watch their time-outs run off before they hear what had come in time.
         """
@@ -209,15 +212,17 @@ class RackServer:
         stalls.stalls += now - wanted > STALL_NS
 
     def _catch_up(self, now: int) -> None:
-        """Everything up to ``now``. What has ended on the bus does not wait for the arm's next step to be computed."""
-        while (due := self.rack.due_ns()) <= now:
-            self.rack.run_until(due)
+        """Advance to ``now``. Frames that have ended on the bus are delivered before the arm's next step is
+        computed.
+        """
+        while (due := self.emulator.due_ns()) <= now:
+            self.emulator.run_until(due)
             self._give()
-        self.rack.run_until(now)
+        self.emulator.run_until(now)
         self._give()
 
     def _give(self) -> None:
-        delivered = self.rack.delivered()
+        delivered = self.emulator.delivered()
         if delivered:
             self.endpoint.give(delivered)
             late_ns = self._clock_ns() - delivered[0][0]
@@ -235,7 +240,7 @@ class RackServer:
             request.done.set()
 
     def _pass_events(self) -> None:
-        news = self.rack.take_news()
+        news = self.emulator.take_news()
         if self.on_event is not None:
             for event in news:
                 self.on_event(event)
@@ -286,7 +291,7 @@ def open_endpoint(channel: str, bus_bitrate: int) -> Endpoint:
 
 
 def served_channel(options: CanOptions) -> str:
-    """The channel at which a cell's master looks for its drives. Raises EndpointError where it cannot be served."""
+    """The channel at which a cell's master expects its drives. Raises EndpointError where it cannot be served."""
     channel = str(options.channel)
     if channel.startswith("socket://"):
         return channel

@@ -1,4 +1,4 @@
-"""The bus as discrete events: arbitration, frame times (ISO 11898-1), and the disturbances that frames meet."""
+"""Discrete-event model of the CAN wire: arbitration, frame times (ISO 11898-1), and injected disturbances."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stereoservo_drivers.can.load import frame_bits
 from stereoservo_sim.emulators.nodes.node import NEVER_NS
 
 MASTER = 0
-"""The sender that is not a node of the rack; nodes are 1, 2, ... in their order."""
+"""The sender that is not a node of the emulated bus; nodes are 1, 2, ... in their order."""
 QUEUE_LIMIT = 2000
 """Frames that a sender may have waiting; further ones are lost, as from a full transmit buffer."""
 SECOND_NS = 1_000_000_000
@@ -22,7 +22,7 @@ SYNC_ID = 0x080
 
 
 def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
-    """The bits of the arbitration field in the order of sending, dominant as 0: the smallest wins.
+    """Bits of the arbitration field in the order of sending, dominant as 0: the smallest wins.
 
     A data frame so goes before the remote frame of its id, and a standard one before an extended one that begins alike.
     """
@@ -32,7 +32,7 @@ def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
 
 
 class Wire:
-    """One frame at a time. Every sender's frames go out in their order; among senders, arbitration decides.
+    """The wire, one frame at a time. Each sender's frames keep their order; between senders, arbitration decides.
 
     ``bitrate`` [bit/s]; None: frames take no time. A frame occupies its stuffed bits and the intermission and arrives
     when those are over. Bit errors, and the collision of two frames with one id, are not modelled: both go out.
@@ -68,7 +68,7 @@ class Wire:
         return len(self._queues.get(sender, ()))
 
     def start(self, t_ns: int) -> None:
-        """Where the bus is free at ``t_ns``, put the frame on it that wins the arbitration."""
+        """If the bus is idle at ``t_ns``, start the frame that wins the arbitration."""
         if self._sending is not None or not self._heads:
             return
         sender = heapq.heappop(self._heads)[1]
@@ -82,7 +82,7 @@ class Wire:
         self.end_ns = t_ns + duration
 
     def finish(self) -> tuple[int, CanFrame]:
-        """The frame on the wire has ended: its sender and itself."""
+        """End the frame on the wire; returns its sender and the frame."""
         assert self._sending is not None  # end_ns is NEVER_NS otherwise
         ended = self._sending
         self._sending = None
@@ -91,14 +91,14 @@ class Wire:
         return ended
 
     def duration_ns(self, frame: CanFrame) -> int:
-        """How long ``frame`` occupies the bus, intermission included."""
+        """Duration of ``frame`` on the bus, intermission included."""
         if self.bitrate is None:
             return 0
         return frame_bits(frame) * SECOND_NS // self.bitrate
 
 
 class Disturbances:
-    """Ordered disturbances in force, by node number. Decides what becomes of each frame."""
+    """Active disturbances by node number, which determine whether each frame is delayed or lost."""
 
     def __init__(self) -> None:
         self.master_connected = True
@@ -111,7 +111,7 @@ class Disturbances:
         """Frames still to be lost by node and id."""
 
     def fate_ns(self, node_id: int, frame: CanFrame) -> int | None:
-        """By how much a frame that ``node_id`` sends is held back; None: it is lost."""
+        """Delay of a frame of ``node_id``; None: it is lost."""
         if node_id in self.silent or node_id in self.cut:
             return None
         left = self.lose.get((node_id, frame.id), 0)
@@ -127,7 +127,7 @@ class Disturbances:
         return not (self.drop_sync and frame.id == SYNC_ID and not frame.extended)
 
     def words(self, node_id: int) -> str:
-        """What is wrong at a node, for people."""
+        """Disturbances of a node, as text."""
         parts = []
         if node_id in self.cut or not self.master_connected:
             parts.append("cable out")

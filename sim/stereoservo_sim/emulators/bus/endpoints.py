@@ -1,4 +1,6 @@
-"""Where a served rack meets its master: serial-line CAN on TCP or a pty, or any python-can interface."""
+"""Endpoints by which a master connects to an emulated bus: serial-line CAN on TCP or a pty, or any python-can
+interface.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +25,11 @@ WRONG_BITRATE = 0x80 | 0x20 | 0x04
 
 
 class EndpointError(Exception):
-    """A channel cannot be served; says which and why."""
+    """A channel cannot be served; the text names it and the cause."""
 
 
 class Endpoint(Protocol):
-    """The master's side of the bus.
+    """Protocol of the master's side of the bus.
 
     ``channel``: how a master reaches it. ``descriptors``: what to wait for; empty where it has to be asked.
     """
@@ -35,7 +37,7 @@ class Endpoint(Protocol):
     channel: str
 
     def descriptors(self) -> list[int]:
-        """File descriptors that become readable when something comes."""
+        """File descriptors that become readable when data arrive."""
         ...
 
     def take(self) -> list[CanFrame]:
@@ -56,7 +58,7 @@ class Endpoint(Protocol):
 
 
 class _SerialClient:
-    """One serial-line client: bytes in, bytes out, an emulated adapter between."""
+    """One serial-line client, with an emulated adapter between bytes and frames."""
 
     def __init__(self, descriptor: int, bus_bitrate: int) -> None:
         self.descriptor = descriptor
@@ -110,7 +112,7 @@ class _SerialClient:
 
 
 class SlcanTcp:
-    """Serial-line CAN on 127.0.0.1, one client at a time; a second one is turned away. Port 0: a free one."""
+    """Serial-line CAN on 127.0.0.1, one client at a time; a second one is refused. Port 0: a free one."""
 
     def __init__(self, port: int, bus_bitrate: int) -> None:
         self._bitrate = bus_bitrate
@@ -166,7 +168,7 @@ class SlcanTcp:
             self._drop()
 
     def plug(self, plugged: bool) -> None:
-        """Unplugged, the connection is closed and nobody listens."""
+        """Plug or unplug: unplugged, the connection is closed and the port does not listen."""
         if plugged and self._listener is None:
             self._listen()
         elif not plugged:
@@ -218,7 +220,7 @@ class SlcanPty:
         self.channel = os.ttyname(self._theirs)
 
     def descriptors(self) -> list[int]:
-        """Our end."""
+        """Descriptor of our end."""
         return [self._ours] if self._ours >= 0 else []
 
     def take(self) -> list[CanFrame]:
@@ -231,7 +233,7 @@ class SlcanPty:
             self._line.give(frames)
 
     def plug(self, plugged: bool) -> None:
-        """Unplugged, the terminal vanishes; plugged in again it may get another path."""
+        """Plug or unplug: unplugged, the terminal does not exist; plugged in again it may have another path."""
         if plugged and self._ours < 0:
             self._open()
         elif not plugged and self._ours >= 0:
@@ -240,7 +242,7 @@ class SlcanPty:
             self._ours = -1
 
     def close(self) -> None:
-        """The terminal vanishes."""
+        """Remove the terminal."""
         self.plug(False)
 
 
@@ -261,7 +263,7 @@ class PythonCanEndpoint:
         self.lost = 0
 
     def descriptors(self) -> list[int]:
-        """The bus's, where it has one."""
+        """Descriptor of the bus, where it has one."""
         try:
             descriptor = self._bus.fileno()
         except NotImplementedError:
@@ -269,7 +271,7 @@ class PythonCanEndpoint:
         return [descriptor] if descriptor >= 0 else []
 
     def take(self) -> list[CanFrame]:
-        """What is on the bus."""
+        """Frames on the bus."""
         frames = []
         while (message := self._bus.recv(timeout=0)) is not None:
             if not message.is_error_frame:
@@ -277,7 +279,7 @@ class PythonCanEndpoint:
         return frames if self._plugged else []
 
     def give(self, frames: list[tuple[int, CanFrame]]) -> None:
-        """Onto the bus; what its transmit buffer does not take is lost and counted in ``lost``."""
+        """Send to the bus; frames that its transmit buffer does not accept are lost and counted in ``lost``."""
         if not self._plugged:
             return
         for _, frame in frames:
@@ -287,9 +289,9 @@ class PythonCanEndpoint:
                 self.lost += 1
 
     def plug(self, plugged: bool) -> None:
-        """Unplugged, nothing passes: a python-can bus cannot be taken out of its master's hands."""
+        """Plug or unplug: unplugged, no frame passes (a python-can bus cannot be removed from its master)."""
         self._plugged = plugged
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         self._bus.shutdown()

@@ -1,4 +1,6 @@
-"""Racks from cell files: nodes of the cell's protocol and the plant that ``[emulate.drives]`` names."""
+"""Construction of emulated buses from cell files: nodes of the cell's protocol, and the plant of
+``[emulate.drives]``.
+"""
 
 from __future__ import annotations
 
@@ -31,11 +33,11 @@ DEFAULT_RATED_TORQUE = 100.0
 
 
 class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[emulate.drives]``.
+    """Section ``[emulate.drives]`` of a cell file.
 
     ``plant``: ``pybullet``, the simulated arm as rigid bodies (joints of its names), or ``ideal``, any joints, without
     mass. ``bit_time``: frames take their time on the wire. ``start``: positions by joint [rad or m] of an arm that was
-    never moved; ``resume``: an arm whose truth file exists stands where that ends. ``brake_ms``: what the brakes take
+    never moved; ``resume``: an arm whose truth file exists starts at its end. ``brake_ms``: what the brakes take
     to open and to close. ``rated_torques`` by joint [N m or N] where they are not the driver's. ``eds``: of the
     emulated drives where it is not the driver's, relative to the cell file. ``machine``: see PlantSettings.
     """
@@ -71,7 +73,7 @@ def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
     return options, settings
 
 
-def make_rack(
+def make_bus_emulator(
     options: CanOptions,
     settings: DrivesSettings | None = None,
     *,
@@ -129,7 +131,7 @@ def _node(
 
 
 def _start(options: CanOptions, settings: DrivesSettings) -> FloatArray:
-    """Where an arm stands that was never moved: as ordered, else the simulated cell's base, else the middle."""
+    """Initial joint positions: as configured, else the simulated cell's base, else mid-range."""
     positions = np.array([min(max(0.0, joint.position_min), joint.position_max) for joint in options.joint])
     names = tuple(joint.name for joint in options.joint)
     if settings.plant == "pybullet":
@@ -152,7 +154,7 @@ def _start(options: CanOptions, settings: DrivesSettings) -> FloatArray:
 def _plant(
     options: CanOptions, settings: DrivesSettings, positions: FloatArray
 ) -> tuple[Plant, list[float] | None]:
-    """What moves, and what its efforts are shares of."""
+    """The plant, and the rated torques that its efforts are shares of."""
     if settings.plant == "ideal":
         return IdealPlant(positions), None
     from stereoservo_sim.world.physics import PhysicsError, PybulletPlant

@@ -1,4 +1,4 @@
-"""The fault table: what is ordered, who must end motion, within which bound, with which code."""
+"""Table of the CAN arm's fault cases: fault command, detecting side, time bound, fault code."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ Stage = Literal["running", "standing", "start", "reset"]
 
 
 class FaultCase(msgspec.Struct, frozen=True, kw_only=True):
-    """One line of the table.
+    """One fault case of the table.
 
-    ``orders``: given to the rack at the moment of the fault (``stage`` running), when the arm is enabled and about to
-    move (standing; times count from its first command), before bring-up (start), or a fault whose reset is then
-    tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
+    ``orders``: given to the emulated bus at the moment of the fault (``stage`` running), when the arm is
+    enabled and about to move (standing; times count from its first command), before bring-up (start), or a fault
+    whose reset is then tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
     the master may latch first or bring-up may refuse with, one or several by the fault's phase; empty: nothing
     latches, motion goes on. ``bound_ms``: from the fault to all axes at rest. ``by``: who ends motion.
     ``afterwards``: ordered once the axes rest: the cause goes away, and nothing may move again by itself.

@@ -1,4 +1,4 @@
-"""Fault commands of the emulated bus: the table of verbs, what their words mean and what each does."""
+"""Fault commands of the emulated bus: the verbs, their arguments, and their effects."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ REMAPPING = ((0x1800, 1, None), (0x1A00, 0, 0), (0x1A00, 1, 0x60410010), (0x1A00
 
 
 class BusCommand(FaultCommand, frozen=True):
-    """One command to the bus. ``node``: 0 is the whole bus. ``number``: an error code, a count, an NMT command, as the
-    verb has it."""
+    """One fault command. ``node``: 0 is the whole bus. ``number``: an error code, a count, an NMT command, by the
+    verb.
+    """
 
     node: int = 0
     number: int = 0
@@ -105,7 +106,7 @@ def _check_emergency(command: BusCommand) -> None:
 
 
 def _cable_words(words: list[str]) -> dict[str, Any]:
-    """The node may be left out, before the word that must be there."""
+    """Parse arguments whose node may be left out, before the required word."""
     fields = _node(words[0]) if words and words[0] not in IN_OR_OUT else {}
     rest = words[len(fields) :]
     at_most(rest, 1)
@@ -135,58 +136,58 @@ NMT_WORD = choice_word({name: {"what": name, "number": number} for name, number 
 # -- actions ----------------------------------------------------------------------------------------------------------
 
 
-def _fault(rack: BusEmulator, command: BusCommand) -> str:
-    slot = rack.slot(command.node)
-    slot.node.trip(command.number, rack.t_ns)
-    rack.look(slot)
+def _fault(emulator: BusEmulator, command: BusCommand) -> str:
+    slot = emulator.slot(command.node)
+    slot.node.trip(command.number, emulator.t_ns)
+    emulator.look(slot)
     return f"node {command.node}: fault {command.number:#06x}; now {slot.node.state()}"
 
 
-def _sticky(rack: BusEmulator, command: BusCommand) -> str:
-    causes: set[int] | None = getattr(rack.slot(command.node).node, "sticky", None)
+def _sticky(emulator: BusEmulator, command: BusCommand) -> str:
+    causes: set[int] | None = getattr(emulator.slot(command.node).node, "sticky", None)
     if command.what == "off":
-        rack.disturbances.sticky.pop(command.node, None)
+        emulator.disturbances.sticky.pop(command.node, None)
         if causes is not None:
             causes.clear()
         return f"node {command.node}: the cause is gone"
     if causes is None:  # a node without persistent causes: the emulator trips it again after each reset
-        rack.disturbances.sticky[command.node] = command.number
+        emulator.disturbances.sticky[command.node] = command.number
     else:
         causes.add(command.number)
-    return f"{_fault(rack, command)}; the cause stays"
+    return f"{_fault(emulator, command)}; the cause stays"
 
 
-def _emcy(rack: BusEmulator, command: BusCommand) -> str:
+def _emcy(emulator: BusEmulator, command: BusCommand) -> str:
     data = struct.pack("<HB5x", command.number, GENERIC_ERROR)
-    rack.wire.send(rack.slot(command.node).sender, CanFrame(COB_IDS["emcy"] + command.node, data))
+    emulator.wire.send(emulator.slot(command.node).sender, CanFrame(COB_IDS["emcy"] + command.node, data))
     return f"node {command.node}: emergency {command.number:#06x}"
 
 
-def _silence(rack: BusEmulator, command: BusCommand) -> Answer:
-    rack.disturbances.silent.add(command.node)
-    return f"node {command.node}: silent", lambda: rack.disturbances.silent.discard(command.node)
+def _silence(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.disturbances.silent.add(command.node)
+    return f"node {command.node}: silent", lambda: emulator.disturbances.silent.discard(command.node)
 
 
-def _speak(rack: BusEmulator, command: BusCommand) -> str:
-    rack.disturbances.silent.discard(command.node)
+def _speak(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.disturbances.silent.discard(command.node)
     return f"node {command.node}: speaks"
 
 
-def _reboot(rack: BusEmulator, command: BusCommand) -> str:
-    slot = rack.slot(command.node)
-    slot.node.power_up(rack.t_ns)
-    rack.look(slot)
+def _reboot(emulator: BusEmulator, command: BusCommand) -> str:
+    slot = emulator.slot(command.node)
+    slot.node.power_up(emulator.t_ns)
+    emulator.look(slot)
     return f"node {command.node}: reboots"
 
 
-def _lose(rack: BusEmulator, command: BusCommand) -> str:
+def _lose(emulator: BusEmulator, command: BusCommand) -> str:
     can_id = frame_id(command.node, command.what)
-    rack.disturbances.lose[command.node, can_id] = command.number
+    emulator.disturbances.lose[command.node, can_id] = command.number
     return f"node {command.node}: {command.number} of its frames {can_id:#05x} will be lost"
 
 
-def _late(rack: BusEmulator, command: BusCommand) -> Answer:
-    late_ns = rack.disturbances.late_ns
+def _late(emulator: BusEmulator, command: BusCommand) -> Answer:
+    late_ns = emulator.disturbances.late_ns
     before = late_ns.get(command.node, 0)
     late_ns[command.node] = command.duration_ns
 
@@ -196,18 +197,20 @@ def _late(rack: BusEmulator, command: BusCommand) -> Answer:
     return f"node {command.node}: late by {command.duration_ns * 1e-6:g} ms", undo
 
 
-def _duplicate(rack: BusEmulator, command: BusCommand) -> str:
-    doubles = [slot for slot in rack.slots if slot.plant_index is None and slot.node.node_id == command.node]
+def _duplicate(emulator: BusEmulator, command: BusCommand) -> str:
+    doubles = [
+        slot for slot in emulator.slots if slot.plant_index is None and slot.node.node_id == command.node
+    ]
     if command.what == "off":
-        rack.remove(doubles)
+        emulator.remove(doubles)
         return f"node {command.node}: {len(doubles)} doubles removed"
     # A copy has the state of its original; one that boots forgets it.
-    rack.add(copy.deepcopy(rack.slot(command.node).node), boots=command.what == "boots")
+    emulator.add(copy.deepcopy(emulator.slot(command.node).node), boots=command.what == "boots")
     return f"node {command.node}: a second one {'boots' if command.what == 'boots' else 'runs beside it'}"
 
 
-def _remap(rack: BusEmulator, command: BusCommand) -> str:
-    slot = rack.slot(command.node)
+def _remap(emulator: BusEmulator, command: BusCommand) -> str:
+    slot = emulator.slot(command.node)
     can_id = COB_IDS["tpdo1"] + command.node
     for k, (index, subindex, value) in enumerate(REMAPPING):
         if value is None:
@@ -215,8 +218,8 @@ def _remap(rack: BusEmulator, command: BusCommand) -> str:
         size = 1 if subindex == 0 else 4
         head = 0x23 | (4 - size) << 2  # expedited download with its size
         data = struct.pack("<BHBI", head, index, subindex, value)
-        slot.node.receive(CanFrame(0x600 + command.node, data), rack.t_ns)
-        answers = rack.look(slot, keep=COB_IDS["sdo"] + command.node)
+        slot.node.receive(CanFrame(0x600 + command.node, data), emulator.t_ns)
+        answers = emulator.look(slot, keep=COB_IDS["sdo"] + command.node)
         if not answers:
             raise FaultCommandError(f"node {command.node} answers no SDO: its protocol has no mapping")
         if answers[0].data[0] != 0x60:
@@ -227,60 +230,60 @@ def _remap(rack: BusEmulator, command: BusCommand) -> str:
     return f"node {command.node}: TPDO 1 carries the status word alone"
 
 
-def _cable(rack: BusEmulator, command: BusCommand) -> Answer:
+def _cable(emulator: BusEmulator, command: BusCommand) -> Answer:
     def connect(there: bool) -> None:
         if command.node == 0:
-            rack.disturbances.master_connected = there
+            emulator.disturbances.master_connected = there
         else:
-            (rack.disturbances.cut.discard if there else rack.disturbances.cut.add)(command.node)
+            (emulator.disturbances.cut.discard if there else emulator.disturbances.cut.add)(command.node)
 
     connect(command.what == "in")
     where = f"node {command.node}: " if command.node else ""
     return f"{where}bus cable {command.what}", lambda: connect(command.what == "out")
 
 
-def _adapter(rack: BusEmulator, command: BusCommand) -> Answer:
-    rack.on_adapter(command.what == "in")
-    return f"adapter {command.what}", lambda: rack.on_adapter(command.what == "out")
+def _adapter(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.on_adapter(command.what == "in")
+    return f"adapter {command.what}", lambda: emulator.on_adapter(command.what == "out")
 
 
-def _drop_sync(rack: BusEmulator, command: BusCommand) -> Answer:
-    rack.disturbances.drop_sync = True
+def _drop_sync(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.disturbances.drop_sync = True
 
     def undo() -> None:
-        rack.disturbances.drop_sync = False
+        emulator.disturbances.drop_sync = False
 
     return "SYNC does not get through", undo
 
 
-def _pass_sync(rack: BusEmulator, command: BusCommand) -> str:
-    rack.disturbances.drop_sync = False
+def _pass_sync(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.disturbances.drop_sync = False
     return "SYNC gets through"
 
 
-def _limit(rack: BusEmulator, command: BusCommand) -> str:
-    rack.slot(command.node).node.axis.limit_switch = command.number
-    _update_inputs(rack, command)
+def _limit(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.slot(command.node).node.axis.limit_switch = command.number
+    _update_inputs(emulator, command)
     sides = {1: "positive limit switch active", -1: "negative limit switch active", 0: "limit switches free"}
     return f"node {command.node}: {sides[command.number]}"
 
 
-def _invert(rack: BusEmulator, command: BusCommand) -> str:
-    rack.slot(command.node).node.axis.inverted_encoder = command.what == "on"
-    _update_inputs(rack, command)
+def _invert(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.slot(command.node).node.axis.inverted_encoder = command.what == "on"
+    _update_inputs(emulator, command)
     return f"node {command.node}: encoder {'against' if command.what == 'on' else 'with'} the motion"
 
 
-def _update_inputs(rack: BusEmulator, command: BusCommand) -> None:
-    """Let the drive read its inputs at once."""
-    slot = rack.slot(command.node)
-    rack.plant.observe(rack.t_ns)
-    slot.node.advance(rack.t_ns)
-    rack.look(slot)
+def _update_inputs(emulator: BusEmulator, command: BusCommand) -> None:
+    """Let the drive read its inputs immediately."""
+    slot = emulator.slot(command.node)
+    emulator.plant.observe(emulator.t_ns)
+    slot.node.advance(emulator.t_ns)
+    emulator.look(slot)
 
 
-def _block(rack: BusEmulator, command: BusCommand) -> Answer:
-    axis = rack.slot(command.node).node.axis
+def _block(emulator: BusEmulator, command: BusCommand) -> Answer:
+    axis = emulator.slot(command.node).node.axis
     axis.blocked = True
 
     def undo() -> None:
@@ -289,40 +292,40 @@ def _block(rack: BusEmulator, command: BusCommand) -> Answer:
     return f"node {command.node}: blocked", undo
 
 
-def _free(rack: BusEmulator, command: BusCommand) -> str:
-    rack.slot(command.node).node.axis.blocked = False
+def _free(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.slot(command.node).node.axis.blocked = False
     return f"node {command.node}: free"
 
 
-def _nmt(rack: BusEmulator, command: BusCommand) -> str:
-    rack.wire.send(FOREIGN, CanFrame(0x000, bytes((command.number, command.node))))
+def _nmt(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.wire.send(FOREIGN, CanFrame(0x000, bytes((command.number, command.node))))
     return f"foreign NMT command {command.what} to {f'node {command.node}' if command.node else 'all nodes'}"
 
 
-def _flood(rack: BusEmulator, command: BusCommand) -> Answer:
-    rack.babble[command.node] = rack.t_ns, round(1e9 / command.rate_hz)
+def _flood(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.babble[command.node] = emulator.t_ns, round(1e9 / command.rate_hz)
 
     def undo() -> None:
-        rack.babble.pop(command.node, None)
+        emulator.babble.pop(command.node, None)
 
     return f"node {command.node}: babbles at {command.rate_hz:g} Hz", undo
 
 
-def _calm(rack: BusEmulator, command: BusCommand) -> str:
-    rack.babble.pop(command.node, None)
+def _calm(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.babble.pop(command.node, None)
     return f"node {command.node}: calm"
 
 
-def _status(rack: BusEmulator, command: BusCommand) -> str:
-    return "\n".join(rack.status())
+def _status(emulator: BusEmulator, command: BusCommand) -> str:
+    return "\n".join(emulator.status())
 
 
-def _help(rack: BusEmulator, command: BusCommand) -> str:
+def _help(emulator: BusEmulator, command: BusCommand) -> str:
     return "\n".join(LANGUAGE.help_lines())
 
 
 def frame_id(node_id: int, what: str) -> int:
-    """Id of a frame of a node: by its name in the predefined connection set, or itself as ``0x…``."""
+    """CAN id of a node's frame: by its name in the predefined connection set, or itself as ``0x…``."""
     return int(what, 16) if what.startswith("0x") else COB_IDS[what] + node_id
 
 

@@ -1,4 +1,4 @@
-"""Trials of one fault, summed up in a row of the table."""
+"""Summary of the trials of one fault as a row of the fault table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereoservo_sim.emulators.bus.fault_trials import RATE_HZ, Trial, run_trial
 
 
 class FaultRow(msgspec.Struct, frozen=True):
-    """One fault over several trials.
+    """Summary of one fault over several trials.
 
     Times [ms] after the fault. ``detected_cycles``: largest, in cycles of the master. ``codes``: what was latched
     first, how often. ``restarts``: trials in which something moved or was powered again by itself.
@@ -38,7 +38,7 @@ class FaultRow(msgspec.Struct, frozen=True):
 
 
 def trial_rng(case: FaultCase, protocol: str, seed: int, trial: int) -> np.random.Generator:
-    """What draws phase and directions of one trial: another one for every fault."""
+    """Random generator of one trial's phase and directions, different for every fault."""
     return np.random.default_rng([seed, trial, zlib.crc32(f"{protocol} {case.name}".encode())])
 
 
@@ -55,7 +55,9 @@ def run_row(case: FaultCase, protocol: str, trials: int, seed: int, *, run_on_s:
 
 
 def sum_up(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
-    """The row. Of a fault that only the drives see, what the master latches afterwards is not its detection."""
+    """Row of a fault's trials. For faults that only the drives detect, a later latch of the master is not a
+    detection.
+    """
     seen = [] if case.host in ("killed", "cycle_hangs") else [trial.detected_ms for trial in trials]
     detected_median, detected_max = _median_and_max(seen)
     rest_median, rest_max = _median_and_max([trial.rest_ms for trial in trials])
@@ -79,7 +81,7 @@ def sum_up(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
 
 
 def _median_and_max(values: Sequence[float | None]) -> tuple[float | None, float | None]:
-    """Of the values there are, to 0.01; None where there is none."""
+    """Median and maximum of the values that are not None, to 0.01; None where there are none."""
     there = [value for value in values if value is not None]
     if not there:
         return None, None

@@ -1,4 +1,4 @@
-"""Faults of the CAN arm in virtual time: the driver's master against the emulated rack, bit times included.
+"""Fault trials of the CAN arm in virtual time: the driver's master on the emulated bus, bit times included.
 
 Each trial drives six axes at a steady speed, makes one fault happen at a random phase of the cycle, and looks at the
 axes' true velocities: when the master knew, when all axes stood, what was latched, whether anything moved or
@@ -19,7 +19,7 @@ from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.canopen.driver import make_bringup, make_codec
 from stereoservo_drivers.canopen.master import Master, MasterFault, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_rack
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 from stereoservo_sim.emulators.bus.fault_cases import FaultCase
 from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
 
@@ -38,7 +38,7 @@ SETTLE_S = 0.1
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """One fault, once. Times after the fault [ms]; None: not detected, or never at rest.
+    """Result of one fault trial. Times after the fault [ms]; None: not detected, or never at rest.
 
     ``code``: what was latched first, or why bring-up refused. ``restarted``: something moved or was powered
     again by itself. ``problem``: what went otherwise than the table says, or that reset and enable did not bring
@@ -53,7 +53,7 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class TrialError(Exception):
-    """The trial could not even begin: bring-up or enabling failed without a fault having been ordered."""
+    """The trial could not begin: bring-up or enabling failed before a fault was injected."""
 
 
 def trial_options(protocol: str, **changes: object) -> CanOptions:
@@ -87,31 +87,31 @@ def trial_options(protocol: str, **changes: object) -> CanOptions:
 
 
 def trial_speed() -> float:
-    """[rad/s]"""
+    """Speed of the trials [rad/s]."""
     return SPEED_COUNTS_S / (COUNTS_PER_REV * GEAR_RATIO / (2.0 * math.pi))
 
 
 class FaultRig:
-    """Rack, master and its host, up to where the case's fault happens."""
+    """Emulated bus, master and its host, up to the injection of the case's fault."""
 
     def __init__(self, case: FaultCase, protocol: str) -> None:
         self.case = case
         options = trial_options(protocol, **case.options)
-        self.rack = make_rack(options, DrivesSettings(plant="ideal", bit_time=True), t_ns=0)
-        self.axes = [node.axis for node in self.rack.nodes]
+        self.emulator = make_bus_emulator(options, DrivesSettings(plant="ideal", bit_time=True), t_ns=0)
+        self.axes = [node.axis for node in self.emulator.nodes]
         codec = make_codec(options)
         self.bringup = make_bringup(options, codec, Path())
         self.master = Master(codec, MasterSettings.of(options))
-        self.host = VirtualHost(self.rack, self.master)
+        self.host = VirtualHost(self.emulator, self.master)
         self.host.wait(BOOT_S)
 
     def order(self, texts: tuple[str, ...]) -> None:
-        """Give orders to the rack now."""
+        """Send fault commands to the emulator now."""
         for text in texts:
-            self.rack.order(text, self.host.t_ns)
+            self.emulator.order(text, self.host.t_ns)
 
     def enable(self) -> None:
-        """Ask for it and let time pass until the master has decided."""
+        """Request enabling and run until the master has decided."""
         self.master.request_enable(self.host.t_ns)
         until = self.host.t_ns + round(ENABLE_S * 1e9)
         while self.host.t_ns < until and self.master.mode in (Mode.OFF, Mode.ENABLING):
@@ -119,7 +119,7 @@ class FaultRig:
             self.host.wait(1.0 / RATE_HZ)
 
     def start(self) -> None:
-        """Bring-up and enable. Raises TrialError."""
+        """Run bring-up and enable. Raises TrialError."""
         try:
             self.bringup.connect(self.host)
         except DriverError as error:
@@ -139,12 +139,12 @@ class FaultRig:
             raise TrialError(f"not at speed: {self.master.fault}, {[axis.velocity for axis in self.axes]}")
 
     def all_move(self, speed: FloatArray) -> bool:
-        """All axes at ``speed`` (n,), within 2 %."""
+        """Whether all axes move at ``speed`` (n,), within 2 %."""
         return all(abs(axis.velocity - v) < 0.02 * abs(v) for axis, v in zip(self.axes, speed, strict=True))
 
     def still(self) -> bool:
-        """All axes at rest."""
-        return self.rack.at_rest()
+        """Whether all axes are at rest."""
+        return self.emulator.at_rest()
 
 
 def run_trial(
@@ -192,7 +192,7 @@ def _run(rig: FaultRig, rng: np.random.Generator, run_on_s: float) -> Trial:
 
 
 def _strike(rig: FaultRig) -> None:
-    """What becomes of the host."""
+    """Inject the fault of the master's host."""
     if rig.case.host in ("killed", "cycle_hangs"):
         rig.host.cycling = False
     elif rig.case.host == "loop_hangs":
@@ -200,16 +200,16 @@ def _strike(rig: FaultRig) -> None:
 
 
 def _until_rest(rig: FaultRig, t0: int) -> int | None:
-    """Run on until the axes have stood for a while; when the last one came to rest, None: never."""
+    """Run until the axes have been at rest for a while; returns when the last one stopped, None: never."""
     rig.host.wait(max(SETTLE_S, 2e-3 * (rig.case.bound_ms or 0.0)))
     if not rig.still():
         return None
-    rests = [event.t_ns for event in rig.rack.events if event.kind == "all_rest" and event.t_ns >= t0]
+    rests = [event.t_ns for event in rig.emulator.events if event.kind == "all_rest" and event.t_ns >= t0]
     return rests[-1] if rests else None
 
 
 def _recover(rig: FaultRig) -> None:
-    """The cause goes away; a thread that hung goes on."""
+    """Remove the cause; a hung thread continues."""
     rig.order(rig.case.afterwards)
     if rig.case.host == "cycle_hangs":
         rig.host.cycling = True
@@ -217,7 +217,7 @@ def _recover(rig: FaultRig) -> None:
 
 
 def _restarts(rig: FaultRig, run_on_s: float) -> bool:
-    """Whether anything moves or gets power within ``run_on_s``, though commands go on and enabling is asked for."""
+    """Whether anything moves or is powered within ``run_on_s``, while commands continue and enabling is requested."""
     since = rig.host.t_ns
     positions = [axis.position for axis in rig.axes]
     rig.host.velocities = np.full(AXES, trial_speed())
@@ -225,7 +225,7 @@ def _restarts(rig: FaultRig, run_on_s: float) -> bool:
         rig.master.request_enable(since)
     rig.host.wait(run_on_s)
     moved = max(abs(axis.position - before) for axis, before in zip(rig.axes, positions, strict=True))
-    again = any(event.kind in ("moves", "power_on") for event in rig.rack.events if event.t_ns > since)
+    again = any(event.kind in ("moves", "power_on") for event in rig.emulator.events if event.t_ns > since)
     return again or moved > 1e-4 or not rig.still()
 
 
@@ -243,7 +243,9 @@ def _problem(case: FaultCase, fault: MasterFault | None, rest_ms: float | None, 
 
 
 def _reset(rig: FaultRig, speed: FloatArray) -> str:
-    """Reset, see that it enables nothing, enable, move. What went wrong; with a cause that stays: that nothing did."""
+    """Reset, check that it enables nothing, enable, move. Returns the failure; for persistent causes, that the
+    reset was wrongly accepted.
+    """
     if rig.case.host == "killed":
         return ""
     rig.host.end_cycle()
@@ -287,7 +289,7 @@ def _tolerated(rig: FaultRig, speed: FloatArray) -> Trial:
 
 
 def _start_trial(rig: FaultRig, run_on_s: float) -> Trial:
-    """Faults that are there before bring-up: refused, or latched and enabling refused."""
+    """Trial of a fault that is present before bring-up: it is refused, or latched and enabling refused."""
     rig.order(rig.case.orders)
     rig.host.wait(0.01)  # what was on the wire
     code = ""

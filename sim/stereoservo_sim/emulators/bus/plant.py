@@ -1,4 +1,4 @@
-"""What moves between drives and arm: ramps of the drives, brakes, contact, end stops, efforts, on a fixed time grid."""
+"""Simulation of drives and arm on a fixed time grid: ramps, brakes, contact, end stops, efforts."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ RECORD_STEPS = 4
 AWAKE_NS = 100_000_000
 """How long the plant is followed at rest after power or contact has changed, for its efforts."""
 RESTING = 1e-3
-"""Below this [rad/s or m/s] an axis is said to be at rest; rigid bodies tremble."""
+"""Below this [rad/s or m/s] an axis counts as at rest; simulated rigid bodies oscillate."""
 EFFORT_FILTER_S = 0.005
 
 
 class PlantSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the machine is like [rad, s; m for prismatic joints; efforts in shares of the rated torque].
+    """Parameters of the machine [rad, s; m for prismatic joints; efforts in shares of the rated torque].
 
-    ``brake_s``: from closing until the axis stands. ``coast_deceleration``: of an axis without power and brake.
+    ``brake_s``: from closing until the axis is at rest. ``coast_deceleration``: of an axis without power and brake.
     ``end_stop_margin``: how far behind the position limits the mechanical stops are. ``contact_stiffness``: effort
     for each unit that a blocked axis lags; ``effort_max``: where the drive's current saturates. Of a plant without
     torques of its own: ``inertia`` (effort for each unit/s²), ``friction``, ``gravity`` (times the cosine of the
@@ -50,7 +50,7 @@ class PlantSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 @dataclass
 class _Command:
-    """An axis's command, in force for one step of the grid."""
+    """Command of an axis during one step of the grid."""
 
     powered: bool
     brake_closed: bool
@@ -60,7 +60,7 @@ class _Command:
 
 
 class _Body:
-    """One joint: where its drive wants it and where it can go."""
+    """State of one joint: its drive's set-point and its mechanical limits."""
 
     def __init__(self, axis: EmulatedAxis, settings: PlantSettings) -> None:
         self.axis = axis
@@ -76,12 +76,12 @@ class _Body:
         axis.set_position = axis.position
 
     def read(self) -> _Command:
-        """The command now."""
+        """The current command."""
         axis = self.axis
         return _Command(axis.powered, axis.brake_closed, axis.target, axis.acceleration, axis.blocked)
 
     def latch(self) -> bool:
-        """Take the command for the next step; whether power, brake or contact changed."""
+        """Apply the command to the next step; returns whether power, brake or contact changed."""
         before = self.command
         now = self.command = self.read()
         if now.brake_closed and not before.brake_closed:
@@ -91,7 +91,7 @@ class _Body:
         )  # fmt: skip
 
     def resting(self) -> bool:
-        """Nothing moves and nothing wants to."""
+        """Whether neither the joint nor its set-point moves."""
         axis, command = self.axis, self.command
         driven = command.powered and not command.brake_closed
         if driven and (
@@ -101,7 +101,7 @@ class _Body:
         return self.velocity == 0.0
 
     def move(self, h: float) -> None:
-        """One step of ``h`` [s]: the drive's set-point, and what the joint is made to follow."""
+        """Advance by ``h`` [s]: the drive's set-point, and the joint that follows it."""
         before = self.velocity
         if self.command.powered and not self.command.brake_closed:
             self._drive(h)
@@ -148,7 +148,9 @@ class _Body:
         return self.settings.contact_stiffness * (self.set_position - self.position)
 
     def free_effort(self) -> float:
-        """Inertia, friction and gravity of a joint whose plant knows no torques, in shares of the rated torque."""
+        """Effort of inertia, friction and gravity of a joint whose plant has no torques, in shares of the rated
+        torque.
+        """
         s = self.settings
         moving = math.tanh(self.velocity / RESTING)
         return s.inertia * self.acceleration + s.friction * moving + s.gravity * math.cos(self.position)
@@ -157,9 +159,9 @@ class _Body:
 class AxisPlant:
     """Axes and plant, step by step. A command acts from the first grid point after it came: never too early.
 
-    A position asked for between grid points goes on at the velocity of the last one. While everything rests, steps are
+    A position between grid points is extrapolated with the velocity of the last one. While everything rests, steps are
     skipped. ``history`` takes the truth. ``rated`` (n,) [N m or N]: what the plant's efforts are shares of; None: the
-    plant has no mass, and inertia, friction and gravity of the settings stand for it.
+    plant has no mass, and inertia, friction and gravity of the settings are used instead.
     Without power and brake an axis coasts down by friction; that an arm then sinks under gravity is not modelled.
     """
 
@@ -189,14 +191,14 @@ class AxisPlant:
         self._record()
 
     def due_ns(self, now_ns: int) -> int:
-        """When ``advance`` is next needed, after ``now_ns``."""
+        """Time at which ``advance`` is next needed, after ``now_ns``."""
         if not self._resting:
             return self.t_ns + self.step_ns
         step = self.step_ns if self._wanted() else self._record_ns
         return (now_ns // step + 1) * step
 
     def advance(self, now_ns: int) -> None:
-        """Move on to the last grid point not after ``now_ns``."""
+        """Advance to the last grid point not after ``now_ns``."""
         while (steps := (now_ns - self.t_ns) // self.step_ns) > 0:
             if self._resting:
                 self.t_ns += steps * self.step_ns
@@ -209,7 +211,7 @@ class AxisPlant:
             self._record()
 
     def observe(self, now_ns: int) -> None:
-        """Bring the axes' positions to ``now_ns``, less than a step after the last grid point."""
+        """Update the axes' positions to ``now_ns``, less than a step after the last grid point."""
         if self._resting or now_ns == self._seen_ns:
             return
         self._seen_ns = now_ns
@@ -223,7 +225,7 @@ class AxisPlant:
                 axis.set_position = axis.position
 
     def at_rest(self, node: int | None = None) -> bool:
-        """Whether all axes (or the one of index ``node``) stand."""
+        """Whether all axes (or the one of index ``node``) are at rest."""
         axes = self.axes if node is None else self.axes[node : node + 1]
         return all(abs(axis.velocity) < RESTING for axis in axes)
 

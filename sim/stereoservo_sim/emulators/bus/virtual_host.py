@@ -1,4 +1,6 @@
-"""The master's computer in the rack's virtual time: bring-up, the cycle, and how it can fail. No thread, no clock."""
+"""The master's computer in the emulated bus's virtual time: bring-up, cycle, and its failures; without threads or
+clock.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,11 @@ class VirtualHost(Subscriptions):
     waits for it.
     """
 
-    def __init__(self, rack: BusEmulator, master: Master) -> None:
+    def __init__(self, emulator: BusEmulator, master: Master) -> None:
         super().__init__()
-        self.rack = rack
+        self.emulator = emulator
         self.master = master
-        self.t_ns = rack.t_ns
+        self.t_ns = emulator.t_ns
         self.velocities: FloatArray | None = None
         self.cycling = True
         self.plugged = True
@@ -30,17 +32,17 @@ class VirtualHost(Subscriptions):
         self._next_ns: int | None = None
         self._heartbeat_ns = self.t_ns
         self._waiting: list[tuple[int, CanFrame]] = []
-        rack.on_adapter = self._adapter
+        emulator.on_adapter = self._adapter
 
     # -- link -----------------------------------------------------------------------------------------------
 
     def send(self, frames: list[CanFrame]) -> None:
-        """Queue on the wire now."""
+        """Queue frames on the wire now."""
         for frame in frames:
-            self.rack.inject(frame, self.t_ns)
+            self.emulator.inject(frame, self.t_ns)
 
     def wait(self, seconds: float) -> None:
-        """Let the bus go on."""
+        """Let the bus run for some time."""
         self.run_until(self.t_ns + round(seconds * 1e9))
 
     def now_ns(self) -> int:
@@ -50,21 +52,21 @@ class VirtualHost(Subscriptions):
     # -- cycle ----------------------------------------------------------------------------------------------
 
     def begin_cycle(self) -> None:
-        """From now on tick the master instead of pumping."""
+        """Start ticking the master."""
         self.master.clear()
         self._next_ns = self.t_ns
 
     def resume_cycle(self) -> None:
-        """Tick again after a reset that failed: what is latched stays."""
+        """Tick again after a failed reset: latched faults stay."""
         self._next_ns = self.t_ns
 
     def end_cycle(self) -> None:
-        """Pump again, for a reset."""
+        """Stop ticking, for a reset; the bus is still served."""
         self._next_ns = None
         self._heartbeat_ns = self.t_ns
 
     def run_until(self, t_ns: int) -> None:
-        """Bus and host up to ``t_ns``, included."""
+        """Run bus and host up to ``t_ns``, included."""
         while (due := self._due_ns()) <= t_ns:
             self._advance(due)
             self._act()
@@ -74,9 +76,9 @@ class VirtualHost(Subscriptions):
         return self._heartbeat_ns if self._next_ns is None else self._next_ns
 
     def _advance(self, t_ns: int) -> None:
-        self.rack.run_until(t_ns)
+        self.emulator.run_until(t_ns)
         self.t_ns = t_ns
-        self._waiting += self.rack.delivered() if self.plugged else []
+        self._waiting += self.emulator.delivered() if self.plugged else []
         if not self.cycling:
             return
         arrived, self._waiting = self._waiting, []
@@ -85,7 +87,7 @@ class VirtualHost(Subscriptions):
             self.tell(frame)
 
     def _act(self) -> None:
-        """What is due at ``t_ns``: a heartbeat between the cycles, else a tick."""
+        """Execute what is due at ``t_ns``: a heartbeat between the cycles, else a tick."""
         if self._next_ns is None:
             self._heartbeat_ns = self.t_ns + self.master.settings.heartbeat_ms * 1_000_000
             self.send(self.master.codec.heartbeat())
@@ -98,9 +100,9 @@ class VirtualHost(Subscriptions):
         self.send(self.master.tick(self.t_ns))
 
     def _adapter(self, plugged: bool) -> None:
-        """As the bus thread takes an exception of its channel: latch, and end."""
+        """Handle an exception of the channel like the bus thread: latch, and end."""
         self.plugged = plugged
         if not plugged:
             self.master.latch(
-                MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.rack.t_ns)
+                MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.emulator.t_ns)
             )

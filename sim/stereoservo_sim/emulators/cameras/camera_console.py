@@ -1,4 +1,4 @@
-"""Emulated cameras of a cell from start to end, as ``stereoservo emulate cameras`` runs them."""
+"""Lifetime of a cell's emulated cameras, as run by ``stereoservo emulate cameras``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PRIORITY = 3
 """SCHED_FIFO where it is allowed: real cameras take no processor; below the servo process and emulated drives."""
 
 
-def make_studio(cell: CellFile, settings: CamerasSettings, runtime_dir: Path) -> CameraEmulator:
+def make_camera_emulator(cell: CellFile, settings: CamerasSettings, runtime_dir: Path) -> CameraEmulator:
     """The cameras of ``settings``, mounted as those of the cell are. Raises DriverError."""
     clock = MonotonicClock()
     cameras = [
@@ -46,11 +46,11 @@ def serve_cameras(
     settings = cameras_of_cell(cell)
     port = settings.port if channel is None else port_of(channel)
     cv2.setNumThreads(1)  # on small images they only wait for each other
-    studio = make_studio(cell, settings, cell_directories(cell.cell.name).runtime)
+    emulator = make_camera_emulator(cell, settings, cell_directories(cell.cell.name).runtime)
     for text in orders:
-        studio.order(text, studio.start_ns)
-    server = CameraServer(studio, cell=cell.cell.name, port=port, connections=settings.connections)
-    studio.open()
+        emulator.order(text, emulator.start_ns)
+    server = CameraServer(emulator, cell=cell.cell.name, port=port, connections=settings.connections)
+    emulator.open()
     printer = Printer(as_json)
     console = Console(server, printer)
     console.attach()
@@ -59,7 +59,7 @@ def serve_cameras(
     gc.freeze()  # what was imported is not looked through again
     printer.say(
         "ready", f"listening on {server.url}: {', '.join(server.streams.values())}", channel=server.url,
-        streams={name: server.url + path for name, path in server.streams.items()}, t_ns=studio.start_ns,
+        streams={name: server.url + path for name, path in server.streams.items()}, t_ns=emulator.start_ns,
         pid=os.getpid(),
     )  # fmt: skip
     try:

@@ -1,4 +1,4 @@
-"""All emulated cameras of a cell: which picture goes into which stream and when, and the orders that change it.
+"""All emulated cameras of a cell: their images and streams over time, and the fault commands that change them.
 
 Sans I/O: the same in virtual and in real time. ``take`` and ``order`` may be called by two threads.
 """
@@ -34,12 +34,12 @@ class CameraEvent(msgspec.Struct, frozen=True):
         return {"camera": self.camera}
 
     def where(self) -> str:
-        """The camera, in words."""
+        """The camera, as text."""
         return self.camera
 
 
 class CameraEmulator:
-    """``cameras`` by their streams. ``start_ns``: what the times of orders count from."""
+    """Emulator of ``cameras``, by their streams. ``start_ns``: zero of the fault commands' times."""
 
     def __init__(self, cameras: Sequence[EmulatedCamera], start_ns: int) -> None:
         self.cameras = tuple(cameras)
@@ -47,7 +47,7 @@ class CameraEmulator:
         self.stalled: set[str] = set()
         self.refused: set[str] = set()
         self.wanted: set[str] = {camera.stream for camera in cameras}
-        """Streams that somebody looks at; no picture is taken for others."""
+        """Streams with a client; no picture is taken for others."""
         self.on_hang_up: Callable[[str, bool], None] = lambda stream, within: None
         """Called to close a stream's connections, at once or within the next picture."""
         self._camera_lock = threading.Lock()
@@ -61,7 +61,7 @@ class CameraEmulator:
         self._count = 0
 
     def open(self) -> None:
-        """Load the renderers; shutters from now on. Raises DriverError."""
+        """Load the renderers and start the shutters. Raises DriverError."""
         for camera in self.cameras:
             camera.open()
 
@@ -73,7 +73,7 @@ class CameraEmulator:
     # -- pictures ---------------------------------------------------------------------------------------------------
 
     def take(self, now_ns: int) -> int:
-        """Take every picture that is due and wanted; when to call again [ns]."""
+        """Take every image that is due and requested; returns when to call again [ns]."""
         due_ns = NEVER_NS
         for camera in self.cameras:
             if self._streams[camera.name] not in self.wanted:
@@ -90,13 +90,13 @@ class CameraEmulator:
         return due_ns
 
     def sending_ns(self) -> int:
-        """When the next picture is to be sent, or the next order to be done."""
+        """Time at which the next image is to be sent, or the next fault command to be executed."""
         with self._heap_lock:
             picture_ns = self._waiting[0][0] if self._waiting else NEVER_NS
         return min(picture_ns, self.faults.due_ns())
 
     def sent(self, now_ns: int) -> list[tuple[str, StreamPicture]]:
-        """Pictures that are to be sent by now, oldest first, with their streams."""
+        """Images to be sent by now, oldest first, with their streams."""
         pictures = []
         with self._heap_lock:
             while self._waiting and self._waiting[0][0] <= now_ns:
@@ -107,14 +107,14 @@ class CameraEmulator:
     # -- orders -----------------------------------------------------------------------------------------------------
 
     def order(self, text: str, now_ns: int) -> str:
-        """Do the fault command ``text``, now or at its own time after the start; the answer.
+        """Execute the fault command ``text``, now or at its own time after the start; returns the reply.
 
         Raises FaultCommandError.
         """
         return self.faults.order(text, now_ns)
 
     def run_until(self, now_ns: int) -> None:
-        """Do the commands whose time has come, and take back those whose time has ended."""
+        """Execute the fault commands whose time has come, and undo those whose time has ended."""
         while self.faults.advance(now_ns):
             pass
 
@@ -137,7 +137,7 @@ class CameraEmulator:
         self._news.append(CameraEvent(t_ns, kind, camera, text))
 
     def status(self) -> list[str]:
-        """One line a camera."""
+        """Status, one line a camera."""
         return [
             f"{camera.name} at {self._streams[camera.name]}: {camera.rate_hz:g} Hz, "
             f"skew {camera.view.phase_s * 1e3:g} ms, {camera.condition.words()}{self._stream_words(camera.stream)}"
@@ -151,7 +151,7 @@ class CameraEmulator:
     # -- what orders do to streams ----------------------------------------------------------------------------------
 
     def named(self, name: str) -> tuple[EmulatedCamera, ...]:
-        """The camera of that name, or ``all``. Raises FaultCommandError, listing those there are."""
+        """The camera of that name, or ``all``. Raises FaultCommandError, which lists the cameras."""
         if name == ALL:
             return self.cameras
         found = tuple(camera for camera in self.cameras if camera.name == name)
@@ -162,15 +162,15 @@ class CameraEmulator:
         return found
 
     def swap(self, first: EmulatedCamera, second: EmulatedCamera) -> None:
-        """Exchange what the streams of two cameras show."""
+        """Exchange the images of two cameras' streams."""
         streams = self._streams
         streams[first.name], streams[second.name] = streams[second.name], streams[first.name]
 
     def unswap(self, camera: EmulatedCamera) -> None:
-        """Its own stream shows it again."""
+        """Undo the exchange of a camera's stream."""
         other = next(c for c in self.cameras if self._streams[c.name] == camera.stream)
         self.swap(camera, other)
 
     def hang_up(self, stream: str, *, within: bool = False) -> None:
-        """Close the connections of a stream, at once or ``within`` the next picture."""
+        """Close the connections of a stream, at once or ``within`` the next image."""
         self.on_hang_up(stream, within)

@@ -1,4 +1,4 @@
-"""One emulated camera: shutters, pictures, and when they are sent. The same in virtual and in real time."""
+"""One emulated camera: shutters, images, and their sending times; identical in virtual and in real time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from stereoservo_sim.world.workpiece import Moved
 
 @dataclass(frozen=True)
 class StreamPicture:
-    """A JPEG and its stamps: shutter and sending time [ns], ``seq`` of the camera's grid of shutters."""
+    """A JPEG and its stamps: shutter and sending time [ns], ``seq`` on the camera's grid of shutters."""
 
     seq: int
     t_shutter_ns: int
@@ -32,7 +32,7 @@ class StreamPicture:
 
 @dataclass
 class CameraCondition:
-    """What orders have made of a camera. ``look``: ``black``, ``white``, ``flip``, ``mirror``, or empty.
+    """Fault state of a camera. ``look``: ``black``, ``white``, ``flip``, ``mirror``, or empty.
 
     ``gone``: its pictures are lost. ``truncate``, ``corrupt``: so many of the next JPEGs are spoilt.
     """
@@ -49,7 +49,7 @@ class CameraCondition:
     corrupt: int = 0
 
     def words(self) -> str:
-        """For people."""
+        """The state as text."""
         marks = [name for name in ("frozen", "gone", "lamp") if getattr(self, name)]
         marks += [self.look] if self.look else []
         marks += [f"{self.size[0]}x{self.size[1]}"] if self.size else []
@@ -60,31 +60,31 @@ class CameraCondition:
 
 
 class EmulatedView(PybulletCameraDriver):
-    """The simulated camera whose grid of shutters and losses may change while it runs."""
+    """A simulated camera whose shutter grid and loss rate may change while it runs."""
 
     driver = "emulated"
 
     def change(self, **options: Any) -> None:
-        """Other ``phase_s`` or ``drop_rate`` from the next shutter on."""
+        """Change ``phase_s`` or ``drop_rate`` from the next shutter on."""
         self._options = msgspec.structs.replace(self._options, **options)
 
     @property
     def phase_s(self) -> float:
-        """When its shutters open, after those of a camera without skew."""
+        """Delay of its shutters after those of a camera without skew."""
         return self._options.phase_s
 
     @property
     def drop_rate(self) -> float:
-        """Chance that a picture is lost."""
+        """Probability that an image is lost."""
         return self._options.drop_rate
 
     def next_shutter_ns(self) -> int:
-        """When the next shutter opens that no picture was taken of."""
+        """Time of the next shutter without an image."""
         return self._shutter(self._next)
 
 
 class EmulatedCamera:
-    """Pictures of one view of the simulated cell, whose arm's history lies in ``runtime_dir``.
+    """Camera with images of one view of the simulated cell, whose arm's history is in ``runtime_dir``.
 
     ``services``: the arm's history in this process instead. Raises DriverError where the rig has no such view.
     """
@@ -131,7 +131,7 @@ class EmulatedCamera:
         )
 
     def open(self) -> None:
-        """Load the renderer; shutters from now on."""
+        """Load the renderer and start the shutters."""
         self.view.configure()
         self.view.activate()
 
@@ -140,11 +140,11 @@ class EmulatedCamera:
         self.view.close()
 
     def due_ns(self) -> int:
-        """When the next shutter opens."""
+        """Time of the next shutter."""
         return self.view.next_shutter_ns()
 
     def expose(self) -> StreamPicture | None:
-        """The picture of the newest shutter, once the arm's history reaches it; None before, and for a lost one."""
+        """Image of the newest shutter, once the arm's history reaches it; None before, and for a lost one."""
         frames = self.view.poll()
         if not frames or self.condition.gone:
             return None
@@ -174,7 +174,7 @@ class EmulatedCamera:
         return image if condition.size is None else effects.resized(image, condition.size)
 
     def _sending_ns(self, frame: Frame, rng: np.random.Generator) -> int:
-        """Pictures keep their order, whatever the jitter."""
+        """Sending time, which keeps the images in order whatever the jitter."""
         condition = self.condition
         jitter = round(condition.jitter_ns * float(rng.uniform(-1.0, 1.0)))
         self._sent_ns = max(self._sent_ns, frame.t_shutter_ns + max(condition.latency_ns + jitter, 0))
@@ -191,7 +191,7 @@ class EmulatedCamera:
         return data
 
     def bump(self, turn_deg: float, shift_m: float, axis: int) -> None:
-        """Turn about its own ``axis`` (0 x, 1 y, 2 z) and shift along its x, beside what it was moved by before."""
+        """Rotate about its own ``axis`` (0 x, 1 y, 2 z) and shift along its x, in addition to earlier bumps."""
         turns, shifts = list(self._moved.turn_deg), list(self._moved.shift_m)
         turns[axis] += turn_deg
         shifts[0] += shift_m
@@ -202,10 +202,10 @@ class EmulatedCamera:
         self.view.bump(moved)
 
     def put_back(self) -> None:
-        """Where it stood at first."""
+        """Restore the initial pose."""
         self._move(self._stream.moved)
 
     def clear(self) -> None:
-        """All as the cell file has it, but for where the camera stands."""
+        """Restore the cell file's settings, except the camera's pose."""
         self.condition = self._fresh(self._stream)
         self.view.change(phase_s=self._stream.skew_ms * 1e-3, drop_rate=self._stream.drop_rate)

@@ -1,4 +1,4 @@
-"""Fault commands of emulated cameras: the table of verbs, what their words mean and what each does."""
+"""Fault commands of emulated cameras: the verbs, their arguments, and their effects."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ LARGEST_SIZE = 4096
 
 
 class CameraCommand(FaultCommand, frozen=True):
-    """One command. ``camera``: its name, or ``all``. ``number``: a count, a share, a gain, an angle [deg], as the verb
-    has it; ``length_m``; ``size`` (width, height); ``what``: a second word."""
+    """One fault command. ``camera``: its name, or ``all``. ``number``: a count, a share, a gain, an angle [deg], by
+    the verb; ``length_m``; ``size`` (width, height); ``what``: a second word.
+    """
 
     camera: str = ""
     number: float = 0.0
@@ -46,7 +47,7 @@ class CameraCommand(FaultCommand, frozen=True):
 
 
 def _number_word(what: str, low: float, high: float, default: float | None = None) -> Word:
-    """A number, or a percentage, from ``low`` to ``high``."""
+    """Argument: a number, or a percentage, from ``low`` to ``high``."""
 
     def read(text: str) -> dict[str, Any]:
         try:
@@ -80,7 +81,7 @@ def _check_two(command: CameraCommand) -> None:
 
 
 def _bump_words(words: list[str]) -> dict[str, Any]:
-    """``CAM back``, or an angle and a length in any order and the axis of the rotation."""
+    """Arguments: ``CAM back``, or an angle and a length in any order and the axis of the rotation."""
     if not words:
         raise FaultCommandError(str(CAMERA.missing))
     fields = CAMERA.read(words[0])
@@ -121,12 +122,12 @@ CameraAction = Callable[["CameraEmulator", EmulatedCamera, CameraCommand], Answe
 
 
 def _each(act: CameraAction) -> Callable[[CameraEmulator, CameraCommand], Answer]:
-    """The action done to every camera that the command names, and taken back of each."""
+    """Action on every camera that the command names, with its undo."""
 
-    def act_on_all(studio: CameraEmulator, command: CameraCommand) -> Answer:
+    def act_on_all(emulator: CameraEmulator, command: CameraCommand) -> Answer:
         answers, undos = [], []
-        for camera in studio.named(command.camera):
-            done = act(studio, camera, command)
+        for camera in emulator.named(command.camera):
+            done = act(emulator, camera, command)
             answer = done if isinstance(done, str) else done[0]
             answers.append(f"{camera.name}: {answer}")
             if not isinstance(done, str):
@@ -142,7 +143,7 @@ def _each(act: CameraAction) -> Callable[[CameraEmulator, CameraCommand], Answer
 
 
 def _set(camera: EmulatedCamera, answer: str, **marks: object) -> tuple[str, Undo]:
-    """Set fields of the camera's condition; the undo restores them."""
+    """Action that sets fields of the camera's condition; the undo restores them."""
     before = {name: getattr(camera.condition, name) for name in marks}
 
     def undo() -> None:
@@ -155,92 +156,92 @@ def _set(camera: EmulatedCamera, answer: str, **marks: object) -> tuple[str, Und
 
 
 def _setter(answer: str, **marks: object) -> Callable[[CameraEmulator, CameraCommand], Answer]:
-    """An action that sets fixed fields of the condition."""
-    return _each(lambda studio, camera, command: _set(camera, answer, **marks))
+    """Factory of actions that set fixed fields of the condition."""
+    return _each(lambda emulator, camera, command: _set(camera, answer, **marks))
 
 
 @_each
-def _stall(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    studio.stalled.add(camera.stream)
-    return "stalls", lambda: studio.stalled.discard(camera.stream)
+def _stall(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.stalled.add(camera.stream)
+    return "stalls", lambda: emulator.stalled.discard(camera.stream)
 
 
 @_each
-def _disconnect(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    studio.hang_up(camera.stream)
+def _disconnect(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.hang_up(camera.stream)
     return "connections closed"
 
 
 @_each
-def _cut(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    studio.hang_up(camera.stream, within=True)
+def _cut(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.hang_up(camera.stream, within=True)
     return "connections end in the middle of the next picture"
 
 
 @_each
-def _refuse(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    studio.refused.add(camera.stream)
-    studio.hang_up(camera.stream)
-    return "connections refused", lambda: studio.refused.discard(camera.stream)
+def _refuse(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.refused.add(camera.stream)
+    emulator.hang_up(camera.stream)
+    return "connections refused", lambda: emulator.refused.discard(camera.stream)
 
 
 @_each
-def _latency(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _latency(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"latency {command.time_ns * 1e-6:g} ms", latency_ns=command.time_ns)
 
 
 @_each
-def _jitter(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _jitter(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"jitter {command.time_ns * 1e-6:g} ms", jitter_ns=command.time_ns)
 
 
 @_each
-def _skew(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _skew(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     before = camera.view.phase_s
     camera.view.change(phase_s=command.time_ns * 1e-9)
     return f"skew {command.time_ns * 1e-6:g} ms", lambda: camera.view.change(phase_s=before)
 
 
 @_each
-def _loss(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _loss(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     before = camera.view.drop_rate
     camera.view.change(drop_rate=command.number)
     return f"loses {command.number:.0%} of its pictures", lambda: camera.view.change(drop_rate=before)
 
 
 @_each
-def _exposure(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _exposure(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"exposure {command.number:g}", gain=command.number)
 
 
 @_each
-def _lamp(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _lamp(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"lamp {command.what}", lamp=command.what == "on")
 
 
 @_each
-def _resize(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _resize(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"{command.size[0]}x{command.size[1]}", size=command.size)
 
 
-def _swap(studio: CameraEmulator, command: CameraCommand) -> Answer:
-    first, second = studio.named(command.camera)[0], studio.named(command.what)[0]
-    studio.swap(first, second)
-    return f"{first.name} and {second.name}: swapped", lambda: studio.swap(first, second)
+def _swap(emulator: CameraEmulator, command: CameraCommand) -> Answer:
+    first, second = emulator.named(command.camera)[0], emulator.named(command.what)[0]
+    emulator.swap(first, second)
+    return f"{first.name} and {second.name}: swapped", lambda: emulator.swap(first, second)
 
 
 @_each
-def _truncate(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _truncate(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"{command.number:g} JPEGs end in the middle", truncate=int(command.number))
 
 
 @_each
-def _corrupt(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _corrupt(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     return _set(camera, f"{command.number:g} JPEGs spoilt", corrupt=int(command.number))
 
 
 @_each
-def _bump(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _bump(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     if command.what == "back":
         camera.put_back()
         return "where it stood at first"
@@ -252,19 +253,19 @@ def _bump(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand
 
 
 @_each
-def _clear(studio: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+def _clear(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     camera.clear()
-    for marks in (studio.stalled, studio.refused):
+    for marks in (emulator.stalled, emulator.refused):
         marks.discard(camera.stream)
-    studio.unswap(camera)
+    emulator.unswap(camera)
     return "as the cell file has it"
 
 
-def _status(studio: CameraEmulator, command: CameraCommand) -> str:
-    return "\n".join(studio.status())
+def _status(emulator: CameraEmulator, command: CameraCommand) -> str:
+    return "\n".join(emulator.status())
 
 
-def _help(studio: CameraEmulator, command: CameraCommand) -> str:
+def _help(emulator: CameraEmulator, command: CameraCommand) -> str:
     return "\n".join(LANGUAGE.help_lines())
 
 

@@ -1,4 +1,4 @@
-"""What the server of emulated cameras says in HTTP."""
+"""HTTP requests and responses of the server of emulated cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REQUEST_LIMIT = 8192
 
 
 class BadRequestError(Exception):
-    """A request that is none, or asks for what there is not."""
+    """An invalid request, or one of an unknown resource."""
 
     def __init__(self, status: str, message: str) -> None:
         super().__init__(message)
@@ -22,7 +22,7 @@ class BadRequestError(Exception):
 
 @dataclass(frozen=True)
 class HttpRequest:
-    """What a client asks for; ``head``: without the content."""
+    """A parsed request; ``head``: without the content."""
 
     path: str
     head: bool = False
@@ -46,7 +46,7 @@ def parse_request(data: bytes) -> HttpRequest | None:
 
 
 def answer(status: str, kind: str, body: bytes, *, head: bool = False) -> bytes:
-    """A whole answer."""
+    """A complete response."""
     lines = (
         f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n"
         "Cache-Control: no-store\r\nConnection: close\r\n\r\n"
@@ -55,18 +55,18 @@ def answer(status: str, kind: str, body: bytes, *, head: bool = False) -> bytes:
 
 
 def failure(error: BadRequestError, streams: Sequence[str]) -> bytes:
-    """What is wrong with a request, and the streams that there are."""
+    """Error response, which lists the streams."""
     text = f"{error}\nstreams: {', '.join(streams)}\n"
     return answer(error.status, "text/plain; charset=utf-8", text.encode())
 
 
 def still(picture: StreamPicture) -> bytes:
-    """One picture, ``/NAME.jpg``."""
+    """Response with one image, ``/NAME.jpg``."""
     return answer("200 OK", "image/jpeg", picture.data)
 
 
 def stream_head() -> bytes:
-    """The head of a stream, and its first boundary."""
+    """Head of a stream's response, and its first boundary."""
     return (
         "HTTP/1.1 200 OK\r\n"
         f"Content-Type: multipart/x-mixed-replace; boundary={BOUNDARY}\r\n"
@@ -76,7 +76,7 @@ def stream_head() -> bytes:
 
 
 def part(picture: StreamPicture) -> bytes:
-    """One picture of a stream. It ends with the next boundary, so that nobody waits for it."""
+    """One image of a stream, which ends with the next boundary, so that nobody waits for it."""
     head = (
         f"Content-Type: image/jpeg\r\nContent-Length: {len(picture.data)}\r\nX-Sequence: {picture.seq}\r\n"
         f"X-Timestamp: {picture.t_shutter_ns // 10**9}.{picture.t_shutter_ns % 10**9:09d}\r\n\r\n"
@@ -85,7 +85,7 @@ def part(picture: StreamPicture) -> bytes:
 
 
 def index(cell: str, streams: Sequence[str]) -> bytes:
-    """The page for people."""
+    """HTML index page of the streams."""
     title = f"Emulated cameras of {html.escape(cell)}"
     figures = "".join(
         f'<figure><img src="{html.escape(s)}" alt="{html.escape(s)}"><figcaption><a href="{html.escape(s)}">'
@@ -101,5 +101,5 @@ def index(cell: str, streams: Sequence[str]) -> bytes:
 
 
 def still_path(stream: str) -> str:
-    """Where one picture of a stream is."""
+    """Path of the single image of a stream."""
     return f"{stream.removesuffix('.mjpg')}.jpg"

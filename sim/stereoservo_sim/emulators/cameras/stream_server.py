@@ -1,4 +1,6 @@
-"""The streams of a studio over HTTP on loopback, in real time: one loop for all clients, one thread that renders."""
+"""HTTP server of the emulated cameras' streams on loopback, in real time: one loop for all clients, one rendering
+thread.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ BACKLOG = 16
 
 
 class _Client:
-    """A connection. ``stream``: once it has asked for one; ``once``: for one picture of it."""
+    """A client's connection. ``stream``: once it has requested one; ``once``: for one image of it."""
 
     def __init__(self, link: socket.socket, now_ns: int) -> None:
         self.link = link
@@ -41,15 +43,15 @@ class _Client:
 
 
 class CameraServer:
-    """Serves ``studio`` at ``http://127.0.0.1:port`` (0: a free one), in the thread that calls ``run``.
+    """Serves ``emulator`` at ``http://127.0.0.1:port`` (0: a free one), in the thread that calls ``run``.
 
     ``on_event`` gets every event, in that thread. Raises EmulationError where the port is taken.
     """
 
     def __init__(
-        self, studio: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32
+        self, emulator: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32
     ) -> None:
-        self.studio = studio
+        self.emulator = emulator
         self.on_event: Callable[[CameraEvent], None] | None = None
         self.pictures = 0
         self.withheld = 0
@@ -77,23 +79,23 @@ class CameraServer:
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
-        studio.on_hang_up = self._hang_up
-        studio.wanted.clear()
+        emulator.on_hang_up = self._hang_up
+        emulator.wanted.clear()
 
     @property
     def url(self) -> str:
-        """Where the streams are."""
+        """URL of the streams."""
         return f"http://127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
     def start_ns(self) -> int:
-        """What the times of orders count from."""
-        return self.studio.start_ns
+        """Zero of the fault commands' times."""
+        return self.emulator.start_ns
 
     @property
     def streams(self) -> dict[str, str]:
-        """Paths by the cameras' names."""
-        return {camera.name: camera.stream for camera in self.studio.cameras}
+        """Paths of the streams by camera name."""
+        return {camera.name: camera.stream for camera in self.emulator.cameras}
 
     def watch(self, descriptor: int, act: Callable[[], None]) -> None:
         """Call ``act`` in the serving loop whenever ``descriptor`` is readable."""
@@ -103,25 +105,25 @@ class CameraServer:
             self._watched[descriptor] = act
 
     def unwatch(self, descriptor: int) -> None:
-        """End it."""
+        """Stop watching a descriptor."""
         if self._watched.pop(descriptor, None) is None:
             self._selector.unregister(descriptor)
 
     def obey(self, text: str) -> str:
-        """An order, from the serving thread itself. Raises FaultCommandError."""
-        answer = self.studio.order(text, time.monotonic_ns())
+        """Execute a fault command, from the serving thread itself. Raises FaultCommandError."""
+        answer = self.emulator.order(text, time.monotonic_ns())
         self._look.set()
         return f"{answer}\n{self.words()}" if text.split()[:1] == ["status"] else answer
 
     def words(self) -> str:
-        """For people."""
+        """The statistics as text."""
         return (
             f"{len(self._clients)} connections; {self.pictures} pictures sent, {self.withheld} withheld since this "
             f"computer was busy (at most {self.late_ns * 1e-6:.1f} ms after their time)"
         )
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until ``ended``; then close all. What fails in rendering is raised here."""
+        """Serve until ``ended``; then close all. Rendering errors are raised here."""
         darkroom = threading.Thread(target=self._render, name="darkroom", daemon=True)
         darkroom.start()
         try:
@@ -137,7 +139,7 @@ class CameraServer:
             self._listener.close()
             os.close(self._wake_read)
             os.close(self._wake_write)
-            self.studio.close()
+            self.emulator.close()
         if self._failure is not None:
             raise self._failure
 
@@ -146,9 +148,9 @@ class CameraServer:
     def _render(self) -> None:
         try:
             while not self._ended.is_set():
-                before_ns = self.studio.sending_ns()
-                due_ns = self.studio.take(time.monotonic_ns())
-                if self.studio.sending_ns() != before_ns:
+                before_ns = self.emulator.sending_ns()
+                due_ns = self.emulator.take(time.monotonic_ns())
+                if self.emulator.sending_ns() != before_ns:
                     self._wake()
                 wait_s = LONGEST_WAIT_S if due_ns == NEVER_NS else (due_ns - time.monotonic_ns()) * 1e-9
                 if wait_s > 0 and self._look.wait(min(wait_s, LONGEST_WAIT_S)):
@@ -168,7 +170,7 @@ class CameraServer:
     # -- the loop -----------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        until_ns = self.studio.sending_ns()
+        until_ns = self.emulator.sending_ns()
         wait_s = min(max((until_ns - time.monotonic_ns()) * 1e-9, 0.0), LONGEST_WAIT_S)
         for key, events in self._selector.select(0.0 if self._watched else wait_s):
             if isinstance(key.data, _Client):
@@ -178,8 +180,8 @@ class CameraServer:
         for act in list(self._watched.values()):
             act()
         now_ns = time.monotonic_ns()
-        self.studio.run_until(now_ns)
-        for stream, picture in self.studio.sent(now_ns):
+        self.emulator.run_until(now_ns)
+        for stream, picture in self.emulator.sent(now_ns):
             late_ns = now_ns - picture.t_send_ns
             self.late_ns = max(self.late_ns, late_ns)
             if late_ns > LATEST_NS:
@@ -195,7 +197,7 @@ class CameraServer:
         self._pass_events()
 
     def _pass_events(self) -> None:
-        for event in self.studio.take_news():
+        for event in self.emulator.take_news():
             if self.on_event is not None:
                 self.on_event(event)
 
@@ -220,7 +222,7 @@ class CameraServer:
             self._feed(client)
 
     def _hear(self, client: _Client) -> bool:
-        """What a client says; False where it has gone."""
+        """Read from a client; False where it has gone."""
         try:
             data = client.link.recv(4096)
         except BlockingIOError:
@@ -241,12 +243,12 @@ class CameraServer:
         return True
 
     def _answer(self, client: _Client, request: http_pages.HttpRequest) -> None:
-        """Raises BadRequestError."""
+        """Respond to a request. Raises BadRequestError."""
         streams = list(self.streams.values())
         stream = next((s for s in streams if request.path in (s, http_pages.still_path(s))), None)
         if stream is None and request.path != "/":
             raise http_pages.BadRequestError("404 Not Found", f"no {request.path[:80]} here")
-        if stream in self.studio.refused:
+        if stream in self.emulator.refused:
             raise http_pages.BadRequestError("503 Service Unavailable", f"{request.path} is refused by order")
         if stream is None or request.head:
             page = http_pages.index(self._cell, streams)
@@ -266,15 +268,15 @@ class CameraServer:
         self._say(client, http_pages.failure(error, list(self.streams.values())))
 
     def _say(self, client: _Client, data: bytes) -> None:
-        """Send, then close."""
+        """Send a response, then close."""
         client.waiting, client.last = memoryview(data), True
         self._feed(client)
 
     def _feed(self, client: _Client) -> None:
-        """Send what waits; once nothing does, begin with the newest picture."""
+        """Send queued data; once there are none, start with the newest image."""
         if not client.waiting and client.stream and not client.last:
             self._next(client)
-        stalled = client.stream in self.studio.stalled
+        stalled = client.stream in self.emulator.stalled
         allowed = len(client.waiting) - (client.hold if stalled else 0)
         if allowed > 0:
             try:
@@ -323,12 +325,12 @@ class CameraServer:
             self._wanted()
 
     def _say_event(self, kind: str, stream: str) -> None:
-        name = next(camera.name for camera in self.studio.cameras if camera.stream == stream)
-        self.studio.tell(time.monotonic_ns(), kind, name)
+        name = next(camera.name for camera in self.emulator.cameras if camera.stream == stream)
+        self.emulator.tell(time.monotonic_ns(), kind, name)
 
     def _wanted(self) -> None:
-        self.studio.wanted = {client.stream for client in self._clients if client.stream}
+        self.emulator.wanted = {client.stream for client in self._clients if client.stream}
         for stream in list(self._newest):
-            if stream not in self.studio.wanted:
+            if stream not in self.emulator.wanted:
                 del self._newest[stream]
         self._look.set()

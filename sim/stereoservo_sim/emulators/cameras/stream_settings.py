@@ -1,4 +1,4 @@
-"""``[emulate.cameras]`` of a cell file."""
+"""Settings of the emulated cameras: section ``[emulate.cameras]`` of a cell file."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class CamerasSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[emulate.cameras]``.
+    """Section ``[emulate.cameras]``.
 
     ``port`` on this host; 0: a free one, told when ready. ``background``: ``pybullet`` is its rendered arm, refreshed
     now and then; ``arm`` draws room and arm for every picture; ``plain`` is an even grey. ``noise``: sigma of the
@@ -96,7 +96,7 @@ def cameras_of_cell(cell: CellFile) -> CamerasSettings:
 
 
 def port_of(channel: str) -> int:
-    """The port of ``http://127.0.0.1:PORT``. Raises EmulationError."""
+    """Port of ``http://127.0.0.1:PORT``. Raises EmulationError."""
     port = channel.removeprefix(CHANNEL).rstrip("/")
     if not channel.startswith(CHANNEL) or not port.isdecimal() or int(port) > 65_535:
         raise EmulationError(

@@ -1,4 +1,4 @@
-"""An emulated CiA 402 servo drive on CAN: CANopen device (CiA 301) around the power machine, sans I/O."""
+"""Emulated CiA 402 servo drive on CAN: the CANopen device (CiA 301) with its power state machine, without I/O."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMMUNICATION, HEARTBEAT_LOST, SYNC_LOST, PASSIVE = 0x8100, 0x8130, 0x8700, 0x81
 
 
 class Nmt(IntEnum):
-    """NMT states (CiA 301, 7.3.2), as heartbeats tell them; below 0: nothing is sent."""
+    """NMT states (CiA 301, 7.3.2), as in heartbeats; below 0: silent."""
 
     OFF = -2
     RESETTING = -1
@@ -33,7 +33,8 @@ class Nmt(IntEnum):
 
 
 class Cia402Node:
-    """See ``node.EmulatedNode``. ``sticky``: error codes whose cause stays, so that a fault reset is refused.
+    """Emulated CiA 402 node, see ``node.EmulatedNode``. ``sticky``: error codes of persistent causes, whose reset
+    is refused.
 
     ``frame.id`` is all that it knows of other nodes; two of it with one number behave as two such drives do.
     """
@@ -75,7 +76,7 @@ class Cia402Node:
     # -- power and NMT -------------------------------------------------------------------------------------------
 
     def power_up(self, t_ns: int) -> None:
-        """Power on, or a reboot: everything but stored parameters is lost, the axis's power too."""
+        """Power on, or reboot: everything but stored parameters is lost, the axis's power too."""
         self._t_ns = t_ns = max(t_ns, self._t_ns)
         self.nmt = Nmt.BOOTING
         self._boot_ns = t_ns + round(self.settings.boot_ms * 1e6)
@@ -129,7 +130,7 @@ class Cia402Node:
             self._sync.reset()
 
     def _reset_node(self) -> None:
-        """The reaction of 0x6007 first: the drive comes to rest, silent; then it starts anew."""
+        """NMT reset node: the reaction of 0x6007 first (the drive comes to rest, silent), then a reboot."""
         moving = self.machine.powered and abs(self.axis.set_velocity) > REST_VELOCITY
         self._connection_aborted(COMMUNICATION)
         if moving and self.machine.powered and self.machine.ramp is not None:
@@ -149,7 +150,7 @@ class Cia402Node:
     # -- errors --------------------------------------------------------------------------------------------------
 
     def trip(self, code: int, t_ns: int, *, sticky: bool = False) -> None:
-        """See ``EmulatedNode``. ``sticky``: the cause stays until it is taken out of ``self.sticky``."""
+        """Trip, see ``EmulatedNode``. ``sticky``: the cause stays until it is removed from ``self.sticky``."""
         if self.nmt < Nmt.BOOTING:
             return
         self._t_ns = max(t_ns, self._t_ns)
@@ -168,7 +169,7 @@ class Cia402Node:
         self.machine.fault()
 
     def _clear_faults(self) -> bool:
-        """A fault reset: whether every cause is gone; then the errors are, too."""
+        """Reset faults; returns whether every cause is gone, and the errors with them."""
         if self._reset_refused or self.sticky.intersection(self.faults):
             return False
         self.emergencies.gone(self.faults)
@@ -193,7 +194,9 @@ class Cia402Node:
             self._recovered(code)
 
     def _connection_aborted(self, code: int) -> None:
-        """0x6007. An NMT command makes a fault only of a drive that is powered; a lost heartbeat of every one."""
+        """Reaction 0x6007 to a lost connection. An NMT command is a fault only of a powered drive; a lost heartbeat
+        of every one.
+        """
         powered = self.machine.powered
         if self.machine.connection_aborted() and (powered or code == HEARTBEAT_LOST):
             self._fault(code)
@@ -221,7 +224,7 @@ class Cia402Node:
         )
 
     def receive(self, frame: CanFrame, t_ns: int) -> None:
-        """See ``EmulatedNode``. The axis is to stand where it is at ``t_ns``: SYNC samples it."""
+        """See ``EmulatedNode``. The axis must be up to date at ``t_ns``: SYNC samples it."""
         if self.nmt <= Nmt.BOOTING or frame.extended:
             return
         can_id = frame.id
@@ -304,7 +307,7 @@ class Cia402Node:
         self._settle()
 
     def _settle(self) -> None:
-        """Bring motion, event-driven TPDOs and emergencies to the present."""
+        """Update motion, event-driven TPDOs and emergencies to the present."""
         t_ns = self._t_ns
         if self.motion.step(t_ns) and self.machine.state not in (
             Cia402State.FAULT_REACTION,
@@ -345,7 +348,7 @@ class Cia402Node:
         return out
 
     def state(self) -> str:
-        """NMT state, power state, errors."""
+        """NMT state, power state and errors as text."""
         if self._words is None:
             self._words = self._in_words()
         return self._words

@@ -1,4 +1,4 @@
-"""The object dictionary of an emulated node: read from an EDS, with access rights, limits and SDO abort codes."""
+"""Object dictionary of an emulated node, from an EDS, with access rights, limits and SDO abort codes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Abort(IntEnum):
 
 
 class SdoError(Exception):
-    """The node refuses an access; ``code``: what the client is told."""
+    """The node refuses an access; ``code``: the abort code."""
 
     def __init__(self, code: Abort) -> None:
         super().__init__(f"SDO abort 0x{code:08X} ({code.name.lower().replace('_', ' ')})")
@@ -83,22 +83,22 @@ class Entry:
 
     @property
     def readable(self) -> bool:
-        """By SDO."""
+        """Whether SDO may read it."""
         return self.access != "wo"
 
     @property
     def writable(self) -> bool:
-        """By SDO."""
+        """Whether SDO may write it."""
         return self.access in ("rw", "wo", "rwr", "rww")
 
     @property
     def receivable(self) -> bool:
-        """May be mapped into an RPDO."""
+        """Whether it may be mapped into an RPDO."""
         return self.mappable and self.access in ("rw", "rww", "wo")
 
     @property
     def transmittable(self) -> bool:
-        """May be mapped into a TPDO."""
+        """Whether it may be mapped into a TPDO."""
         return self.mappable and self.access in ("ro", "rw", "rwr")
 
     def encode(self, value: Value) -> bytes:
@@ -159,20 +159,20 @@ class Dictionary:
         self._readings: dict[int, Callable[[int], None]] = {}
 
     def guard(self, index: int, check: Guard) -> None:
-        """Ask ``check`` before the bus changes the object."""
+        """Call ``check`` before the bus changes the object."""
         self._guards[index] = check
 
     def changed(self, index: int, tell: Changed) -> None:
-        """Tell of what the bus has changed."""
+        """Call back after the bus has changed the object."""
         self._changed[index] = tell
 
     def live(self, index: int, sub: int, value: Callable[[], int]) -> None:
-        """The object's value is computed when it is read. Nothing where the EDS lacks it."""
+        """Compute the object's value when it is read. No effect where the EDS lacks it."""
         if (index, sub) in self.entries:
             self._live[index, sub] = value
 
     def reading(self, index: int, check: Callable[[int], None]) -> None:
-        """Ask ``check(sub)`` before the bus reads the object; it raises SdoError."""
+        """Call ``check(sub)`` before the bus reads the object; it may raise SdoError."""
         self._readings[index] = check
 
     def get(self, index: int, sub: int = 0, default: int = 0) -> int:
@@ -183,19 +183,19 @@ class Dictionary:
         return int(self._values.get((index, sub), default))
 
     def set(self, index: int, sub: int, value: Value) -> None:
-        """By the firmware: no checks, nobody told. Nothing where the EDS lacks it."""
+        """Set a value from the firmware: without checks and callbacks. No effect where the EDS lacks it."""
         if (index, sub) in self.entries:
             self._values[index, sub] = value
 
     def find(self, index: int, sub: int) -> Entry:
-        """The description. Raises SdoError where there is none."""
+        """Description of an object. Raises SdoError where there is none."""
         entry = self.entries.get((index, sub))
         if entry is None:
             raise SdoError(Abort.NO_SUB_INDEX if index in self._indices else Abort.NO_OBJECT)
         return entry
 
     def encoded(self, index: int, sub: int) -> bytes:
-        """The value as on the wire, without a look at rights (PDO)."""
+        """Value as on the wire, without a check of access rights (PDO)."""
         entry = self.entries[index, sub]
         live = self._live.get((index, sub))
         return entry.encode(self._values[index, sub] if live is None else live())
@@ -209,19 +209,19 @@ class Dictionary:
         return self.encoded(index, sub)
 
     def writable(self, index: int, sub: int) -> Entry:
-        """The description of what SDO may write. Raises SdoError."""
+        """Description of an object that SDO may write. Raises SdoError."""
         entry = self.find(index, sub)
         if not entry.writable:
             raise SdoError(Abort.READ_ONLY)
         return entry
 
     def download(self, index: int, sub: int, data: bytes) -> None:
-        """Written by SDO. Raises SdoError."""
+        """Write by SDO. Raises SdoError."""
         self.writable(index, sub)
         self.store(index, sub, data)
 
     def store(self, index: int, sub: int, data: bytes) -> None:
-        """Take bytes from the bus: length, limits, guard. Raises SdoError and changes nothing."""
+        """Store bytes from the bus after checks of length, limits and guard. Raises SdoError without a change."""
         entry = self.entries[index, sub]
         value = entry.decode(data)
         if not isinstance(value, bytes):
@@ -237,13 +237,13 @@ class Dictionary:
             self._changed[index](sub, number)
 
     def restore(self, first: int, last: int, stored: dict[tuple[int, int], Value] | None = None) -> None:
-        """Objects ``first`` to ``last`` as after power on: of ``stored``, else the EDS's defaults."""
+        """Restore objects ``first`` to ``last`` to their values at power on: ``stored``, else the EDS's defaults."""
         stored = stored or {}
         for key, entry in self.entries.items():
             if first <= key[0] <= last:
                 self._values[key] = stored.get(key, entry.default)
 
     def storable(self) -> dict[tuple[int, int], Value]:
-        """What 0x1010 saves: everything that the bus can write, but commands, modes and histories."""
+        """Objects that 0x1010 saves: all that the bus can write, except commands, modes and histories."""
         skipped = {0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60FF}
         return {k: self._values[k] for k, e in self.entries.items() if e.writable and k[0] not in skipped}

@@ -1,4 +1,4 @@
-"""What an emulated CiA 402 drive does with its power stage, brake and ramps, and what it measures.
+"""Motion of an emulated CiA 402 drive: power stage, brake and ramps, and its measured values.
 
 Units: positions in counts, velocities in the drive's velocity units, accelerations in velocity units per second.
 """
@@ -18,7 +18,7 @@ FOLLOWING_ERROR = 0x8611
 REACHED_SHARE = 0.01
 """Velocity window of "target reached" as a share of the largest velocity; the EDS has no 0x606D."""
 STANDING_UNITS = 1
-"""Up to this velocity [velocity units] bit 12 of profile velocity says that the speed is zero (0x606F)."""
+"""Up to this velocity [velocity units] bit 12 of profile velocity reports zero speed (0x606F)."""
 PARAMETERS = (HALT_OPTION, 0x6065, 0x6066, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085)
 LIMIT_FACTOR = 2.0
 """Braking at the current limit, as a multiple of the quick stop deceleration."""
@@ -35,7 +35,7 @@ def clamp16(value: int) -> int:
 
 
 class Brake:
-    """A holding brake that takes its time."""
+    """A holding brake with a delay."""
 
     def __init__(self, travel_ns: int) -> None:
         self._travel_ns = travel_ns
@@ -44,7 +44,7 @@ class Brake:
         self._due_ns = NEVER_NS
 
     def move(self, closed: bool, t_ns: int) -> None:
-        """Order it; the same order again changes nothing."""
+        """Open or close it; repeated requests have no effect."""
         if closed is not self._wanted:
             self._wanted = closed
             self._due_ns = t_ns + self._travel_ns
@@ -53,12 +53,12 @@ class Brake:
             self._due_ns = NEVER_NS
 
     def due_ns(self) -> int:
-        """When it arrives."""
+        """Time at which the motion ends."""
         return self._due_ns
 
 
 class DriveMotion:
-    """Drives one axis as the power machine and the objects say; computes the objects that tell of it."""
+    """Moves one axis by the power state machine and the objects; computes the measured objects."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class DriveMotion:
         self.load_parameters()
 
     def load_parameters(self) -> None:
-        """Take limits and ramps over from the dictionary."""
+        """Read limits and ramps from the dictionary."""
         get = self._dictionary.get
         speeding_up, slowing_down, quick = (self._acceleration(index) for index in (0x6083, 0x6084, 0x6085))
         limit = LIMIT_FACTOR * quick
@@ -104,14 +104,16 @@ class DriveMotion:
         self._window_ns = get(0x6066) * 1_000_000
 
     def _acceleration(self, index: int) -> float:
-        """[rad/s² or m/s²]"""
+        """Acceleration [rad/s² or m/s²]."""
         value = self._dictionary.get(index)
         return value / abs(self._units) if value else self.axis.joint.acceleration_max
 
     # -- what is measured ----------------------------------------------------------------------------------------
 
     def _measured(self) -> float:
-        """Joint position as the encoder has it: mirrored about where it was when it began to count backwards."""
+        """Joint position as the encoder reports it: mirrored about the position at which an injected reversal
+        began.
+        """
         axis = self.axis
         if not axis.inverted_encoder:
             self._mirror = None
@@ -121,16 +123,16 @@ class DriveMotion:
         return 2.0 * self._mirror - axis.position
 
     def position(self) -> int:
-        """0x6064."""
+        """Position, 0x6064."""
         return wrap32(round(self._counts * (self._measured() + self._offset)))
 
     def velocity(self) -> int:
-        """0x606C."""
+        """Velocity, 0x606C."""
         velocity = -self.axis.velocity if self.axis.inverted_encoder else self.axis.velocity
         return wrap32(round(self._units * velocity))
 
     def velocity_demand(self) -> int:
-        """0x606B."""
+        """Velocity demand, 0x606B."""
         return wrap32(round(self._units * self.axis.set_velocity))
 
     def torque(self) -> int:
@@ -150,7 +152,9 @@ class DriveMotion:
         return (side < 0) | (side > 0) << 1
 
     def status(self) -> int:
-        """0x6041. Bit 12 in mode 9: the drive follows the command; in mode 3: speed is zero, bit 10 target reached."""
+        """Status word 0x6041. Bit 12 in mode 9: the drive follows the command; in mode 3: speed is zero, bit 10
+        target reached.
+        """
         machine = self.machine
         word = STATUS[machine.state] | 0x10 | 0x200
         if self.warning and machine.state not in (Cia402State.FAULT, Cia402State.FAULT_REACTION):
@@ -176,7 +180,7 @@ class DriveMotion:
     # -- what is done --------------------------------------------------------------------------------------------
 
     def power_lost(self, t_ns: int) -> None:
-        """The supply is gone or the firmware starts anew, with its parameters."""
+        """Reset after loss of the supply or a reboot of the firmware."""
         self.load_parameters()
         self._limited = self._following = False
         self._beyond_since_ns = NEVER_NS
@@ -190,7 +194,9 @@ class DriveMotion:
         axis.brake_closed = self._brake.closed
 
     def step(self, t_ns: int) -> bool:
-        """Bring axis, brake and machine to ``t_ns``; whether the following error has exceeded its limit."""
+        """Advance axis, brake and state machine to ``t_ns``; returns whether the following error has exceeded its
+        limit.
+        """
         for _ in range(len(Cia402State)):
             state = self.machine.state
             self._act(t_ns)
@@ -231,10 +237,10 @@ class DriveMotion:
         self.axis.acceleration = self._ramps[ramp]
 
     def _follow(self) -> None:
-        """Enabled: the target velocity within the drive's limits; ramps of 0x6083 and 0x6084.
+        """Enabled: follow the target velocity within the drive's limits, with ramps of 0x6083 and 0x6084.
 
         In cyclic synchronous velocity the standard leaves ramps to the master; this drive bounds the acceleration by
-        0x6083 there, both ways, as many do.
+        0x6083 there, in both directions, as many do.
         """
         axis, get = self.axis, self._dictionary.get
         mode = get(0x6061)
@@ -252,7 +258,7 @@ class DriveMotion:
         self._following = mode == CYCLIC_VELOCITY and not stopped
 
     def _barred(self, side: float) -> bool:
-        """Whether a limit switch or a software limit (0x607D) stands against motion to ``side`` of the joint.
+        """Whether a limit switch or a software limit (0x607D) prevents motion to ``side`` of the joint.
 
         Software limits are seen in time for the quick stop ramp to end there; the whole range of 32 bits is no limit.
         """
@@ -279,6 +285,6 @@ class DriveMotion:
         return t_ns - self._beyond_since_ns >= self._window_ns
 
     def due_ns(self, t_ns: int) -> int:
-        """When ``step`` is next needed."""
+        """Time at which ``step`` is next needed."""
         tick = t_ns + self._settings.tick_ns if self.machine.powered else NEVER_NS
         return min(tick, self._brake.due_ns())

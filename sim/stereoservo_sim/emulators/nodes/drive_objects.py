@@ -1,4 +1,6 @@
-"""What the objects of an emulated CiA 402 drive mean: measured values, commands, refusals, stored parameters."""
+"""Objects of an emulated CiA 402 drive, bound to its motion: measured values, commands, refusals, stored
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ OPTION_CODES = {
 
 
 class DriveObjects:
-    """Ties a dictionary to the drive; keeps what 0x1010 has saved."""
+    """Binds a dictionary to the drive; keeps what 0x1010 has saved."""
 
     def __init__(
         self,
@@ -84,14 +86,14 @@ class DriveObjects:
         self._stored = {}
 
     def power_on(self) -> None:
-        """All objects as after power on."""
+        """Set all objects to their values at power on."""
         self._dictionary.restore(0x0000, 0xFFFF, self._stored)
         self._dictionary.set(0x6502, 0, SUPPORTED_MODES)
         self._dictionary.set(0x6061, 0, self._dictionary.get(0x6060))
         self._fix()
 
     def reset_communication(self) -> None:
-        """The communication profile's objects as after power on; errors and their history stay."""
+        """Set the communication profile's objects to their values at power on; errors and their history stay."""
         keys = [key for key in self._dictionary.entries if key[0] in (0x1001, 0x1003)]
         errors = {key: self._dictionary.get(*key) for key in keys}
         self._dictionary.restore(0x1000, 0x1FFF, self._stored)

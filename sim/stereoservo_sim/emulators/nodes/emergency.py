@@ -14,7 +14,7 @@ _QUEUED = 32
 
 
 def register_bits(code: int) -> int:
-    """Error register (0x1001) of an error code: generic, and the class that the code's first digits name."""
+    """Error register (0x1001) of an error code: generic, and the class given by the code's first digits."""
     top = code >> 12
     bits = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0xF: 0x80}.get(top, 0)
     if top == 0x8:
@@ -23,7 +23,7 @@ def register_bits(code: int) -> int:
 
 
 class Emergencies:
-    """Errors of one node. ``active``: codes whose cause is there or that a fault reset has not cleared."""
+    """Errors of one node. ``active``: codes whose cause is present or that a fault reset has not cleared."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -36,7 +36,7 @@ class Emergencies:
         dictionary.reading(HISTORY, self._check_reading)
 
     def power_on(self) -> None:
-        """Nothing is wrong yet."""
+        """Clear all errors."""
         self.active.clear()
         self._queue.clear()
         self._free_ns = 0
@@ -54,7 +54,7 @@ class Emergencies:
             self._dictionary.set(HISTORY, sub, 0)
 
     def occurred(self, code: int) -> None:
-        """An error: in the register, the newest of the history, and a frame."""
+        """Add an error: register, history, and a frame."""
         if code not in self.active:
             self.active.append(code)
         count = self._dictionary.get(HISTORY, 0)
@@ -65,7 +65,7 @@ class Emergencies:
         self._tell(code)
 
     def gone(self, codes: list[int]) -> None:
-        """These errors are there no more: one frame with code 0 and what is left in the register."""
+        """Remove errors: one frame with code 0 and the remaining register."""
         left = [code for code in self.active if code not in codes]
         if len(left) != len(self.active):
             self.active[:] = left
@@ -79,7 +79,7 @@ class Emergencies:
         self._queue.append(struct.pack("<HB5x", code & 0xFFFF, register))
 
     def frames(self, t_ns: int) -> list[CanFrame]:
-        """What may be sent now; the inhibit time (0x1015) holds the rest back."""
+        """Frames to send now; the inhibit time (0x1015) delays the others."""
         cob_id = self._dictionary.get(COB_ID, 0, 1 << 31)
         if cob_id & 1 << 31:
             self._queue.clear()
@@ -92,5 +92,5 @@ class Emergencies:
         return frames
 
     def due_ns(self) -> int:
-        """When a held back frame may go."""
+        """Time at which a delayed frame may be sent."""
         return self._free_ns if self._queue else NEVER_NS

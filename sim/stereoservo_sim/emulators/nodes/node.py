@@ -1,4 +1,4 @@
-"""One emulated axis: what drive firmware and plant say to each other, in joint units."""
+"""Interface of an emulated axis: variables shared by drive firmware and plant, in joint units; protocol of a node."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from stereoservo_drivers.can.frames import CanFrame
 
 @dataclass
 class EmulatedAxis:
-    """The firmware of a drive writes the first group, the plant the second, ordered faults the third.
+    """Shared state of an axis: the firmware writes the first group, the plant the second, injected faults the
+    third.
 
     [rad, rad/s, rad/s² or m]. ``effort``: share of the rated torque, signed. ``set_position`` and ``set_velocity`` are
     the drive's own ramp, which the plant follows.
@@ -44,7 +45,8 @@ class EmulatedAxis:
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """``brake_ms``: what the brake takes to open and to close. ``boot_ms``: from power on to the boot-up frame.
+    """Times of a node. ``brake_ms``: to open and to close the brake. ``boot_ms``: from power on to the boot-up
+    frame.
 
     ``tick_ns``: period of the drive's own control while its power stage is on. ``sync_timeout_factor``: periods of
     0x1006 without SYNC that make error 0x8700. ``following_window``: limit of the following error [rad or m] where
@@ -70,39 +72,39 @@ NEVER_NS = 2**63 - 1
 
 
 class EmulatedNode(Protocol):
-    """One drive. All times [ns] of the bus."""
+    """Protocol of one emulated drive. All times [ns] of the bus."""
 
     node_id: int
     axis: EmulatedAxis
 
     def power_up(self, t_ns: int) -> None:
-        """Boot: says so on the bus. A reboot likewise; the axis loses its power."""
+        """Boot or reboot, with a boot-up frame; the axis loses its power."""
         ...
 
     def hears(self, frame: CanFrame) -> bool:
-        """Whether a frame can mean anything to it; others need not be given to ``receive``."""
+        """Whether a frame is relevant to it; others need not be given to ``receive``."""
         ...
 
     def receive(self, frame: CanFrame, t_ns: int) -> None:
-        """A frame of somebody else has ended on the bus at ``t_ns``."""
+        """Process a frame of another sender that has ended on the bus at ``t_ns``."""
         ...
 
     def advance(self, t_ns: int) -> None:
-        """Do what timers ask for up to ``t_ns``: heartbeats, time-outs, ramps' ends, the axis's new state."""
+        """Run timers up to ``t_ns``: heartbeats, time-outs, ramps' ends, the axis's new state."""
         ...
 
     def due_ns(self) -> int:
-        """When ``advance`` is next needed; NEVER_NS where nothing is pending."""
+        """Time at which ``advance`` is next needed; NEVER_NS where nothing is pending."""
         ...
 
     def outgoing(self) -> list[CanFrame]:
-        """Frames that the node wants to send since the last call, in its order."""
+        """Frames to send since the last call, in order."""
         ...
 
     def trip(self, code: int, t_ns: int) -> None:
-        """An ordered fault of the drive, with its (CiA 402 or native) error code."""
+        """Inject a fault of the drive, with its (CiA 402 or native) error code."""
         ...
 
     def state(self) -> str:
-        """In words, for the console."""
+        """State as text, for the console."""
         ...

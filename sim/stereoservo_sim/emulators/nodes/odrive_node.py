@@ -1,4 +1,4 @@
-"""An emulated ODrive (CANSimple, firmware 0.6): its own reading of the protocol, nothing shared with the driver."""
+"""Emulated ODrive (CANSimple, firmware 0.6); the protocol is implemented independently of the driver."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STATE_NAMES = {AXIS_IDLE: "idle", AXIS_CLOSED_LOOP: "closed loop control"}
 
 @dataclass(frozen=True)
 class OdriveSettings:
-    """What is configured over USB, and what the hardware can do. Ramps [turns/s²] of the motor, ``current_limit`` [A].
+    """Settings made over USB, and limits of the hardware. Ramps [turns/s²] of the motor, ``current_limit`` [A].
 
     ``watchdog_ns``: an armed axis that gets no velocity for so long disarms; 0: never.
     ``torque_acceleration``: what the motor's torque allows where the input is not ramped.
@@ -79,7 +79,7 @@ class OdriveNode:
 
     @property
     def booted(self) -> bool:
-        """Whether it takes part in the bus."""
+        """Whether it has booted and takes part in the bus."""
         return self._heartbeat_due_ns != NEVER_NS
 
     def power_up(self, t_ns: int) -> None:
@@ -89,7 +89,7 @@ class OdriveNode:
         self._boot_end_ns = t_ns + self.settings.boot_ns
 
     def hears(self, frame: CanFrame) -> bool:
-        """Every frame: with it the encoder is followed."""
+        """Whether a frame is relevant: every frame, since each updates the encoder."""
         return True
 
     def receive(self, frame: CanFrame, t_ns: int) -> None:
@@ -106,7 +106,7 @@ class OdriveNode:
                 take(self, frame.data, t_ns)
 
     def advance(self, t_ns: int) -> None:
-        """Boot's end, heartbeats, the watchdog, end stops; the encoder."""
+        """Run timers up to ``t_ns``: boot, heartbeats, the watchdog, end stops; the encoder."""
         self._follow_encoder()
         if self._boot_end_ns <= t_ns:
             self._heartbeat_due_ns = self._boot_end_ns
@@ -121,7 +121,7 @@ class OdriveNode:
             self._heartbeat_due_ns += self.settings.heartbeat_ns
 
     def due_ns(self) -> int:
-        """The earliest timer."""
+        """Time of the earliest timer."""
         return min(self._boot_end_ns, self._heartbeat_due_ns, self._watchdog_due_ns)
 
     def outgoing(self) -> list[CanFrame]:
@@ -130,12 +130,12 @@ class OdriveNode:
         return frames
 
     def trip(self, code: int, t_ns: int) -> None:
-        """Error bits: disarms."""
+        """Set error bits, and disarm."""
         self.advance(t_ns)
         self._disarm(code)
 
     def state(self) -> str:
-        """State and error bits."""
+        """State and error bits as text."""
         if not self.booted:
             return "off" if self._boot_end_ns == NEVER_NS else "booting"
         name = STATE_NAMES[self.axis_state]
@@ -175,7 +175,7 @@ class OdriveNode:
             self._say(command, struct.pack("<ff", torque * scale, torque * scale))
 
     def _disarm(self, reason: int) -> None:
-        """Power off; the reason stays until it is cleared."""
+        """Power off; the reason remains until it is cleared."""
         self.disarm_reason |= reason
         self.procedure_result = DISARMED
         self._idle()
@@ -192,7 +192,9 @@ class OdriveNode:
             self._watchdog_due_ns = t_ns + self.settings.watchdog_ns
 
     def _set_target(self) -> None:
-        """What the velocity loop follows; position control holds where it is, as nothing here sets positions."""
+        """Set the target of the velocity loop; position control holds its position, since nothing here sets
+        positions.
+        """
         if self.axis_state != AXIS_CLOSED_LOOP:
             return
         turns_s = self.input_vel if self.control_mode == CONTROL_VELOCITY else 0.0

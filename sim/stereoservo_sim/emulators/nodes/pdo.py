@@ -1,4 +1,4 @@
-"""Process data of an emulated node: four RPDOs and four TPDOs as their parameters say (CiA 301, 7.2.2, 7.5.2.35)."""
+"""Process data of an emulated node: four RPDOs and four TPDOs by their parameters (CiA 301, 7.2.2, 7.5.2.35)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Tpdo:
 
 
 class ProcessData:
-    """PDOs of one node. ``operational`` is set by the node; nothing is taken or sent outside of it."""
+    """PDOs of one node. ``operational`` is set by the node; PDOs are received and sent only then."""
 
     def __init__(self, dictionary: Dictionary, report: Report) -> None:
         self._dictionary = dictionary
@@ -94,7 +94,7 @@ class ProcessData:
         self._event_driven = [p for p in self._tpdos if p.can_id is not None and p.kind in EVENT_TYPES]
 
     def reload(self) -> None:
-        """Take all parameters over from the dictionary; counts and deadlines start anew."""
+        """Read all parameters from the dictionary; counts and deadlines restart."""
         self._rpdos = [self._rpdo(k) for k in range(COUNT)]
         self._tpdos = [self._tpdo(k) for k in range(COUNT)]
         self._index()
@@ -128,7 +128,7 @@ class ProcessData:
         )
 
     def enter_operational(self, operational: bool) -> None:
-        """On the NMT state's change: event-driven TPDOs are sent once, deadlines begin with the first RPDO."""
+        """Enter the NMT state operational: event-driven TPDOs are sent once, deadlines begin with the first RPDO."""
         if operational == self.operational:
             return
         self.operational = operational
@@ -154,7 +154,7 @@ class ProcessData:
         return frame.id in (self._requested if frame.remote else self._received)
 
     def receive(self, frame: CanFrame, t_ns: int) -> list[CanFrame]:
-        """An RPDO, or a remote request of a TPDO, that it listens to; gives what is sent at once."""
+        """Process an RPDO, or a remote request of a TPDO; returns the frames to send at once."""
         if frame.remote:
             asked = [p for p in self._tpdos if p.can_id == frame.id and p.remote]
             return [self._transmit(p, t_ns) for p in asked]
@@ -184,11 +184,11 @@ class ProcessData:
             at += o.size
 
     def waits_for_sync(self) -> bool:
-        """Whether an RPDO has come that the next SYNC makes effective."""
+        """Whether a received RPDO takes effect at the next SYNC."""
         return any(rpdo.pending is not None for rpdo in self._rpdos)
 
     def sync(self, counter: int | None, t_ns: int) -> list[CanFrame]:
-        """SYNC: synchronous TPDOs with values of now, then synchronous RPDOs take effect."""
+        """Process SYNC: synchronous TPDOs with current values, then synchronous RPDOs take effect."""
         if not self.operational:
             return []
         frames = [self._transmit(p, t_ns) for p in self._synchronous if self._due_at_sync(p, counter)]
@@ -224,7 +224,7 @@ class ProcessData:
         return CanFrame(id=tpdo.can_id, data=tpdo.sent)
 
     def check_deadlines(self, t_ns: int) -> None:
-        """Report RPDOs that have not come in time."""
+        """Report RPDOs that missed their deadline."""
         if not self.operational:
             return
         for rpdo in self._rpdos:
@@ -233,7 +233,7 @@ class ProcessData:
                 self._error(DEADLINE, there=True)
 
     def events(self, t_ns: int) -> list[CanFrame]:
-        """Event-driven TPDOs whose content has changed or whose timer has run out, as the inhibit time allows."""
+        """Event-driven TPDOs whose content has changed or whose timer has expired, subject to the inhibit time."""
         if not self.operational:
             return []
         frames = []
@@ -245,7 +245,7 @@ class ProcessData:
         return frames
 
     def due_ns(self) -> int:
-        """When ``check_deadlines`` or ``events`` is next needed."""
+        """Time at which ``check_deadlines`` or ``events`` is next needed."""
         if not self.operational:
             return NEVER_NS
         due = min([rpdo.deadline_ns for rpdo in self._rpdos])

@@ -1,4 +1,4 @@
-"""When PDO parameters may be changed by SDO (CiA 301, 7.5.2.35 to 7.5.2.38), and what they then mean."""
+"""Rules for changes of PDO parameters by SDO (CiA 301, 7.5.2.35 to 7.5.2.38), and their decoding."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Mapped:
 
 
 def mapped(dictionary: Dictionary, index: int) -> tuple[Mapped, ...]:
-    """What the mapping object ``index`` says."""
+    """Objects listed in the mapping object ``index``."""
     objects = []
     for k in range(1, dictionary.get(index, 0) + 1):
         word = dictionary.get(index, k)
@@ -44,7 +44,7 @@ def mapped(dictionary: Dictionary, index: int) -> tuple[Mapped, ...]:
 
 
 def check_communication(dictionary: Dictionary, index: int, sub: int, value: int) -> None:
-    """Guard of 0x1400 and 0x1800 onwards. Raises SdoError."""
+    """Check a write to 0x1400 or 0x1800 onwards. Raises SdoError."""
     before = dictionary.get(index, 1)
     exists = not before & INVALID
     transmit = index >= TPDO_COMMUNICATION
@@ -70,7 +70,7 @@ def _check_cob_id(dictionary: Dictionary, index: int, before: int, value: int) -
 
 
 def check_mapping(dictionary: Dictionary, index: int, sub: int, value: int) -> None:
-    """Guard of 0x1600 and 0x1A00 onwards: PDO switched off, count 0, objects, count. Raises SdoError."""
+    """Check a write to 0x1600 or 0x1A00 onwards: PDO switched off, count 0, objects, count. Raises SdoError."""
     transmit = index >= TPDO_MAPPING
     if not dictionary.get(index - 0x200, 1) & INVALID:
         raise SdoError(Abort.DEVICE_STATE)

@@ -14,7 +14,7 @@ _TOGGLE = 0x10
 
 @dataclass
 class _Transfer:
-    """A segmented transfer that goes on. ``size`` announced by the client of a download, 0 where it did not."""
+    """A segmented transfer in progress. ``size`` announced by the client of a download, 0 where it was not."""
 
     index: int
     sub: int
@@ -26,7 +26,7 @@ class _Transfer:
 
 
 class SdoServer:
-    """One server channel: a request's 8 bytes in, an answer's 8 bytes or None out."""
+    """One server channel: a request's 8 bytes in, a reply's 8 bytes or None out."""
 
     def __init__(self, dictionary: Dictionary, *, timeout_ns: int = TIMEOUT_NS) -> None:
         self._dictionary = dictionary
@@ -35,21 +35,21 @@ class SdoServer:
         self._last = (0, 0)
 
     def reset(self) -> None:
-        """Forget a transfer that goes on."""
+        """Abandon a transfer in progress."""
         self._transfer = None
 
     def due_ns(self) -> int:
-        """When a half transfer times out."""
+        """Time at which an incomplete transfer times out."""
         return NEVER_NS if self._transfer is None else self._transfer.deadline_ns
 
     def advance(self, t_ns: int) -> bytes | None:
-        """The abort of a transfer that the client has left half done."""
+        """Abort frame of a transfer that has timed out."""
         if t_ns < self.due_ns():
             return None
         return self._abort(Abort.TIMED_OUT)
 
     def request(self, data: bytes, t_ns: int) -> bytes | None:
-        """Answer to a client's frame; None to an abort and to a frame that is no SDO request."""
+        """Reply to a client's frame; None to an abort and to a frame that is no SDO request."""
         if len(data) != 8:
             return None
         command = data[0] >> 5

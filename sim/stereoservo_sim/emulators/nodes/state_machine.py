@@ -10,7 +10,7 @@ from enum import Enum, IntEnum, StrEnum
 
 
 class Cia402State(StrEnum):
-    """As the standard names them."""
+    """States by their names in the standard."""
 
     NOT_READY = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -23,7 +23,7 @@ class Cia402State(StrEnum):
 
 
 class Command(Enum):
-    """Of the control word's bits 0 to 3."""
+    """Commands of the control word's bits 0 to 3."""
 
     SHUTDOWN = 1
     SWITCH_ON = 2
@@ -33,7 +33,7 @@ class Command(Enum):
 
 
 class Ramp(IntEnum):
-    """How to come to rest: the common meaning of option codes 0 to 4."""
+    """Stop reactions: the common meaning of option codes 0 to 4."""
 
     COAST = 0
     SLOW_DOWN = 1
@@ -82,7 +82,7 @@ class PowerMachine:
 
     A command that changes the state is carried out before the next (IEC 61800-7-201): one that comes while the drive
     slows down for transition 5 or 8 waits, the newest counts; disable voltage and quick stop do not wait. Transition
-    16 needs a new command: a master that goes on sending "enable" does not undo a quick stop that the drive began.
+    16 needs a new command: a master that keeps sending "enable" does not undo a quick stop that the drive began.
     """
 
     def __init__(self, option: Callable[[int], int], clear_faults: Callable[[], bool]) -> None:
@@ -91,7 +91,7 @@ class PowerMachine:
         self.power_on()
 
     def power_on(self) -> None:
-        """Transition 0."""
+        """Transition 0, power on."""
         self.word = 0
         self._enter(Cia402State.NOT_READY)
 
@@ -115,7 +115,7 @@ class PowerMachine:
         return bool(self.word & HALT)
 
     def control(self, word: int) -> None:
-        """A control word has been received."""
+        """Process a control word."""
         edge = bool(word & FAULT_RESET) and not self.word & FAULT_RESET
         before = command(self.word)
         self.word = word
@@ -133,7 +133,7 @@ class PowerMachine:
         self._obey(given, new=given is not before)
 
     def fault(self) -> None:
-        """Transition 13, from any state; 14 at once where no power stage has to be brought to rest."""
+        """Transition 13, from any state; 14 at once where no power stage must be brought to rest."""
         if self.state in (Cia402State.FAULT_REACTION, Cia402State.FAULT):
             return
         moving = self.state in (Cia402State.ENABLED, Cia402State.QUICK_STOP)
@@ -144,7 +144,7 @@ class PowerMachine:
             self._enter(Cia402State.FAULT)
 
     def connection_aborted(self) -> bool:
-        """The reaction of 0x6007 to a lost connection; gives whether the caller has to report a fault instead."""
+        """Reaction of 0x6007 to a lost connection; returns whether the caller must report a fault instead."""
         option = self._option(ABORT_OPTION)
         if option == 2:
             self._obey(Command.DISABLE_VOLTAGE, new=True)
@@ -153,12 +153,12 @@ class PowerMachine:
         return option == 1
 
     def opened(self) -> None:
-        """The brake is open: transition 4 is complete."""
+        """Complete transition 4: the brake is open."""
         if self.opening:
             self._enter(Cia402State.ENABLED)
 
     def rested(self) -> None:
-        """The drive stands and its brake is closed."""
+        """Complete a stop: the drive is at rest and its brake is closed."""
         if self.after is None:
             return
         waiting = self._waiting

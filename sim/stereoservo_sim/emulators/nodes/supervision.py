@@ -1,4 +1,4 @@
-"""What an emulated node watches on the bus: heartbeats of others, the SYNC period; its own heartbeat (CiA 301)."""
+"""Monitoring by an emulated node: heartbeats of others and the SYNC period; its own heartbeat (CiA 301)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ CONSUMER, PRODUCER, SYNC_ID, SYNC_PERIOD = 0x1016, 0x1017, 0x1005, 0x1006
 
 
 class HeartbeatConsumer:
-    """Nodes of 0x1016; each is watched from its first heartbeat on, again after it was lost (7.2.8.2.2)."""
+    """Monitors the nodes of 0x1016, each from its first heartbeat on, also after a loss (7.2.8.2.2)."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -31,11 +31,11 @@ class HeartbeatConsumer:
         return (node, time) if node and time else (0, 0)
 
     def reset(self) -> None:
-        """Wait for first heartbeats anew."""
+        """Wait for first heartbeats again."""
         self._deadlines.clear()
 
     def heard(self, node: int, t_ns: int) -> bool:
-        """A heartbeat has come; whether its node is watched."""
+        """Process a heartbeat; returns whether its node is monitored."""
         for sub in self._subs:
             watched, time = self._entry(sub)
             if watched == node:
@@ -44,19 +44,19 @@ class HeartbeatConsumer:
         return False
 
     def lost(self, t_ns: int) -> list[int]:
-        """Nodes whose heartbeat is overdue, each told once."""
+        """Nodes whose heartbeat is overdue, each reported once."""
         nodes = [node for node, deadline in self._deadlines.items() if t_ns >= deadline]
         for node in nodes:
             del self._deadlines[node]
         return nodes
 
     def due_ns(self) -> int:
-        """When the next is overdue."""
+        """Time at which the next heartbeat is overdue."""
         return min(self._deadlines.values(), default=NEVER_NS)
 
 
 class HeartbeatProducer:
-    """0x1017 [ms]; 0: none."""
+    """Produces heartbeats with the period 0x1017 [ms]; 0: none."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -65,16 +65,16 @@ class HeartbeatProducer:
         dictionary.changed(PRODUCER, lambda sub, value: self.restart(self.now_ns))
 
     def restart(self, t_ns: int) -> None:
-        """The first after one period."""
+        """Restart; the first heartbeat is due after one period."""
         period = self._dictionary.get(PRODUCER)
         self._next_ns = t_ns + period * 1_000_000 if period else NEVER_NS
 
     def silence(self) -> None:
-        """Until ``restart``."""
+        """Stop until ``restart``."""
         self._next_ns = NEVER_NS
 
     def tick(self, t_ns: int) -> bool:
-        """Whether one is to be sent now; those that were missed are not made up for."""
+        """Whether a heartbeat is to be sent now; missed ones are not sent later."""
         if t_ns < self._next_ns:
             return False
         period_ns = self._dictionary.get(PRODUCER) * 1_000_000
@@ -82,12 +82,13 @@ class HeartbeatProducer:
         return True
 
     def due_ns(self) -> int:
-        """When the next is due."""
+        """Time of the next heartbeat."""
         return self._next_ns
 
 
 class SyncWatch:
-    """0x1006 [us]: after ``factor`` periods without SYNC the node says so, once; from the first SYNC on.
+    """Monitors SYNC with the period 0x1006 [us]: a loss is reported once after ``factor`` periods, from the first
+    SYNC on.
 
     ``can_id``: of SYNC, from 0x1005.
     """
@@ -104,12 +105,12 @@ class SyncWatch:
         self.can_id = self._dictionary.get(SYNC_ID, 0, 0x80) & 0x7FF
 
     def reset(self) -> None:
-        """Wait for a first SYNC anew."""
+        """Wait for a first SYNC again."""
         self._listen()
         self._deadline_ns = NEVER_NS
 
     def heard(self, t_ns: int) -> None:
-        """SYNC has come."""
+        """Process a SYNC."""
         period_ns = self._dictionary.get(SYNC_PERIOD) * 1000
         self._deadline_ns = t_ns + round(self._factor * period_ns) if period_ns else NEVER_NS
 
@@ -121,5 +122,5 @@ class SyncWatch:
         return True
 
     def due_ns(self) -> int:
-        """When it will be."""
+        """Time at which SYNC is overdue."""
         return self._deadline_ns

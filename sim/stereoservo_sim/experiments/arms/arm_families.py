@@ -1,4 +1,6 @@
-"""Random arms of the families of thesis chapter 6, their singular poses, and who judges them."""
+"""Random arms of the families of thesis chapter 6, their singular configurations, and their Euclidean reference
+solvers.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ PUMA_ROWS = ((0, -90, 0), (0.4318, 0, 0.15), (0.0203, -90, 0), (0, 90, 0.4318), 
 
 @dataclass(frozen=True, eq=False)
 class SingularPose:
-    """Joints (n,) at a singular configuration. ``free``: a joint that the goal leaves free, None where it leaves none
-    and two solutions fall together. ``point`` (3,) where the goal is that of a single one.
+    """Joints (n,) at a singular configuration. ``free``: a joint that the goal leaves free, None where two
+    solutions coincide instead. ``point`` (3,) where the goal is that of a single one.
     """
 
     joints: FloatArray
@@ -35,9 +37,9 @@ Judge = Callable[[EuclideanAxes, FloatArray, FloatArray | None, np.random.Genera
 
 @dataclass(frozen=True, eq=False)
 class ArmFamily:
-    """``axes`` draws an arm; ``judge`` solves poses (N, 4, 4), or what they do to points (N, 3), for an arm: (N, s, n);
-    None of a redundant arm. ``single_point``: whether the goals are those of one point. ``singular`` draws a pose.
-    ``bounded``: whether goals 5 m away are out of reach.
+    """A family of arms. ``axes`` draws an arm; ``judge`` solves poses (N, 4, 4), or what they do to points (N, 3),
+    for an arm: (N, s, n); None of a redundant arm. ``single_point``: whether the goals are those of one point.
+    ``singular`` draws a singular pose. ``bounded``: whether goals 5 m away are out of reach.
     """
 
     axes: Callable[[np.random.Generator], EuclideanAxes]
@@ -62,7 +64,7 @@ def _place(rng: np.random.Generator) -> FloatArray:
 
 
 def _directions(rng: np.random.Generator, count: int, least: float = 0.3) -> FloatArray:
-    """Directions (count, 3), well apart."""
+    """Directions (count, 3) with a minimum angle between them."""
     while True:
         directions = np.array([unit(rng) for _ in range(count)])
         if np.linalg.svd(directions, compute_uv=False)[-1] > least:
@@ -70,7 +72,7 @@ def _directions(rng: np.random.Generator, count: int, least: float = 0.3) -> Flo
 
 
 def sliding(count: int) -> Callable[[np.random.Generator], EuclideanAxes]:
-    """Prismatic joints in general directions."""
+    """Arm of prismatic joints in general directions."""
     return lambda rng: EuclideanAxes(
         _directions(rng, count), np.zeros((count, 3)), np.zeros(count, dtype=bool)
     )
@@ -85,7 +87,7 @@ def two(rng: np.random.Generator) -> EuclideanAxes:
 
 
 def parallel_pair(rng: np.random.Generator) -> EuclideanAxes:
-    """Two parallel axes, of either sense, 0.2 to 0.5 m apart."""
+    """Arm of two parallel axes, of either sense, 0.2 to 0.5 m apart."""
     w = unit(rng)
     across = np.cross(w, unit(rng))
     across /= np.linalg.norm(across)
@@ -95,7 +97,7 @@ def parallel_pair(rng: np.random.Generator) -> EuclideanAxes:
 
 
 def shoulder_and_elbow(rng: np.random.Generator) -> EuclideanAxes:
-    """Arm configuration, the first axis at 30° to 150° to the others."""
+    """Arm with the elbow's axes parallel, the first axis at 30° to 150° to the others."""
     while True:
         first, rest = unit(rng), parallel_pair(rng)
         if abs(first @ rest.directions[0]) < 0.87:
@@ -103,12 +105,12 @@ def shoulder_and_elbow(rng: np.random.Generator) -> EuclideanAxes:
 
 
 def concurrent(rng: np.random.Generator) -> EuclideanAxes:
-    """Wrist configuration, the axes at any angles."""
+    """Wrist of three concurrent axes at any angles."""
     return _revolute(list(_directions(rng, 3)), [_place(rng)] * 3)
 
 
 def square_wrist(rng: np.random.Generator) -> EuclideanAxes:
-    """Axes 1 and 3 square to axis 2, so that they can fall together; points anywhere on the axes."""
+    """Wrist with axes 1 and 3 normal to axis 2, so that they can coincide; points anywhere on the axes."""
     w1, centre = unit(rng), _place(rng)
     w2 = np.cross(w1, unit(rng))
     w2 /= np.linalg.norm(w2)
@@ -117,7 +119,7 @@ def square_wrist(rng: np.random.Generator) -> EuclideanAxes:
 
 
 def joined(first: EuclideanAxes, second: EuclideanAxes) -> EuclideanAxes:
-    """Joints of ``second`` behind those of ``first``."""
+    """Arm with the joints of ``second`` after those of ``first``."""
     return EuclideanAxes(
         np.vstack([first.directions, second.directions]),
         np.vstack([first.points, second.points]),
@@ -136,7 +138,7 @@ def from_rows(rows: tuple[tuple[float, float, float], ...]) -> EuclideanAxes:
 
 
 def offset(rng: np.random.Generator) -> EuclideanAxes:
-    """Axes 2, 3, 4 parallel, the last three without a common point."""
+    """Arm with axes 2, 3, 4 parallel, the last three without a common point."""
     a2, a3 = rng.uniform(0.3, 0.5, 2)
     d2, d4, d5 = rng.uniform(0.05, 0.15, 3)
     rows = (
@@ -151,7 +153,7 @@ def offset(rng: np.random.Generator) -> EuclideanAxes:
 
 
 def general(rng: np.random.Generator) -> EuclideanAxes:
-    """Six axes of no special geometry, half of the angles square: up to 16 solutions."""
+    """Arm of six axes without special geometry, half of the angles right: up to 16 solutions."""
     rows = []
     for _ in range(6):
         alpha = rng.choice([-90.0, 90.0]) if rng.random() < 0.5 else rng.uniform(-150.0, 150.0)
@@ -164,14 +166,16 @@ def _on_axis(axes: EuclideanAxes, j: int, rng: np.random.Generator) -> FloatArra
 
 
 def point_on_first_axis(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """Joints anywhere, and the point that they bring onto the first axis: that joint is free."""
+    """Random joints, and the point that they move onto the first axis: that joint is free."""
     q = rng.uniform(-np.pi, np.pi, len(axes.directions))
     outer = axes.part(slice(1, None)).displacements(q[None, 1:])[0]
     return SingularPose(q, 0, (np.linalg.inv(outer) @ np.append(_on_axis(axes, 0, rng), 1.0))[:3])
 
 
 def stretched(axes: EuclideanAxes, point: FloatArray, upper: int, q: FloatArray, sense: float) -> FloatArray:
-    """``q`` (n,) with the elbow ``upper + 1`` so that ``point`` (3,) is farthest from axis ``upper``, or nearest."""
+    """Configuration ``q`` (n,) with elbow ``upper + 1`` such that ``point`` (3,) is farthest from axis ``upper``,
+    or nearest.
+    """
     w, c = axes.directions[upper + 1], axes.points[upper + 1]
     between = sense * (c - axes.points[upper])
     q = q.copy()
@@ -180,7 +184,7 @@ def stretched(axes: EuclideanAxes, point: FloatArray, upper: int, q: FloatArray,
 
 
 def stretched_point(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """The last two joints, parallel, stretched or folded before a point: two solutions are one."""
+    """Configuration of two parallel joints, stretched or folded towards a point: two solutions coincide."""
     point = rng.uniform(-0.5, 0.5, 3)
     n = len(axes.directions)
     q = rng.uniform(-np.pi, np.pi, n)
@@ -188,7 +192,9 @@ def stretched_point(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPo
 
 
 def aligned_wrist(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """A square wrist whose outer axes fall together: its first and last joint turn against one another."""
+    """Configuration of a square wrist whose outer axes coincide: its first and last joint rotate against each
+    other.
+    """
     n = len(axes.directions)
     q = rng.uniform(-np.pi, np.pi, n)
     q[~axes.revolute] *= 0.1
@@ -198,7 +204,7 @@ def aligned_wrist(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose
 
 
 def arm_singularity(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """Elbow stretched, or wrist aligned, in turn by chance."""
+    """Configuration with the elbow stretched, or the wrist aligned, at random."""
     if rng.random() < 0.5:
         return aligned_wrist(axes, rng)
     q = rng.uniform(-np.pi, np.pi, 6)
@@ -207,7 +213,7 @@ def arm_singularity(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPo
 
 
 def point_singularity(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """Of an arm: elbow stretched, or the point on the first axis."""
+    """Singular configuration of an arm: elbow stretched, or the point on the first axis."""
     return (stretched_point if rng.random() < 0.5 else point_on_first_axis)(axes, rng)
 
 

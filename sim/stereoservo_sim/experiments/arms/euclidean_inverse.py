@@ -1,4 +1,4 @@
-"""Inverse kinematics in metric coordinates, all poses at once: the judge of the projective one.
+"""Inverse kinematics in metric coordinates, vectorised over poses: reference of the projective solver.
 
 Axes are lines of Euclidean space, lengths and angles are measured; joints are eliminated in another order than
 `stereoservo.kinematics.inverse` does where there is a choice. Solutions are (N, s, n) [rad or m], NaN where a branch
@@ -27,7 +27,7 @@ class EuclideanAxes:
     revolute: npt.NDArray[np.bool_]
 
     def part(self, joints: slice) -> EuclideanAxes:
-        """Some of them."""
+        """Axes of some of the joints."""
         return EuclideanAxes(self.directions[joints], self.points[joints], self.revolute[joints])
 
     def twists(self) -> FloatArray:
@@ -57,13 +57,13 @@ class EuclideanAxes:
 
 
 def turned(w: FloatArray, angle: FloatArray, v: FloatArray) -> FloatArray:
-    """Rodrigues: vectors ``v`` (N, 3) turned about unit ``w`` (3,) by ``angle`` (N,)."""
+    """Vectors ``v`` (N, 3) rotated about unit ``w`` (3,) by ``angle`` (N,) (Rodrigues)."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     return np.asarray(c * v + s * np.cross(w, v) + (1 - c) * (v @ w)[:, None] * w, dtype=np.float64)
 
 
 def about(w: FloatArray, c: FloatArray, angle: FloatArray, p: FloatArray) -> FloatArray:
-    """Points (N, 3) turned about an axis."""
+    """Points (N, 3) rotated about an axis."""
     return c + turned(w, angle, p - c)
 
 
@@ -94,25 +94,27 @@ def projected_roots(
 
 
 def prismatic(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
-    """(N, 1, n)."""
+    """Solutions (N, 1, n) of prismatic joints."""
     return np.asarray(((goal - p) @ np.linalg.pinv(axes.directions.T).T)[:, None], dtype=np.float64)
 
 
 def revolute(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
-    """(N, 1, 1)."""
+    """Solutions (N, 1, 1) of one revolute joint."""
     w, c = axes.directions[0], axes.points[0]
     return angle_between(w, p - c, goal - c)[:, None, None]
 
 
 def two_revolute(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
-    """(N, 2, 2): the second joint first, by the height along the first axis; the radius about it decides."""
+    """Solutions (N, 2, 2) of two joints: the second first, by the height along the first axis; the radius about it
+    decides.
+    """
     (w1, w2), (c1, c2) = axes.directions, axes.points
     seconds = projected_roots(w2, p, c2, w1, goal @ w1)
     return _with_first(w1, c1, w2, c2, p, goal, seconds)
 
 
 def two_parallel(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
-    """(N, 2, 2): the second joint first, by the squared distance from the first axis."""
+    """Solutions (N, 2, 2) of two parallel joints: the second first, by the squared distance from the first axis."""
     (w1, w2), (c1, c2) = axes.directions, axes.points
     arm = p - c2
     arm = arm - (arm @ w2)[:, None] * w2
@@ -144,7 +146,7 @@ def _with_first(
 
 
 def arm(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
-    """(N, 4, 3)."""
+    """Solutions (N, 4, 3) of an arm's first three joints."""
     w1, c1, w2 = axes.directions[0], axes.points[0], axes.directions[1]
     found = []
     for first in projected_roots(-w1, goal, c1, w2, p @ w2).T:
@@ -156,7 +158,9 @@ def arm(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
 
 
 def wrist(axes: EuclideanAxes, R: FloatArray) -> FloatArray:
-    """(N, 2, 3) of rotation matrices (N, 3, 3): the middle joint first, by the angle between the outer axes."""
+    """Solutions (N, 2, 3) of rotation matrices (N, 3, 3): the middle joint first, by the angle between the outer
+    axes.
+    """
     w1, w2, w3 = axes.directions
     n = len(R)
     last, turned_last = np.broadcast_to(w3, (n, 3)), R @ w3
@@ -182,7 +186,7 @@ def crossing(axes: EuclideanAxes, first: int, second: int) -> FloatArray:
 
 
 def with_wrist(axes: EuclideanAxes, H: FloatArray) -> FloatArray:
-    """(N, 8, 6) on an arm, (N, 2, 6) on a gantry: first three joints by the wrist's centre."""
+    """Solutions (N, 8, 6) of an arm, (N, 2, 6) of a gantry: first three joints by the wrist's centre."""
     centre = crossing(axes, 3, 4)
     p = np.broadcast_to(centre, (len(H), 3))
     goal = H[:, :3, :3] @ centre + H[:, :3, 3]
@@ -198,7 +202,7 @@ def with_wrist(axes: EuclideanAxes, H: FloatArray) -> FloatArray:
 
 
 def three_parallel(axes: EuclideanAxes, H: FloatArray) -> FloatArray:
-    """(N, 8, 6) of an arm whose axes 2, 3, 4 are parallel and whose axes 5, 6 meet: an offset wrist."""
+    """Solutions (N, 8, 6) of an arm whose axes 2, 3, 4 are parallel and whose axes 5, 6 intersect: an offset wrist."""
     z, w = axes.directions[1], axes.directions
     R, n = H[:, :3, :3], len(H)
     centre = crossing(axes, 4, 5)

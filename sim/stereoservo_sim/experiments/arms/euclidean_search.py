@@ -1,5 +1,5 @@
-"""The judge for six revolute joints without a closed form: Newton's method on position and rotation vector, in metric
-coordinates, from many random starts.
+"""Reference solver of six revolute joints without a closed form: Newton's method in metric coordinates from many
+random starts.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _forward(
 
 @numba.njit(cache=True)
 def _error(goal: FloatArray, R: FloatArray, t: FloatArray, e: FloatArray) -> float:
-    """Spatial twist (6,) of the way to ``goal`` (4, 4), to first order in its turn; its norm."""
+    """Spatial twist (6,) to ``goal`` (4, 4), to first order in its rotation; its norm."""
     D = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -97,7 +97,7 @@ def _eliminate(A: FloatArray, b: FloatArray) -> None:
 def _newton(
     directions: FloatArray, points: FloatArray, goal: FloatArray, starts: FloatArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Ends (s, n) and what is left at each (s,), [m] and [rad] in one norm."""
+    """End configurations (s, n) and their residuals (s,), [m] and [rad] in one norm."""
     s, n = starts.shape
     q = starts.copy()
     left = np.full(s, np.inf)

@@ -1,4 +1,4 @@
-"""Inverse kinematics of every family of arms (thesis 6) on random arms, hidden by random projective frames.
+"""Experiment: inverse kinematics of all families of arms (thesis 6) on random arms in random projective frames.
 
 The projective solver is given operators and points or displacements; a metric solver that shares nothing with it judges
 whether all solutions are found and how far their joints are off.
@@ -42,7 +42,7 @@ THESIS = "chapter 6 derives the solutions and prints no figure of their accuracy
 
 @dataclass(frozen=True, eq=False)
 class Hidden:
-    """An arm as the projective solver sees it, and the frame (4, 4) that hides it."""
+    """An arm in a random projective frame (4, 4), as the projective solver sees it."""
 
     axes: EuclideanAxes
     frame: FloatArray
@@ -50,7 +50,7 @@ class Hidden:
     recognition: Recognition
 
     def solve(self, pose: FloatArray, point: FloatArray | None) -> InverseSolutions:
-        """The projective answer for a Euclidean ``pose`` (4, 4), or for what it does to a ``point`` (3,)."""
+        """Projective solution for a Euclidean ``pose`` (4, 4), or for its effect on a ``point`` (3,)."""
         if point is None:
             H = self.frame @ pose @ np.linalg.inv(self.frame)
             return inverse_kinematics(self.chain, displacement=H, recognition=self.recognition)
@@ -64,7 +64,7 @@ class Hidden:
 
 
 def hide(axes: EuclideanAxes, rng: np.random.Generator) -> Hidden:
-    """``axes`` in a random, well-conditioned frame; zeros of the joints anywhere."""
+    """Transform ``axes`` into a random, well-conditioned frame; random joint zeros."""
     while True:
         frame = np.eye(4) + 0.35 * rng.normal(size=(4, 4))
         if np.linalg.det(frame) > 0.2 and np.linalg.cond(frame) < 8.0:
@@ -76,7 +76,7 @@ def hide(axes: EuclideanAxes, rng: np.random.Generator) -> Hidden:
 
 
 def run_inverse_kinematics(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Every family over ``seeds`` poses, with a tenth as many singular and unreachable ones."""
+    """Run every family over ``seeds`` poses, with a tenth as many singular and unreachable ones."""
     rows = []
     for i, (name, family) in enumerate(FAMILIES.items()):
         progress("inverse kinematics", i, len(FAMILIES))
@@ -155,7 +155,7 @@ def family_row(name: str, family: ArmFamily, poses: int, rng: np.random.Generato
 
 
 def differences(axes: EuclideanAxes, right: FloatArray, joints: FloatArray) -> FloatArray:
-    """Largest difference (s,) [rad or m] of each right solution (s, n) to the nearest of ``joints`` (r, n)."""
+    """Largest difference (s,) [rad or m] of each valid solution (s, n) to the nearest of ``joints`` (r, n)."""
     if not len(joints):
         return np.full(len(right), np.inf)
     apart = right[:, None] - joints[None]
@@ -164,7 +164,7 @@ def differences(axes: EuclideanAxes, right: FloatArray, joints: FloatArray) -> F
 
 
 def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
-    """Whether the answer at a singular pose reaches it and says what is free, or gives the isolated solution."""
+    """Whether the result at a singular pose reaches it and reports the free joint, or is the isolated solution."""
     goal = hidden.axes.displacements(pose.joints[None])[0]
     answer = hidden.solve(goal, pose.point)
     if not answer.reached or answer.residuals.max() > SOLVED:
@@ -176,7 +176,7 @@ def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
 
 
 def unreachable_handled(hidden: Hidden, family: ArmFamily, rng: np.random.Generator) -> bool:
-    """Whether a goal far away is said to be unreachable, with the nearest approach."""
+    """Whether a distant goal is reported as unreachable, with the closest approach."""
     q = rng.uniform(-0.5, 0.5, (1, len(hidden.axes.revolute)))
     goal = hidden.axes.displacements(q)[0]
     away = rng.normal(size=3)
@@ -188,7 +188,7 @@ def unreachable_handled(hidden: Hidden, family: ArmFamily, rng: np.random.Genera
 
 
 def walk_handled(hidden: Hidden, answer: InverseSolutions, goal: FloatArray) -> bool:
-    """Whether the self-motion told of a redundant arm leaves the goal reached over `WALK`."""
+    """Whether the reported self-motion of a redundant arm keeps the goal reached over `WALK`."""
     if not answer.reached or not len(answer.self_motions[0]):
         return False
     target = (hidden.frame @ goal @ np.linalg.inv(hidden.frame)).T
@@ -205,7 +205,7 @@ def _of(handled: list[int]) -> str | None:
 
 
 def _shares(poses: int, arms: int | None = None) -> list[int]:
-    """How many of ``poses`` each arm gets."""
+    """Number of ``poses`` of each arm."""
     arms = max(1, min(ARMS, poses // 5)) if arms is None else arms
     return [poses // arms + (i < poses % arms) for i in range(arms)]
 

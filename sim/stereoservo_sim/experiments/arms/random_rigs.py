@@ -1,8 +1,10 @@
-"""Self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds, and that it never lies.
+"""Experiment: success rate of self-calibration on random rigs, arms, bodies and noise, and whether reported
+accuracy holds.
 
-Each case is judged by the truth that only the judge knows. *Success*: a model whose predictions of held-out
-configurations are as far from the exact pixels as its own covariance says, and whose stated focal lengths and
-principal point are true within their deviations. *Failure*: a CalibrationError. *Wrong*: a model that fails the judge.
+Each case is evaluated against the ground truth, which the calibration does not use. *Success*: a model whose
+predictions of held-out configurations are as far from the exact pixels as its own covariance says, and whose stated
+focal lengths and principal point are true within their deviations. *Failure*: a CalibrationError. *Wrong*: a model
+that fails the judge.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ PROMISED = 0.995
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What became of a case.
+    """Outcome of a case.
 
     ``error_ratio``: squared errors of held-out pixels over those that the model's covariance states; with
     ``freedom`` effective degrees of freedom it must not exceed ``limit``. ``intrinsics_sigmas``: largest error of the
@@ -66,7 +68,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 def judged(seed: int) -> Verdict:
-    """The verdict on the case of ``seed``, fitted from nothing."""
+    """Outcome of the case of ``seed``, calibrated without prior knowledge."""
     case = random_case(seed)
     trials = case.trials()
     begin = time.process_time()
@@ -226,7 +228,7 @@ def draw_random_rigs(answer: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def show_random_rigs(answer: dict[str, Any], console: Console) -> None:
-    """The rate with its interval, rows, and what did not succeed."""
+    """Print the rate with its interval, rows, and the failures."""
     show_rows(answer, console)
     low, high = answer["wilson_95"]
     console.print(

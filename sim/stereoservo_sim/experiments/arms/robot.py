@@ -1,4 +1,6 @@
-"""``robot`` (tables 5.1 to 5.4): self-calibration of a 6R arm from a turned plate; images, axes, links, intrinsics."""
+"""Experiment ``robot`` (tables 5.1 to 5.4): self-calibration of a 6R arm from a moving plate; images, axes, links,
+intrinsics.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ LINK_2 = KnownLength("a", ("j2",), 0.4)
 
 @dataclass(frozen=True)
 class TableQuantity:
-    """A value of a table: where it stands, what it is called, its unit."""
+    """A quantity of a table: its place, name and unit."""
 
     table: str
     name: str
@@ -161,7 +163,8 @@ def jacobian_at(
 
 
 def _points_noise(rig: RigModel, data: Measurements, sigmas: FloatArray) -> FloatArray:
-    """What noise of points triangulated at the rig's zero from pixels with ``sigmas`` (c, m) does to the residuals.
+    """Derivative of the residuals by the noise of points triangulated at the rig's zero from pixels with ``sigmas``
+    (c, m).
 
     Columns (2 k, 3 m), one standard deviation each.
     """

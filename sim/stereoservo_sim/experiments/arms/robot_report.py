@@ -1,4 +1,4 @@
-"""``robot``: its answer as JSON, and its pictures."""
+"""JSON report and figures of the experiment ``robot``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PARTS_OF_AXES_2_3 = ("axes 2, 3 about their normal", "axes 2, 3 in their plane")
 
 
 def run_robot(seeds: int = 30, seed: int = 0, progress: ProgressCall = lambda *_: None) -> dict[str, Any]:
-    """Tables 5.1 to 5.4 over ``seeds`` simulated calibrations beside the thesis's."""
+    """Run ``seeds`` simulated calibrations; tables 5.1 to 5.4 beside the thesis's."""
     return answer(simulate(seeds, seed, progress), seed)
 
 
@@ -134,12 +134,12 @@ def _metric_rows(runs: RobotRuns) -> list[dict[str, Any]]:
 
 
 def _clean(value: float) -> float:
-    """A zero that is told with rounding errors as zero."""
+    """A zero with rounding errors as exactly zero."""
     return 0.0 if abs(value) < 1e-9 else value
 
 
 def _thesis_values(table: str, name: str) -> tuple[Any, Any]:
-    """Factory (or off-line) value and the experiment's, None where the thesis has none."""
+    """Published reference (factory or off-line) value and the experiment's, None where the thesis has none."""
     if table == "5.2":
         side, part = name.split()
         return tuple(THESIS["5.2"][side].get(part, (None, None)))
@@ -184,7 +184,7 @@ def _histogram(runs: RobotRuns, joint: int) -> list[int]:
 
 
 def show_robot(answer: dict[str, Any], console: Console) -> None:
-    """One table for each of the thesis's, then what they say together."""
+    """Print one table for each of the thesis's, then the summary."""
     for number, what in (
         ("5.1", "mean image distance [px], with what the noise alone gives"),
         ("5.2", "intrinsics [px]"),
@@ -237,7 +237,7 @@ def draw_robot(answer: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def _draw_tracks(answer: dict[str, Any], figure: Any) -> None:
-    """The dots in both images over all trial motions (figs 5.14, 5.15)."""
+    """Figure of the dots in both images over all trial motions (figs 5.14, 5.15)."""
     cell = thesis_cell()
     positions, trials = trial_motions(cell)
     pixels = cell.pixels(positions)
@@ -268,7 +268,7 @@ def _draw_residuals(answer: dict[str, Any], figure: Any) -> None:
 
 
 def _draw_errors(answer: dict[str, Any], figure: Any) -> None:
-    """Errors of the thesis, ours and the bound, by table."""
+    """Figure of the errors of the thesis, ours and the bound, by table."""
     panels = figure.subplots(1, 3, width_ratios=[8, 5, 5])
     for axis, table, unit in zip(panels, ("5.2", "5.3", "5.4"), ("px", "deg", "mm"), strict=True):
         rows = [row for row in answer["rows"] if row["table"] == table and row["thesis_error"] is not None]

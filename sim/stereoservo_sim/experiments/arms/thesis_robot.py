@@ -26,7 +26,7 @@ ROWS = (
     (0.0, 0.0, 0.085),
 )
 """a [m], alpha [°], d [m] of table 5.4: link 2 is a of joint 2, link 3 the offset from axis 3 to the wrist along axis
-4; axes 4 and 6 miss each other by 0.3 mm along axis 5. Base height and flange are not told, nor identifiable."""
+4; axes 4 and 6 miss each other by 0.3 mm along axis 5. Base height and flange are neither stated nor identifiable."""
 HOME_DEG = (10.0, -60.0, 120.0, 20.0, 40.0, 15.0)
 STROKES_DEG = (8.0, 8.0, 8.0, 30.0, 25.0, 170.0)
 """Each joint goes from minus to plus this about home."""

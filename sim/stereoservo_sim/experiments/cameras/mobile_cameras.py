@@ -1,4 +1,4 @@
-"""More than two cameras, mobile ones among them, before one tool: any pair, or all at once (thesis 9, fig. 9.1).
+"""Experiment: servoing with more than two cameras, some of them moving, by any pair or all (thesis 9, fig. 9.1).
 
 The demo's arm in lockstep before four cameras, two of which may be carried about. A calibration a seed, one goal shown;
 then the same goal by every pair, by all, by all while both mobile cameras are carried along a smooth path in its
@@ -60,7 +60,9 @@ LIMIT_S = 60.0
 
 @dataclass(frozen=True)
 class CarryCondition:
-    """``used``: cameras that the goal names; ``carried`` in its midst; ``covered`` once these stand."""
+    """An experimental condition. ``used``: cameras that the goal names; ``carried`` during the motion; ``covered``
+    once these are at rest.
+    """
 
     name: str
     used: tuple[str, ...]
@@ -92,7 +94,7 @@ class CarriedGoalResult:
 
 @dataclass
 class _Carrying:
-    """Which cameras somebody carries, and since when."""
+    """Cameras that are being carried, and since when."""
 
     since_ns: int = 0
     moves: tuple[str, ...] = ()
@@ -176,7 +178,7 @@ def fly(
     seed: int,
     recording: Path | None = None,
 ) -> CarriedGoalResult:
-    """Send the arm from home to the goal under one condition; deterministic given the seed."""
+    """Servo the arm from home to the goal under one condition; deterministic given the seed."""
     history = TrueJointHistory.in_memory(6, capacity=1 << 14)
     carrying = _Carrying()
     with (
@@ -225,7 +227,7 @@ def _shown_to(target: FeatureTarget, used: tuple[str, ...]) -> FeatureTarget:
 
 
 def _carry(cell: LockstepCell, carrying: _Carrying, inputs: StepInputs) -> None:
-    """Put the carried cameras where they are at this moment of their ways."""
+    """Set the carried cameras to their poses at this time."""
     share = min(max((inputs.now_ns - carrying.since_ns) * 1e-9 / CARRIED_S, 0.0), 1.0)
     for name in carrying.moves:
         camera: Any = cell.cameras[ALL.index(name)]
@@ -233,7 +235,7 @@ def _carry(cell: LockstepCell, carrying: _Carrying, inputs: StepInputs) -> None:
 
 
 def carried_to(name: str, share: float) -> Moved:
-    """Where camera ``name`` is after a ``share`` of its way, from the rig's camera that it stands for."""
+    """Pose of camera ``name`` after a ``share`` of its path, from that of the rig's camera."""
     from scipy.spatial.transform import Rotation
 
     shift, turn = np.array(PATHS[name].shift_m) * share, np.array(PATHS[name].turn_deg) * share
@@ -243,7 +245,7 @@ def carried_to(name: str, share: float) -> Moved:
 
 
 def _camera_error(cell: LockstepCell, carried: tuple[str, ...], q: FloatArray) -> float | None:
-    """Rms [px] a coordinate of what the core expects carried cameras to see, less what they would see without noise."""
+    """Rms error [px] per coordinate of the core's predicted pixels in carried cameras, against noise-free ones."""
     model = cell.core.state.model
     if not carried or model is None:
         return None

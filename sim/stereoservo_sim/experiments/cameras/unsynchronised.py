@@ -1,4 +1,4 @@
-"""Servoing by cameras without a trigger, beside the same with one: does skew cost accuracy, does a wrong latency?
+"""Experiment: servoing accuracy with unsynchronised cameras, or a wrong latency, against triggered cameras.
 
 The demo's cell in lockstep, cameras at 30 Hz that arrive 40 ms after their shutters, with the noise that rendered dots
 have. Four conditions, each with a calibration of its own: a trigger; 15 ms between the shutters; the same with a
@@ -45,7 +45,9 @@ MEASURES = ("final_error_px", "final_error_mm", "line_deviation_mm", "innovation
 
 @dataclass(frozen=True)
 class TimingCondition:
-    """``skew_s`` of the right camera's shutter; ``told_s``: the latency that its stamps reckon with."""
+    """An experimental condition. ``skew_s`` of the right camera's shutter; ``told_s``: the latency assumed by its
+    stamps.
+    """
 
     name: str
     skew_s: float
@@ -62,7 +64,7 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class TimedGoalResult:
-    """One goal: its judgement by the truth, and the rms of what the images said beside the model in motion [px]."""
+    """Result of one goal: its evaluation against ground truth, and the rms innovation in motion [px]."""
 
     goal: Judgement
     innovation_px: float
@@ -97,7 +99,7 @@ def run_unsynchronised(*, seeds: int, seed: int, progress: ProgressCall) -> dict
 
 
 def fly(condition: TimingCondition, seed: int) -> list[TimedGoalResult]:
-    """Calibrate a cell of ``condition`` and send its arm to every goal; deterministic given the seed."""
+    """Calibrate a cell of ``condition`` and servo its arm to every goal; deterministic given the seed."""
     cell = cell_of(condition)
     history = TrueJointHistory.in_memory(len(cell.safety.limit), capacity=1 << 16)
     watch = _Watch(TruthLog(history))
@@ -148,7 +150,7 @@ def cell_of(condition: TimingCondition) -> CellFile:
 
 
 class _Watch:
-    """Keeps what judgement needs of every step."""
+    """Log of every step, for the evaluation."""
 
     def __init__(self, log: TruthLog) -> None:
         self.log = log
@@ -160,7 +162,7 @@ class _Watch:
         self._innovations: dict[str, list[float]] = {}
 
     def see(self, inputs: StepInputs, outputs: StepOutputs) -> None:
-        """One step."""
+        """Log one step."""
         status = outputs.status
         self._times.append(inputs.now_ns)
         self._errors.append(np.nan if status.error_px is None else status.error_px)
@@ -173,7 +175,7 @@ class _Watch:
             self.log.take()
 
     def course(self) -> Course:
-        """All of it."""
+        """Time series of all steps."""
         return Course(
             np.array(self._times), np.array(self._errors), np.array(self._commands), self._goals, self._events
         )

@@ -1,4 +1,6 @@
-"""The benchmark of thesis 8.7: half a turn about the roll axis, the face tilted by 60°; and an arm that reaches it."""
+"""Experiment: the benchmark of thesis 8.7 (180° about the roll axis, face tilted by 60°), and an arm that reaches
+it.
+"""
 
 from __future__ import annotations
 
@@ -38,32 +40,39 @@ ASIDE_M = {"centred": 0.0, "aside": 0.15}
 LIMIT_MARGIN = np.radians(5.0)
 WAY_STEPS = 25
 LARGEST_JOINT_STEP = np.radians(25.0)
-"""Between two samples of the way: beyond it the arm would change its posture."""
+"""Between two samples of the path: beyond it the arm would change its posture."""
 TRIED_GAIN, TRIED_SEEDS = 1.0, 4
 
 
 def benchmark_task(where: str) -> AlignmentTask:
-    """``centred``: nothing but the turn; ``aside``: the plate's middle goes from one side of the axis to the other."""
+    """The task. ``centred``: only the rotation; ``aside``: the plate's centre moves from one side of the axis to
+    the other.
+    """
     goal = translation(ASIDE_M[where], 0.0, DEPTH_M) @ rotation("y", TILT_DEG)
     start = rotation("z", 180.0) @ goal
     number = list(ASIDE_M).index(where)
     return AlignmentTask(number, 0, 180.0, 2.0 * ASIDE_M[where], np.array([1.0, 0.0, 0.0]), start, goal)
 
 
-def true_way(task: AlignmentTask, profile: Profile = "linear") -> CartesianPath:
-    """The Cartesian way (7.25) of the plate in the rig's own frame."""
+def true_path(task: AlignmentTask, profile: Profile = "linear") -> CartesianPath:
+    """Cartesian path (7.25) of the plate in the rig's own frame."""
     A, A_star = HOMOGENEOUS_MARKERS @ task.start.T, HOMOGENEOUS_MARKERS @ task.goal.T
-    eyes = np.hstack([camera_poses()[:, :3, 3], np.ones((2, 1))])
+    camera_centres = np.hstack([camera_poses()[:, :3, 3], np.ones((2, 1))])
     parts = decompose(
-        cartesian_twists(task.start[:3, 3]), A[FACE], A_star[FACE], A.mean(axis=0), A_star.mean(axis=0), eyes
+        cartesian_twists(task.start[:3, 3]),
+        A[FACE],
+        A_star[FACE],
+        A.mean(axis=0),
+        A_star.mean(axis=0),
+        camera_centres,
     )
     return cartesian_path(parts, profile)
 
 
-def known_way(
+def known_path(
     knowledge: Knowledge, targets: FloatArray, profile: Profile = "linear"
 ) -> tuple[CartesianPath, FloatArray]:
-    """The same from what a controller knows, towards points ``targets`` (m, 4); and the points (m, 4) now.
+    """Cartesian path by a controller's knowledge, towards points ``targets`` (m, 4); and the current points (m, 4).
 
     Raises ValueError where it does not know the markers' places on the body.
     """
@@ -82,7 +91,8 @@ def known_way(
 
 
 def placed_rx90(task: AlignmentTask, seed: int, tries: int = 2000) -> SyntheticCell | None:
-    """The RX 90 with its base where it drives the whole Cartesian way of ``task`` without a limit; None if not found.
+    """RX 90 with its base placed such that it follows the whole Cartesian path of ``task`` within its limits; None
+    if not found.
 
     Configurations at the start are drawn by seed. The Cartesian laws then have to drive it with an exact model, for
     several seeds of the noise: it decides the sense of half a turn. Home is the configuration nearest to the start in
@@ -92,8 +102,8 @@ def placed_rx90(task: AlignmentTask, seed: int, tries: int = 2000) -> SyntheticC
     low, high = RX90_LIMITS[:, 0] + LIMIT_MARGIN, RX90_LIMITS[:, 1] - LIMIT_MARGIN
     limits = np.stack([low, high], axis=1)
     back = np.linalg.inv(PLATE_ON_FLANGE)
-    way = true_way(task)
-    poses = [way.displacement(s) @ task.start @ back for s in np.linspace(0.0, 1.0, WAY_STEPS)]
+    path = true_path(task)
+    poses = [path.displacement(s) @ task.start @ back for s in np.linspace(0.0, 1.0, WAY_STEPS)]
     for _ in range(tries):
         q = rng.uniform(low, high)
         base = poses[0] @ np.linalg.inv(np.linalg.inv(cell.base) @ cell.flange(q))
@@ -176,7 +186,7 @@ TITLE = "benchmark-180: half a turn, face tilted by 60°; rates over the gain: 1
 
 
 class BenchmarkRun(NamedTuple):
-    """A run that is asked for."""
+    """Specification of one run."""
 
     scene: str
     arm: ArmName
@@ -195,7 +205,9 @@ COMPARED = (
 
 
 def asked() -> list[BenchmarkRun]:
-    """All runs: classical laws, Cartesian laws on both arms, several gains on the RX 90, and the metric model."""
+    """Specifications of all runs: classical laws, Cartesian laws on both arms, several gains on the RX 90, the
+    metric model.
+    """
     arms: tuple[ArmName, ...] = ("free", "rx90")
     return [
         *(
@@ -224,7 +236,7 @@ def asked() -> list[BenchmarkRun]:
 def run_benchmark_180(
     *, seed: int, progress: ProgressCall, runs: list[BenchmarkRun] | None = None
 ) -> dict[str, Any]:
-    """All runs and the planned ways. Raises CalibrationError."""
+    """Run all laws and planned paths. Raises CalibrationError."""
     runs = asked() if runs is None else runs
     tasks = {scene: benchmark_task(scene) for scene in ASIDE_M}
     known = _calibrations(runs, tasks, seed)
@@ -259,7 +271,7 @@ def run_benchmark_180(
 def _calibrations(
     runs: list[BenchmarkRun], tasks: dict[str, AlignmentTask], seed: int
 ) -> dict[tuple[str, ArmName, str], TaskCalibration | None]:
-    """By scene (of the placed arm), arm and model; None where no placement was found."""
+    """Calibrations by scene (of the placed arm), arm and model; None where no placement was found."""
     free = free_cell()
     known: dict[tuple[str, ArmName, str], TaskCalibration | None] = {
         ("", "free", "projective"): self_calibrated("free", free, NOISE_PX, seed),
@@ -312,13 +324,13 @@ def _row(run: BenchmarkRun, task: AlignmentTask, result: TaskResult, trace: Trac
 
 
 def stalled_s(errors: FloatArray, gain: float, dt_s: float) -> float:
-    """How long an image error (k,) [px] that is far from small falls at less than a tenth of the gain [s]."""
+    """Time [s] for which an image error (k,) [px] that is not small decays at less than a tenth of the gain."""
     rates = -np.diff(np.log(np.maximum(errors, 1e-9))) / dt_s
     return dt_s * int(((rates < SLOW * gain) & (errors[:-1] > FAR_PX)).sum())
 
 
 def _curve(run: BenchmarkRun, task: AlignmentTask, trace: Trace) -> dict[str, Any]:
-    """What the figures show of a run."""
+    """Data of a run for the figures."""
     pixels = images(trace.poses)
     return {
         **run._asdict(),
@@ -333,7 +345,7 @@ def _curve(run: BenchmarkRun, task: AlignmentTask, trace: Trace) -> dict[str, An
 
 
 def _classical(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What becomes of the classical laws, in words, beside the thesis's."""
+    """Outcome of the classical laws as text, beside the thesis's."""
     return [
         {
             "law": row["law"],
@@ -351,17 +363,17 @@ def _classical(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _planned(
     scene: str, task: AlignmentTask, calibration: TaskCalibration | None, profile: Profile
 ) -> dict[str, Any]:
-    """A planned way (figs 8.15, 8.16): truth judged, and the projective model's way beside it in the images."""
+    """A planned path (figs 8.15, 8.16): ground truth, and the projective model's path beside it in the images."""
     assert calibration is not None
     knowledge = known_at_start(calibration, task, None)
     set_points = sight(task.goal).pixels
     found, _ = triangulate(knowledge.matrices, set_points, np.ones(set_points.shape[:2]), 5)
-    way, points = known_way(knowledge, found / (found @ knowledge.plane_at_infinity)[:, None], profile)
+    path, points = known_path(knowledge, found / (found @ knowledge.plane_at_infinity)[:, None], profile)
     sigmas = np.linspace(0.0, 1.0, 101)
     planned = np.array(
-        [project_points(knowledge.matrices, points @ way.displacement(s).T)[0] for s in sigmas]
+        [project_points(knowledge.matrices, points @ path.displacement(s).T)[0] for s in sigmas]
     )
-    truth = true_way(task, profile)
+    truth = true_path(task, profile)
     parts = truth.decomposition
     # Half a turn has two senses: the model's is compared with the nearer.
     other = CartesianPath(
@@ -385,7 +397,7 @@ def _planned(
 def _overlap(
     task: AlignmentTask, known: dict[tuple[str, ArmName, str], TaskCalibration | None], seed: int
 ) -> dict[str, Any]:
-    """How far the control errors of projective and metric model are apart, the images free of noise (fig. 8.20)."""
+    """Difference of the control errors of projective and metric model, with noise-free images (fig. 8.20)."""
     found = []
     for run in COMPARED:
         calibration = known["", run.arm, run.model]

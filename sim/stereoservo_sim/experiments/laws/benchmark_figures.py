@@ -14,7 +14,7 @@ Curve = dict[str, Any]
 
 
 def draw_benchmark_180(answer: dict[str, Any], folder: Path) -> list[Path]:
-    """Classical laws, control errors, ways of the centre, image errors, joint motions."""
+    """Figures of classical laws, control errors, paths of the centre, image errors, joint motions."""
     curves = answer["curves"]
     return [
         _classical(_of(curves, scene="aside", arm="free"), folder),
@@ -73,7 +73,7 @@ def _control_errors(curves: list[Curve], folder: Path) -> Path:
 
 
 def _centres(curves: list[Curve], folder: Path) -> Path:
-    """The centre's way beside its line for several gains (figs 8.17, 8.18)."""
+    """Path of the centre beside its line for several gains (figs 8.17, 8.18)."""
     figure = picture(11, 6)
     for line, law in zip(figure.subplots(2, 2, sharey=True), ("cartesian3", "cartesian2"), strict=True):
         for axis, step in zip(line, ("first order", "corrected"), strict=True):

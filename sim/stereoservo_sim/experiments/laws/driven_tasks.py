@@ -1,4 +1,4 @@
-"""Alignment tasks driven by laws: run in parallel, their ways measured and drawn. For the experiments of chapter 8."""
+"""Alignment tasks run by control laws in parallel, with measures and drawings of their paths, for chapter 8."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0
 
 
 class Case(NamedTuple):
-    """How tasks are run: what the controller knows, and how it goes about it."""
+    """How tasks are run: the controller's knowledge and settings."""
 
     calibration: TaskCalibration
     settings: LoopSettings
@@ -40,7 +40,7 @@ _cases: Sequence[Case] = ()
 def results_of(
     cases: Sequence[Case], tasks: Sequence[AlignmentTask], jobs: int, tell: Callable[[int, int], None]
 ) -> list[list[TaskResult]]:
-    """All tasks in all cases, one list a case; ``tell(done, total)`` as they end."""
+    """Results of all tasks in all cases, one list a case; ``tell(done, total)`` as they end."""
     total = len(cases) * len(tasks)
     found: list[list[TaskResult]] = [[] for _ in cases]
     tell(0, total)
@@ -90,21 +90,23 @@ def image_errors(poses: FloatArray, goal: FloatArray) -> FloatArray:
 
 
 def path_ratio(poses: FloatArray) -> float:
-    """Length of the markers' ways in the images over the distance from their start to their end, over all of them."""
+    """Length of the markers' image paths over the distance from their start to their end, over all of them."""
     pixels = images(poses)
     walked = np.linalg.norm(np.diff(pixels, axis=0), axis=-1).sum()
     return float(walked / np.linalg.norm(pixels[-1] - pixels[0], axis=-1).sum())
 
 
 class Decay(NamedTuple):
-    """``A e^{-rate t}`` fitted to an error by least squares of its logarithm: ``rate`` [1/s], and ``r_squared``."""
+    """Exponential ``A e^{-rate t}`` fitted to an error by least squares of its logarithm: ``rate`` [1/s], and
+    ``r_squared``.
+    """
 
     rate: float
     r_squared: float
 
 
 def decay(errors: FloatArray, dt_s: float, least: float) -> Decay | None:
-    """Fit of errors (k,) from the first on until they have fallen to ``least`` of it; None below four samples.
+    """Fit of errors (k,) from the first one until they have fallen to ``least`` of it; None below four samples.
 
     None, too, where the first is not positive: there is nothing to decay.
     """
@@ -122,7 +124,7 @@ def decay(errors: FloatArray, dt_s: float, least: float) -> Decay | None:
 
 
 def thinned(values: FloatArray, digits: int = 4) -> list[Any]:
-    """At most ``CURVE_POINTS`` of the values (k, …), evenly, the first and the last among them, for an answer."""
+    """At most ``CURVE_POINTS`` of the values (k, …), evenly spaced, with the first and the last."""
     if len(values) == 0:
         return []
     picked = np.unique(np.linspace(0, len(values) - 1, CURVE_POINTS).round().astype(int))
@@ -138,7 +140,7 @@ def picture(width: float, height: float) -> Figure:
 
 
 def saved(figure: Figure, folder: Path, name: str) -> Path:
-    """Written as ``NAME.png``."""
+    """Save the figure as ``NAME.png``."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.png"
     figure.savefig(path, dpi=110)
@@ -146,7 +148,7 @@ def saved(figure: Figure, folder: Path, name: str) -> Path:
 
 
 def labelled(axis: Axes, title: str, across: str, up: str) -> None:
-    """Title and labels in the experiments' sizes."""
+    """Set title and labels in the experiments' sizes."""
     axis.set_title(title, fontsize=9)
     axis.set_xlabel(across, fontsize=8)
     axis.set_ylabel(up, fontsize=8)
@@ -154,7 +156,7 @@ def labelled(axis: Axes, title: str, across: str, up: str) -> None:
 
 
 def draw_images(axis: Axes, pixels: FloatArray, colour: str, label: str) -> None:
-    """Ways of markers (k, m, 2) in one image: a line each, a ring where they end."""
+    """Draw tracks of markers (k, m, 2) in one image: a line each, a ring where they end."""
     for p in range(pixels.shape[1]):
         axis.plot(*pixels[:, p].T, color=colour, linewidth=0.9, label=label if p == 0 else None)
         axis.plot(*pixels[-1, p], "o", color=colour, markersize=4, fillstyle="none")

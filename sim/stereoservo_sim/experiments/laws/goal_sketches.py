@@ -1,4 +1,4 @@
-"""Small motions towards every kind of goal, for pictures: the free arm with its exact model, without noise."""
+"""Short motions towards every kind of goal, for figures: the free arm with its exact model, without noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Commanded = Callable[[Scene, float], FloatArray]
 
 DT_S, GAIN, SECONDS = 0.04, 1.0, 8.0
 SIGMA_PX = 0.1
-"""What pixels are said to be known to."""
+"""Stated standard deviation of the pixels."""
 MARKERS = 4
 WORKPIECE = np.array(
     [
@@ -45,24 +45,24 @@ CIRCLE_M, TURN_S = 0.1, 8.0
 
 
 class Drive(NamedTuple):
-    """A motion: ``poses`` (k, 4, 4) of the plate, ``pixels`` (k, 2, 4, 2) noise-free."""
+    """A recorded motion: ``poses`` (k, 4, 4) of the plate, ``pixels`` (k, 2, 4, 2) noise-free."""
 
     poses: FloatArray
     pixels: FloatArray
 
 
 def start_pose() -> FloatArray:
-    """(4, 4): where sketches begin."""
+    """Start pose (4, 4) of the sketches."""
     return translation(-0.14, 0.06, 1.1) @ rotation("y", 20) @ rotation("x", -15)
 
 
 def goal_pose() -> FloatArray:
-    """(4, 4): where they go to."""
+    """Goal pose (4, 4) of the sketches."""
     return translation(0.12, -0.08, 1.0) @ rotation("z", 60) @ rotation("y", -20)
 
 
 class World:
-    """The arm at a start, what its controller knows, and how it is driven."""
+    """The arm at a start pose, with its controller's knowledge."""
 
     def __init__(self, calibration: TaskCalibration, start: FloatArray) -> None:
         self._calibration = calibration
@@ -72,19 +72,19 @@ class World:
         self.points: FloatArray = self.knowledge.points
 
     def points_at(self, pose: FloatArray) -> FloatArray:
-        """(4, 4) points of the plate at ``pose``, in the model's frame, heights 1."""
+        """Points (4, 4) of the plate at ``pose``, in the model's frame, of scale 1."""
         found = self._known(pose).points
         assert found is not None
         return found
 
     def seen_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (2, n, 2) of points (n, 4) of the rig, and the points (n, 4) in the model's frame, heights 1."""
+        """Pixels (2, n, 2) of points (n, 4) of the rig, and the points (n, 4) in the model's frame, of scale 1."""
         pixels, _ = project_points(MATRICES, points)
         found, _ = triangulate(self.knowledge.matrices, pixels, np.ones(pixels.shape[:2]), 5)
         return pixels, with_unit_height(found, self.knowledge.plane_at_infinity)
 
     def towards(self, targets: FloatArray) -> Task:
-        """The task of taking the plate to ``targets`` (4, 4), points in the model's frame."""
+        """Task of moving the plate to ``targets`` (4, 4), points in the model's frame."""
         set_points, _ = project_points(self.knowledge.matrices, targets)
         return Task(
             set_points, np.ones((2, MARKERS)), np.zeros_like(set_points), targets,
@@ -92,7 +92,7 @@ class World:
         )  # fmt: skip
 
     def drive(self, command: Commanded, seconds: float) -> Drive:
-        """Run ``command(scene, t)`` for so long."""
+        """Run ``command(scene, t)`` for some time."""
         arm, points = FreeArm(self.start), self.points
         poses = [arm.pose]
         for k in range(round(seconds / DT_S)):
@@ -134,7 +134,7 @@ def shown(calibration: TaskCalibration, law: str = "stereo") -> Drive:
 
 
 def displaced_twice(calibration: TaskCalibration) -> tuple[Drive, Drive]:
-    """``displacement``: the same matrix twice, each from where the body then is."""
+    """Goal ``displacement``: the same matrix twice, each from the body's present pose."""
     pose, drives = start_pose(), []
     first = World(calibration, pose)
     step = translation(0.13, -0.09, 0.0) @ _about(pose, rotation("z", 35))
@@ -146,20 +146,22 @@ def displaced_twice(calibration: TaskCalibration) -> tuple[Drive, Drive]:
 
 
 def _about(pose: FloatArray, turn: FloatArray) -> FloatArray:
-    """``turn`` (4, 4) about the middle of the plate at ``pose``."""
+    """Displacement ``turn`` (4, 4) about the centre of the plate at ``pose``."""
     middle = translation(*pose[:3, 3])
     return np.asarray(middle @ turn @ np.linalg.inv(middle))
 
 
 def _frame(world: World, pose: FloatArray) -> FloatArray:
-    """(5, 4) points fixed to a body at ``pose``, in the model's frame, heights 1: they tell a displacement of it."""
+    """Points (5, 4) fixed to a body at ``pose``, in the model's frame, of scale 1, which determine its
+    displacement.
+    """
     corners = np.vstack([np.eye(4) * 0.1, [[0.1, 0.1, 0.1, 0.0]]])
     corners[:, 3] = 1.0
     return world.seen_points(corners @ pose.T)[1]
 
 
 class GoalSketch(NamedTuple):
-    """A goal carried over to a workpiece that has moved; pixels (2, n, 2)."""
+    """A goal transferred to a moved workpiece; pixels (2, n, 2)."""
 
     taught: FloatArray
     workpiece_then: FloatArray
@@ -169,7 +171,7 @@ class GoalSketch(NamedTuple):
 
 
 def carried_over(calibration: TaskCalibration) -> GoalSketch:
-    """``taught``: relative to five markers of the workpiece, by a homography of space alone."""
+    """Goal ``taught``: relative to five markers of the workpiece, by a homography of space alone."""
     world = World(calibration, start_pose())
     then = translation(0.06, 0.06, 1.12) @ rotation("x", 10)
     now = translation(0.12, -0.02, 1.05) @ rotation("z", -25) @ rotation("y", 15)
@@ -184,7 +186,7 @@ def carried_over(calibration: TaskCalibration) -> GoalSketch:
 
 
 class OnLine(NamedTuple):
-    """``line`` (2, 2, 2) pixels of two points of it; motions with the other freedoms left alone, and given away."""
+    """Motions onto ``line`` (2, 2, 2), pixels of two of its points, with the remaining freedoms unused, and used."""
 
     line: FloatArray
     alone: Drive
@@ -193,7 +195,7 @@ class OnLine(NamedTuple):
 
 
 def point_on_line(calibration: TaskCalibration) -> OnLine:
-    """``incidence``: marker 0 onto a line; the freedoms left alone, or used for set-points as far as they allow."""
+    """Goal ``incidence``: marker 0 onto a line; the remaining freedoms unused, or used for set-points."""
     world = World(calibration, start_pose())
     line_pixels, line_points = world.seen_points(np.array([(-0.2, -0.15, 1.05, 1.0), (0.3, -0.05, 1.0, 1.0)]))
     on_line = incidence_task(
@@ -215,7 +217,7 @@ def point_on_line(calibration: TaskCalibration) -> OnLine:
 
 
 class Streamed(NamedTuple):
-    """``target`` (k, 2, 4, 2) pixels; followed with its velocity fed forward, and without."""
+    """``target`` (k, 2, 4, 2) pixels; tracked with velocity feedforward, and without."""
 
     target: FloatArray
     fed_forward: Drive
@@ -223,7 +225,7 @@ class Streamed(NamedTuple):
 
 
 def streamed(calibration: TaskCalibration) -> Streamed:
-    """A target that goes round, one turn after the arm has caught up."""
+    """A target on a circle, one turn after the arm has caught up."""
     world = World(calibration, start_pose())
 
     def pose_at(k: int) -> FloatArray:

@@ -1,4 +1,4 @@
-"""``stereoservo reproduce laws``: every law on three demanding tasks, and a sketch of every kind of goal.
+"""Experiment ``laws``: every law on three demanding tasks, and a sketch of every kind of goal.
 
 The pictures of `docs/goals-and-laws.md`. Laws run as in ``stereoservo simulate``: the free arm, self-calibrated; the
 controller sees noisy pixels, the table and the pictures show the truth.
@@ -23,7 +23,7 @@ from stereoservo_sim.world.synthetic import rotation, translation
 
 NOISE_PX = 0.1
 LARGE_ID, BENT_ID = 5032, 5116
-"""Of the shipped hard tasks: one whose turn swings corners out of the image, one whose straight way leaves it."""
+"""Of the shipped hard tasks: one whose turn swings corners out of the image, one whose straight path leaves it."""
 ROLL_ID = 1
 CURRENT = "stereo, current"
 VARIANTS = ("stereo", CURRENT, *(law for law in LAWS if law != "stereo"))
@@ -36,7 +36,7 @@ THESIS = {
 
 @dataclass(frozen=True, eq=False)
 class ComparedRun:
-    """A law on a task: what the judge says, and the way it went."""
+    """A law on a task: its evaluation, and the path taken."""
 
     name: str
     task: AlignmentTask
@@ -92,7 +92,7 @@ def run_laws(
 
 
 def report_laws(comparison: LawComparison) -> dict[str, Any]:
-    """The JSON object: a row a task and law."""
+    """JSON report: a row a task and law."""
     rows = [_row(law, run) for runs in comparison.runs.values() for law, run in runs.items()]
     return {
         "experiment": "laws", "rows": rows, "thesis": THESIS, "seed": comparison.seed, "noise_px": NOISE_PX,
@@ -113,7 +113,7 @@ def _row(law: str, run: ComparedRun) -> dict[str, Any]:
 
 
 def show_laws(answer: dict[str, Any], console: Console) -> None:
-    """The rows for people; 90° of view angle and more is the back, negative room is out of the image."""
+    """Print the rows; a view angle of 90° and more is the back, a negative margin is out of the image."""
     table = Table(
         title="laws on demanding tasks, self-calibrated, 25 Hz", title_justify="left", caption_justify="left",
     )  # fmt: skip

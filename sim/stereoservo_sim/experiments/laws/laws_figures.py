@@ -1,4 +1,4 @@
-"""Pictures of `laws_compared` and `goal_sketches`: small enough to be kept beside the page that shows them."""
+"""Figures of `laws_compared` and `goal_sketches`, small enough for the repository."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ENDINGS = {
     "NOT_CONVERGED": "does not arrive",
 }
 AROUND_PX = 25.0
-"""Drawn around the markers' ways, so that what leaves the image shows beside its border."""
+"""Drawn around the markers' tracks, so that what leaves the image shows beside its border."""
 LONGEST_S, EVERY = 16.0, 5
 """Of the curves over time: their length, and every how many steps a point is drawn."""
 TASKS = {
@@ -41,7 +41,7 @@ TASKS = {
 
 
 def draw_laws(comparison: LawComparison, folder: Path) -> list[Path]:
-    """All pictures into ``folder``, which is there."""
+    """Write all figures into ``folder``, which must exist."""
     calibration = calibrate("free", "exact", 0.0, comparison.seed)
     figures = {
         "laws-large": _tracks(comparison, "large"),
@@ -60,7 +60,7 @@ def draw_laws(comparison: LawComparison, folder: Path) -> list[Path]:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    """With a palette: the pictures are kept in the repository."""
+    """Save with a palette, to keep the repository small."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI)
     Image.open(drawn).convert("RGB").quantize(COLOURS_KEPT).save(path, optimize=True)
@@ -73,7 +73,7 @@ def _figure(width: float, height: float) -> Figure:
 
 
 def _image(axis: Axes, title: str, around: FloatArray | None = None) -> None:
-    """An empty left image with its border; only what lies ``around`` (2, 2), least and largest, where that is given."""
+    """An empty left image with its border; cropped to ``around`` (2, 2), least and largest, where that is given."""
     axis.add_patch(Rectangle((0, 0), WIDTH, HEIGHT, facecolor="#f4f4f4", edgecolor="#888888", linewidth=0.8))
     low, high = np.array([(-10.0, -10.0), (WIDTH + 10.0, HEIGHT + 10.0)]) if around is None else around
     axis.set_xlim(low[0], high[0])
@@ -93,18 +93,18 @@ def _outline(axis: Axes, pixels: FloatArray, colour: str, style: str = "-", widt
 
 
 def _marker_tracks(axis: Axes, pixels: FloatArray, colour: str, style: str = "-") -> None:
-    """Tracks (k, 4, 2)."""
+    """Draw tracks (k, 4, 2)."""
     for marker in range(pixels.shape[1]):
         axis.plot(pixels[:, marker, 0], pixels[:, marker, 1], style, color=colour, linewidth=0.9)
 
 
 def _left(run: ComparedRun) -> FloatArray:
-    """(k, 4, 2): the left image of a run."""
+    """Left image (k, 4, 2) of a run."""
     return np.array([sight(pose).pixels[0] for pose in run.trace.poses])
 
 
 def _around(runs: list[ComparedRun]) -> FloatArray:
-    """(2, 2): where the markers' ways lie, but for the wildest."""
+    """Bounds (2, 2) of the markers' tracks without the most extreme ones."""
     pixels = np.concatenate([_left(run).reshape(-1, 2) for run in runs])
     ends = np.concatenate([sight(pose).pixels[0] for run in runs for pose in (run.task.start, run.task.goal)])
     least = np.minimum(np.percentile(pixels, 0.5, axis=0), ends.min(axis=0))
@@ -141,7 +141,7 @@ def _tracks(comparison: LawComparison, task: str) -> Figure:
 
 
 def _off_line_mm(run: ComparedRun) -> FloatArray:
-    """(k,): distances of the plate's middle from the straight line through start and goal."""
+    """Distances (k,) of the plate's centre from the straight line through start and goal."""
     begin, end = run.task.start[:3, 3], run.task.goal[:3, 3]
     offset = run.trace.poses[:, :3, 3] - begin
     length = float(np.linalg.norm(end - begin))
@@ -152,7 +152,7 @@ def _off_line_mm(run: ComparedRun) -> FloatArray:
 
 
 def _left_deg(run: ComparedRun) -> FloatArray:
-    """(k,): angle [°] between the plate and its goal."""
+    """Remaining angle (k,) [°] between the plate and its goal."""
     trace = np.einsum("kij,ij->k", run.trace.poses[:, :3, :3], run.task.goal[:3, :3])
     return np.asarray(np.degrees(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))))
 
@@ -249,7 +249,7 @@ def _features(axis: Axes, drive: Drive) -> None:
 
 
 def _points(axis: Axes, drive: Drive) -> None:
-    """From above, the plate as a bar of its first two markers."""
+    """Top view, with the plate as a bar of its first two markers."""
     middles = drive.poses[:, :3, 3]
     axis.plot(1e3 * middles[:, 0], 1e3 * middles[:, 2], color=COLOURS["cartesian3"], linewidth=1.2)
     for k, colour in ((0, "#888888"), (8, "#cccccc"), (20, "#cccccc"), (40, "#cccccc"), (-1, "black")):

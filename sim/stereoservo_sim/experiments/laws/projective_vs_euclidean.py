@@ -1,5 +1,6 @@
-"""``projective-vs-euclidean``: the comparison that thesis 9.3 asks for. The same tasks with a self-calibrated model
-and with metric ones of growing errors."""
+"""Experiment ``projective-vs-euclidean`` (thesis 9.3): the same tasks with a self-calibrated model and with metric
+ones of growing errors.
+"""
 
 from __future__ import annotations
 

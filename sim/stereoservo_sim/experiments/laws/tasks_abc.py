@@ -1,5 +1,6 @@
-"""``tasks-abc`` (8.6, figs 8.6 to 8.12): three alignments with the RX 90, image-based stereo control, self-calibrated
-projectively or metric with coarse errors."""
+"""Experiment ``tasks-abc`` (8.6, figs 8.6 to 8.12): three alignments with the RX 90 by image-based stereo control,
+self-calibrated projectively or metric with coarse errors.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.tasks.arms import rx90_cell, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, calibrate
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, Trace, run_task
-from stereoservo_sim.tasks.hard_tasks import straight_way
+from stereoservo_sim.tasks.hard_tasks import straight_path_margins
 from stereoservo_sim.tasks.random_tasks import random_ends, unit, visible
 from stereoservo_sim.tasks.setting import DEFAULT_RATE_HZ, FOCAL_ERROR, HAND_EYE_ERROR_DEG, HEIGHT, WIDTH
 from stereoservo_sim.tasks.task_file import AlignmentTask
@@ -69,9 +70,9 @@ def abc_tasks(seed: int) -> tuple[AlignmentTask, ...]:
     exact = calibrate("rx90", "exact", 0.0, seed)
     solvable = LoopSettings(law="stereo", arm="rx90", jacobian="current", noise_px=0.0)
     found = []
-    for number, way in enumerate(DRAWN.values()):
+    for number, parameters in enumerate(DRAWN.values()):
         rng = np.random.default_rng([seed, number])
-        while not run_task(task := drawn(rng, number, seed, *way), exact, solvable)[0].success:
+        while not run_task(task := drawn(rng, number, seed, *parameters), exact, solvable)[0].success:
             pass
         found.append(task)
     return tuple(found)
@@ -80,13 +81,13 @@ def abc_tasks(seed: int) -> tuple[AlignmentTask, ...]:
 def drawn(
     rng: np.random.Generator, number: int, seed: int, angle_deg: float, distance_m: float
 ) -> AlignmentTask:
-    """A task about 1 m off that the RX 90 reaches and whose straight way keeps the plate in view."""
+    """A random task about 1 m away that the RX 90 reaches and whose straight path keeps the plate in view."""
     cell = rx90_cell()
     while True:
         start, goal = random_ends(rng, angle_deg, distance_m)
         if abs(goal[2, 3] - DEPTH_M) > DEPTH_SPREAD_M or not (visible(start) and visible(goal)):
             continue
-        margin, facing = straight_way(start, goal)
+        margin, facing = straight_path_margins(start, goal)
         if margin > 0.0 and facing > 0.0 and rx90_reach(cell, start, goal) is not None:
             return AlignmentTask(number, seed, angle_deg, distance_m, unit(rng), start, goal)
 
@@ -94,7 +95,8 @@ def drawn(
 def run_tasks_abc(
     *, seeds: int, seed: int, progress: ProgressCall, gains: tuple[float, ...] = GAINS
 ) -> dict[str, Any]:
-    """All tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's kind.
+    """All tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's
+    kind.
 
     Raises CalibrationError.
     """
@@ -173,7 +175,7 @@ def _row(
 def _curve(
     name: str, calibration: str, settings: LoopSettings, trace: Trace, task: AlignmentTask
 ) -> dict[str, Any]:
-    """What the figures show of a run."""
+    """Data of a run for the figures."""
     return {
         "task": name,
         "calibration": calibration,
@@ -187,7 +189,7 @@ def _curve(
 
 
 def _beside(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Who solves what, over the gains, with the thesis's law."""
+    """Success of each calibration, over the gains, beside the thesis's."""
     found = []
     for name in DRAWN:
         for calibration in CALIBRATIONS:
@@ -209,7 +211,7 @@ def _beside(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _drawn_more(reasons: dict[str, list[str]]) -> list[dict[str, Any]]:
-    """How often poses of B's angle and distance are solved, whoever solves them."""
+    """Success rates of random poses of B's angle and distance."""
     return [
         {
             "task": "B drawn",

@@ -1,4 +1,4 @@
-"""Uncalibrated cameras and tag corners fitted to what the arm says that its hand did.
+"""Calibration of cameras and tag corners from images and the reported displacements of a real arm's hand.
 
 The arm's recorded displacements ``D`` (n, 4, 4) carry the tag's corners ``X`` (k, 3) [m], unknown in the
 hand; each camera is a free 3x4 matrix with, if asked for, one radial term. No intrinsics, no size of the tag,
@@ -156,7 +156,7 @@ def refit(model: DrivenCameras, displacements: FloatArray, views: TagViews, *, r
 
 
 def _offsets(rng: np.random.Generator) -> FloatArray:
-    """Guesses (g, 3) [m]: an even spiral of directions, turned at random, on each of RADII."""
+    """Start values (g, 3) [m]: an even spiral of directions, rotated at random, on each of RADII."""
     i = np.arange(DIRECTIONS) + 0.5
     z, angle = 1.0 - 2.0 * i / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
     ring = np.sqrt(1.0 - z**2)
@@ -166,7 +166,7 @@ def _offsets(rng: np.random.Generator) -> FloatArray:
 
 
 def carried(displacements: FloatArray, corners: FloatArray) -> FloatArray:
-    """Corners (k, 3) carried by displacements (v, 4, 4): (v, k, 3)."""
+    """Corners (k, 3) moved by displacements (v, 4, 4): (v, k, 3)."""
     points: FloatArray = (
         np.einsum("vij,kj->vki", displacements[:, :3, :3], corners) + displacements[:, None, :3, 3]
     )
@@ -175,7 +175,7 @@ def carried(displacements: FloatArray, corners: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _CameraProblem:
-    """The data in normalised units: lengths over ``spread`` about ``middle``, pixels by ``N`` (c, 3, 3).
+    """The data in normalised units: lengths divided by ``spread`` about ``middle``, pixels by ``N`` (c, 3, 3).
 
     Unknowns ``z``: cameras (c, 3, 4), radial terms (c,), corners (k, 3), in one row.
     """
@@ -304,8 +304,9 @@ class _CameraProblem:
         robust: bool,
         inliers: BoolArray | None = None,
     ) -> tuple[FloatArray, float]:
-        """Unknowns of least (robust) reprojection error and the cost [px²]; each camera's scale is left
-        out."""
+        """Bundle adjustment: unknowns of least (robust) reprojection error and the cost [px²]; each camera's scale
+        is left out.
+        """
         c = len(Ps)
         unit = [P / np.linalg.norm(P) for P in Ps]
         start = np.concatenate([np.ravel(unit), radial_terms, corners.ravel()])
@@ -363,7 +364,9 @@ class _CameraProblem:
 
 @dataclass(frozen=True)
 class Triangulated:
-    """Cameras (indices) that were used, and the distances ``errors`` (n,) [m] of the corners from where they are."""
+    """Triangulation errors: the cameras (indices) used, and the distances ``errors`` (n,) [m] of the corners from
+    their true positions.
+    """
 
     cameras: tuple[int, ...]
     errors: FloatArray

@@ -1,4 +1,4 @@
-"""Reading a hand-eye set: images ``pose##_cam#.jpg`` and the arm's poses in ``ee_poses.csv``."""
+"""Reader of a hand-eye data set: images ``pose##_cam#.jpg`` and the arm's poses in ``ee_poses.csv``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Real input: a real arm before fixed cameras, of which nothing is known but the arm's recorded
-displacements.
+"""Experiment with real images: fixed uncalibrated cameras, calibrated from a real arm's recorded displacements
+alone.
 
 A tag on the hand is found in the images; free 3x4 cameras and the tag's four corners in the hand are fitted
 to the arm's poses; poses that the fit has not seen are predicted. Folds are fixed: pose index modulo FOLDS is
@@ -51,7 +51,7 @@ STILL_PX, STILL_M = 3.0, 0.05
 
 @dataclass(frozen=True)
 class Observations:
-    """What the images hold. ``camera`` (v,) indexes ``cameras``; ``pose`` (v,) is the pose index of the file
+    """Detections in the images. ``camera`` (v,) indexes ``cameras``; ``pose`` (v,) is the pose index of the file
     names.
 
     ``pixels`` (v, 4, 2) registered corners, ``start`` (v, 4, 2) those of cv2's subpixel refinement [px].
@@ -83,7 +83,7 @@ class Fits:
 
     @property
     def better(self) -> DrivenCameras:
-        """The model that these views, and no others, speak for."""
+        """The model that Akaike's criterion prefers on these views."""
         return self.radial if self.radial_better else self.pinhole
 
     def errors(self, model: DrivenCameras, displacements: FloatArray, views: TagViews) -> FloatArray:
@@ -258,8 +258,9 @@ def fit_both(displacements: FloatArray, views: TagViews, sizes: IntArray, seed: 
 def _prefers_radial(
     pinhole: DrivenCameras, radial: DrivenCameras, displacements: FloatArray, views: TagViews
 ) -> bool:
-    """Akaike's criterion. A view counts as two measurements: its corners share the error of the arm's
-    pose."""
+    """Whether Akaike's criterion prefers radial terms. A view counts as two measurements: its corners share the
+    error of the arm's pose.
+    """
     common = pinhole.inliers & radial.inliers
     rss = [
         float(((predict(m, displacements, views.camera, views.pose) - views.pixels)[common] ** 2).sum())

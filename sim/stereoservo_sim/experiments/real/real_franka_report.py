@@ -1,4 +1,4 @@
-"""Figures of the real-arm experiment as plain JSON types, and its pictures."""
+"""JSON report and figures of the real-arm experiment."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ STATE = "distance of a predicted tag corner from the measured one [px], over all
 
 
 def report_real_franka(result: RealFrankaResult) -> dict[str, Any]:
-    """The one JSON object of ``reproduce real-franka``."""
+    """JSON object of ``reproduce real-franka``."""
     seen, model = result.observations, result.fits.better
     sides = 1e3 * np.linalg.norm(model.corners - np.roll(model.corners, -1, axis=0), axis=1)
     fit = result.fits.errors(model, result.displacements, result.views)

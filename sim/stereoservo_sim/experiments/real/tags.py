@@ -1,4 +1,4 @@
-"""ArUco tags in grey images, their corners registered on the whole printed pattern.
+"""ArUco tags in grey images: detection, and registration of their corners on the whole printed pattern.
 
 ``CORNER_REFINE_SUBPIX`` looks at a few pixels about each corner; on tags of 20 px, with cells of 3 px, it
 pulls the corners inwards (2 % of the side) and is unsure by up to a pixel. Here it is only the start: the

@@ -1,4 +1,4 @@
-"""``homing`` (fig. 4.10): a pan-tilt head finds home from the stereo image of one point.
+"""Experiment ``homing`` (fig. 4.10): homing of a pan-tilt head from the stereo image of one point.
 
 The bound is that of an estimator which knows the calibration only as well as its own trial motions tell: the noise of
 the current image and of the home image, new in each trial, and that of the calibration, common to all of a seed.
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.kinematics.joint_angles import homing_problem, sensitivity, way_home
+from stereoservo.kinematics.joint_angles import homing_displacement, homing_problem, sensitivity
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, seen_chain
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.rotations.thesis_head import (
@@ -37,7 +37,7 @@ TRIALS = 35
 """Fig. 4.10."""
 JOINTS = ("pan", "tilt")
 LIMITS = np.radians([[-90.0, 90.0], [-90.0, 90.0]])
-"""Of the head: all that the search is told."""
+"""Limits of the head, the only prior knowledge of the search."""
 TAIL = 0.005
 """Probability of each tail outside the interval of the normalised errors."""
 THESIS = {
@@ -78,25 +78,25 @@ def homings(
     positions: FloatArray,
     pixels: FloatArray,
 ) -> Homings:
-    """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), known to the judge alone, to what ``home_pixels``
-    (t, c, m, 2) show at ``home`` (2,).
+    """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), unknown to the estimator, to what
+    ``home_pixels`` (t, c, m, 2) show at ``home`` (2,).
 
-    Without ``calibration`` the head counts as exactly known. Raises JointAnglesError as `way_home` does.
+    Without ``calibration`` the head counts as exactly known. Raises JointAnglesError as `homing_displacement` does.
     """
     others = [] if calibration is None else list(calibration.deviations())
     errors, levers, own = [], [], []
     ambiguous = 0
     for q, image, at_home in zip(positions, pixels, home_pixels, strict=True):
         problem = homing_problem(seen, home, at_home, image, SIGMA)
-        way = way_home(problem, home, limits=LIMITS)
-        ambiguous += bool(way.alternatives)
-        errors.append(way.displacement - (home - q))
-        own.append(way.covariance)
+        found = homing_displacement(problem, home, limits=LIMITS)
+        ambiguous += bool(found.alternatives)
+        errors.append(found.displacement - (home - q))
+        own.append(found.covariance)
         changes = [
             sensitivity(
                 problem,
                 *(homing_problem(other, home, at_home, image, SIGMA) for other in pair),
-                way.current.q,
+                found.current.q,
             )
             for pair in others
         ]

@@ -1,4 +1,5 @@
-"""``pan-tilt`` (table 4.1, figs 4.8, 4.9): calibration of the pan-tilt head, and the image after a motion foretold.
+"""Experiment ``pan-tilt`` (table 4.1, figs 4.8, 4.9): calibration of a pan-tilt head, and prediction of images
+after a motion.
 
 Points reconstructed from one stereo image are moved by the joints' difference and compared with the next image. What
 is left with a perfect calibration is the noise of the two images; the calibration adds little to it.
@@ -79,7 +80,7 @@ THESIS = {
 
 
 def step_pairs(used: tuple[int, ...], steps: int) -> list[tuple[int, int]]:
-    """Consecutive steps neither of which calibrates (4.5.2)."""
+    """Consecutive steps that are not used for calibration (4.5.2)."""
     return [(i, i + 1) for i in range(steps) if i not in used and i + 1 not in used]
 
 
@@ -237,7 +238,7 @@ def _row(
 
 
 def _path_lengths(cell: SyntheticCell) -> tuple[float, float]:
-    """Mean length [px] of a point's way between the ends of the pan and of the tilt trajectory."""
+    """Mean length [px] of a point's track between the ends of the pan and of the tilt trajectory."""
     ends = cell.home + cell.ranges * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
     exact = cell.pixels(ends)
     pan, tilt = (float(np.linalg.norm(exact[:, k] - exact[:, 0], axis=-1).mean()) for k in (1, 2))

@@ -1,4 +1,4 @@
-"""The pan-tilt head of thesis 4.5 in numbers: two cameras on two joints before a mountain of interest points.
+"""Simulation of the pan-tilt head of thesis 4.5: two cameras on two joints before a mountain of interest points.
 
 What `pan-tilt` and `homing` share: the cell, the trial motions, the tracker's noise, the calibration and what its
 noise leaves open.
@@ -66,7 +66,7 @@ def mountain(rng: np.random.Generator, points: int = POINTS) -> FloatArray:
 
 
 def head(rng: np.random.Generator) -> SyntheticCell:
-    """The head before a new mountain, at home in the middle of its trajectories."""
+    """Head before a random mountain, at home in the middle of its trajectories."""
     inward = 7.5
     K = np.array([[FOCAL_PX, 0, 0.5 * (WIDTH - 1)], [0, FOCAL_PX, 0.5 * (HEIGHT - 1)], [0, 0, 1]])
     poses = [rotation("y", side * inward) @ translation(-side * 0.5 * BASELINE, 0, 0) for side in (-1.0, 1.0)]
@@ -142,7 +142,7 @@ def tracks_of(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> Tr
 
 
 def trial_data(cell: SyntheticCell, tracks: Tracks) -> TrialData:
-    """What calibrates: a subset of steps and of points, with the noise that the tracker may expect of them."""
+    """Trial data for calibration: a subset of steps and of points, with the tracker's expected noise."""
     own, steps, positions, pixels = [], [], [], []
     for joint, (used, where, images) in enumerate(
         (
@@ -179,7 +179,7 @@ class HeadCalibration:
 
     @property
     def seen(self) -> SeenChain:
-        """The head as calibrated."""
+        """Calibrated head as a `SeenChain`."""
         return _seen(self.solution.rig, self.zero)
 
     def deviations(self) -> Iterator[tuple[SeenChain, SeenChain]]:
@@ -229,7 +229,7 @@ def _rig_of(model: CellModel) -> tuple[RigModel, Stratum]:
 
 
 def separate_rotations(trials: TrialData) -> SeenChain:
-    """The head from two rotations estimated one by one (4.42), as in the thesis: cameras by their epipolar geometry,
+    """Head from two rotations estimated separately (4.42), as in the thesis: cameras by their epipolar geometry,
     each generator linear, then of maximum likelihood with free points.
 
     Both trajectories start at the first stop, which is the chain's zero. Raises CalibrationError, GeometryError where

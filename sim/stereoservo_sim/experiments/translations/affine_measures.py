@@ -1,4 +1,4 @@
-"""How good an affine calibration is: ``e_D`` and ``e_Q`` (3.41)-(3.43), and what the images allow at best.
+"""Error measures ``e_D`` and ``e_Q`` of an affine calibration (3.41)-(3.43), and their Cramér-Rao bound.
 
 Structure is reconstructed projectively and upgraded afterwards (thesis 3.3), [m] in, [mm] out.
 """
@@ -219,7 +219,7 @@ def answer_of(
     thesis: dict[str, Any],
     assumptions: list[str],
 ) -> dict[str, Any]:
-    """What an experiment of chapter 3 answers, its rows beside the thesis's values and what was assumed."""
+    """JSON report of an experiment of chapter 3, with the thesis's values and the assumptions."""
     return {
         "experiment": name,
         "seed": seed,

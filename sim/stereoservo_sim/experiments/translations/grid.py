@@ -1,4 +1,6 @@
-"""``grid`` (fig. 3.6): affine calibration of a moved rig before a calibration grid, motion by motion and cumulative."""
+"""Experiment ``grid`` (fig. 3.6): affine calibration of a moving rig before a calibration grid, per motion and
+cumulative.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,7 @@ from stereoservo_sim.summaries import spread
 from stereoservo_sim.world.camera_rig import StereoRig
 
 DISTANCE = 1.1
-"""[m] of the grid's edge from the rig; not said in the thesis."""
+"""[m] of the grid's edge from the rig; not stated in the thesis."""
 SIGMA = 0.05
 """[px], as the thesis states it."""
 STEP = 0.02
@@ -73,7 +75,7 @@ def grid_points() -> FloatArray:
 
 
 def scene_shifts() -> FloatArray:
-    """Where the scene stands against the rig at the 18 stops, (18, 3) [m], from the first one."""
+    """Translation of the scene relative to the rig at the 18 stops, (18, 3) [m], from the first one."""
     directions = np.repeat(np.eye(3)[[0, 2, 1]], [5, 6, 6], axis=0)
     path = np.vstack([np.zeros(3), STEP * np.cumsum(directions, axis=0)])
     # Half of every axis on either side of where the cameras look.
@@ -191,7 +193,7 @@ def _corrupted(
     scenes: FloatArray,
     rng: np.random.Generator,
 ) -> None:
-    """Five stops spoilt: at three a fifth of the matches is wrong, at two the rig turned by 1° on the way."""
+    """Corruption of five stops: at three a fifth of the matches is wrong, at two the rig rotates by 1° as well."""
     from scipy.spatial.transform import Rotation
 
     pixels, last = pixels.copy(), len(pixels) - 1

@@ -1,4 +1,5 @@
-"""``gripper`` (fig. 3.5): affine calibration of a rig from small translations of a gripper, over noise and motions.
+"""Experiment ``gripper`` (fig. 3.5): affine calibration of a rig from small translations of a gripper, over noise
+and motions.
 
 With these cameras the bound of e_D in full lies above the thesis's figures: a marker triangulated in one image alone is
 about 3 mm off in depth at 1 px. With the structure's own noise taken out, the non-linear estimate stands at the bound
@@ -169,7 +170,7 @@ def _ratio(errors: list[float], bounds: list[float]) -> float:
 
 
 def _beside_thesis(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Our medians of e_D beside the thesis's limits: reached or not, and whether the bound itself lies above."""
+    """Our medians of e_D against the thesis's limits: reached or not, and whether the bound itself exceeds them."""
     return [
         {
             "sigma_px": row["sigma_px"],
@@ -212,7 +213,7 @@ def _collect_bounds(
 def _planes(
     cameras: FloatArray, pixels: FloatArray, sigma: float
 ) -> dict[str, tuple[FloatArray | None, FloatArray]]:
-    """Plane at infinity by each method, and the structure that goes with it; None where it fails."""
+    """Plane at infinity by each method, and the corresponding structure; None where it fails."""
     rest = triangulate(cameras, pixels[0])
     weighting = image_weighting(cameras, rest)
     Hs = np.stack([translation_homography(cameras, rest, p) for p in pixels[1:]])

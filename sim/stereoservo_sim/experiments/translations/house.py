@@ -1,4 +1,6 @@
-"""``house`` (fig. 3.7): affine calibration from interest points of an unknown object, judged on the grid."""
+"""Experiment ``house`` (fig. 3.7): affine calibration from interest points of an unknown object, evaluated on the
+grid.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scripted node of the rack's protocol, and racks of them."""
+"""A scripted node of the emulated bus's protocol, and emulated buses of them."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def command(node_id: int, velocity: float, powered: bool = True) -> CanFrame:
     return CanFrame(0x200 + node_id, bytes([powered]) + target)
 
 
-def make_rack_of(count: int, bitrate: int | None = None, **plant_options) -> BusEmulator:
+def make_bus_emulator_of(count: int, bitrate: int | None = None, **plant_options) -> BusEmulator:
     axes = [make_axis(k) for k in range(count)]
     nodes = [ScriptedNode(k + 1, axis) for k, axis in enumerate(axes)]
     plant = AxisPlant(axes, IdealPlant(np.zeros(count)), t_ns=0, **plant_options)
@@ -98,10 +98,10 @@ def make_rack_of(count: int, bitrate: int | None = None, **plant_options) -> Bus
 
 @pytest.fixture
 def scripted():
-    """Makes racks of scripted nodes; ``command`` makes their commands, ``axis`` a joint."""
+    """Makes emulated buses of scripted nodes; ``command`` makes their commands, ``axis`` a joint."""
 
     class Kit:
-        rack = staticmethod(make_rack_of)
+        emulator = staticmethod(make_bus_emulator_of)
         command = staticmethod(command)
         axis = staticmethod(make_axis)
         node = ScriptedNode

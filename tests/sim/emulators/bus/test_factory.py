@@ -1,4 +1,4 @@
-"""Racks from cell files: what is built, what is refused, and an arm that goes on where it stood."""
+"""Emulated buses from cell files: what is built, what is refused, and an arm that goes on where it stood."""
 
 import msgspec
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.emulators.bus.factory import DrivesSettings, drives_of_cell, make_rack
+from stereoservo_sim.emulators.bus.factory import DrivesSettings, drives_of_cell, make_bus_emulator
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.emulators.nodes.odrive_node import OdriveNode
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
@@ -32,27 +32,27 @@ def with_emulation(cell, **drives):
 
 def test_the_shipped_cell_is_the_simulated_arm_at_its_base(cell):
     options, settings = drives_of_cell(cell)
-    rack = make_rack(options, settings, t_ns=0)
-    assert [node.node_id for node in rack.nodes] == [1, 2, 3, 4, 5, 6]
-    assert np.allclose([node.axis.position for node in rack.nodes], demo_cell().base)
-    assert rack.wire.bitrate is None
-    rack.run_until(20 * MS)
-    assert {frame.id for _, frame in rack.delivered()} >= {0x701, 0x702, 0x703, 0x704, 0x705, 0x706}
-    rack.close()
+    emulator = make_bus_emulator(options, settings, t_ns=0)
+    assert [node.node_id for node in emulator.nodes] == [1, 2, 3, 4, 5, 6]
+    assert np.allclose([node.axis.position for node in emulator.nodes], demo_cell().base)
+    assert emulator.wire.bitrate is None
+    emulator.run_until(20 * MS)
+    assert {frame.id for _, frame in emulator.delivered()} >= {0x701, 0x702, 0x703, 0x704, 0x705, 0x706}
+    emulator.close()
 
 
 def test_bit_times_and_start_as_asked(options):
     settings = DrivesSettings(plant="ideal", bit_time=True, start={"j2": -0.5})
-    rack = make_rack(options, settings, t_ns=0)
-    assert rack.wire.bitrate == options.bitrate
-    assert [node.axis.position for node in rack.nodes] == [0.0, -0.5, 0.0, 0.0, 0.0, 0.0]
+    emulator = make_bus_emulator(options, settings, t_ns=0)
+    assert emulator.wire.bitrate == options.bitrate
+    assert [node.axis.position for node in emulator.nodes] == [0.0, -0.5, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_odrives_are_built_by_protocol(options):
-    rack = make_rack(
+    emulator = make_bus_emulator(
         msgspec.structs.replace(options, protocol="odrive"), DrivesSettings(plant="ideal"), t_ns=0
     )
-    assert all(isinstance(node, OdriveNode) for node in rack.nodes)
+    assert all(isinstance(node, OdriveNode) for node in emulator.nodes)
 
 
 def test_an_arm_goes_on_where_its_truth_ends_unless_told_otherwise(options, tmp_path):
@@ -61,14 +61,14 @@ def test_an_arm_goes_on_where_its_truth_ends_unless_told_otherwise(options, tmp_
     history.append(50 * MS, stood, np.zeros(6))
     history.close()
     ideal = DrivesSettings(plant="ideal")
-    rack = make_rack(options, ideal, t_ns=100 * MS, runtime_dir=tmp_path)
-    assert np.array_equal([node.axis.position for node in rack.nodes], stood)
-    rack.run_until(200 * MS)
-    rack.close()
+    emulator = make_bus_emulator(options, ideal, t_ns=100 * MS, runtime_dir=tmp_path)
+    assert np.array_equal([node.axis.position for node in emulator.nodes], stood)
+    emulator.run_until(200 * MS)
+    emulator.close()
     reader = TrueJointHistory.open(tmp_path / FILE_NAME)
     assert reader.newest()[0] == 200 * MS
     assert np.array_equal(reader.at(150 * MS), stood)
-    fresh = make_rack(
+    fresh = make_bus_emulator(
         options, msgspec.structs.replace(ideal, resume=False), t_ns=300 * MS, runtime_dir=tmp_path
     )
     assert not any(node.axis.position for node in fresh.nodes)
@@ -77,7 +77,7 @@ def test_an_arm_goes_on_where_its_truth_ends_unless_told_otherwise(options, tmp_
 
 def test_a_remapped_pdo_is_shorter_on_the_bus(options):
     """By SDO alone, as somebody's tool would do it; the drive itself then sends the short frame."""
-    rack = make_rack(options, DrivesSettings(plant="ideal"), t_ns=0)
+    emulator = make_bus_emulator(options, DrivesSettings(plant="ideal"), t_ns=0)
     for k, frame in enumerate(
         (
             CanFrame(0x603, b"\x23\x00\x18\x01\x83\x01\x00\x80"),  # TPDO 1 off,
@@ -86,42 +86,42 @@ def test_a_remapped_pdo_is_shorter_on_the_bus(options):
             CanFrame(0, b"\x01\x00"),  # operational
         )
     ):
-        rack.inject(frame, (10 + k) * MS)
-    rack.run_until(20 * MS)
-    answer = rack.order("remap 3", 20 * MS)
+        emulator.inject(frame, (10 + k) * MS)
+    emulator.run_until(20 * MS)
+    answer = emulator.order("remap 3", 20 * MS)
     assert "status word alone" in answer
-    rack.run_until(30 * MS)
-    rack.delivered()
-    rack.inject(CanFrame(0x80), 30 * MS)
-    rack.run_until(40 * MS)
-    lengths = {frame.id: len(frame.data) for _, frame in rack.delivered() if 0x181 <= frame.id <= 0x186}
+    emulator.run_until(30 * MS)
+    emulator.delivered()
+    emulator.inject(CanFrame(0x80), 30 * MS)
+    emulator.run_until(40 * MS)
+    lengths = {frame.id: len(frame.data) for _, frame in emulator.delivered() if 0x181 <= frame.id <= 0x186}
     assert lengths[0x183] == 2
-    rack.close()
+    emulator.close()
 
 
 def test_a_drive_whose_cause_stays_refuses_its_reset(options):
-    rack = make_rack(options, DrivesSettings(plant="ideal"), t_ns=0)
-    rack.order("sticky 3 0x4310", 10 * MS)
+    emulator = make_bus_emulator(options, DrivesSettings(plant="ideal"), t_ns=0)
+    emulator.order("sticky 3 0x4310", 10 * MS)
     for k, word in enumerate((0x00, 0x80, 0x00)):
         data = b"\x2b\x40\x60\x00" + word.to_bytes(2, "little") + b"\0\0"
-        rack.inject(CanFrame(0x603, data), (20 + k) * MS)
-    rack.run_until(30 * MS)
-    assert "fault" in rack.nodes[2].state()
-    rack.order("sticky 3 off", 30 * MS)
+        emulator.inject(CanFrame(0x603, data), (20 + k) * MS)
+    emulator.run_until(30 * MS)
+    assert "fault" in emulator.nodes[2].state()
+    emulator.order("sticky 3 off", 30 * MS)
     for k, word in enumerate((0x00, 0x80, 0x00)):
         data = b"\x2b\x40\x60\x00" + word.to_bytes(2, "little") + b"\0\0"
-        rack.inject(CanFrame(0x603, data), (40 + k) * MS)
-    rack.run_until(50 * MS)
-    assert "fault" not in rack.nodes[2].state()
+        emulator.inject(CanFrame(0x603, data), (40 + k) * MS)
+    emulator.run_until(50 * MS)
+    assert "fault" not in emulator.nodes[2].state()
 
 
 def test_a_running_double_of_a_drive_does_not_share_its_arm(options):
-    rack = make_rack(options, DrivesSettings(plant="ideal"), t_ns=0)
-    rack.inject(CanFrame(0, b"\x01\x00"), 10 * MS)
-    rack.run_until(20 * MS)
-    rack.order("duplicate 3 running", 20 * MS)
-    original, double = rack.nodes[2], rack.nodes[6]
-    rack.order("fault 3 0x3210", 21 * MS)
+    emulator = make_bus_emulator(options, DrivesSettings(plant="ideal"), t_ns=0)
+    emulator.inject(CanFrame(0, b"\x01\x00"), 10 * MS)
+    emulator.run_until(20 * MS)
+    emulator.order("duplicate 3 running", 20 * MS)
+    original, double = emulator.nodes[2], emulator.nodes[6]
+    emulator.order("fault 3 0x3210", 21 * MS)
     assert "fault" in original.state()
     assert "fault" not in double.state()
     assert double.axis is not original.axis
@@ -168,11 +168,11 @@ def test_other_tables_of_emulation_are_refused(cell):
 )
 def test_settings_that_fit_no_joint_are_refused(options, settings, told):
     with pytest.raises(EmulationError, match=told):
-        make_rack(options, settings, t_ns=0)
+        make_bus_emulator(options, settings, t_ns=0)
 
 
 def test_the_simulated_arm_has_the_joints_of_its_names_only(options):
     two = msgspec.structs.replace(options, joint=options.joint[:2])
     with pytest.raises(EmulationError, match="plant = 'ideal'"):
-        make_rack(two, DrivesSettings(), t_ns=0)
-    assert len(make_rack(two, DrivesSettings(plant="ideal"), t_ns=0).nodes) == 2
+        make_bus_emulator(two, DrivesSettings(), t_ns=0)
+    assert len(make_bus_emulator(two, DrivesSettings(plant="ideal"), t_ns=0).nodes) == 2

@@ -1,4 +1,4 @@
-"""Scripted racks in real time behind serial-line CAN, spoken to with plain sockets and files."""
+"""Scripted emulated buses in real time behind serial-line CAN, spoken to with plain sockets and files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
-from stereoservo_sim.emulators.bus.bus_server import RackServer, open_endpoint, served_channel
+from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint, served_channel
 from stereoservo_sim.emulators.bus.endpoints import EndpointError, PythonCanEndpoint, SlcanPty, SlcanTcp
 from stereoservo_sim.emulators.bus.plant import AxisPlant
 from stereoservo_sim.emulators.fault_engine import FaultCommandError
@@ -31,10 +31,10 @@ def serve(scripted):
         now = time.monotonic_ns()
         axes = [scripted.axis(k) for k in range(2)]
         nodes = [scripted.node(k + 1, axis, beat_ns=10**12) for k, axis in enumerate(axes)]
-        rack = BusEmulator(
+        emulator = BusEmulator(
             nodes, AxisPlant(axes, IdealPlant(np.zeros(2)), t_ns=now), bitrate=bitrate, t_ns=now
         )
-        server = RackServer(rack, endpoint).__enter__()
+        server = BusServer(emulator, endpoint).__enter__()
         servers.append(server)
         return server
 
@@ -130,7 +130,7 @@ def test_at_another_bit_rate_than_the_bus_there_is_silence_and_a_bus_error(serve
     wire.wait_for(b"z\r")
     wire.say(b"F\r")
     assert wire.wait_for(b"FA4\r") == b"FA4\r"
-    assert all(frame.id != 0x80 for node in server.rack.nodes for _, frame in node.heard)
+    assert all(frame.id != 0x80 for node in server.emulator.nodes for _, frame in node.heard)
     wire.say(b"C\rS8\rO\r")
     wire.wait_for(b"\r\r\r")
     assert b"t181" in last_answer(wire)
@@ -213,13 +213,15 @@ def test_a_defect_of_a_node_ends_the_server_and_is_raised(scripted):
     now = time.monotonic_ns()
     axis = scripted.axis()
     node = scripted.node(1, axis)
-    rack = BusEmulator([node], AxisPlant([axis], IdealPlant(np.zeros(1)), t_ns=now), bitrate=None, t_ns=now)
+    emulator = BusEmulator(
+        [node], AxisPlant([axis], IdealPlant(np.zeros(1)), t_ns=now), bitrate=None, t_ns=now
+    )
 
     def broken(t_ns):
         raise ZeroDivisionError("a defect")
 
     node.advance = broken
-    server = RackServer(rack, SlcanTcp(0, 1_000_000)).__enter__()
+    server = BusServer(emulator, SlcanTcp(0, 1_000_000)).__enter__()
     server._thread.join(PATIENCE_S)
     with pytest.raises(FaultCommandError, match="the server has ended"):
         server.order("status")

@@ -21,13 +21,13 @@ SPEED = 0.2
 
 
 class Bench:
-    """A studio in virtual time; ``sent`` has what went out: time, stream, picture."""
+    """A camera emulator in virtual time; ``sent`` has what went out: time, stream, picture."""
 
     def __init__(self, streams: tuple[StreamSettings, ...], **settings: Any) -> None:
         self.clock = VirtualClock()
         self.history = TrueJointHistory.in_memory(6)
         self.settings = CamerasSettings(camera=streams, background="plain", **settings)
-        self.studio = CameraEmulator(
+        self.emulator = CameraEmulator(
             [
                 EmulatedCamera(stream, self.settings, clock=self.clock, services={"world": self.history})
                 for stream in streams
@@ -36,7 +36,7 @@ class Bench:
         )
         self.sent: list[tuple[int, str, StreamPicture]] = []
         self.arm_at(0)
-        self.studio.open()
+        self.emulator.open()
 
     def arm_at(self, t_ns: int) -> None:
         """The arm's truth up to ``t_ns``."""
@@ -51,14 +51,14 @@ class Bench:
             now = self.clock.now_ns() + MS
             self.clock.advance_to(now)
             self.arm_at(now)
-            self.studio.run_until(now)
-            self.studio.take(now)
-            self.sent += [(now, stream, picture) for stream, picture in self.studio.sent(now)]
+            self.emulator.run_until(now)
+            self.emulator.take(now)
+            self.sent += [(now, stream, picture) for stream, picture in self.emulator.sent(now)]
         return self.sent[first:]
 
     def order(self, text: str) -> str:
         """An order, now."""
-        return self.studio.order(text, self.clock.now_ns())
+        return self.emulator.order(text, self.clock.now_ns())
 
 
 @pytest.fixture
@@ -73,4 +73,4 @@ def make_bench() -> Iterator[Callable[..., Bench]]:
 
     yield make
     for bench in made:
-        bench.studio.close()
+        bench.emulator.close()

@@ -106,7 +106,7 @@ def test_what_lasts_ends_by_itself(make_bench):
     bench.run(0.1)
     after = bench.run(0.2)
     assert len({picture.data for _, _, picture in after}) == len(after) >= 5
-    assert [event.kind for event in bench.studio.take_news()] == ["order", "ended"]
+    assert [event.kind for event in bench.emulator.take_news()] == ["order", "ended"]
 
 
 def test_orders_wait_for_their_time(make_bench):
@@ -152,7 +152,7 @@ def test_spoilt_jpegs_are_as_many_as_ordered(make_bench):
     assert sum(length < 0.7 * whole for length in lengths) == 3
     bench.order("corrupt left 2")
     bench.run(0.3)
-    assert bench.studio.cameras[0].condition.corrupt == 0
+    assert bench.emulator.cameras[0].condition.corrupt == 0
 
 
 def test_a_bump_moves_the_camera_in_its_own_frame_at_once(make_bench, tmp_path):
@@ -201,6 +201,6 @@ def test_no_camera_of_that_name(make_bench):
 
 def test_nobody_looks_nothing_is_rendered(make_bench):
     bench = make_bench()
-    bench.studio.wanted = {"/right.mjpg"}
+    bench.emulator.wanted = {"/right.mjpg"}
     sent = bench.run(0.2)
     assert {stream for _, stream, _ in sent} == {"/right.mjpg"}

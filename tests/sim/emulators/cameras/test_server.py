@@ -36,14 +36,14 @@ class Served:
         )
         settings = CamerasSettings(camera=streams, background="plain", noise=20.0)
         clock = MonotonicClock()
-        self.studio = CameraEmulator(
+        self.emulator = CameraEmulator(
             [EmulatedCamera(one, settings, clock=clock, runtime_dir=tmp_path) for one in streams],
             clock.now_ns(),
         )
-        self.server = CameraServer(self.studio, cell="t", **options)
+        self.server = CameraServer(self.emulator, cell="t", **options)
         self.events: list[tuple[str, str]] = []
         self.server.on_event = lambda event: self.events.append((event.kind, event.camera))
-        self.studio.open()
+        self.emulator.open()
         self.end = threading.Event()
         self.asked: list[tuple[str, list[str], threading.Event]] = []
         self.thread = threading.Thread(target=self.server.run, args=(self._over,))
@@ -198,4 +198,4 @@ def test_disconnect_refuse_stall_and_cut(serve):
 def test_a_port_that_is_taken_is_told(serve):
     served = serve()
     with pytest.raises(EmulationError, match="cannot listen on"):
-        CameraServer(served.studio, port=int(served.server.url.rpartition(":")[2]))
+        CameraServer(served.emulator, port=int(served.server.url.rpartition(":")[2]))
