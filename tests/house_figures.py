@@ -153,7 +153,8 @@ def vision_path() -> CallPath:
         scenes = importlib.import_module("house_detectors.scenes")
     finally:
         sys.path.pop(0)
-    from stereoservo.daemon.ipc_messages import PRIOR_CAPACITY, PRIOR_LAYOUT, encode
+    from stereoservo.core.cycle import encode
+    from stereoservo.daemon.ipc_messages import PRIOR_CAPACITY, PRIOR_LAYOUT
     from stereoservo.daemon.seqlock import SlotWriter
     from stereoservo.daemon.vision import CameraPipeline, VisionSlots
     from stereoservo.messages.directories import CellDirectories

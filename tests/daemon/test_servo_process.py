@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import Event
+from stereoservo.core.cycle import Event, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import core_settings
 from stereoservo.daemon.ipc_messages import (
@@ -19,7 +19,6 @@ from stereoservo.daemon.ipc_messages import (
     Heartbeat,
     Hello,
     ServoState,
-    encode,
     event_decoder,
     state_decoder,
     steps_decoder,

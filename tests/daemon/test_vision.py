@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereoservo.core.cycle import encode
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
     PRIOR_LAYOUT,
-    encode,
     observation_decoder,
     report_decoder,
 )

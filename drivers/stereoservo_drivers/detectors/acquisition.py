@@ -13,8 +13,8 @@ from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
 from stereoservo.ports.devices import Prior
 from stereoservo_drivers.detectors.centroids import measure_windows
 from stereoservo_drivers.detectors.components import AREA, FIELDS, LOPSIDED, MAX_WINDOW, OK
+from stereoservo_drivers.detectors.face_fit import whole
 from stereoservo_drivers.detectors.face_options import Pattern
-from stereoservo_drivers.detectors.face_tracking import whole
 from stereoservo_drivers.detectors.patterns import find_face
 
 SHRINK_FROM = 240

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import (
     CameraObservation,
     DetectorDescription,
@@ -21,13 +22,33 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
-from stereoservo_drivers.detectors import acquisition, centroids, face_tracking, levels, patterns
+from stereoservo_drivers.detectors import acquisition, centroids, face_fit, patterns
 from stereoservo_drivers.detectors.acquisition import Expectation, find_spots
 from stereoservo_drivers.detectors.centroids import measure_windows
-from stereoservo_drivers.detectors.components import FIELDS, scratch
+from stereoservo_drivers.detectors.components import (
+    AREA,
+    CONTRAST,
+    CXX,
+    CXY,
+    CYY,
+    FIELDS,
+    NOISE,
+    OK,
+    scratch,
+)
+from stereoservo_drivers.detectors.face_fit import (
+    FEW_TOLERANCE,
+    SHAPE,
+    THINNEST,
+    agree_with_prior,
+    median,
+    settle_face,
+    whole,
+)
 from stereoservo_drivers.detectors.face_options import FaceOptions, Positive, patterns_of
-from stereoservo_drivers.detectors.face_tracking import SHAPE, expect, judge, settle_face
 from stereoservo_drivers.detectors.frame_images import sized_image
+from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle
+from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile_for, given, written
 
 SAME_SPOT_PX = 2.0
 """A spot this near to a dot that was tracked is that dot."""
@@ -104,8 +125,8 @@ class DotDetector:
         self._labels, self._stack = scratch()
         centroids.compile_kernels()
         patterns.compile_kernels()
-        face_tracking.compile_kernels()
-        levels.compile_kernels()
+        face_fit.compile_kernels()
+        _compile_kernels()
         self._size = self.options.image_size
         self._every_id = np.array([pattern.ids for pattern in self._patterns])
         self._order = np.argsort(self._every_id.ravel())
@@ -237,7 +258,7 @@ class DotDetector:
         rows = self._order[used.ravel()[self._order]]
         ids, chosen = self._every_id.ravel()[rows], dots.reshape(-1, FIELDS)[rows]
         covariance = np.empty((len(ids), 2, 2))
-        levels.covariances(chosen, self.options.floor_px, covariance)
+        centroids.covariances(chosen, self.options.floor_px, covariance)
         return CameraObservation(
             camera=frame.camera,
             seq=frame.seq,
@@ -247,3 +268,160 @@ class DotDetector:
             pixels=np.ascontiguousarray(chosen[:, :2]),
             covariances=covariance,
         )
+
+
+MIN_HALF_WINDOW = 14
+MAX_HALF_WINDOW = 64
+SHAPE_MARGIN = 6
+"""Pixels between a dot's expected outline and the rim of its window, beside the prior's uncertainty."""
+
+
+@kernel
+def expect(
+    every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s,
+    predicted, present, shapes, windows, least,
+):  # fmt: skip
+    """Windows for the dots of a prior of ``ids`` (k,), ``pixels``, ``velocities`` (k, 2), ``covariances``
+    (k, 2, 2).
+
+    ``every_id`` (f, n), ``patterns`` (f, n, 2), ``radii`` (f,) are the faces. Writes ``predicted`` (m, 2)
+    [px] at ``dt_s`` [s] after the prior, ``present`` (m,), ``shapes`` (m, SHAPE), ``windows`` (m, 4),
+    ``least`` (m,) pixels of a dot. Faces that the prior shows from behind, too thin, too uncertain or by
+    fewer than four dots stay empty. Returns the number of windows.
+    """
+    faces, n = every_id.shape
+    count = 0
+    H = np.zeros((3, 3))
+    spread = np.zeros(n)
+    for f in range(faces):
+        mine = present[f * n : (f + 1) * n]
+        places = predicted[f * n : (f + 1) * n]
+        for i in range(n):
+            for k in range(ids.size):
+                if ids[k] != every_id[f, i]:
+                    continue
+                du, dv = velocities[k, 0] * dt_s, velocities[k, 1] * dt_s
+                u, v = pixels[k, 0] + du, pixels[k, 1] + dv
+                xx, xy, yy = covariances[k, 0, 0], covariances[k, 0, 1], covariances[k, 1, 1]
+                largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+                reach = 3.0 * np.sqrt(max(largest, 0.0)) + 0.25 * (abs(du) + abs(dv))
+                # comparisons fail for NaN
+                if abs(u) < 1e6 and abs(v) < 1e6 and reach < MAX_HALF_WINDOW:
+                    places[i, 0] = u
+                    places[i, 1] = v
+                    spread[i] = reach
+                    mine[i] = True
+        good = fit_homography(patterns[f], places, mine, H)
+        for i in range(n):
+            shape = shapes[f * n + i]
+            if good and not image_of_circle(H, patterns[f, i, 0], patterns[f, i, 1], radii[f], shape):
+                good = False
+            if (
+                good
+                and mine[i]
+                and (shape[6] < THINNEST or shape[5] + spread[i] + SHAPE_MARGIN > MAX_HALF_WINDOW)
+            ):
+                good = False
+        for i in range(n):
+            if good and mine[i]:
+                shape = shapes[f * n + i]
+                half = max(int(np.ceil(shape[5] + spread[i])) + SHAPE_MARGIN, MIN_HALF_WINDOW)
+                u, v = int(np.floor(places[i, 0] + 0.5)), int(np.floor(places[i, 1] + 0.5))
+                window = windows[f * n + i]
+                window[0], window[1], window[2], window[3] = u - half, v - half, u + half + 1, v + half + 1
+                least[f * n + i] = max(5, int(0.4 * shape[4]))
+                count += 1
+        if not good:
+            mine[:] = False
+    return count
+
+
+@kernel
+def _gates(predicted, present, shapes, status, spread, limit, lopsided, dots, used):
+    """Gates of each dot of a face, by itself and relative to its neighbours, into ``used`` (n,)."""
+    n = used.size
+    contrasts = np.zeros(n)
+    scales = np.zeros(n)
+    for i in range(n):
+        used[i] = False
+        if not present[i] or status[i] != OK:
+            continue
+        area, shape, dot = dots[i, AREA], shapes[i], dots[i]
+        # blur inflates the area of thin dots
+        most = np.pi * (shape[5] + 1.0) * (shape[6] + 1.0) * 1.4
+        du, dv = dots[i, 0] - predicted[i, 0], dots[i, 1] - predicted[i, 1]
+        noise = max(dot[NOISE], 0.08)
+        xx, xy = spread[i, 0] + noise * dot[CXX], spread[i, 1] + noise * dot[CXY]
+        yy = spread[i, 2] + noise * dot[CYY]
+        off = yy * du * du - 2.0 * xy * du * dv + xx * dv * dv
+        near = off <= limit * (xx * yy - xy * xy) or limit == np.inf
+        contrasts[i] = dots[i, CONTRAST]
+        scales[i] = area / shape[4]
+        used[i] = area > 0.6 * shape[4] and area < most and near and whole(dot, lopsided)
+    contrast = median(contrasts, used)
+    scale = median(scales, used)
+    for i in range(n):
+        if used[i]:
+            alike = contrasts[i] > 0.5 * contrast and contrasts[i] < 2.0 * contrast
+            used[i] = alike and scales[i] > 0.8 * scale and scales[i] < 1.25 * scale
+
+
+@kernel
+def judge(
+    patterns, radii, predicted, present, shapes, status, spread, limit, lopsided, tolerance, dots, used
+):
+    """Accept measured dots: complete, of the expected size, similar, nearest to their own prediction, consistent
+    with the face.
+
+    ``spread`` (m, 3): covariances (xx, xy, yy) of the prior [px²], and ``limit`` the largest squared distance from it
+    with the measurement's covariance added, infinite for none;
+    ``lopsided``, ``tolerance`` [px] as in the options. Moves ``dots`` (m, FIELDS) to the dots' centres,
+    writes ``used`` (m,). Returns their number.
+    """
+    faces, n = patterns.shape[0], patterns.shape[1]
+    total = 0
+    for f in range(faces):
+        a, b = f * n, (f + 1) * n
+        mine = used[a:b]
+        _gates(
+            predicted[a:b],
+            present[a:b],
+            shapes[a:b],
+            status[a:b],
+            spread[a:b],
+            limit,
+            lopsided,
+            dots[a:b],
+            mine,
+        )
+        count = 0
+        for i in range(a, b):
+            if not used[i]:
+                continue
+            own = (dots[i, 0] - predicted[i, 0]) ** 2 + (dots[i, 1] - predicted[i, 1]) ** 2
+            for k in range(faces * n):
+                other = (dots[i, 0] - predicted[k, 0]) ** 2 + (dots[i, 1] - predicted[k, 1]) ** 2
+                if present[k] and other < own:
+                    used[i] = False
+            count += 1 if used[i] else 0
+        count = settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, 4) if count >= 4 else 0
+        if count == 0 or (
+            count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine, FEW_TOLERANCE)
+        ):
+            mine[:] = False
+            count = 0
+        total += count
+    return total
+
+
+def _compile_kernels() -> None:
+    """Compile the kernels of tracking, or load them from the cache."""
+    compile_for(
+        expect, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(FLOAT, 2), given(FLOAT, 2),
+        given(FLOAT, 3), FLOAT, written(FLOAT, 2), written(BOOL, 1), written(FLOAT, 2), written(INT, 2),
+        written(INT, 1),
+    )  # fmt: skip
+    compile_for(
+        judge, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(BOOL, 1), given(FLOAT, 2), given(INT, 1),
+        given(FLOAT, 2), FLOAT, FLOAT, FLOAT, written(FLOAT, 2), written(BOOL, 1),
+    )  # fmt: skip

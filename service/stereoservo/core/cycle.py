@@ -186,3 +186,11 @@ def decode_array(kind: type, value: object) -> object:
     dtype, shape, data = parts
     array: npt.NDArray[np.generic] = np.frombuffer(data, dtype=np.dtype(dtype)).reshape(shape).copy()
     return array
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
+
+
+def encode(value: object) -> bytes:
+    """A struct, or anything made of structs and arrays, as msgpack; arrays bit for bit."""
+    return _encoder.encode(value)

@@ -10,7 +10,7 @@ import numpy as np
 from stereoservo.control.face_choice import FaceChoice
 from stereoservo.control.faces import Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
-from stereoservo.core.cycle import decode_array, encode_array
+from stereoservo.core.cycle import decode_array, encode
 from stereoservo.core.monitor_state import (
     MobileCamera,
     ModelMonitor,
@@ -480,13 +480,12 @@ class _Versioned(msgspec.Struct):
     version: int
 
 
-_encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
 _decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
 
 
 def encode_state(state: CoreState) -> bytes:
     """The state as bytes, bit for bit."""
-    return _encoder.encode(state)
+    return encode(state)
 
 
 def decode_state(data: bytes) -> CoreState:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from stereoservo.core.cycle import Event, Status, decode_array, encode_array
+from stereoservo.core.cycle import Event, Status, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.daemon.pacing import LoopStatistics
 from stereoservo.kinematics.model import CellModel
@@ -129,11 +128,6 @@ class PlanError(Exception):
     """The run plan of a cell cannot be read."""
 
 
-def _encoder() -> msgspec.msgpack.Encoder:
-    return msgspec.msgpack.Encoder(enc_hook=encode_array)
-
-
-_any_encoder = _encoder()
 to_servo_decoder = msgspec.msgpack.Decoder(ToServo, dec_hook=decode_array)
 event_decoder = msgspec.msgpack.Decoder(Event, dec_hook=decode_array)
 state_decoder = msgspec.msgpack.Decoder(ServoState, dec_hook=decode_array)
@@ -142,11 +136,6 @@ prior_decoder = msgspec.msgpack.Decoder(Prior, dec_hook=decode_array)
 steps_decoder = msgspec.msgpack.Decoder(StepMessage, dec_hook=decode_array)
 report_decoder = msgspec.msgpack.Decoder(Report)
 _plan_decoder = msgspec.msgpack.Decoder(RunPlan)
-
-
-def encode(message: Any) -> bytes:
-    """Encode any of these structs as msgpack, arrays bit for bit."""
-    return _any_encoder.encode(message)
 
 
 def save_plan(plan: RunPlan) -> None:

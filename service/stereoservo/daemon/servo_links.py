@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from stereoservo.core.cycle import Event, ModelUpdate
+from stereoservo.core.cycle import Event, ModelUpdate, encode
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
@@ -15,7 +15,6 @@ from stereoservo.daemon.ipc_messages import (
     Hello,
     NewModel,
     ServoState,
-    encode,
     observation_decoder,
     to_servo_decoder,
 )

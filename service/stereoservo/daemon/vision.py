@@ -14,6 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereoservo.core.cycle import encode
 from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
@@ -22,7 +23,6 @@ from stereoservo.daemon.ipc_messages import (
     PlanError,
     Report,
     RunPlan,
-    encode,
     load_plan,
     prior_decoder,
 )

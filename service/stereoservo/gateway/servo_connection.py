@@ -8,7 +8,7 @@ import time
 
 import msgspec
 
-from stereoservo.core.cycle import Event
+from stereoservo.core.cycle import Event, encode
 from stereoservo.daemon.ipc_messages import (
     STATE_LAYOUT,
     Ask,
@@ -16,7 +16,6 @@ from stereoservo.daemon.ipc_messages import (
     Hello,
     NewModel,
     ServoState,
-    encode,
     event_decoder,
     state_decoder,
     steps_decoder,

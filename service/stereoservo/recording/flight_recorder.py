@@ -9,7 +9,7 @@ from types import TracebackType
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from stereoservo.core.cycle import encode_array
+from stereoservo.core.cycle import encode
 from stereoservo.core.settings import CoreSettings
 from stereoservo.recording.step_records import Fingerprint, RecordedCheckpoint, RecordedStep
 
@@ -30,7 +30,7 @@ class FlightRecorder:
         self._stream = open(path, "wb")  # noqa: SIM115 - lives as long as the recorder
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
         self._writer.start(profile=FORMAT, library="stereoservo")
-        encoded = msgspec.msgpack.encode(settings, enc_hook=encode_array)
+        encoded = encode(settings)
         self._channels = {
             topic: self._writer.register_channel(topic=topic, message_encoding="msgpack", schema_id=0)
             for topic in ("header", "step", "checkpoint", "gap")

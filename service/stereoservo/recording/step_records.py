@@ -14,7 +14,7 @@ import numpy as np
 
 import stereoservo
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array, encode_array
+from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import encode_state
@@ -44,7 +44,6 @@ class Fingerprint(msgspec.Struct, frozen=True):
     """Version and source hash of every law that was installed; empty in recordings made before it was kept."""
 
 
-_encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
 _decoder = msgspec.msgpack.Decoder(StepRecord, dec_hook=decode_array)
 
 
@@ -55,9 +54,9 @@ def encode_step(inputs: StepInputs, outputs: StepOutputs) -> bytes:
         inputs,
         outputs.command,
         outputs.status.command_raw,
-        zlib.crc32(_encoder.encode(outputs)),
+        zlib.crc32(encode(outputs)),
     )
-    return _encoder.encode(record)
+    return encode(record)
 
 
 def decode_step(data: bytes) -> StepRecord:

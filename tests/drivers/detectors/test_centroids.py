@@ -5,7 +5,7 @@ import pytest
 
 from stereoservo_drivers.detectors import centroids, components
 from stereoservo_drivers.detectors.components import scratch
-from stereoservo_drivers.detectors.face_tracking import whole
+from stereoservo_drivers.detectors.face_fit import whole
 
 from .rendering import Scene, conic_of_circle, digitise
 from .scenes import normalised, rms

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import Event, ModelUpdate
+from stereoservo.core.cycle import Event, ModelUpdate, encode
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -25,7 +25,6 @@ from stereoservo.daemon.ipc_messages import (
     Hello,
     NewModel,
     ServoState,
-    encode,
     event_decoder,
     state_decoder,
 )

@@ -21,7 +21,7 @@ from stereoservo.calibration.relocalization.relocalized_model import (
     relocalize,
 )
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.core.cycle import Event, decode_array, encode_array
+from stereoservo.core.cycle import Event, decode_array, encode
 from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model, write_atomically
 
@@ -112,7 +112,7 @@ def relocalize_from_events(
 
 def save_events(path: Path, events: list[Event]) -> None:
     """Save events for the process that fits. Raises OSError."""
-    write_atomically(path, msgspec.msgpack.encode(events, enc_hook=encode_array))
+    write_atomically(path, encode(events))
 
 
 def load_events(path: Path) -> list[Event]:
