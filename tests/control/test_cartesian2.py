@@ -10,7 +10,7 @@ from oracles.cartesian import CartesianStep, cartesian_law
 from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.cartesian2 import cartesian2_reasons
-from stereoservo.control.laws.cartesian3 import cartesian_step
+from stereoservo.control.laws.cartesian3 import FaceTask, Pace, cartesian_step
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.planning.three_point_decomposition import ComponentStatus
 
@@ -29,10 +29,17 @@ def inputs(virtual, world, composition, T0, T_star, single, gain=1.0, dt_s=0.0, 
     )  # fmt: skip
 
 
+def kernel(
+    operators, composition, points, targets, centre, centre_target, eyes, gains, dt_s, turn, speed, single
+):
+    task, pace = FaceTask(points, targets, centre, centre_target), Pace(gains, dt_s, turn, speed)
+    return cartesian_step(operators, int(composition), task, eyes, pace, single)
+
+
 def assert_same(arguments):
     expected, found = (
         cartesian_law(*arguments),
-        cartesian_step(arguments[0], int(arguments[1]), *arguments[2:]),
+        kernel(*arguments),
     )
     for name, a, b in zip(expected._fields, expected, found, strict=True):
         np.testing.assert_allclose(b, a, rtol=0, atol=1e-8, err_msg=name)

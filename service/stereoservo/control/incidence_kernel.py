@@ -98,36 +98,40 @@ def _reducible(J: FloatArray, e: FloatArray) -> float:
     return part
 
 
-@kernel
-def incidence_kernel(
-    operators: FloatArray,
-    composition: int,
-    matrices: FloatArray,
-    points: FloatArray,
-    kinds: IntArray,
-    markers: IntArray,
-    fixed: FloatArray,
-    tolerance_px: float,
-    gain: float,
-    dt_s: float,
-    damping: float,
-    metric: FloatArray,
-    second_rows: FloatArray,
-    second_rates: FloatArray,
-    second_weights: FloatArray,
-) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
-    """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
-
-    ``kinds`` (k,), ``markers`` (k, 3) indices into ``points`` (m, 4), ``fixed`` (k, 3, 4) as `incidence.IncidenceTask`
-    has them; ``metric`` (n,) > 0. The second task wants ``second_rows`` (r, n) times the velocity to be
-    ``second_rates`` (r,), weighted by ``second_weights`` (r,); r may be 0.
+class Linearization(NamedTuple):
+    """The incidences to first order: ``J`` (b·2c, n) and ``e`` (b·2c,) [px] by the ``metric``, rows of a constraint's
+    moving points, ``owner`` (b,) of the blocks, the constraints' ``error`` (k,) [px], and whether all is ``finite``.
     """
-    n = operators.shape[0]
-    constraints = kinds.shape[0]
-    rows = 2 * matrices.shape[0]
-    velocity = np.zeros(n)
+
+    J: FloatArray
+    e: FloatArray
+    owner: IntArray
+    error: FloatArray
+    finite: bool
+
+
+class Decomposition(NamedTuple):
+    """Right singular vectors ``V`` and ``values`` of a Jacobian; ``along`` (n,): the error's components, 0 beyond
+    ``rank``; squares of the error in ``total`` and its drivable ``part``; ``conditioning``; drivable ``share``.
+    """
+
+    V: FloatArray
+    values: FloatArray
+    along: FloatArray
+    total: float
+    rank: int
+    part: float
+    conditioning: float
+    share: float
+
+
+@kernel
+def _linearized(
+    operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, kinds: IntArray,
+    markers: IntArray, fixed: FloatArray, metric: FloatArray,
+) -> tuple[Seen, Linearization]:  # fmt: skip
+    n, constraints, rows = operators.shape[0], kinds.shape[0], 2 * matrices.shape[0]
     error = np.zeros(constraints)
-    status = np.zeros(constraints, dtype=np.int64)
     blocks = 0
     for k in range(constraints):
         blocks += moving_count(kinds[k])
@@ -168,21 +172,23 @@ def incidence_kernel(
             if not distance <= error[k]:
                 error[k] = distance
             b += 1
-    if not finite:
-        for k in range(constraints):
-            status[k] = NOT_FINITE
-        return velocity, error, status, 0, 0.0, 0.0
+    seen = Seen(operators, composition, points, at, gradients, tangents, bases)
+    return seen, Linearization(J, e, owner, error, finite)
 
+
+@kernel
+def _decomposed(J: FloatArray, e: FloatArray) -> Decomposition:
+    rows, n = J.shape
     V, values = right_singular(J)
     along = np.zeros(n)
     for i in range(n):
-        for r in range(blocks * rows):
+        for r in range(rows):
             s = 0.0
             for j in range(n):
                 s += J[r, j] * V[j, i]
             along[i] += s * e[r]
     total = 0.0
-    for r in range(blocks * rows):
+    for r in range(rows):
         total += e[r] * e[r]
     rank = 0
     part = 0.0
@@ -194,6 +200,44 @@ def incidence_kernel(
             along[i] = 0.0
     conditioning = (values[rank - 1] / values[0]) ** 2 if rank > 0 else 0.0
     share = math.sqrt(min(1.0, part / total)) if total > 0.0 else 1.0
+    return Decomposition(V, values, along, total, rank, part, conditioning, share)
+
+
+@kernel
+def incidence_kernel(
+    operators: FloatArray,
+    composition: int,
+    matrices: FloatArray,
+    points: FloatArray,
+    kinds: IntArray,
+    markers: IntArray,
+    fixed: FloatArray,
+    tolerance_px: float,
+    gain: float,
+    dt_s: float,
+    damping: float,
+    metric: FloatArray,
+    second_rows: FloatArray,
+    second_rates: FloatArray,
+    second_weights: FloatArray,
+) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
+    """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
+
+    ``kinds`` (k,), ``markers`` (k, 3) indices into ``points`` (m, 4), ``fixed`` (k, 3, 4) as `incidence.IncidenceTask`
+    has them; ``metric`` (n,) > 0. The second task wants ``second_rows`` (r, n) times the velocity to be
+    ``second_rates`` (r,), weighted by ``second_weights`` (r,); r may be 0.
+    """
+    n, constraints = operators.shape[0], kinds.shape[0]
+    velocity = np.zeros(n)
+    status = np.zeros(constraints, dtype=np.int64)
+    seen, linear = _linearized(operators, composition, matrices, points, kinds, markers, fixed, metric)
+    error = linear.error
+    if not linear.finite:
+        for k in range(constraints):
+            status[k] = NOT_FINITE
+        return velocity, error, status, 0, 0.0, 0.0
+    found = _decomposed(linear.J, linear.e)
+    rank, total, part, share = found.rank, found.total, found.part, found.share
 
     within = True
     for k in range(constraints):
@@ -201,36 +245,28 @@ def incidence_kernel(
             status[k] = DONE
         else:
             within = False
-    seen = Seen(operators, composition, points, at, gradients, tangents, bases)
     step = np.zeros(n)
     escaped = False
     if not within and (not share > STATIONARY or (share < MOSTLY and math.sqrt(part) <= tolerance_px)):
-        escaped = _way_out(seen, V, metric, total, part, step)
+        escaped = _way_out(seen, found.V, metric, total, part, step)
         if not escaped:
-            _blame(J, e, owner, rows, status)
+            _blame(linear.J, linear.e, linear.owner, 2 * matrices.shape[0], status)
     if not escaped and rank > 0:
         ahead = min(1.0, max(gain * dt_s, AHEAD))
-        _damped_step(seen, V, values, along, metric, total, damping, ahead, step)
+        _damped_step(seen, found, metric, damping, ahead, step)
     for j in range(n):
         velocity[j] = gain * step[j]
-    _second_task(velocity, V, rank, metric, second_rows, second_rates, second_weights, damping)
-    return velocity, error, status, rank, conditioning, share
+    _second_task(velocity, found.V, rank, metric, second_rows, second_rates, second_weights, damping)
+    return velocity, error, status, rank, found.conditioning, share
 
 
 @kernel
 def _damped_step(
-    seen: Seen,
-    V: FloatArray,
-    values: FloatArray,
-    along: FloatArray,
-    metric: FloatArray,
-    total: float,
-    damping: float,
-    ahead: float,
-    step: FloatArray,
+    seen: Seen, found: Decomposition, metric: FloatArray, damping: float, ahead: float, step: FloatArray
 ) -> None:
     """A step (n,) of damped least squares whose residual, seen ahead, falls as the linear model says."""
     n = step.shape[0]
+    V, values, along, total = found.V, found.values, found.along, found.total
     largest = values[0] * values[0]
     damp = damping * largest
     look = np.empty(n)

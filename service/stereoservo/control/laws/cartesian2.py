@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.laws.cartesian3 import (
     ROTATION,
     cartesian_reasons,
-    cartesian_step,
+    velocity_step,
 )
 from stereoservo.messages.reasons import Reason
 from stereoservo.planning.primitives import TRANSLATION
@@ -22,14 +20,7 @@ def cartesian2(scene: Scene, task: Task, options: Options) -> LawStep:
     The rotation takes the short way round, or the long one where only that keeps the face in sight; where neither
     does, the hinge of the law in three components goes first, and the status says WAITS.
     """
-    return LawStep(
-        *cartesian_step(
-            scene.operators, scene.composition, scene.points[task.face], task.target_points[task.face], task.centre,
-            task.centre_target, scene.camera_centres, np.full(2, options.gain), options.dt_s, options.rotation_rate,
-            options.translation_rate, True,
-        ),
-        1.0,
-    )  # fmt: skip
+    return velocity_step(scene, task, options, 2)
 
 
 def cartesian2_reasons(step: LawStep) -> tuple[Reason, ...]:

@@ -9,6 +9,7 @@ and turn one rotation (8.55). A component that would turn the face out of a came
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,38 +79,72 @@ def is_flat(A: FloatArray, face: FloatArray) -> bool:
     return not norm(face) > FLAT_FACE * first * second * norm(A[0])
 
 
-@kernel
-def decompose_into(
-    operators: FloatArray,
-    basis: FloatArray,
-    points: FloatArray,
-    targets: FloatArray,
-    centre: FloatArray,
-    centre_target: FloatArray,
-    screws: FloatArray,
-    generators: FloatArray,
-    amount: FloatArray,
-    status: IntArray,
-) -> None:
-    """Translation, hinge and planar turn (7.18 to 7.24) into screws (3, n), generators (3, 4, 4), amount, status (3,).
-
-    ``basis`` (n, r) of the arm's freedoms; ``points``, ``targets`` (3, 4) span faces. Amounts are >= 0, angles in
-    [0, π]. Screws and generators of components that are done or not reachable are left as they are: hand in zeros.
+class FaceTask(NamedTuple):
+    """Three ``points`` (3, 4) of one face now and at the goal, ``targets`` (3, 4); ``centre`` and ``centre_target``
+    (4,): all of height ``a∞ᵀM = 1``.
     """
+
+    points: FloatArray
+    targets: FloatArray
+    centre: FloatArray
+    centre_target: FloatArray
+
+
+class Components(NamedTuple):
+    """Translation, hinge and planar turn (7.18 to 7.24): ``screws`` (3, n), ``generators`` (3, 4, 4), ``amount`` (3,),
+    ``status`` (3,). Amounts are >= 0, angles in [0, π]. Screws and generators of components that are done or not
+    reachable are zero.
+    """
+
+    screws: FloatArray
+    generators: FloatArray
+    amount: FloatArray
+    status: IntArray
+
+
+@kernel
+def decompose(operators: FloatArray, basis: FloatArray, task: FaceTask) -> Components:
+    """The components of a motion. ``basis`` (n, r) of the arm's freedoms."""
+    points, targets, centre = task.points, task.targets, task.centre
     n = operators.shape[0]
+    found = Components(np.zeros((3, n)), np.zeros((3, 4, 4)), np.zeros(3), np.full(3, DONE))
     system = np.zeros((8, n))
     unit_centre = unit(centre)
+    _translation(operators, basis, task, unit_centre, system, found)
+    A_c = _shifted(points, centre)
+    A_r = _shifted(targets, centre)
+    a = unit(minors(A_c[0], A_c[1], A_c[2]))
+    a_t = unit(minors(A_r[0], A_r[1], A_r[2]))
+    _hinge(operators, basis, centre, unit_centre, a, a_t, A_c, A_r, system, found)
+    set_plane_rows(operators, a, system, 0)
+    set_point_rows(operators, unit_centre, system, 4)
+    found.status[2] = NOT_REACHABLE
+    screw, H = np.zeros(n), np.zeros((4, 4))
+    if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
+        theta = _planar_angle(H, A_c, A_r)
+        if theta < 0.0:
+            scale_primitive(screw, H, -1.0)
+            theta = -theta
+        found.amount[2] = theta
+        _keep(screw, H, 2, found)
+    return found
+
+
+@kernel
+def _translation(
+    operators: FloatArray, basis: FloatArray, task: FaceTask, unit_centre: FloatArray, system: FloatArray,
+    found: Components,
+) -> None:  # fmt: skip
+    """The centre's translation into the first of the components; ``system`` (8, n): scratch."""
+    centre, centre_target = task.centre, task.centre_target
+    n = operators.shape[0]
     displacement = np.empty(4)
     for k in range(4):
         displacement[k] = centre_target[k] - centre[k]
-    for i in range(3):
-        amount[i] = 0.0
-        status[i] = DONE
-
     tau = norm(displacement)
     if tau > COINCIDENT * norm(centre):
-        amount[0] = tau
-        status[0] = NOT_REACHABLE
+        found.amount[0] = tau
+        found.status[0] = NOT_REACHABLE
         direction = unit(displacement)
         a1, a2 = complement(unit_centre, direction)
         set_plane_rows(operators, a1, system, 0)
@@ -120,13 +155,20 @@ def decompose_into(
             scale = math.copysign(norm(step), dot(step, direction))
             if abs(scale) > DEGENERATE_RATIO * norm(centre):
                 scale_primitive(screw, H, 1.0 / scale)
-                amount[0] = dot(displacement, apply(H, centre))
-                _keep(screw, H, 0, screws, generators, status)
+                found.amount[0] = dot(displacement, apply(H, centre))
+                _keep(screw, H, 0, found)
 
-    A_c = _shifted(points, centre)
-    A_r = _shifted(targets, centre)
-    a = unit(minors(A_c[0], A_c[1], A_c[2]))
-    a_t = unit(minors(A_r[0], A_r[1], A_r[2]))
+
+@kernel
+def _hinge(
+    operators: FloatArray, basis: FloatArray, centre: FloatArray, unit_centre: FloatArray, a: FloatArray,
+    a_t: FloatArray, A_c: FloatArray, A_r: FloatArray, system: FloatArray, found: Components,
+) -> None:  # fmt: skip
+    """The hinge of the face's plane ``a`` (4,) to ``a_t`` into the second of the components.
+
+    The face's points at the goal, ``A_r`` (3, 4), are turned back by it; ``A_c`` (3, 4): those now.
+    """
+    n = operators.shape[0]
     together = dot(a, a_t)
     difference = np.empty(4)
     for k in range(4):
@@ -146,8 +188,8 @@ def decompose_into(
                 for k in range(4):
                     axis_point[k] = A_c[i, k]
     if hinged:
-        amount[1] = math.acos(min(1.0, max(-1.0, together)))
-        status[1] = NOT_REACHABLE
+        found.amount[1] = math.acos(min(1.0, max(-1.0, together)))
+        found.status[1] = NOT_REACHABLE
         along = dot(axis_point, unit_centre)
         second_point = np.empty(4)
         for k in range(4):
@@ -160,8 +202,8 @@ def decompose_into(
             if theta < 0.0:
                 scale_primitive(screw, H, -1.0)
                 theta = -theta
-            amount[1] = theta
-            _keep(screw, H, 1, screws, generators, status)
+            found.amount[1] = theta
+            _keep(screw, H, 1, found)
             sine, versine = math.sin(-theta), 2.0 * math.sin(0.5 * theta) ** 2
             for i in range(3):
                 once = apply(H, A_r[i])
@@ -169,29 +211,15 @@ def decompose_into(
                 for k in range(4):
                     A_r[i, k] += sine * once[k] + versine * twice[k]
 
-    set_plane_rows(operators, a, system, 0)
-    set_point_rows(operators, unit_centre, system, 4)
-    status[2] = NOT_REACHABLE
-    screw, H = np.zeros(n), np.zeros((4, 4))
-    if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
-        theta = _planar_angle(H, A_c, A_r)
-        if theta < 0.0:
-            scale_primitive(screw, H, -1.0)
-            theta = -theta
-        amount[2] = theta
-        _keep(screw, H, 2, screws, generators, status)
-
 
 @kernel
-def _keep(
-    screw: FloatArray, H: FloatArray, i: int, screws: FloatArray, generators: FloatArray, status: IntArray
-) -> None:
-    status[i] = MOVES
+def _keep(screw: FloatArray, H: FloatArray, i: int, found: Components) -> None:
+    found.status[i] = MOVES
     for j in range(screw.shape[0]):
-        screws[i, j] = screw[j]
+        found.screws[i, j] = screw[j]
     for k in range(4):
         for m in range(4):
-            generators[i, k, m] = H[k, m]
+            found.generators[i, k, m] = H[k, m]
 
 
 @kernel
@@ -227,17 +255,11 @@ def _planar_angle(H: FloatArray, A: FloatArray, A_r: FloatArray) -> float:
 
 @kernel
 def _one_rotation(
-    operators: FloatArray,
-    basis: FloatArray,
-    screws: FloatArray,
-    generators: FloatArray,
-    amount: FloatArray,
-    status: IntArray,
-    screw: FloatArray,
-    V: FloatArray,
+    operators: FloatArray, basis: FloatArray, parts: Components, screw: FloatArray, V: FloatArray
 ) -> tuple[float, int]:
     """Angle and status of hinge and planar turn as one rotation (8.50 to 8.52); its screw and generator ``V``."""
     n, rank = basis.shape
+    generators, amount, status = parts.generators, parts.amount, parts.status
     found = MOVES
     if status[1] == NOT_REACHABLE or status[2] == NOT_REACHABLE:
         found = NOT_REACHABLE
@@ -306,32 +328,46 @@ def _moved_into(G: FloatArray, amount: float, points: FloatArray, work: FloatArr
             points[p, i] = H[i, 0] * x + H[i, 1] * y + H[i, 2] * z + H[i, 3] * w
 
 
+class Pace(NamedTuple):
+    """``gains`` (k,) [1/s] of the components; ``dt_s`` [s] and the rates as in `control.law.Options`."""
+
+    gains: FloatArray
+    dt_s: float
+    rotation_rate: float
+    translation_rate: float
+
+
+class Sight(NamedTuple):
+    """The ``share`` of the translation and the ``turn`` of the rotation that visibility allows; whether the hinge comes
+    first, in place of one rotation, and the ``whole`` of this rotation.
+    """
+
+    share: float
+    turn: float
+    hinge_first: bool
+    whole: float
+
+
 @kernel
 def cartesian_step(
     operators: FloatArray,
     composition: int,
-    points: FloatArray,
-    targets: FloatArray,
-    centre: FloatArray,
-    centre_target: FloatArray,
+    task: FaceTask,
     camera_centres: FloatArray,
-    gains: FloatArray,
-    dt_s: float,
-    rotation_rate: float,
-    translation_rate: float,
+    pace: Pace,
     single: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Joint velocity (n,), task error (k,), allowed (k,) and status (k,) of both laws in one call.
 
     The components are translation, hinge and turn (8.42), or, ``single``, translation and one rotation (8.55).
 
-    ``operators`` (n, 4, 4) at the current configuration (5.21), ``points`` and ``targets`` (3, 4) of one face,
-    ``centre`` and ``centre_target`` (4,), ``camera_centres`` (c, 4): all of height ``a∞ᵀM = 1``. ``gains`` (k,)
-    [1/s]; ``dt_s`` [s] and the rates as in `control.law.Options`. Task error: τ in lengths of the frame's coordinates,
-    angles [rad], all >= 0; allowed: what of it visibility lets the components plan for; status: `ComponentStatus`. A
-    component that the arm cannot make, or that visibility holds back, does not hold up the others.
+    ``operators`` (n, 4, 4) at the current configuration (5.21), ``camera_centres`` (c, 4) of height ``a∞ᵀM = 1``. Task
+    error: τ in lengths of the frame's coordinates, angles [rad], all >= 0; allowed: what of it visibility lets the
+    components plan for; status: `ComponentStatus`. A component that the arm cannot make, or that visibility holds
+    back, does not hold up the others.
     """
-    n, cameras = operators.shape[0], camera_centres.shape[0]
+    points, targets, centre, centre_target = task
+    n, dt_s = operators.shape[0], pace.dt_s
     count = 2 if single else 3
     velocity, errors, allowed = np.zeros(n), np.zeros(count), np.zeros(count)
     shown = np.full(count, NO_FACE)
@@ -343,12 +379,44 @@ def cartesian_step(
     if is_flat(points, face) or is_flat(targets, target_face) or not math.isfinite(centres):
         return velocity, errors, allowed, shown
     basis = freedoms_of(operators)
-    screws, generators = np.zeros((3, n)), np.zeros((3, 4, 4))
-    amount = np.zeros(3)
-    status = np.full(3, DONE)
-    decompose_into(
-        operators, basis, points, targets, centre, centre_target, screws, generators, amount, status
-    )
+    parts = decompose(operators, basis, task)
+    sight = _kept_in_view(operators, basis, task, face, target_face, camera_centres, single, parts)
+    steps = _paced(parts, sight, pace, errors, allowed, shown)
+    for i in range(count):
+        for j in range(n):
+            velocity[j] += steps[i] * parts.screws[i, j]
+    if dt_s > 0.0:
+        held, wanted = np.empty((4, 4)), np.empty((4, 4))
+        for k in range(4):
+            for i in range(3):
+                held[i, k] = points[i, k]
+            held[3, k] = centre[k]
+        for i in range(4):
+            for k in range(4):
+                wanted[i, k] = held[i, k]
+        work = np.empty((3, 4, 4))
+        for back in range(count):
+            i = count - 1 - back
+            if steps[i] != 0.0:
+                _moved_into(parts.generators[i], steps[i], wanted, work)
+        step = corrected_step(operators, composition, held, wanted, velocity)
+        for j in range(n):
+            velocity[j] = step[j] / dt_s
+    if sight.hinge_first:
+        errors[1] = sight.whole
+        shown[1] = WAITS
+    return velocity, errors, allowed, shown
+
+
+@kernel
+def _kept_in_view(
+    operators: FloatArray, basis: FloatArray, task: FaceTask, face: FloatArray, target_face: FloatArray,
+    camera_centres: FloatArray, single: bool, parts: Components,
+) -> Sight:  # fmt: skip
+    """How far the components may go with the face in view; the rotation, in its sense, goes into ``parts``."""
+    centre, centre_target = task.centre, task.centre_target
+    n, cameras = operators.shape[0], camera_centres.shape[0]
+    screws, generators, amount, status = parts
     side = 1.0
     if cameras > 0:
         middle = np.zeros(4)
@@ -365,7 +433,7 @@ def cartesian_step(
     whole = 0.0
     if single:
         screw, V = np.empty(n), np.empty((4, 4))
-        whole, found = _one_rotation(operators, basis, screws, generators, amount, status, screw, V)
+        whole, found = _one_rotation(operators, basis, parts, screw, V)
         angle, share, turn, clear = way_in_sight(face, V, displacement, camera_centres, side, whole)
         if not clear and status[1] == MOVES:
             other = way_in_sight(face, generators[1], displacement, camera_centres, side, amount[1])
@@ -388,7 +456,17 @@ def cartesian_step(
         scale_primitive(screws[1], generators[1], -1.0)
     if single or status[1] == MOVES:
         amount[1] = abs(angle)
+    return Sight(share, turn, hinge_first, whole)
 
+
+@kernel
+def _paced(
+    parts: Components, sight: Sight, pace: Pace, errors: FloatArray, allowed: FloatArray, shown: IntArray
+) -> FloatArray:
+    """What each component makes in this step (k,), or its rate where ``dt_s`` is 0; errors, allowed and status."""
+    screws, amount, status = parts.screws, parts.amount, parts.status
+    share, turn, dt_s = sight.share, sight.turn, pace.dt_s
+    count, n = errors.shape[0], screws.shape[1]
     steps = np.zeros(count)
     for i in range(count):
         errors[i] = amount[i]
@@ -409,50 +487,28 @@ def cartesian_step(
                 limit = STEP_OF_BOUND * turn
         if status[i] == MOVES and allowed[i] < amount[i]:
             shown[i] = WAITS
-        rate = translation_rate if i == 0 else rotation_rate
+        rate = pace.translation_rate if i == 0 else pace.rotation_rate
         if dt_s > 0.0:
-            steps[i] = min(-math.expm1(-gains[i] * dt_s) * allowed[i], rate * dt_s, limit)
+            steps[i] = min(-math.expm1(-pace.gains[i] * dt_s) * allowed[i], rate * dt_s, limit)
         else:
-            steps[i] = min(gains[i] * allowed[i], rate)
-        for j in range(n):
-            velocity[j] += steps[i] * screws[i, j]
-    if dt_s > 0.0:
-        held, wanted = np.empty((4, 4)), np.empty((4, 4))
-        for k in range(4):
-            for i in range(3):
-                held[i, k] = points[i, k]
-            held[3, k] = centre[k]
-        for i in range(4):
-            for k in range(4):
-                wanted[i, k] = held[i, k]
-        work = np.empty((3, 4, 4))
-        for back in range(count):
-            i = count - 1 - back
-            if steps[i] != 0.0:
-                _moved_into(generators[i], steps[i], wanted, work)
-        step = corrected_step(operators, composition, held, wanted, velocity)
-        for j in range(n):
-            velocity[j] = step[j] / dt_s
-    if hinge_first:
-        errors[1] = whole
-        shown[1] = WAITS
-    return velocity, errors, allowed, shown
+            steps[i] = min(pace.gains[i] * allowed[i], rate)
+    return steps
 
 
 @kernel
 def cartesian3_step(
-    operators: FloatArray,
-    points: FloatArray,
-    targets: FloatArray,
-    centre: FloatArray,
-    centre_target: FloatArray,
-    camera_centres: FloatArray,
-    gains: FloatArray,
+    operators: FloatArray, task: FaceTask, camera_centres: FloatArray, gains: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """The instantaneous law in three components: `cartesian_step` with ``dt_s`` 0 and no rate limits (8.42)."""
-    return cartesian_step(
-        operators, 0, points, targets, centre, centre_target, camera_centres, gains, 0.0, math.inf, math.inf, False
-    )  # fmt: skip
+    return cartesian_step(operators, 0, task, camera_centres, Pace(gains, 0.0, math.inf, math.inf), False)
+
+
+def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:
+    """The step of a law with ``count`` components, 3 or 2, each at the gain of ``options``."""
+    face = FaceTask(scene.points[task.face], task.target_points[task.face], task.centre, task.centre_target)
+    pace = Pace(np.full(count, options.gain), options.dt_s, options.rotation_rate, options.translation_rate)
+    step = cartesian_step(scene.operators, scene.composition, face, scene.camera_centres, pace, count == 2)
+    return LawStep(*step, 1.0)
 
 
 def cartesian_reasons(
@@ -490,14 +546,7 @@ def cartesian_reasons(
 
 def cartesian3(scene: Scene, task: Task, options: Options) -> LawStep:
     """``q̇ = [q̂_t q̂_r q̂_p] Λ e``, ``e = (τ, θ_r, θ_p)`` the motion still to be made (8.42)."""
-    return LawStep(
-        *cartesian_step(
-            scene.operators, scene.composition, scene.points[task.face], task.target_points[task.face], task.centre,
-            task.centre_target, scene.camera_centres, np.full(3, options.gain), options.dt_s, options.rotation_rate,
-            options.translation_rate, False,
-        ),
-        1.0,
-    )  # fmt: skip
+    return velocity_step(scene, task, options, 3)
 
 
 def cartesian3_reasons(step: LawStep) -> tuple[Reason, ...]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from math import expm1, inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,28 @@ NO_STATUS = np.zeros(0, dtype=np.int64)
 DESIRED = int(JacobianChoice.DESIRED)
 MEAN = int(JacobianChoice.MEAN)
 FIXED_DEPTH = int(JacobianChoice.FIXED_DEPTH)
+
+
+class View(NamedTuple):
+    """``matrices`` (c, 3, 4) and ``camera_centres`` (c, 4) of the cameras; of their markers ``pixels``, ``set_points``
+    and the set-points' ``rates`` [px/s], (c, m, 2) each, ``weights`` (c, m) [1/px] and ``wanted`` (c, m).
+    """
+
+    matrices: FloatArray
+    camera_centres: FloatArray
+    pixels: FloatArray
+    set_points: FloatArray
+    rates: FloatArray
+    weights: FloatArray
+    wanted: FloatArray
+
+
+class Body(NamedTuple):
+    """Marker ``points`` (m, 4) now, and at the goal ``target_points`` (m, 4) where ``target_known`` (m,) is 1."""
+
+    points: FloatArray
+    target_points: FloatArray
+    target_known: FloatArray
 
 
 @kernel
@@ -69,23 +92,11 @@ def add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, r
 
 @kernel
 def image_equations_into(
-    operators: FloatArray,
-    matrices: FloatArray,
-    camera_centres: FloatArray,
-    points: FloatArray,
-    target_points: FloatArray,
-    target_known: FloatArray,
-    pixels: FloatArray,
-    set_points: FloatArray,
-    rates: FloatArray,
-    weights: FloatArray,
-    wanted: FloatArray,
-    gain: float,
-    choice: int,
-    N: FloatArray,
-    b: FloatArray,
+    operators: FloatArray, view: View, body: Body, gain: float, choice: int, N: FloatArray, b: FloatArray
 ) -> None:
     """The normal equations ``N x = b`` of `image_step`, undamped; of ``N`` (n, n) the lower triangle."""
+    matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
+    points, target_points, target_known = body
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
     for i in range(n):
         b[i] = 0.0
@@ -138,28 +149,12 @@ def image_equations_into(
 
 @kernel
 def image_step(
-    operators: FloatArray,
-    matrices: FloatArray,
-    camera_centres: FloatArray,
-    points: FloatArray,
-    target_points: FloatArray,
-    target_known: FloatArray,
-    pixels: FloatArray,
-    set_points: FloatArray,
-    rates: FloatArray,
-    weights: FloatArray,
-    wanted: FloatArray,
-    gain: float,
-    choice: int,
-    damping: float,
+    operators: FloatArray, view: View, body: Body, gain: float, choice: int, damping: float
 ) -> tuple[FloatArray, float]:
     """Velocity (n,) of least ``Σ w²|J q̇ − gain (s* − s) − ṡ*|²``, damped, and the conditioning; see `control.law`."""
     n = operators.shape[0]
     N, b, x = np.empty((n, n)), np.empty(n), np.zeros(n)
-    image_equations_into(
-        operators, matrices, camera_centres, points, target_points, target_known, pixels, set_points, rates,
-        weights, wanted, gain, choice, N, b,
-    )  # fmt: skip
+    image_equations_into(operators, view, body, gain, choice, N, b)
     conditioning = damped_solve(N, b, damping, x)
     return x, conditioning
 
@@ -204,11 +199,13 @@ def image_velocity_step(
     scene: Scene, task: Task, options: Options, jacobian: int, rates: FloatArray
 ) -> LawStep:
     """The kernel's step for a choice of the Jacobian and a feed-forward (c, m, 2) [px/s]."""
+    view = View(
+        scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted
+    )
+    body = Body(scene.points, task.target_points, task.target_known)
     velocity, conditioning = image_step(
-        scene.operators, scene.matrices, scene.camera_centres, scene.points, task.target_points, task.target_known,
-        scene.pixels, task.set_points, rates, scene.weights, task.wanted, held_gain(options), int(jacobian),
-        options.damping,
-    )  # fmt: skip
+        scene.operators, view, body, held_gain(options), int(jacobian), options.damping
+    )
     return limited(scene, task, options, velocity, conditioning)
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
-from stereoservo.control.laws.stereo import image_equations_into, image_reasons, limited
+from stereoservo.control.laws.stereo import Body, View, image_equations_into, image_reasons, limited
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, step_into
 from stereoservo.kinematics.kernels import project_points, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
@@ -24,43 +25,42 @@ bias a well determined direction by is 1e-4 of their disagreement, below image n
 """
 
 
+class PlannedJoints(NamedTuple):
+    """Of a plan now: joint ``rates`` (n,), joint ``error`` (n,), its ``weight`` [0, 1]; empty arrays without a plan."""
+
+    rates: FloatArray
+    error: FloatArray
+    weight: float
+
+
+class Pull(NamedTuple):
+    """Weights ``pull`` (n,) of the velocities ``meant`` (n,) by the plan; ``planned``: whether there is one."""
+
+    pull: FloatArray
+    meant: FloatArray
+    planned: bool
+
+
 @kernel
 def trajectory_step(
-    operators: FloatArray,
-    composition: int,
-    matrices: FloatArray,
-    camera_centres: FloatArray,
-    points: FloatArray,
-    pixels: FloatArray,
-    set_points: FloatArray,
-    rates: FloatArray,
-    weights: FloatArray,
-    wanted: FloatArray,
-    gain: float,
-    dt_s: float,
-    damping: float,
-    joint_rates: FloatArray,
-    joint_error: FloatArray,
-    joint_weight: float,
-) -> tuple[FloatArray, float]:
+    operators: FloatArray, composition: int, view: View, points: FloatArray, plan: PlannedJoints, gain: float,
+    dt_s: float, damping: float,
+) -> tuple[FloatArray, float]:  # fmt: skip
     """Joint velocity (n,) and conditioning; for ``dt_s`` > 0 refined by Newton's method on the images."""
-    n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
+    n = operators.shape[0]
     x, pull, meant = np.zeros(n), np.zeros(n), np.zeros(n)
-    known = np.zeros(markers)
+    known = np.zeros(points.shape[0])
     held = -math.expm1(-gain * dt_s) / dt_s if dt_s > 0.0 else gain
     N, b = np.empty((n, n)), np.empty(n)
-    image_equations_into(
-        operators, matrices, camera_centres, points, points, known, pixels, set_points, rates, weights, wanted,
-        held, 0, N, b,
-    )  # fmt: skip
-    planned = joint_rates.shape[0] == n
+    image_equations_into(operators, view, Body(points, points, known), held, 0, N, b)
+    planned = plan.rates.shape[0] == n
     if planned:
         largest = 0.0
         for j in range(n):
             largest = max(largest, N[j, j])
         for j in range(n):
-            pull[j] = damping * largest + joint_weight * JOINT_SHARE * N[j, j]
-            meant[j] = joint_rates[j] + joint_weight * held * joint_error[j]
+            pull[j] = damping * largest + plan.weight * JOINT_SHARE * N[j, j]
+            meant[j] = plan.rates[j] + plan.weight * held * plan.error[j]
             if not math.isfinite(pull[j] * meant[j]):
                 return x, 0.0
             N[j, j] += pull[j]
@@ -68,8 +68,22 @@ def trajectory_step(
         conditioning = cholesky_solve(N, b, x)
     else:
         conditioning = damped_solve(N, b, damping, x)
-    if not dt_s > 0.0 or conditioning == 0.0:
-        return x, conditioning
+    if dt_s > 0.0 and conditioning != 0.0:
+        _refine(operators, composition, view, points, Pull(pull, meant, planned), held, dt_s, damping, x)
+    return x, conditioning
+
+
+@kernel
+def _refine(
+    operators: FloatArray, composition: int, view: View, points: FloatArray, plan: Pull, held: float, dt_s: float,
+    damping: float, x: FloatArray,
+) -> None:  # fmt: skip
+    """Refine a velocity ``x`` (n,), held for ``dt_s``, so that the images move as meant to all orders."""
+    matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
+    pull, meant, planned = plan
+    n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
+    known = np.zeros(markers)
+    N, b = np.empty((n, n)), np.empty(n)
     goal, _ = project_points(matrices, points)
     for c in range(cameras):
         for p in range(markers):
@@ -102,10 +116,8 @@ def trajectory_step(
         before = error
         for j in range(n):
             best[j] = found[j]
-        image_equations_into(
-            turned, matrices, camera_centres, moved, moved, known, seen, goal, no_rates, weights, wanted, 1.0, 0,
-            N, b,
-        )  # fmt: skip
+        ahead = View(matrices, camera_centres, seen, goal, no_rates, weights, wanted)
+        image_equations_into(turned, ahead, Body(moved, moved, known), 1.0, 0, N, b)
         if planned:
             for j in range(n):
                 N[j, j] += pull[j]
@@ -121,7 +133,6 @@ def trajectory_step(
             break
     for j in range(n):
         x[j] = best[j] / dt_s
-    return x, conditioning
 
 
 def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
@@ -141,11 +152,26 @@ def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
             f"an arm of {n} joints takes {n} planned rates and errors, or none of both; got "
             f"{len(task.joint_rates)} and {len(task.joint_error)}"
         )
+    view = View(
+        scene.matrices,
+        scene.camera_centres,
+        scene.pixels,
+        task.set_points,
+        task.rates,
+        scene.weights,
+        task.wanted,
+    )
+    plan = PlannedJoints(task.joint_rates, task.joint_error, task.joint_weight)
     velocity, conditioning = trajectory_step(
-        scene.operators, scene.composition, scene.matrices, scene.camera_centres, scene.points, scene.pixels,
-        task.set_points, task.rates, scene.weights, task.wanted, options.gain, options.dt_s, options.damping,
-        task.joint_rates, task.joint_error, task.joint_weight,
-    )  # fmt: skip
+        scene.operators,
+        scene.composition,
+        view,
+        scene.points,
+        plan,
+        options.gain,
+        options.dt_s,
+        options.damping,
+    )
     return limited(scene, task, options, velocity, conditioning)
 
 

@@ -15,7 +15,7 @@ from math import isfinite
 import numpy as np
 
 from stereoservo.control.faces import FLAT_PX, Faces, find_faces, sights_along
-from stereoservo.control.laws.cartesian3 import cartesian3_step
+from stereoservo.control.laws.cartesian3 import FaceTask, cartesian3_step
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import markers_at
@@ -163,7 +163,7 @@ def _displacement_by_law(
     centre_target = _middle(targets, known)
     for _ in range(LAW_STEPS):
         twist, _, _, _ = cartesian3_step(
-            basis, moved[face], targets[face], _middle(moved, known), centre_target, nobody, gains
+            basis, FaceTask(moved[face], targets[face], _middle(moved, known), centre_target), nobody, gains
         )
         D = _onwards(basis, twist, D)
         moved = transform_points(D, points)
