@@ -12,7 +12,7 @@ import pytest
 
 from stereoservo.core.cycle import DriverFault, ModelUpdate
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state import UNRECORDED, StateVersionError, decode_state, encode_state, is_recorded
 from stereoservo.messages.goals import (
     Calibrate,
     CancelGoal,
@@ -436,3 +436,27 @@ def test_state_survives_serialisation_bit_for_bit(bench: Any) -> None:
         again = twin.step(inputs)
         assert again.command.tobytes() == outputs.command.tobytes()
     assert encode_state(twin.state) == encode_state(bench.core.state)
+
+
+def test_a_state_of_version_6_is_taken_up(bench: Any) -> None:
+    """A recording of before stamps and gaps were checked: the same state but for what it does not hold."""
+    moving(bench)
+    state = bench.core.state
+    old = msgspec.msgpack.decode(encode_state(state))
+    for name in UNRECORDED:
+        del old[name]
+    old["contact"]["reason"] = old.pop("stop_reason")
+    old["version"] = 6
+    data = msgspec.msgpack.encode(old)
+    taken = decode_state(data)
+    assert taken.last_step_ns == 0
+    assert len(taken.refused_frames) == len(state.cameras)
+    for name in UNRECORDED:
+        setattr(taken, name, getattr(state, name))
+    assert encode_state(taken) == encode_state(state)
+    assert is_recorded(state, data)
+    state.command[0] += 1e-9
+    assert not is_recorded(state, data)
+    old["version"] = 5
+    with pytest.raises(StateVersionError):
+        decode_state(msgspec.msgpack.encode(old))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -492,7 +492,37 @@ def decode_state(data: bytes) -> CoreState:
     """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
     # Asked first: a state of another version may hold other fields, too.
     version = msgspec.msgpack.decode(data, type=_Versioned).version
-    if version != STATE_VERSION:
+    if version == 6:
+        data = msgspec.msgpack.encode(_from_version_6(data))
+    elif version != STATE_VERSION:
         raise StateVersionError(version)
     state: CoreState = _decoder.decode(data)
+    return state
+
+
+UNRECORDED = ("last_step_ns", "refused_joints", "refused_frames")
+"""Fields that a state of version 6 does not hold."""
+
+
+def is_recorded(state: CoreState, data: bytes) -> bool:
+    """Whether ``data`` is this state bit for bit, in the fields that its version holds."""
+    encoded = encode_state(state)
+    if msgspec.msgpack.decode(data, type=_Versioned).version == STATE_VERSION:
+        return encoded == data
+    now, recorded = msgspec.msgpack.decode(encoded), _from_version_6(data)
+    recorded |= {name: now[name] for name in UNRECORDED}
+    return encoded == msgspec.msgpack.encode({name: recorded[name] for name in now})
+
+
+def _from_version_6(data: bytes) -> dict[str, Any]:
+    """A state of before stamps and gaps of the loop were checked, with nothing refused yet; arrays still encoded."""
+    state: dict[str, Any] = msgspec.msgpack.decode(data)
+    nothing = msgspec.to_builtins(Refused())
+    state |= {
+        "version": STATE_VERSION,
+        "last_step_ns": 0,
+        "refused_joints": nothing,
+        "refused_frames": [nothing for _ in state["cameras"]],
+        "stop_reason": state["contact"].pop("reason"),
+    }
     return state

@@ -18,7 +18,7 @@ from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import StateVersionError, decode_state, encode_state
+from stereoservo.core.state import StateVersionError, decode_state, is_recorded
 from stereoservo.messages.goals import IncidenceTarget, JointTarget, RunGoal
 from stereoservo.recording.flight_recorder import FORMAT
 from stereoservo.recording.step_records import (
@@ -84,7 +84,7 @@ class _Replay:
             self.checkpoints += 1
             if self._core is None:
                 self._core = ServoCore(self._settings, decode_state(state))
-            elif self.differs is None and encode_state(self._core.state) != state:
+            elif self.differs is None and not is_recorded(self._core.state, state):
                 self.differs = step
         elif topic == "step" and self._core is not None and self._settings is not None:
             self._take_step(decode_step(data), self._core, self._settings.law)
