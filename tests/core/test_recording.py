@@ -93,8 +93,8 @@ def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
 
     bench = benches(3, noise_px=0.1)
     bench.ready()
-    laws = {**LAWS, DEFAULT_LAW: dataclasses.replace(LAWS[DEFAULT_LAW], step=step)}
-    monkeypatch.setattr("stereoservo.core.sources.law.LAWS", laws)
+    raising = dataclasses.replace(LAWS[DEFAULT_LAW], step=step)
+    monkeypatch.setitem(LAWS.usable(), DEFAULT_LAW, raising)
     target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
     goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(target)))
     events = [event for k in range(50) for event in bench.step(*([RunGoal(goal)] if k == 5 else [])).events]
@@ -176,11 +176,11 @@ def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_p
     path = tmp_path / "old.mcap"
     older = msgspec.structs.replace(fingerprint(), stereoservo="0.0.1")
     with FlightRecorder(path, bench.settings, older) as recorder:
-        recorder.checkpoint(3, of_version(STATE_VERSION - 1), 1)
+        recorder.checkpoint(3, of_version(STATE_VERSION - 2), 1)
     with pytest.raises(RecordingError) as caught:
         replay(path)
     said = str(caught.value)
-    assert f"state is of version {STATE_VERSION - 1}, this program works with version {STATE_VERSION}" in said
+    assert f"state is of version {STATE_VERSION - 2}, this program works with version {STATE_VERSION}" in said
     assert "written by stereoservo 0.0.1" in said
     assert "Replay it with the version that wrote it, or record anew" in said
     assert "not damaged" in said
