@@ -16,10 +16,13 @@ settings.load_profile("stereoservo")
 FAST = ("control", "core", "geometry", "kinematics", "messages", "planning")
 """Folders whose tests have the marker `fast`, slow ones aside."""
 NOT_FAST = {
+    "control/test_cartesian2.py",
     "control/test_image_moved_cameras.py",
     "control/test_pd.py",
+    "control/test_sight.py",
     "core/test_goal_attacks.py",
     "core/test_goal_kinds.py",
+    "core/test_goal_life.py",
     "core/test_mobile.py",
     "core/test_reanchoring.py",
     "core/test_recording.py",
@@ -27,12 +30,15 @@ NOT_FAST = {
     "geometry/test_alignment.py",
     "geometry/test_distortion_lines.py",
     "geometry/test_incidences.py",
+    "geometry/test_moved_cameras.py",
     "geometry/test_rotations.py",
     "geometry/test_translations.py",
     "kinematics/inverse/test_families.py",
+    "kinematics/inverse/test_recognition.py",
     "kinematics/test_denavit_hartenberg.py",
     "kinematics/test_gauge_free.py",
     "kinematics/test_generality.py",
+    "kinematics/test_joint_angles.py",
     "messages/test_locks.py",  # starts processes
 }
 """What of them takes seconds a test: marker `fast` is for less than a minute in all."""
