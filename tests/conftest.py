@@ -1,6 +1,7 @@
 """Settings of the whole suite."""
 
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -11,6 +12,63 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # No deadline: the machines that run this are shared and stall, and kernels compile on first use.
 settings.register_profile("stereoservo", deadline=None)
 settings.load_profile("stereoservo")
+
+FAST = ("control", "core", "geometry", "kinematics", "messages", "planning")
+"""Folders whose tests have the marker `fast`, slow ones aside."""
+NOT_FAST = {
+    "control/test_cartesian2.py",
+    "control/test_image_moved_cameras.py",
+    "control/test_pd.py",
+    "control/test_sight.py",
+    "core/test_goal_attacks.py",
+    "core/test_goal_kinds.py",
+    "core/test_goal_life.py",
+    "core/test_mobile.py",
+    "core/test_reanchoring.py",
+    "core/test_recording.py",
+    "core/test_trials.py",
+    "geometry/test_alignment.py",
+    "geometry/test_distortion_lines.py",
+    "geometry/test_incidences.py",
+    "geometry/test_moved_cameras.py",
+    "geometry/test_rotations.py",
+    "geometry/test_translations.py",
+    "kinematics/inverse/test_families.py",
+    "kinematics/inverse/test_recognition.py",
+    "kinematics/test_denavit_hartenberg.py",
+    "kinematics/test_gauge_free.py",
+    "kinematics/test_generality.py",
+    "kinematics/test_joint_angles.py",
+    "messages/test_locks.py",  # starts processes
+}
+"""What of them takes seconds a test: marker `fast` is for less than a minute in all."""
+
+
+def is_fast(path: Path) -> bool:
+    """Whether the tests of a file have the marker `fast`."""
+    try:
+        name = path.relative_to(Path(__file__).parent)
+    except ValueError:
+        return False
+    return name.parts[0] in FAST and name.as_posix() not in NOT_FAST
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``-m fast`` no other test file is even imported."""
+    other = (
+        collection_path.name.startswith("test_")
+        and collection_path.is_file()
+        and not is_fast(collection_path)
+    )
+    return True if other and config.option.markexpr == "fast" else None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the fast ones before ``-m`` chooses."""
+    for item in items:
+        if is_fast(item.path) and item.get_closest_marker("slow") is None:
+            item.add_marker("fast")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -33,8 +33,17 @@ def two_at_a_time(cell):
     return np.array(stops), np.full(len(stops), -1)
 
 
-@pytest.mark.parametrize("maker", [rx90, offset_wrist])
-@pytest.mark.parametrize("swapped", [(0, 1), (3, 4), (1, 5)])
+@pytest.mark.parametrize(
+    ("maker", "swapped"),
+    [
+        (rx90, (1, 5)),
+        (offset_wrist, (0, 1)),
+        pytest.param(rx90, (0, 1), marks=pytest.mark.slow),
+        pytest.param(rx90, (3, 4), marks=pytest.mark.slow),
+        pytest.param(offset_wrist, (3, 4), marks=pytest.mark.slow),
+        pytest.param(offset_wrist, (1, 5), marks=pytest.mark.slow),
+    ],
+)
 def test_a_wrong_order_of_joints_fits_its_trials_and_fails_the_check(maker, swapped):
     cell, rng = maker(), np.random.default_rng(5)
     order = np.arange(6)

@@ -72,9 +72,12 @@ def promised(cases, seed):
     return answer
 
 
-def test_fifty_random_rigs_are_calibrated_from_nothing():
-    """With 99.5 % promised, two failures of fifty come once in forty runs; these are fixed cases."""
-    assert promised(50, 0)["success"] >= 49
+@pytest.mark.parametrize("cases", [20, pytest.param(50, marks=pytest.mark.slow)])
+def test_random_rigs_are_calibrated_from_nothing(cases):
+    """With 99.5 % promised, two failures of fifty come once in forty runs, two of twenty once in two hundred; these
+    are fixed cases.
+    """
+    assert promised(cases, 0)["success"] >= cases - 1
 
 
 @pytest.mark.slow

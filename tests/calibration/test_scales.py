@@ -22,6 +22,7 @@ def reported_scales(report):
     return trial_scales(trials, *initial_reconstruction(undistorted(trials, straight_lenses(trials))))
 
 
+@pytest.mark.slow  # in the suite: test_wrong_revolute_scale, by the whole fit
 def test_a_factor_that_explains_the_trial_is_told():
     factors = reported_scales(lambda way: FACTOR * way)
     assert factors[JOINT] == pytest.approx(FACTOR, rel=0.02)

@@ -43,7 +43,7 @@ def check(row, poses):
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_all_solutions_of_a_family_are_found(name):
-    poses = 10 if name in SEARCHED else 100 if name in ("PUMA", "arm with wrist") else 200
+    poses = 5 if name in SEARCHED else 100 if name in ("PUMA", "arm with wrist") else 200
     check(family_row(name, FAMILIES[name], poses, np.random.default_rng(11)), poses)
 
 

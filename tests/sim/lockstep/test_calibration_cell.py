@@ -71,6 +71,7 @@ def test_a_cell_without_ranges_calibrates_to_the_noise_floor(calibrated: Calibra
     assert not [message for message in warnings if "loses the markers" in message], warnings
 
 
+@pytest.mark.slow  # in the suite: the stops of such a plan, tests/core/test_trials.py
 def test_a_spread_joint_gives_every_trial_several_positions_of_the_body(tmp_path: Path) -> None:
     spread = {"joint": "j6", "positions": 3, "range": 0.5}
     ranges = dict(zip(NAMES, (0.2, 0.2, 0.2, 0.5, 0.4, 0.6), strict=True))

@@ -64,10 +64,18 @@ def faked(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("law", "goal"),
-    [("stereo", "near"), ("cartesian2", "roll"), ("cartesian3", "roll"), ("cartesian3", "far")],
+    ("name", "law", "goal"),
+    [
+        ("wide", "stereo", "near"),
+        ("wide", "cartesian3", "far"),
+        ("eye_in_hand", "cartesian2", "roll"),
+        ("eye_in_hand", "cartesian3", "far"),
+        pytest.param("wide", "cartesian2", "roll", marks=pytest.mark.slow),
+        pytest.param("wide", "cartesian3", "roll", marks=pytest.mark.slow),
+        pytest.param("eye_in_hand", "stereo", "near", marks=pytest.mark.slow),
+        pytest.param("eye_in_hand", "cartesian3", "roll", marks=pytest.mark.slow),
+    ],
 )
-@pytest.mark.parametrize("name", ["wide", "eye_in_hand"])
 def test_goal_is_reached_with_an_exact_model(tmp_path: Path, name: str, law: Any, goal: str) -> None:
     file = check_cell(faked(name))
     truth = true_cell(file)

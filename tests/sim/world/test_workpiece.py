@@ -263,9 +263,10 @@ def along(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.timeout(TIMEOUT_S)
-def test_a_goal_on_a_workpiece_that_has_moved_is_reached_there(tmp_path: Path) -> None:
-    """Through rendered images: calibrated beside it, taught, moved, reached; then a marker into a plane of it."""
-    bench = Bench(workpiece_file(images=True), tmp_path)
+@pytest.mark.parametrize("images", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_goal_on_a_workpiece_that_has_moved_is_reached_there(tmp_path: Path, images: bool) -> None:
+    """Calibrated beside it, taught, moved, reached; then a marker into a plane of it. ``images``: as rendered."""
+    bench = Bench(workpiece_file(images=images), tmp_path)
     with bench.cell:
         model = bench.calibrate()
         assert set(model.marker_ids) == set(BODY)  # what stands is left out
