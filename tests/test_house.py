@@ -24,8 +24,8 @@ def test_no_folder_is_beyond_its_limit():
     assert house.folder_figure().items == ()
 
 
-def test_no_function_outside_control_is_beyond_its_limit():
-    assert [item for item in house.function_figure().items if "stereoservo/control" not in item] == []
+def test_no_function_is_beyond_its_limit():
+    assert house.function_figure().items == ()
 
 
 @pytest.mark.parametrize("law", house.LAWS)

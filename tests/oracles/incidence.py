@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoservo.control import incidence_kernel as kernels
-from stereoservo.control.incidence import IncidenceStatus, IncidenceStep, IncidenceTask, SecondTask
-from stereoservo.control.incidence_kernel import METRIC_FLOOR, fixed_dimension, moving_count
+from stereoservo.control.incidence import IncidenceStatus, IncidenceStep, IncidenceTask
+from stereoservo.control.incidence_kernel import METRIC_FLOOR, SecondTask, fixed_dimension, moving_count
 from stereoservo.control.law import Options, Scene
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.kinematics.kernels import image_jacobian

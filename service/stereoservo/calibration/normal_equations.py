@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -97,22 +98,52 @@ def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: Fl
             own[row, a] = total
 
 
+class Motions(NamedTuple):
+    """Partial products ``before`` and ``after`` each joint, and the ``basis`` (4, 4, p) of the generators' parameters,
+    those of joint j from ``start`` (n + 1,) j on.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    basis: FloatArray
+    start: IntArray
+
+
+class Projections(NamedTuple):
+    """``cameras`` (c, 3, 4) and ``lenses`` (c, 4), with the bases of their parameters and where each camera's begin."""
+
+    cameras: FloatArray
+    camera_basis: FloatArray
+    camera_start: IntArray
+    lenses: FloatArray
+    lens_basis: FloatArray
+    lens_start: IntArray
+
+
+class Sightings(NamedTuple):
+    """k measurements: indices of ``camera``, ``stop`` and ``marker`` (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px]."""
+
+    camera: IntArray
+    stop: IntArray
+    marker: IntArray
+    pixels: FloatArray
+    sigmas: FloatArray
+
+
 @kernel
 def _rows_into(
-    before: FloatArray, after: FloatArray, generator_basis: FloatArray, generator_start: IntArray,
-    cameras: FloatArray, camera_basis: FloatArray, camera_start: IntArray,
-    lenses: FloatArray, lens_basis: FloatArray, lens_start: IntArray,
-    points: FloatArray, point_basis: FloatArray,
-    camera: IntArray, stop: IntArray, marker: IntArray, pixels: FloatArray, sigmas: FloatArray,
+    motions: Motions, projections: Projections, points: FloatArray, point_basis: FloatArray, seen: Sightings,
     core: FloatArray, own: FloatArray,
 ) -> None:  # fmt: skip
     """Fill weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's
     first.
 
     ``core`` (2 k, p + 1), zero on entry: derivatives by generators, cameras and lenses, then the residual. ``own``
-    (2 k, 3 or 0): by the coordinates of the measurement's own marker. ``generator_basis`` (4, 4, p), the
-    others with the parameter first.
+    (2 k, 3 or 0): by the coordinates of the measurement's own marker, with ``point_basis`` (m, 3 or 0, 4).
     """
+    before, after, generator_basis, generator_start = motions
+    cameras, camera_basis, camera_start, lenses, lens_basis, lens_start = projections
+    camera, stop, marker, pixels, sigmas = seen
     width = generator_basis.shape[2]
     lens_at = width + camera_basis.shape[0]
     residual_at = core.shape[1] - 1
@@ -223,33 +254,26 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
     lens_basis = np.concatenate([np.zeros((0, 4)), *charts.lenses])
     point_basis = np.array(charts.points)
     width = len(generator_basis) + len(camera_basis) + len(lens_basis)
+    projections = Projections(
+        np.ascontiguousarray(rig.cameras), camera_basis, _starts(charts.cameras), np.ascontiguousarray(rig.lenses),
+        lens_basis, _starts(charts.lenses),
+    )  # fmt: skip
     for first in range(0, len(data.camera), CHUNK):
         here = slice(first, min(first + CHUNK, len(data.camera)))
         stop = data.stop[here]
         before, after = partial_products(rig, data.offsets[stop[0] : stop[-1] + 1])
         core = np.zeros((2 * len(stop), width + 1))
         own = np.empty((2 * len(stop), point_basis.shape[1]))
-        _rows_into(
+        motions = Motions(
             before,
             after,
             np.ascontiguousarray(generator_basis.transpose(1, 2, 0)),
             _starts(charts.generators),
-            np.ascontiguousarray(rig.cameras),
-            camera_basis,
-            _starts(charts.cameras),
-            np.ascontiguousarray(rig.lenses),
-            lens_basis,
-            _starts(charts.lenses),
-            np.ascontiguousarray(rig.points),
-            point_basis,
-            data.camera[here],
-            stop - stop[0],
-            data.marker[here],
-            data.pixels[here],
-            data.sigmas[here],
-            core,
-            own,
         )
+        seen = Sightings(
+            data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here]
+        )
+        _rows_into(motions, projections, np.ascontiguousarray(rig.points), point_basis, seen, core, own)
         yield here, Rows(core, own, data.marker[here])
 
 

@@ -16,6 +16,8 @@ import numpy as np
 
 from stereoservo.control.incidence_kernel import (
     METRIC_FLOOR,
+    Constraints,
+    SecondTask,
     fixed_dimension,
     incidence_kernel,
     joint_metric,
@@ -81,18 +83,6 @@ class IncidenceTask(NamedTuple):
     markers: IntArray
     fixed: FloatArray
     tolerance_px: float
-
-
-class SecondTask(NamedTuple):
-    """What to do with the freedoms that are left: ``rows`` (r, n) times the velocity shall be ``rates`` (r,).
-
-    ``weights`` (r,): 1/sigma of the rates, 0 where a row is not to be read. Build it by `no_second_task`, `joint_task`,
-    `limits_task`, `image_task`.
-    """
-
-    rows: FloatArray
-    rates: FloatArray
-    weights: FloatArray
 
 
 class IncidenceStep(NamedTuple):
@@ -247,22 +237,10 @@ def incidence_step(
         metric = joint_metric(scene.operators, scene.matrices, scene.points)
     rest = no_second_task(n) if second is None else second
     velocity, error, status, rank, conditioning, share = incidence_kernel(
-        scene.operators,
-        int(scene.composition),
-        scene.matrices,
-        scene.points,
-        task.kinds,
-        task.markers,
-        task.fixed,
-        task.tolerance_px,
-        options.gain,
-        options.dt_s,
-        options.damping,
-        metric,
-        rest.rows,
-        rest.rates,
-        rest.weights,
-    )
+        scene.operators, int(scene.composition), scene.matrices, scene.points,
+        Constraints(task.kinds, task.markers, task.fixed), task.tolerance_px, options.gain, options.dt_s,
+        options.damping, metric, rest,
+    )  # fmt: skip
     return IncidenceStep(velocity, error, status, rank, conditioning, share)
 
 

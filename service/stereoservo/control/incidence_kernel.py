@@ -98,6 +98,26 @@ def _reducible(J: FloatArray, e: FloatArray) -> float:
     return part
 
 
+class Constraints(NamedTuple):
+    """``kinds`` (k,), ``markers`` (k, 3) indices into points, ``fixed`` (k, 3, 4), as `incidence.IncidenceTask`."""
+
+    kinds: IntArray
+    markers: IntArray
+    fixed: FloatArray
+
+
+class SecondTask(NamedTuple):
+    """What to do with the freedoms that are left: ``rows`` (r, n) times the velocity shall be ``rates`` (r,).
+
+    ``weights`` (r,): 1/sigma of the rates, 0 where a row is not to be read. Build it by `no_second_task`, `joint_task`,
+    `limits_task`, `image_task`.
+    """
+
+    rows: FloatArray
+    rates: FloatArray
+    weights: FloatArray
+
+
 class Linearization(NamedTuple):
     """The incidences to first order: ``J`` (b·2c, n) and ``e`` (b·2c,) [px] by the ``metric``, rows of a constraint's
     moving points, ``owner`` (b,) of the blocks, the constraints' ``error`` (k,) [px], and whether all is ``finite``.
@@ -127,13 +147,14 @@ class Decomposition(NamedTuple):
 
 @kernel
 def _linearized(
-    operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, kinds: IntArray,
-    markers: IntArray, fixed: FloatArray, metric: FloatArray,
+    operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, constraints: Constraints,
+    metric: FloatArray,
 ) -> tuple[Seen, Linearization]:  # fmt: skip
-    n, constraints, rows = operators.shape[0], kinds.shape[0], 2 * matrices.shape[0]
-    error = np.zeros(constraints)
+    kinds, markers, fixed = constraints
+    n, count, rows = operators.shape[0], kinds.shape[0], 2 * matrices.shape[0]
+    error = np.zeros(count)
     blocks = 0
-    for k in range(constraints):
+    for k in range(count):
         blocks += moving_count(kinds[k])
     at = np.empty(blocks, dtype=np.int64)
     owner = np.empty(blocks, dtype=np.int64)
@@ -146,7 +167,7 @@ def _linearized(
     moved = np.empty(4)
     b = 0
     finite = True
-    for k in range(constraints):
+    for k in range(count):
         for i in range(moving_count(kinds[k])):
             X = points[markers[k, i]]
             A = pixel_gradients(matrices, X)
@@ -205,42 +226,27 @@ def _decomposed(J: FloatArray, e: FloatArray) -> Decomposition:
 
 @kernel
 def incidence_kernel(
-    operators: FloatArray,
-    composition: int,
-    matrices: FloatArray,
-    points: FloatArray,
-    kinds: IntArray,
-    markers: IntArray,
-    fixed: FloatArray,
-    tolerance_px: float,
-    gain: float,
-    dt_s: float,
-    damping: float,
-    metric: FloatArray,
-    second_rows: FloatArray,
-    second_rates: FloatArray,
-    second_weights: FloatArray,
-) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
+    operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, constraints: Constraints,
+    tolerance_px: float, gain: float, dt_s: float, damping: float, metric: FloatArray, second: SecondTask,
+) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:  # fmt: skip
     """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
 
-    ``kinds`` (k,), ``markers`` (k, 3) indices into ``points`` (m, 4), ``fixed`` (k, 3, 4) as `incidence.IncidenceTask`
-    has them; ``metric`` (n,) > 0. The second task wants ``second_rows`` (r, n) times the velocity to be
-    ``second_rates`` (r,), weighted by ``second_weights`` (r,); r may be 0.
+    ``points`` (m, 4); ``metric`` (n,) > 0.
     """
-    n, constraints = operators.shape[0], kinds.shape[0]
+    n, count = operators.shape[0], constraints.kinds.shape[0]
     velocity = np.zeros(n)
-    status = np.zeros(constraints, dtype=np.int64)
-    seen, linear = _linearized(operators, composition, matrices, points, kinds, markers, fixed, metric)
+    status = np.zeros(count, dtype=np.int64)
+    seen, linear = _linearized(operators, composition, matrices, points, constraints, metric)
     error = linear.error
     if not linear.finite:
-        for k in range(constraints):
+        for k in range(count):
             status[k] = NOT_FINITE
         return velocity, error, status, 0, 0.0, 0.0
     found = _decomposed(linear.J, linear.e)
     rank, total, part, share = found.rank, found.total, found.part, found.share
 
     within = True
-    for k in range(constraints):
+    for k in range(count):
         if error[k] <= tolerance_px:
             status[k] = DONE
         else:
@@ -256,7 +262,7 @@ def incidence_kernel(
         _damped_step(seen, found, metric, damping, ahead, step)
     for j in range(n):
         velocity[j] = gain * step[j]
-    _second_task(velocity, found.V, rank, metric, second_rows, second_rates, second_weights, damping)
+    _second_task(velocity, found.V, rank, metric, second.rows, second.rates, second.weights, damping)
     return velocity, error, status, rank, found.conditioning, share
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -185,13 +186,11 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
         inputs.dt_s,
         age,
         speed_scale,
-        limits.position_min,
-        limits.position_max,
-        limits.velocity_max,
-        limits.acceleration_max,
-        limits.position_margin,
-        limits.keep_outs,
-    )
+        JointLimits(
+            limits.position_min, limits.position_max, limits.velocity_max, limits.acceleration_max,
+            limits.position_margin, limits.keep_outs,
+        ),
+    )  # fmt: skip
     if brake:
         reasons.append(_braking(limited, limits, inputs.brake))
     if acted.any():
@@ -382,29 +381,39 @@ def stoppable_speed(distance: float, acceleration: float, dt: float) -> float:
     return 2.0 * acceleration * distance / (step + math.sqrt(step * step + 2.0 * acceleration * distance))
 
 
+class JointLimits(NamedTuple):
+    """Limits of the joints, (n,) each, with the ``margin`` of positions and ``keep_outs`` (k, n, 2): `SafetyLimits`."""
+
+    position_min: FloatArray
+    position_max: FloatArray
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    margin: float
+    keep_outs: FloatArray
+
+
+class VelocityCaps(NamedTuple):
+    """Velocity caps ``low``, ``high`` (n,) and who set them (n,): -1 the position limit, k >= 0 keep-out box k."""
+
+    low: FloatArray
+    high: FloatArray
+    low_by: IntArray
+    high_by: IntArray
+
+
 @kernel
 def _position_caps(
-    ahead: FloatArray,
-    behind: FloatArray,
-    previous: FloatArray,
-    dt: float,
-    position_min: FloatArray,
-    position_max: FloatArray,
-    velocity_max: FloatArray,
-    acceleration_max: FloatArray,
-    margin: float,
-    keep_outs: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-    low_by: IntArray,
-    high_by: IntArray,
-) -> None:
-    """Velocity caps per joint and who set them: -1 the position limit, k >= 0 keep-out box k.
+    ahead: FloatArray, behind: FloatArray, previous: FloatArray, dt: float, limits: JointLimits
+) -> VelocityCaps:
+    """The caps that position limits and keep-outs set.
 
     ``ahead`` and ``behind`` (n,): the joint's extreme positions, given the age of its sample; NaN caps
     nothing.
     """
+    position_min, position_max, velocity_max, acceleration_max, margin, keep_outs = limits
     n = previous.shape[0]
+    low, high = np.empty(n), np.empty(n)
+    low_by, high_by = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     for j in range(n):
         low_by[j] = -1
         high_by[j] = -1
@@ -451,6 +460,7 @@ def _position_caps(
             if cap < high[best]:
                 high[best] = cap
                 high_by[best] = k
+    return VelocityCaps(low, high, low_by, high_by)
 
 
 @kernel
@@ -495,12 +505,7 @@ def limit_velocity(
     dt: float,
     sample_age: float,
     speed_scale: float,
-    position_min: FloatArray,
-    position_max: FloatArray,
-    velocity_max: FloatArray,
-    acceleration_max: FloatArray,
-    margin: float,
-    keep_outs: FloatArray,
+    limits: JointLimits,
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """The stages that act on finite numbers: braking, velocity, positions and keep-outs, acceleration.
 
@@ -508,13 +513,12 @@ def limit_velocity(
     position limit, 2 + k keep-out k; and ``scales`` (4,): velocity scale, its joint, acceleration share, its
     joint.
     """
+    velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
     n = raw.shape[0]
     limited = np.zeros(n)
     acted = np.zeros(n, dtype=np.int64)
     scales = np.empty(4)
     before = _within_speed_limits(previous, velocity_max)
-    low, high = np.empty(n), np.empty(n)
-    low_by, high_by = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     ahead, behind = np.empty(n), np.empty(n)
     for j in range(n):
         # since the sample the joint may have been faster than now, by what it can have braked
@@ -523,10 +527,7 @@ def limit_velocity(
         position = positions[j] if math.isfinite(positions[j]) else math.nan
         ahead[j] = position + max(0.0, drift + faster)
         behind[j] = position + min(0.0, drift - faster)
-    _position_caps(
-        ahead, behind, before, dt, position_min, position_max, velocity_max, acceleration_max, margin,
-        keep_outs, low, high, low_by, high_by,
-    )  # fmt: skip
+    low, high, low_by, high_by = _position_caps(ahead, behind, before, dt, limits)
 
     for j in range(n):
         limited[j] = 0.0 if brake else raw[j]

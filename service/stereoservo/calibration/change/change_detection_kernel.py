@@ -7,6 +7,7 @@ Explicit loops in a fixed order, no LAPACK: the results are part of recordings.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,14 +70,28 @@ def _angle(D: FloatArray) -> float:
     return 2.0 * math.asin(math.sqrt(min(max(quarter, 0.0), 1.0)))
 
 
+class Moment(NamedTuple):
+    """What one moment shows: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm; their
+    ``pixels`` as predicted and ``observed`` (c, p, 2), ``weights`` (c, p) [1/px]; the arm's ``operators`` (n, 4, 4) and
+    the ``twists`` (6 or 0, 4, 4) of a metric model.
+    """
+
+    Ps: FloatArray
+    X: FloatArray
+    markers: int
+    pixels: FloatArray
+    observed: FloatArray
+    weights: FloatArray
+    operators: FloatArray
+    twists: FloatArray
+
+
 @kernel
-def fit_hypothesis(
-    h: int, rounds: int, Ps: FloatArray, X: FloatArray, markers: int, pixels: FloatArray, observed: FloatArray,
-    weights: FloatArray, operators: FloatArray, twists: FloatArray, sizes: IntArray, result: FloatArray,
-) -> None:  # fmt: skip
+def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result: FloatArray) -> None:
     """Estimate of hypothesis ``h`` into ``result`` (4,): chi-square of what it concerns, first-order gain, amount,
     effect [px].
     """
+    Ps, X, markers, pixels, observed, weights, operators, twists = moment
     cameras, joints = Ps.shape[0], operators.shape[0]
     D, total = np.empty((4, 4)), np.empty(MAX_SIZE)
     result[2] = 0.0
@@ -227,6 +242,7 @@ def explain_innovations(
     answer[0], answer[1], answer[2] = NOTHING, 0, -1
     chi2[0] = whole
     amounts[0], effects[0] = 0.0, 0.0
+    moment = Moment(Ps, X, markers, pixels, observed, weights, operators, twists)
     result = np.zeros(4)
     now, gains = np.zeros(count), np.zeros(count)
     any_gain = False
@@ -235,7 +251,7 @@ def explain_innovations(
         gains[h] = -math.inf
         if sizes[h] == 0:
             continue
-        fit_hypothesis(h, 0, Ps, X, markers, pixels, observed, weights, operators, twists, sizes, result)
+        fit_hypothesis(h, 0, moment, sizes, result)
         now[h] = result[0]
         chi2[h] = whole - result[1]
         gains[h] = result[1] - sizes[h] * penalty
@@ -248,9 +264,7 @@ def explain_innovations(
     select_candidates(gains, sizes, candidates)
     for h in range(1, count):
         if candidates[h]:
-            fit_hypothesis(
-                h, ROUNDS, Ps, X, markers, pixels, observed, weights, operators, twists, sizes, result
-            )
+            fit_hypothesis(h, ROUNDS, moment, sizes, result)
             chi2[h] = whole - now[h] + result[0]
             amounts[h], effects[h] = result[2], result[3]
     noise = noise_level(chi2, sizes, candidates, total)

@@ -10,7 +10,6 @@ from stereoservo.control.incidence import (
     KINDS,
     IncidenceStatus,
     IncidenceTask,
-    SecondTask,
     feature_form,
     image_task,
     incidence_freedoms,
@@ -19,6 +18,7 @@ from stereoservo.control.incidence import (
     joint_task,
     no_second_task,
 )
+from stereoservo.control.incidence_kernel import SecondTask
 from stereoservo.control.law import Scene
 from stereoservo.core.context import RefusalError, SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import BodyState
