@@ -49,7 +49,7 @@ def module_name(path: str) -> str:
 
 def entry_point(heading: str) -> tuple[str, str, str]:
     """Group, name and object of a recipe's entry point."""
-    pattern = r'^    \[project\.entry-points\."(.*?)"\]\n    (\S+) = "(.*?)"$'
+    pattern = r'^ *\[project\.entry-points\."(.*?)"\]\n *(\S+) = "(.*?)"$'
     (entry,) = re.findall(pattern, SECTIONS[heading], re.MULTILINE)
     return entry
 
