@@ -1,4 +1,5 @@
-"""Self-calibration of a cell from its trial data (5.4): from pixels and joint readings to a model.
+"""Self-calibration of a cell from its trial data, pixels and joint readings, to a model of arm, cameras and markers
+(thesis 5.4).
 
 Stages: initial reconstruction, single-joint fits, linked joints, projective bundle adjustment, stratum selection.
 """

@@ -1,4 +1,5 @@
-"""Filtered features (9.3): a constant-velocity Kalman filter for each marker and camera, for streams of any rhythm.
+"""Constant-velocity Kalman filter of each marker's pixels in each camera (thesis 9.3), for set-points streamed at any
+rate; and the offset between a client's clock and the daemon's.
 
 A pixel moves as ``ẍ = white noise`` of spectral density ``q`` [px²/s³] and is measured with a deviation ``sigma``
 [px], both axes alike and independent: with ``F = [1 T; 0 1]`` and ``Q = q [T³/3 T²/2; T²/2 T]`` over a step T, which

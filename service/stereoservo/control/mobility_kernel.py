@@ -1,4 +1,5 @@
-"""Freedoms of an arm at its present posture, in numba: rank, joints to block, self-motion away from limits.
+"""Numba kernels of an arm's mobility at its current posture: drivable freedoms by singular values, joints to block
+near a singularity, self-motion away from joint limits.
 
 Freedoms count by the motion of the body's points in right-angled coordinates of any unit: ``rows`` (3m, n) is their
 Jacobian (`point_jacobian`). Pixels would tell sideways from depth, not strong joints from weak ones. No BLAS, LAPACK or

@@ -1,4 +1,5 @@
-"""A velocity held for a whole step that makes the motion that was meant (thesis 8.5.2).
+"""Correction of a joint velocity that is held for a whole control step: its finite displacement becomes the one that
+the law's instantaneous screws intend (thesis 8.5.2).
 
 The screws of a law hold for an instant: driven together for a whole step, joints turn one another's axes, and what
 comes out is off by the brackets of (8.46). Instead of their series, Newton's method finds the step of the joints that

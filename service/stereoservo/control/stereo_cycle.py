@@ -1,4 +1,5 @@
-"""The stereo law's step in numba: bare, from a Jacobian, and a whole one in one call, from joints to velocities.
+"""Numba kernels of a complete stereo servoing step, from joints and pixels to joint velocities: forward kinematics,
+triangulation, image Jacobian, damped least squares.
 
 In `stereo_cycle` the arithmetic is that of `chain_forward`, `triangulate` and `image_step`, but no operator is ever
 formed: a joint's velocity of a point is ``H̄_{j−1} Ĥ_j (exp_j … exp_n M₀)``, vectors instead of matrices.

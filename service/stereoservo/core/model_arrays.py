@@ -1,4 +1,6 @@
-"""A model as the kernels of a step take it, in the order of the cell's cameras."""
+"""The calibrated model of a cell as arrays for the numba kernels of a step: cameras in the cell's order, markers
+scaled to unit height above the plane at infinity.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Stage 3, monitor: requests, then what must stop the arm, put the cell in fault, or end a goal.
+"""Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or
+ends its goal.
 
 Each monitor of `MONITORS` is called with the context, in the order of the table, and gives its findings, on which the
 stage acts at once: what one monitor stops, the next ones see stopped. To add one: a function, and a line in the table.

@@ -1,4 +1,6 @@
-"""What the core remembers of the model's health, and of cameras that are being found anew: parts of its state."""
+"""State of the monitors between steps: fault diagnosis of the model, innovations and timing of each camera, moving
+cameras, relocalization of cameras, averages of pixels at rest.
+"""
 
 from __future__ import annotations
 

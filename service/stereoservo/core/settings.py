@@ -1,4 +1,6 @@
-"""What the core is told once: joints, limits, cameras, defaults. Serialisable, and part of every recording."""
+"""Constant settings of the control core (joints, limits, cameras, calibration motion, collision thresholds), which
+`core_settings` builds from cell file and driver descriptions and validates.
+"""
 
 from __future__ import annotations
 

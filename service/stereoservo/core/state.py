@@ -1,4 +1,6 @@
-"""The state of the core: one versioned, serialisable value. A copy of it, and the inputs, give the same outputs."""
+"""The complete state of the control core as one versioned, serialisable struct: joint history, camera estimates,
+active motion source, goal queue and plans, monitors. A copy of it, and the inputs, give the same outputs.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Alignment of known points with their current images, over the group of maps that the two frames allow.
+"""Alignment of known points with their current images by the map between two projective frames (rigid, similar, affine
+or projective, as these allow), with residuals and reprojected pixels.
 
 `moved_cameras.frame_change` for every stratum: a workpiece that has moved, cameras that were exchanged, points of a
 drawing (thesis 8.6: targets "can be reprojected onto images actually taken, even if the cameras have changed"). With

@@ -1,5 +1,5 @@
-"""Projective rotations: Jordan frames and their geometry, generators from homographies, minimal parameters
-(thesis 4).
+"""Projective rotations: Jordan frames and their geometry, and minimal parameters of rotation generators with
+derivatives (thesis 4).
 
 Exponential, logarithm and single generators are in `displacements`; the fit to pixels in `rotation_fit`.
 """

@@ -1,5 +1,5 @@
-"""Stratification: projective, affine and Euclidean frames, the maps between them, and what is absolute in each
-(thesis 2.2, (2.7)-(2.18)).
+"""Stratification: maps between projective, affine and Euclidean frames, decomposition of cameras, orientation of
+planes (thesis 2.2, (2.7)-(2.18)).
 
 Frames: projective ``P`` with a first camera ``[N⁻¹ | 0]`` (the thesis takes N = I), affine ``A`` with the same camera
 and the plane at infinity (0, 0, 0, 1), Euclidean ``E`` with ``[K | 0]``. ``plane`` (4,) is the plane at infinity in P,

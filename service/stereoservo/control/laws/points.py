@@ -1,4 +1,5 @@
-"""The law on points in space (8.13 to 8.17, 8.34): their differences from the goal's, measured in pixels.
+"""Control law ``points``: servoes the triangulated marker points to their goal points in projective space (thesis 8.13
+to 8.17, 8.34), differences measured in pixels.
 
 A projective frame has no lengths of its own: a displacement of a point counts as what it moves in the images of all
 cameras. The command then does not depend on the frame.

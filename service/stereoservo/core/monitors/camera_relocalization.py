@@ -1,4 +1,5 @@
-"""Cameras that have moved are found anew while the goal waits: brake, look at rest, ask for a model, verify, go on.
+"""Relocalization of moved cameras while the goal waits: brakes, averages observations at rest, requests a model with
+new camera matrices, verifies it, reprojects the goals' set-points and resumes.
 
 That it was the cameras, and not the arm, must be proven at rest (`diagnosis.doubt`); else nothing is found anew, no
 goal is carried over, and the goal stays held with what is known.

@@ -1,4 +1,5 @@
-"""One round of frames that the model does not explain: which change does, in the cell's names and in words.
+"""Fault isolation from frames that contradict the model: which change (camera, marker, joint zero, marker body)
+explains the innovations best, and whether moved cameras can be distinguished from a moved arm.
 
 All cameras moved as one, and an arm that stands elsewhere than its joints say (play, a zero, the marker body), look
 alike in the images of the arm. `doubt` says whether something else tells them apart.
