@@ -71,7 +71,7 @@ def fit_model(
     Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
     joints from the base in both cases. Static markers become the model's static points. ``lens_priors``: by
     camera name, an estimate of its lens from straight lines
-    (`geometry.distortion_lines`).
+    (`geometry.distortion.lens_from_lines`).
 
     ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.

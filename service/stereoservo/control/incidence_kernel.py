@@ -403,7 +403,7 @@ def fixed_dimension(kind: int) -> int:
 
 @kernel
 def joint_metric(operators: FloatArray, matrices: FloatArray, points: FloatArray) -> FloatArray:
-    """`incidence.joint_metric_reference` as a kernel: (n,) [px/rad or px/m]."""
+    """Rms image motion of the points by each joint: (n,) [px/rad or px/m]."""
     n, m, cameras = operators.shape[0], points.shape[0], matrices.shape[0]
     metric = np.zeros(n)
     for p in range(m):

@@ -88,7 +88,7 @@ def point_jacobian(operators: FloatArray, points: FloatArray, form: FloatArray) 
     """Jacobian (3m, n) of points (m, 4) of height 1: ``form (Ĥ_j M)``, over the root of m.
 
     ``form`` (3, 4) maps differences of points to right-angled coordinates: the upper rows of the inverse of
-    `body_frame.body_frame`, which hold as long as the model does, whatever the pose.
+    `mobility.body_frame`, which hold as long as the model does, whatever the pose.
     """
     n, m = operators.shape[0], points.shape[0]
     rows = np.empty((3 * m, n))

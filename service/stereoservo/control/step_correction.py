@@ -76,7 +76,7 @@ def step_into(
     turned: FloatArray,
     work: FloatArray,
 ) -> None:
-    """The displacement by ``step`` into ``H`` (4, 4), `step_correction.step_operators` into ``turned`` (n, 4, 4).
+    """The displacement by ``step`` into ``H`` (4, 4), the joint operators after it into ``turned`` (n, 4, 4).
 
     ``work`` (5, 4, 4): scratch.
     """
@@ -128,7 +128,7 @@ def step_into(
 def corrected_step(
     operators: FloatArray, composition: int, points: FloatArray, wanted: FloatArray, step: FloatArray
 ) -> FloatArray:
-    """`step_correction.corrected_step` as a kernel."""
+    """Joint step (n,) that displaces ``points`` (m, 4) to ``wanted`` (m, 4), by Newton's method from ``step`` (n,)."""
     n, count = step.shape[0], points.shape[0]
     found, best = step.copy(), step.copy()
     H = np.empty((4, 4))

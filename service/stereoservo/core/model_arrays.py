@@ -37,7 +37,7 @@ class ModelArrays:
     scene_pixels: FloatArray
     """Static points in the images (c, s, 2): they never move there."""
     rows: dict[int, int]
-    """Rows of `FrameSights`: the markers, then the static points."""
+    """Rows of `FrameResiduals`: the markers, then the static points."""
 
 
 def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:

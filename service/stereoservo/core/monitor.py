@@ -308,8 +308,8 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
     run = state.reanchoring
     if run is not None and run.phase != "verify":
         if run.phase == "collect":
-            finish_round(context)  # for `reanchoring`, which looks whether they have moved at all
-        return  # at rest, what stands is watched by `reanchoring`
+            finish_round(context)  # for `camera_relocalization`: have they moved at all?
+        return  # at rest, what stands is watched by `camera_relocalization`
     verdict = finish_round(context)
     if any(state.mobile) and moving_camera.takes(context):
         return

@@ -46,7 +46,7 @@ def points_step(
     choice: int,
     damping: float,
 ) -> tuple[FloatArray, float]:
-    """`points.points_velocity` as a kernel: joint velocity (n,) and conditioning."""
+    """The law's step as a kernel: joint velocity (n,) and conditioning."""
     n, markers, rows = operators.shape[0], points.shape[0], metrics.shape[1]
     N = np.zeros((n, n))
     b = np.zeros(n)

@@ -77,7 +77,7 @@ def diagnosed(bench: Bench) -> ModelDiagnosis:
 class Bench:
     """One moment, with the arm at ``q`` (n,), as the cameras ``known`` saw it, for several questions.
 
-    ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `estimate.FrameSights`.
+    ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `prediction.FrameResiduals`.
     """
 
     def __init__(

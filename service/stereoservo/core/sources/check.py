@@ -2,7 +2,7 @@
 be tested against the model in use without a fit.
 
 At stop l joint l stands above, and the joint after it below its base, so that every joint is seen on both sides and
-against the others, with one stop a joint and the base. `kinematics.calibration.check` says what the pixels mean.
+against the others, with one stop a joint and the base. `calibration.change.model_check` evaluates the pixels.
 """
 
 from __future__ import annotations
