@@ -9,7 +9,7 @@ adds up over any division of time, so that irregular stamps need nothing special
     β² / (1 − α) = q T³ / sigma²,        α² = (2 − α) β − β² / 6,
 
 the fixed point of the covariance recursion written by its entries (Kalata 1984 has the same for noise that is
-constant over a step; Bar-Shalom, Li, Kirubarajan 2001, ch. 6.5): `steady_gains`. For set-points that a client streams
+constant over a step; Bar-Shalom, Li, Kirubarajan 2001, ch. 6.5). For set-points that a client streams
 it gives their rates; for measured features the velocity that damping needs (`control.pd`).
 
 State is plain arrays, functions are pure.
