@@ -67,7 +67,7 @@ class Cell:
         )  # fmt: skip
 
     def stops(self) -> np.ndarray:
-        """What the check motion visits: see `runtime.check`."""
+        """What the check motion visits: see `core.sources.check`."""
         n = len(self.cell.kinds)
         found = [self.cell.home]
         for j in range(n):

@@ -36,7 +36,7 @@ def truth(make: Callable[[], SyntheticCell]) -> CellModel:
 
 
 def stops_of(cell: SyntheticCell) -> np.ndarray:
-    """What the check motion visits: see `runtime.check`."""
+    """What the check motion visits: see `core.sources.check`."""
     n = len(cell.kinds)
     steps = 0.5 * np.asarray(cell.ranges) * (np.eye(n) - np.roll(np.eye(n), 1, axis=1))
     return np.vstack([cell.home, cell.home + steps])

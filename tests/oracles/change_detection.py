@@ -1,7 +1,7 @@
 """Readable NumPy twin of `change_detection_kernel`: the same hypotheses, estimates and decision, written apart from it.
 
 Every estimate is Gauss and Newton's: ``chi2(x) = Σ w² |observed - predicted(x)|²``, at most `ROUNDS` steps, none of
-which may raise chi-square. Hypotheses are numbered as in `change_detection.named`.
+which may raise chi-square. Hypotheses are numbered as in `change_detection.hypothesis_subject`.
 """
 
 from __future__ import annotations

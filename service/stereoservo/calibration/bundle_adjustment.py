@@ -1,4 +1,5 @@
-"""Bundle adjustment of generators, cameras, lenses and markers in any stratum (5.53, 5.55-5.57).
+"""Bundle adjustment of joint generators, cameras, lenses and markers in any stratum (projective, affine, metric) by
+Levenberg-Marquardt (thesis 5.53, 5.55 to 5.57).
 
 The model and its residuals are in `rig_model`, its normal equations in `normal_equations`.
 """

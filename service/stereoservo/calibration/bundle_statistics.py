@@ -1,4 +1,6 @@
-"""Statistics of a solved bundle: variance factor, chi-square, rank, covariances of parameters and predictions."""
+"""Statistics of a solved bundle adjustment: variance factor, chi-square, rank, covariances of parameters and
+predictions, residual rms of groups of pixels.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Assembly of a cell's model, its covariance and the statistics of its fit from a solved bundle."""
+"""Result of a calibration: the cell's model with its covariance, assembled from a solved bundle adjustment, and the
+report of the fit (cameras, lenses, outliers).
+"""
 
 from __future__ import annotations
 

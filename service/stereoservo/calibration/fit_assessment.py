@@ -1,4 +1,4 @@
-"""Assessment of a calibration for people: grade, reasons, and advice."""
+"""Assessment of a calibration for people: grade, reasons and advice, of a fitted model or of a failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Start values of a single joint's generator: linear, rigid by nominal cameras, or rotations about all directions."""
+"""Start values of a single joint's generator (its projective twist) from its own trial: linear least squares, rigid by
+nominal cameras, or rotations about a set of directions.
+"""
 
 from __future__ import annotations
 

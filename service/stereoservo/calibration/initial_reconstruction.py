@@ -1,5 +1,5 @@
-"""Initial projective reconstruction before any kinematics: fundamental matrix over all stops, canonical pair, further
-cameras, triangulation.
+"""Initial projective reconstruction of calibration images without kinematics: fundamental matrix over all stops,
+canonical camera pair, further cameras, triangulated markers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Lens models of the cameras: start values, and a significance test of radial distortion.
+"""Lens models of the cameras in a calibration: start values from straight lines or epipolar geometry, undistortion,
+and a significance test of radial distortion.
 
 The models are nested: none, or a radial parameter with its centre for each camera. The centre is held by a weak prior:
 a small distortion does not determine it, but fixing it would underestimate the uncertainty.

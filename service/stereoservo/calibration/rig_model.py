@@ -1,4 +1,5 @@
-"""Model under estimation (5.53, 5.55-5.57): generators, cameras, lenses, markers in any stratum; its residuals.
+"""Parametric model of a cell that a calibration estimates (joint generators, cameras, lenses, markers, in any
+stratum), its predicted pixels and residuals, and changes of its frame (thesis 5.53, 5.55 to 5.57).
 
 Joint readings are exact; raw pixels, behind the lens, carry the noise. Parameters are coordinates of the minimal
 charts of :mod:`stereoservo.kinematics.parameterization`, so that the Jacobian has full rank where the data determine

@@ -1,4 +1,5 @@
-"""Self-calibration of a cell from its trial data (5.4): from pixels and joint readings to a model.
+"""Self-calibration of a cell from its trial data, pixels and joint readings, to a model of arm, cameras and markers
+(thesis 5.4).
 
 Stages: initial reconstruction, single-joint fits, linked joints, projective bundle adjustment, stratum selection.
 """
@@ -70,7 +71,7 @@ def fit_model(
     Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
     joints from the base in both cases. Static markers become the model's static points. ``lens_priors``: by
     camera name, an estimate of its lens from straight lines
-    (`geometry.distortion_lines`).
+    (`geometry.distortion.lens_from_lines`).
 
     ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.

@@ -1,4 +1,5 @@
-"""Fit of a single joint's generator to its own trial, at the configuration of that trial (5.52).
+"""Fit of a single joint's generator (its projective twist) and the markers to the joint's own trial, with the cameras
+fixed (thesis 5.52).
 
 A trial may be driven several times over, each with the joints behind the moving one (towards the markers) at other
 fixed positions: every such *distal configuration* shows the markers as a rigid structure of its own, so that four

@@ -1,4 +1,6 @@
-"""Static points of a cell: which markers are static, and their triangulation into the model with its covariance."""
+"""Static points of a cell (markers that do not move with the arm): which markers are static, their mean observations,
+and their triangulation into the model with its covariance.
+"""
 
 from __future__ import annotations
 

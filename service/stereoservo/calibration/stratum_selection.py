@@ -1,4 +1,4 @@
-"""Selection of the highest stratum that the data identify: metric, affine or projective (5.4.3)."""
+"""Selection of the highest stratum that the data identify: metric, affine or projective (thesis 5.4.3)."""
 
 from __future__ import annotations
 

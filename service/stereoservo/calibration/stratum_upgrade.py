@@ -1,5 +1,5 @@
-"""Upgrade of a projective reconstruction to the affine and metric strata (5.4.3-5.4.4): plane at infinity (5.59),
-intrinsics, metric start.
+"""Upgrade of a projective reconstruction to the affine and metric strata (thesis 5.4.3, 5.4.4): plane at infinity
+(5.59), camera intrinsics, start values of the metric model.
 
 Frames: projective ``P`` with ``P_left = [N⁻¹ | 0]``; affine ``A`` with the plane at infinity (0, 0, 0, 1) and
 the same left camera; Euclidean ``E`` with ``P_left = [K | 0]``. A generator's upper block in ``A`` is ``K̃

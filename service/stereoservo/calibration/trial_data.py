@@ -1,4 +1,6 @@
-"""Trial data of a calibration: pixels of the markers at stops of joint-wise motions, checked, in one npz file."""
+"""Trial data, the input of a calibration: marker pixels at the stops of motions of single joints, with checks, and the
+npz file that stores them.
+"""
 
 from __future__ import annotations
 

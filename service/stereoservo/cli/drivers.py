@@ -1,4 +1,6 @@
-"""``stereoservo drivers``: lists the plug-ins."""
+"""Command ``stereoservo drivers``: lists the installed plug-ins (drivers, detectors, control laws, commands), marking
+those that fail to load.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``stereoservo home``: moves every joint to the home position."""
+"""Command ``stereoservo home``: moves every joint to the cell's home position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``stereoservo init``: writes a commented cell file with the limits that the driver reports."""
+"""Command ``stereoservo init``: writes a commented cell configuration file (TOML) with the joint limits that the
+driver reports.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Ctrl-C as an exception and as a flag, since an exception raised in a destructor or a library's callback is lost."""
+"""Handler of Ctrl-C that raises KeyboardInterrupt and sets a flag for loops to poll, since an exception raised in a
+destructor or a library's callback is lost.
+"""
 
 from __future__ import annotations
 

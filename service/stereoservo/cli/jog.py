@@ -1,4 +1,6 @@
-"""``stereoservo jog``: moves joints at given velocities while this process renews its lease (a dead man's switch)."""
+"""Command ``stereoservo jog``: moves joints at given velocities while this process renews its lease (a dead man's
+switch).
+"""
 
 from __future__ import annotations
 

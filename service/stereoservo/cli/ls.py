@@ -1,4 +1,4 @@
-"""``stereoservo ls``: lists running cells."""
+"""Command ``stereoservo ls``: lists the cells of this user whose daemons run on this host."""
 
 from __future__ import annotations
 

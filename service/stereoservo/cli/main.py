@@ -1,4 +1,6 @@
-"""Entry point ``stereoservo``: imports the command's module on demand, runs it, reports failures and the exit code."""
+"""Entry point of the command line ``stereoservo``: imports the module of a command on demand, runs it, reports
+failures as text or JSON, and returns the exit code.
+"""
 
 from __future__ import annotations
 

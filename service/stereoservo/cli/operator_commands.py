@@ -1,4 +1,6 @@
-"""``stereoservo enable · disable · hold · resume · reset · acknowledge``: commands of the operator without a motion."""
+"""Commands of the operator that set the state of a cell: ``stereoservo enable``, ``disable``, ``hold``, ``resume``,
+``reset`` (after a fault) and ``acknowledge`` (a goal that is reached).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``stereoservo record``: starts or stops a flight recording of a running cell."""
+"""Command ``stereoservo record``: starts or stops a flight recording of a running cell (inputs of every control step,
+images on request).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``stereoservo replay``: runs a recording through the core again and compares."""
+"""Command ``stereoservo replay``: runs the recorded inputs of a flight recording through the control core again and
+compares the outputs.
+"""
 
 from __future__ import annotations
 

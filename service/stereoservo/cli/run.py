@@ -1,4 +1,4 @@
-"""``stereoservo run``: runs the daemon of a cell."""
+"""Command ``stereoservo run``: runs the daemon of a cell (servo loop, cameras, gateway) until it is terminated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``stereoservo status``: prints the state of a cell."""
+"""Command ``stereoservo status``: prints what a cell does now, the progress of its goal, and the reasons why it is
+slow, held or in fault.
+"""
 
 from __future__ import annotations
 

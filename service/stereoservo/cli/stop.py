@@ -1,4 +1,6 @@
-"""``stereoservo stop``: stops the arm over zenoh, or by the stop slot where the gateway does not reply."""
+"""Command ``stereoservo stop``: stops the arm over zenoh, or by a word in shared memory where the gateway does not
+reply.
+"""
 
 from __future__ import annotations
 

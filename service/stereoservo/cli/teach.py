@@ -1,4 +1,6 @@
-"""``stereoservo teach``: stores the current view, or a goal made from CAD drawings, as a goal."""
+"""Command ``stereoservo teach``: stores the current view of the cameras, or a goal made from CAD drawings, as a named
+goal.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``stereoservo warmup``: compiles the kernels of the loop."""
+"""Command ``stereoservo warmup``: compiles the numba kernels of the servo loop into the cache on disk."""
 
 from __future__ import annotations
 

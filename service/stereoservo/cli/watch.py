@@ -1,4 +1,6 @@
-"""``stereoservo watch``: prints what the cell publishes."""
+"""Command ``stereoservo watch``: prints the states, events and (on request) marker observations that a cell publishes,
+one line each.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Requests of a client to calibrate or check a cell: runs the motion under a lease and waits for the result."""
+"""Requests of a client to calibrate a cell, check its model or reset joint zeros: runs the motion under a lease and
+waits for the result.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A goal client: commands, goals, calibration and the stream of messages of one cell.
+"""Goal client for one cell: sends goals and commands, runs calibrations and model checks, and subscribes to states,
+events and features.
 
 Every call either succeeds or raises; "no reply" means refused.
 """

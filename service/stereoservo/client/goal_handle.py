@@ -1,4 +1,6 @@
-"""Handle of an accepted goal: renews its lease, reports progress, waits for its end."""
+"""Handle of a goal that a cell has accepted: renews its lease from a thread, reports progress, cancels it, and waits
+for its end.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Short forms of targets and options of a goal, converted to messages."""
+"""Short forms of a goal's target (name, joint positions or set-points) and options, converted to messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The contract of control laws: a pytest suite that every law passes, a third party's too.
+"""Contract of control laws as a pytest suite for any law, third-party ones included: velocities are finite,
+deterministic, independent of the projective frame and within given rates, and converge on a virtual two-camera cell.
 
 Subclass `LawContract` in a module of tests and set ``law``; pytest runs the rest::
 

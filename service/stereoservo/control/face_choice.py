@@ -1,4 +1,6 @@
-"""Choice of the three markers on which a law works now: of one face, seen in most cameras, largest in the images."""
+"""Choice of the three markers that a control law servoes: of one face of the body, seen in most cameras, largest in
+the images. Also the law's scene, restricted to the cameras that see them.
+"""
 
 from __future__ import annotations
 

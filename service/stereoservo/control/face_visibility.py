@@ -1,4 +1,5 @@
-"""Visibility of a marker face during a Cartesian motion: sense of its rotation, when it waits (thesis 7.4.2).
+"""Visibility of a marker face in the cameras during a Cartesian motion: the sense of rotation that keeps it visible,
+and how far the rotation must wait for the translation (thesis 7.4.2).
 
 The face is turned by ``t`` about an axis through the centre while the centre goes the share ``s`` of its straight
 line. A camera at ``O`` sees it while ``f(s, t) = a(t)ᵀ(O − s Δ) > 0``, ``a(t) = exp(−tĤᵀ)a``: affine in ``s``, a

@@ -1,4 +1,5 @@
-"""Faces of a marker body: which markers lie in one plane, and which side of it is out.
+"""Faces of a marker body: which markers are coplanar and which side of them is outward, from projective points and the
+images; and which faces the cameras see along a path.
 
 Nothing here is metric: markers are points of height ``a∞ᵀM = 1`` in the projective frame, and what "in one plane" means
 is decided by the images. A marker is in the plane of three others when the determinant of the four is within a few of

@@ -1,4 +1,5 @@
-"""Filtered features (9.3): a constant-velocity Kalman filter for each marker and camera, for streams of any rhythm.
+"""Constant-velocity Kalman filter of each marker's pixels in each camera (thesis 9.3), for set-points streamed at any
+rate; and the offset between a client's clock and the daemon's.
 
 A pixel moves as ``ẍ = white noise`` of spectral density ``q`` [px²/s³] and is measured with a deviation ``sigma``
 [px], both axes alike and independent: with ``F = [1 T; 0 1]`` and ``Q = q [T³/3 T²/2; T²/2 T]`` over a step T, which
@@ -8,7 +9,7 @@ adds up over any division of time, so that irregular stamps need nothing special
     β² / (1 − α) = q T³ / sigma²,        α² = (2 − α) β − β² / 6,
 
 the fixed point of the covariance recursion written by its entries (Kalata 1984 has the same for noise that is
-constant over a step; Bar-Shalom, Li, Kirubarajan 2001, ch. 6.5): `steady_gains`. For set-points that a client streams
+constant over a step; Bar-Shalom, Li, Kirubarajan 2001, ch. 6.5). For set-points that a client streams
 it gives their rates; for measured features the velocity that damping needs (`control.pd`).
 
 State is plain arrays, functions are pure.

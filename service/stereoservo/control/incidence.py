@@ -1,8 +1,9 @@
-"""Incidences as a task: points, lines and planes of the body onto points, lines and planes of the scene (thesis 2.5.3).
+"""Control law of incidences: the joint velocity that brings points, lines and planes of the body onto points, lines
+and planes of the scene (thesis 2.5.3), with a second task in the null space. Also why it cannot go further.
 
 What a task leaves free stays as it is, or serves a second task in the null space. Lines and planes have no
-orientation: either way round is reached, whichever is nearer. `incidence_reference` is the readable
-reference; the loop runs `incidence_kernel.incidence_kernel`, which says how residuals are measured.
+orientation: either way round is reached, whichever is nearer. The step runs
+`incidence_kernel.incidence_kernel`, whose module states how residuals are measured.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The loop's form of the incidence law: `incidence.incidence_reference` in numba, tested against it.
+"""Numba kernels of the incidence law (interface: `control.incidence`): linearised image errors of points, lines and
+planes, damped least-squares joint velocity, second task in the null space.
 
 A moving point X of the body and a fixed point, line or plane, ``base + Σ s_k d_k`` with ``base`` of height 1 and
 directions of height 0, are compared in the images: ``A`` (2c, 4), the gradient of X's pixels in all cameras, turns
@@ -408,7 +409,7 @@ def fixed_dimension(kind: int) -> int:
 
 @kernel
 def joint_metric(operators: FloatArray, matrices: FloatArray, points: FloatArray) -> FloatArray:
-    """`incidence.joint_metric_reference` as a kernel: (n,) [px/rad or px/m]."""
+    """Rms image motion of the points by each joint: (n,) [px/rad or px/m]."""
     n, m, cameras = operators.shape[0], points.shape[0], matrices.shape[0]
     metric = np.zeros(n)
     for p in range(m):

@@ -1,4 +1,5 @@
-"""Interface of control laws: the struct `Law` that a plug-in registers, and what its step takes and returns.
+"""Interface of control laws: the struct `Law` that a plug-in registers, and the arguments and result of its step
+(scene, task, options, joint velocity with errors).
 
 Arrays only; a law is a pure function of them. `control.law_registry.LAWS` holds the installed laws by name.
 """

@@ -1,4 +1,5 @@
-"""The installed control laws by name, found by entry point: what the loop, predictions and experiments run.
+"""Registry of the installed control laws, found by entry point: laws by name, and the hash of a law's source for
+recordings.
 
 A law's name is its entry point's name in the group ``stereoservo.laws``; the object is a `control.law.Law`. Laws are
 imported together on first use, so that none is imported while an arm moves. A law that does not import, or is not a

@@ -1,4 +1,6 @@
-"""Warm-up of the control laws alone: each is run once on an example arm, so that the servo loop compiles no kernel."""
+"""Compilation of the numba kernels of control laws, incidences, mobility and self-motion: each runs once on an example
+arm, so that the servo loop compiles none.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Which freedoms an arm has here, in the words of what the cameras see (thesis 7.3.3, 8; errata, deficient arms).
+"""Mobility of an arm at its current posture: which translations and rotations of the body it can make, in words for
+people, and what part of a required motion it lacks (thesis 7.3.3, 8; errata, deficient arms).
 
 A numerical criterion on the Jacobian of the body's points, in right-angled coordinates whose unit is the body's radius.
 Planning and refusals ask here, the loop calls `mobility_kernel`. No LAPACK, no BLAS: the core refuses goals in these

@@ -1,4 +1,5 @@
-"""Freedoms of an arm at its present posture, in numba: rank, joints to block, self-motion away from limits.
+"""Numba kernels of an arm's mobility at its current posture: drivable freedoms by singular values, joints to block
+near a singularity, self-motion away from joint limits.
 
 Freedoms count by the motion of the body's points in right-angled coordinates of any unit: ``rows`` (3m, n) is their
 Jacobian (`point_jacobian`). Pixels would tell sideways from depth, not strong joints from weak ones. No BLAS, LAPACK or
@@ -87,7 +88,7 @@ def point_jacobian(operators: FloatArray, points: FloatArray, form: FloatArray) 
     """Jacobian (3m, n) of points (m, 4) of height 1: ``form (Ĥ_j M)``, over the root of m.
 
     ``form`` (3, 4) maps differences of points to right-angled coordinates: the upper rows of the inverse of
-    `body_frame.body_frame`, which hold as long as the model does, whatever the pose.
+    `mobility.body_frame`, which hold as long as the model does, whatever the pose.
     """
     n, m = operators.shape[0], points.shape[0]
     rows = np.empty((3 * m, n))

@@ -1,4 +1,5 @@
-"""Control in the images of cameras that have moved, or move: they are estimated anew in every step (8.27, 8.28).
+"""Image-based control with cameras that have moved, or move: every camera is estimated again from the markers in every
+step (thesis 8.27, 8.28).
 
 For experiments: it uses LAPACK and loads scipy, and is not for the loop.
 """

@@ -1,4 +1,5 @@
-"""PD tracking of moving set-points (9.3): feed-forward, feedback on the error, damping on the feature velocity.
+"""PD tracking of moving set-points (thesis 9.3): the damping term that is added to the feature rates of a control
+law's task, feature rates from measured joint velocities, and the expected tracking error.
 
 The features shall move at ``ṡ = ṡ* − λ(s − s*) − κ(ṡ_measured − ṡ*)``. A law that drives ``ṡ = rates − λ(s − s*)``
 needs no change: the damping goes into its rates (`damped_rates`).

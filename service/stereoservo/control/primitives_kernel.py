@@ -1,4 +1,5 @@
-"""`planning.primitives` in numba: small algebra of points and planes, and the primitive motions of an arm.
+"""Numba kernels of the primitive motions of an arm (translation, two kinds of revolution; numpy reference:
+`planning.primitives`), and of the algebra of points and planes that they need.
 
 Names, order and thresholds are those of the reference; read that first. No BLAS, no allocation of note.
 """

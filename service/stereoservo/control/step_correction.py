@@ -1,4 +1,5 @@
-"""A velocity held for a whole step that makes the motion that was meant (thesis 8.5.2).
+"""Correction of a joint velocity that is held for a whole control step: its finite displacement becomes the one that
+the law's instantaneous screws intend (thesis 8.5.2).
 
 The screws of a law hold for an instant: driven together for a whole step, joints turn one another's axes, and what
 comes out is off by the brackets of (8.46). Instead of their series, Newton's method finds the step of the joints that
@@ -75,7 +76,7 @@ def step_into(
     turned: FloatArray,
     work: FloatArray,
 ) -> None:
-    """The displacement by ``step`` into ``H`` (4, 4), `step_correction.step_operators` into ``turned`` (n, 4, 4).
+    """The displacement by ``step`` into ``H`` (4, 4), the joint operators after it into ``turned`` (n, 4, 4).
 
     ``work`` (5, 4, 4): scratch.
     """
@@ -127,7 +128,7 @@ def step_into(
 def corrected_step(
     operators: FloatArray, composition: int, points: FloatArray, wanted: FloatArray, step: FloatArray
 ) -> FloatArray:
-    """`step_correction.corrected_step` as a kernel."""
+    """Joint step (n,) that displaces ``points`` (m, 4) to ``wanted`` (m, 4), by Newton's method from ``step`` (n,)."""
     n, count = step.shape[0], points.shape[0]
     found, best = step.copy(), step.copy()
     H = np.empty((4, 4))

@@ -1,4 +1,5 @@
-"""The stereo law's step in numba: bare, from a Jacobian, and a whole one in one call, from joints to velocities.
+"""Numba kernels of a complete stereo servoing step, from joints and pixels to joint velocities: forward kinematics,
+triangulation, image Jacobian, damped least squares.
 
 In `stereo_cycle` the arithmetic is that of `chain_forward`, `triangulate` and `image_step`, but no operator is ever
 formed: a joint's velocity of a point is ``H̄_{j−1} Ĥ_j (exp_j … exp_n M₀)``, vectors instead of matrices.
@@ -129,7 +130,7 @@ def stereo_cycle(
     triangulations: int,
     velocity: FloatArray,
 ) -> float:
-    """`stereo.StereoCycle.step` into ``velocity`` (n,); returns the conditioning."""
+    """`StereoCycle.step` into ``velocity`` (n,); returns the conditioning."""
     n, cameras, markers = q.shape[0], matrices.shape[0], marker_points.shape[0]
     E, B = np.empty((n, 4, 4)), np.empty((n + 1, 4, 4))
     _factors_into(chain, kinds, zero, q, tip_first, E, B)
@@ -187,7 +188,7 @@ def stereo_step(
     gain: float,
     damping: float,
 ) -> tuple[FloatArray, float, float]:
-    """`stereo.stereo_law` as a kernel: joint velocity (n,), largest pixel error [px], conditioning."""
+    """The stereo law from a Jacobian, as a kernel: joint velocity (n,), largest pixel error [px], conditioning."""
     cameras, points, _, n = jacobian.shape
     N = np.zeros((n, n))
     b = np.zeros(n)
@@ -240,7 +241,7 @@ class StereoCycle:
         target_points: FloatArray | None = None,
         triangulations: int = -1,
     ) -> tuple[FloatArray, float]:
-        """Velocity (n,) [rad/s or m/s] and conditioning at joints ``q`` (n,); the rest as in `stereo_law`.
+        """Velocity (n,) [rad/s or m/s] and conditioning at joints ``q`` (n,); the rest as in `stereo_step`.
 
         Points are those of the joints (8.35), or, with ``triangulations`` >= 0 renormalised iterations, triangulated
         (8.34) where two cameras see them. With ``target_points`` (m, 4) the Jacobian is the mean of here and there.

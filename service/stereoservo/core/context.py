@@ -1,4 +1,6 @@
-"""What one step of the core hands from stage to stage: the inputs, the present, findings and the source's output."""
+"""Data types that the stages of one core step share: accepted inputs, robot and camera state, monitors' findings,
+velocity output, refused requests.
+"""
 
 from __future__ import annotations
 

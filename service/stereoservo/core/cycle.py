@@ -1,4 +1,6 @@
-"""Inputs and outputs of one core step: `StepInputs`, `StepOutputs`, status, events, and their array encoding."""
+"""Inputs and outputs of one step of the control core: the structs `StepInputs` and `StepOutputs` with status and
+events, and their msgpack encoding, arrays bit for bit.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Stage 2, estimate: a new model where the arm rests, frames folded in at their own stamps, the present predicted.
+"""Stage 2 of a core step: estimates the current markers by kinematics, corrected by the newest frame of each camera at
+its own time stamp. At rest it puts a new model in use, with its readiness and collision thresholds.
 
 What each camera shows is compared with the prediction at its shutter; what is left is filtered and carried to the
 present by the kinematics (`core.prediction`), so that control goes on between frames and through a lost camera.

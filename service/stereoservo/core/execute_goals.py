@@ -1,4 +1,6 @@
-"""Stage 4, execute_goals: goals planned a slice at a time, begun, blended into the next; leases and the lifecycle."""
+"""Stage 4 of a core step: does one slice of path planning, starts the next goal of the queue or blends into it, and
+ends goals whose client's lease has expired or whose drives are not active.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Stage 1, ingest: the gate for samples and frames, the history of the joints, the lifecycle of the driver.
+"""Stage 1 of a core step: accepts or rejects joint samples and camera frames by time stamp and sequence number, keeps
+the history of the joints, and follows the lifecycle of the joint driver. Also the time-outs of these inputs.
 
 Stamps and ``now_ns`` are of one clock, and the servo process takes ``now_ns`` after it has read everything: a sample
 of the future is wrong, however little.

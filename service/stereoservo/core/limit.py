@@ -1,4 +1,5 @@
-"""Stage 6, limit: the safety stage, one, last, always on. Nothing runs between it and the drive.
+"""Stage 6 of a core step, the safety stage: limits the joint velocities by velocity, acceleration and position limits
+and joint-space keep-outs, and brakes the arm on stale or invalid input.
 
 In this order: finite check, stale-input policy (coast on prediction, then brake), uniform velocity scale,
 braking-aware position margins and joint-space keep-outs, uniform acceleration limit. It is not a safety

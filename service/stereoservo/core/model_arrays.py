@@ -1,4 +1,6 @@
-"""A model as the kernels of a step take it, in the order of the cell's cameras."""
+"""The calibrated model of a cell as arrays for the numba kernels of a step: cameras in the cell's order, markers
+scaled to unit height above the plane at infinity.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ class ModelArrays:
     scene_pixels: FloatArray
     """Static points in the images (c, s, 2): they never move there."""
     rows: dict[int, int]
-    """Rows of `FrameSights`: the markers, then the static points."""
+    """Rows of `FrameResiduals`: the markers, then the static points."""
 
 
 def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:

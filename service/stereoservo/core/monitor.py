@@ -1,4 +1,5 @@
-"""Stage 3, monitor: requests, then what must stop the arm, put the cell in fault, or end a goal.
+"""Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or
+ends its goal.
 
 Each monitor of `MONITORS` is called with the context, in the order of the table, and gives its findings, on which the
 stage acts at once: what one monitor stops, the next ones see stopped. To add one: a function, and a line in the table.
@@ -307,8 +308,8 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
     run = state.reanchoring
     if run is not None and run.phase != "verify":
         if run.phase == "collect":
-            finish_round(context)  # for `reanchoring`, which looks whether they have moved at all
-        return  # at rest, what stands is watched by `reanchoring`
+            finish_round(context)  # for `camera_relocalization`: have they moved at all?
+        return  # at rest, what stands is watched by `camera_relocalization`
     verdict = finish_round(context)
     if any(state.mobile) and moving_camera.takes(context):
         return

@@ -1,4 +1,6 @@
-"""What the core remembers of the model's health, and of cameras that are being found anew: parts of its state."""
+"""State of the monitors between steps: fault diagnosis of the model, innovations and timing of each camera, moving
+cameras, relocalization of cameras, averages of pixels at rest.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +97,7 @@ class ModelMonitor(msgspec.Struct, eq=False):
 
 
 class MobileCamera(msgspec.Struct, eq=False):
-    """A camera that moves for good; see `mobile`. While it is ``moving``, the model has it where it stood last.
+    """A camera declared mobile; see `moving_camera`. While it is ``moving``, the model has it where it stood last.
 
     ``way`` (4, 4): from there to where its newest frame has it, ``P way``. ``reference`` (4, 4): likewise of the first
     of the ``still`` frames that agree with each other; ``twists`` (6,): sum of theirs from there, in the metric basis.
@@ -133,7 +135,7 @@ def standing_camera() -> MobileCamera:
 
 
 class Relocalization(msgspec.Struct, eq=False, kw_only=True):
-    """Cameras that have moved and are being found anew; see `reanchoring`.
+    """Cameras that have moved and are being found anew; see `camera_relocalization`.
 
     ``together``: they moved as one body. ``sums``, ``joint_sum`` (n,): sights at rest. ``reference`` (c, k, 2) [px]:
     the innovations of the first frame at rest, and ``referred`` (c, k) 1 where there is one: what stands keeps them.
@@ -183,7 +185,7 @@ def nothing_sighted(cameras: int, rows: int, joints: int, markers: int) -> Model
 
 
 class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
-    """Sights of the markers, summed up while the arm rests; see ``averaging``."""
+    """Sights of the markers, summed up while the arm rests; see `measure_at_pose`."""
 
     counts: FloatArray
     """Sights of each marker in each camera, (c, m)."""

@@ -1,4 +1,5 @@
-"""Stage 5, move: the active motion source's joint velocity, and the table of all motion sources.
+"""Stage 5 of a core step: the joint velocity of the active motion source (hold, jog, joint move, control law,
+calibration motion, …), and the table of all motion sources.
 
 A motion source is a kind of state (`core.state.Source`) with what the stages must know of it, a `MotionSource`, found
 by the type of the state in `MOTION_SOURCES`. To add one: a state of its own, a step, and a line in the table.

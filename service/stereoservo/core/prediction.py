@@ -1,4 +1,5 @@
-"""Where the markers are now: kinematic prediction (8.35), corrected by what each camera saw at its own stamp.
+"""Marker positions and pixels at a given time, predicted by projective kinematics (thesis 8.35) and corrected by
+camera frames: innovations, outlier gating, filtering, time offset of each camera, priors for the detectors.
 
 Cameras speak in raw pixels. Here they become ideal ones, in which everything behind is linear in homogeneous
 coordinates; priors leave in raw pixels again.

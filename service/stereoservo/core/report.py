@@ -1,4 +1,6 @@
-"""Stage 7, report: a source that has finished is left, then status, reasons, priors and events of the step."""
+"""Stage 7 of a core step: ends a finished motion, then assembles status, reasons, detector priors and events, with
+model health and the estimated time offset of each camera.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""ServoCore: one step from inputs to a joint velocity. Pure given its state: no clock, no I/O, no random number.
+"""`ServoCore`, the control algorithm of the servo loop: one step maps joint samples, camera observations and requests
+to a joint velocity, by seven stages. Deterministic given its state: no clock, no I/O, no random number.
 
 A step is seven stages, each a module of `core`, in this order:
 

@@ -1,4 +1,6 @@
-"""What the core is told once: joints, limits, cameras, defaults. Serialisable, and part of every recording."""
+"""Constant settings of the control core (joints, limits, cameras, calibration motion, collision thresholds), which
+`core_settings` builds from cell file and driver descriptions and validates.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ class LimitSettings(msgspec.Struct, frozen=True, eq=False):
 
 
 class TrialSettings(msgspec.Struct, frozen=True, eq=False):
-    """Trial motions in joint order; see ``cellfile.CalibrationSection``.
+    """Trial motions in joint order; see `messages.cell_file.CalibrationSection`.
 
     ``range`` (n,): NaN where the programme itself finds out how far the joint may go.
     """
@@ -69,7 +71,7 @@ class TrialSettings(msgspec.Struct, frozen=True, eq=False):
 
 
 class ContactSettings(msgspec.Struct, frozen=True, eq=False):
-    """The watch on contact, in joint order; see ``cellfile.ContactSection``.
+    """The watch on contact, in joint order; see `messages.cell_file.ContactSection`.
 
     ``efforts``, ``following_errors`` (n,): stated thresholds, NaN where they are to be learnt. ``effort_units``: for
     people.

@@ -1,4 +1,6 @@
-"""The state of the core: one versioned, serialisable value. A copy of it, and the inputs, give the same outputs."""
+"""The complete state of the control core as one versioned, serialisable struct: joint history, camera estimates,
+active motion source, goal queue and plans, monitors. A copy of it, and the inputs, give the same outputs.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,7 @@ class JointLoadStatistics(msgspec.Struct, eq=False):
 
 
 class Contact(msgspec.Struct, eq=False):
-    """What the drives say of their loads, (n,) each; see ``contact``.
+    """What the drives say of their loads, (n,) each; see `core.monitors.collision`.
 
     ``mean_efforts``: moving mean. ``effort_excess``, ``following_excess`` (samples, n), newest last: how far the last
     samples lay beyond what is expected. ``low``, ``high`` (2, n), of efforts and following errors: what a contact has
@@ -143,7 +145,7 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
 
 
 class ProgressHistory(msgspec.Struct, eq=False):
-    """What of a law's run tells whether it gets on; see ``progress``.
+    """What of a law's run tells whether it gets on; see `core.sources.law`.
 
     ``first_px``: the largest error so far; ``mean_px`` of late; ``least_px``: the smallest such mean, improved for the
     last time after ``least_s`` of motion. ``reasons``: what was found when it was last looked at.
@@ -171,8 +173,8 @@ class Stream(msgspec.Struct, eq=False):
 class LawRun(Leased, eq=False, kw_only=True):
     """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
 
-    Gains [1/s] as in `commands.AdaptiveGain`. ``moved_s``: how long it has been allowed to move; ``held``: frames that
-    the error has been inside its tolerance.
+    Gains [1/s] as in `messages.goals.AdaptiveGain`. ``moved_s``: how long it has been allowed to move; ``held``: frames
+    that the error has been inside its tolerance.
     """
 
     goal: Goal
@@ -243,7 +245,7 @@ class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):
 
 
 class PoseMeasurement(Leased, eq=False, kw_only=True):
-    """Goes to configurations and looks from there at rest; see ``visiting``."""
+    """Goes to configurations and looks from there at rest; see `core.sources.measure_at_pose`."""
 
     id: str
     phase: Literal["move", "settle", "collect", "return", "finish"]
@@ -383,7 +385,7 @@ class CoreState(msgspec.Struct, eq=False):
     fault: list[Reason]
     driver_request: str
     missing_travel: FloatArray
-    """Commanded less measured travel of late (n,) [rad or m]; see ``following``."""
+    """Commanded less measured travel of late (n,) [rad or m]; see `core.monitor`."""
     untold_travel: FloatArray
     """Commanded since the last joint sample (n,)."""
     last_followed_ns: int

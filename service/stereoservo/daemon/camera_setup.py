@@ -1,4 +1,6 @@
-"""Cameras of a cell: driver and detector constructed from the cell file, their joint description, recorded cameras."""
+"""Constructs the camera drivers and detectors of a cell from its cell file, describes them to the other processes, and
+opens recorded cameras in their place.
+"""
 
 from __future__ import annotations
 

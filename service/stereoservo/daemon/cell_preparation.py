@@ -1,4 +1,5 @@
-"""Preparation of a run: checks cell file and drivers, writes the run plan, compiles the kernels.
+"""Preparation of a run in a process of its own: checks cell file and drivers, writes the run plan (the configuration
+that all processes read), compiles the numba kernels.
 
 It is a process of its own: a driver that crashes when it is asked for its description ends nothing else.
 ``python -m stereoservo.daemon.cell_preparation CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID JSON_OPTIONS``.

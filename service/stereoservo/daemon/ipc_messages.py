@@ -1,4 +1,6 @@
-"""Messages between the processes of one cell: structs, their msgpack codecs, capacities and layouts of the slots."""
+"""Messages between the processes of one cell as structs with msgpack codecs (run plan, requests, heartbeats, servo
+state, reports), and the capacities and layouts of their shared-memory slots.
+"""
 
 from __future__ import annotations
 

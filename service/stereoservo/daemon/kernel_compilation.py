@@ -1,4 +1,5 @@
-"""Compilation of all kernels of a servo process (core, laws, planner, monitors) into numba's cache.
+"""Compiles all numba kernels of a servo process (core, laws, planner, monitors) into the cache on disk, in parallel
+processes, by running an example cell.
 
 An example arm with two cameras runs some steps of each law; kernels are compiled by types, not by sizes. The
 cameras' lenses bend, so that the lens's kernels run too.

@@ -1,4 +1,5 @@
-"""Interfaces of the servo loop and the vision loop: links to the other processes, and pacing.
+"""Interfaces (protocols) of the servo loop and the vision loop: links to the other processes, messages from the
+gateway, and pacing of the cycles.
 
 The loops' code exists once. Between processes the links are slots and sockets (`servo_links`, `vision`) and time is the
 host's; in lockstep (`lockstep`) the links are objects in memory and time is virtual.

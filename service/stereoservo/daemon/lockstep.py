@@ -1,4 +1,5 @@
-"""A cell in one process on a virtual clock: the servo and vision loops of the daemon on in-memory links.
+"""A cell in one process on a virtual clock, for tests and simulation: the servo and vision loops of the daemon on
+in-memory links, stepped in turn.
 
 Used by tests, experiments and ``demo --lockstep``: deterministic given the seed, and as fast as the machine.
 """

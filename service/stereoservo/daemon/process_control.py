@@ -1,4 +1,4 @@
-"""Process control of the daemon: death with the parent, termination signals, environment, logging."""
+"""Process control of the daemon: death with the parent, termination signals, environment of children, log lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Sequence-locked slots in shared memory, which pass only the newest record between processes; the stop slot.
+"""Shared-memory slots with a sequence lock, which pass only the newest record between processes; and the stop slot, a
+word that any process may raise to stop the arm.
 
 Python cannot fence memory (aarch64 may reorder the stores), so the sequence lock is only the fast path:
 every record carries a CRC-32 over its sequence number and bytes, and a reader believes nothing else. Files

@@ -1,4 +1,5 @@
-"""The servo loop: reads joints and observations, steps the core, commands the joint driver, publishes the result.
+"""The servo loop and its process: each cycle reads joints and camera observations, runs one step of the control core,
+commands the joint driver, and publishes the result.
 
 `ServoProcess` is the loop on given links, pacing and clock; `main` runs it as a process of its own. That process holds
 nothing that could delay the arm: no zenoh, no scipy solver, no images, and it logs at its start and end only. Whatever

@@ -1,4 +1,6 @@
-"""The servo process's links to the other processes, by slots in shared memory and sockets."""
+"""Links of the servo process to the vision processes and the gateway, by slots in shared memory and sockets; and its
+outbox of recent events.
+"""
 
 from __future__ import annotations
 

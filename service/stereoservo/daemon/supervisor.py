@@ -1,4 +1,5 @@
-"""The supervisor: starts, monitors and restarts the processes of one cell; owns its lock and runtime directory.
+"""The supervisor of a daemon: starts, monitors and restarts the processes of one cell (servo, vision, gateway), and
+owns its lock and runtime directory.
 
 A gateway or vision process that ends is started again after a growing pause. The servo process is never
 started again: when it ends, everything stops. Children die with the supervisor, whatever kills it (the

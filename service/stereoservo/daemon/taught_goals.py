@@ -1,4 +1,5 @@
-"""Taught goals by name and their JSON file: set-points observed at teaching, with the model in use then.
+"""Taught goals (set-points observed at teaching, with the cameras of the model in use then), and the JSON file that
+stores them by name, with migration of older files.
 
 Schema 2 keeps beside the set-points of the moving body all other markers that were seen (the workpiece's, the tool's)
 and the cameras of the model, so that a goal can be transferred to the workpiece's present pose or to other cameras.

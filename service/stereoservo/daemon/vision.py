@@ -1,4 +1,5 @@
-"""The vision loop of one camera: polls the driver, detects with the prior, publishes the newest observation.
+"""The vision loop of one camera: polls the driver, detects the markers near their predicted pixels, publishes the
+newest observation, and records images on request.
 
 `camera_loop` is the loop on given links and clock; `main` runs it as a process of its own. Errors of the camera are
 reported and answered by reconnecting with growing pauses, never by ending.

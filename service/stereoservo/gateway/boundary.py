@@ -1,5 +1,5 @@
-"""Error boundary for untrusted messages: an exception becomes a refusal, counted and logged, and never ends the
-process.
+"""Error boundary for untrusted messages of clients: an exception becomes a refusal, counted and logged at a limited
+rate, and never ends the process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Goals computed from CAD drawings: a tool's pose on a workpiece, as set-points of the current cameras (thesis 8.6)."""
+"""Goals computed from CAD drawings: set-points in the current cameras for a tool's pose on a workpiece, with their
+accuracy (thesis 8.6).
+"""
 
 from __future__ import annotations
 

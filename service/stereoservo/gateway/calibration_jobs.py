@@ -1,4 +1,6 @@
-"""Jobs of calibration and model check: collects the samples, runs the fit in a child process, installs the model."""
+"""Jobs of calibration, model check and zero reset in the gateway: collects the samples of the motion, runs the fit or
+check in a child process, stores the new model and sends it to the core.
+"""
 
 from __future__ import annotations
 

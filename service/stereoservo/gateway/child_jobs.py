@@ -1,4 +1,4 @@
-"""Child processes that fit or check a model, polled without blocking."""
+"""Child processes that fit or check a model, polled without blocking for their progress, result or failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Set-points of taught goals for a moved workpiece, other cameras or a remounted body, by reprojection (thesis 8.6).
+"""Set-points of taught goals, reprojected for a moved workpiece, other cameras or a marker body that was mounted anew
+(thesis 8.6).
 
 A goal keeps the pixels of the moving body (or of a tool on it), of the workpiece, and the cameras that saw them. What
 stood still relative to the goal, the ``common`` markers, gives the map from the frame of teaching to the present one

@@ -1,4 +1,5 @@
-"""Intake of goals and commands: decoded strictly, validated, forwarded to the core, answered with its reply.
+"""Intake of clients' goals and commands: decodes and validates them, forwards them to the servo process, and returns
+its reply.
 
 Nothing here waits: an unanswered request is kept with its deadline.
 """

@@ -1,4 +1,6 @@
-"""Pixels of a taught goal, or of the newest frames, as arrays of undistorted pixels with their cameras."""
+"""Observations of markers as arrays, undistorted pixels with their cameras, of a taught goal or of the newest frames;
+and the projective frame of a goal's or the current model.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Persistent files of a cell's state directory: taught goals, models, the journal; written atomically."""
+"""Files in a cell's state directory: stores of taught goals and models, written atomically, and the journal, a log of
+events.
+"""
 
 from __future__ import annotations
 

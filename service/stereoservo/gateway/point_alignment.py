@@ -1,4 +1,6 @@
-"""Alignment of a taught or CAD goal's points with the markers observed now; reprojection of its set-points."""
+"""Alignment of the points of a taught or CAD goal with the markers observed now, and reprojection of its set-points
+into the current cameras.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Flight recordings: step records of the servo process into files, and the cameras' images beside them."""
+"""Flight recordings in the gateway: starts and ends them, writes the servo process's step records into a file, and
+requests the cameras' images beside it.
+"""
 
 from __future__ import annotations
 

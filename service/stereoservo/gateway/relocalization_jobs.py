@@ -1,4 +1,6 @@
-"""Jobs that relocalize moved cameras, in a child process, on request of the core."""
+"""Jobs of the gateway that relocalize moved cameras on request of the core: collects observations at rest, computes
+new camera matrices in a child process, sends the model to the core. Also stores cameras that the core re-estimated.
+"""
 
 from __future__ import annotations
 

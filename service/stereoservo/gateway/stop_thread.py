@@ -1,4 +1,6 @@
-"""Thread with its own zenoh session that handles stop and enable, separate from all other traffic."""
+"""Thread of the gateway with its own zenoh session, which handles stop and enable commands, separate from all other
+traffic.
+"""
 
 from __future__ import annotations
 

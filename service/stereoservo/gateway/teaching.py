@@ -1,4 +1,6 @@
-"""Taught goals: stored with their model, made from CAD drawings, and resolved to set-points for the current model."""
+"""Registry of a cell's taught goals: stores them with their model, makes goals from CAD drawings, and resolves goals
+to set-points for the current model.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Validation of goals and commands, as far as it does not depend on the state of the arm.
+"""Validation of clients' goals and commands as far as it does not depend on the state of the arm: names, markers,
+joint limits, points, displacements, options; gives all problems of a message.
 
 Each problem names the field, its value and what would have been valid; all of them are reported at once.
 """

@@ -1,6 +1,7 @@
-"""Alignment of known points with their current images, over the group of maps that the two frames allow.
+"""Alignment of known points with their current images by the map between two projective frames (rigid, similar, affine
+or projective, as these allow), with residuals and reprojected pixels.
 
-`moved_cameras.frame_change` for every stratum: a workpiece that has moved, cameras that were exchanged, points of a
+For every stratum: a workpiece that has moved, cameras that were exchanged, points of a
 drawing (thesis 8.6: targets "can be reprojected onto images actually taken, even if the cameras have changed"). With
 two metric frames a rigid motion or a similarity of three points does, with two affine ones an affinity of four, else
 a homography of five. All are fitted to the pixels by one Gauss-Newton iteration on the group. Pixels are ideal ones.
@@ -141,8 +142,8 @@ def align(
     """Map of the family that moves points ``(n, 4)`` of the old frame onto their images in the new cameras.
 
     Of least reprojection error over ``pixels_new`` (c, n, 2) [px], NaN where missing, ``sigmas`` (c, n) or a number
-    [px]; ``M_covariance`` (n, 4, 4) as for `homography_refine`. ``names`` (n,): what to call the points. With the sign
-    that keeps points in front, and its covariance, as `frame_change` returns it.
+    [px]; ``M_covariance`` (n, 4, 4) of the old points. ``names`` (n,): what to call the points. With the sign
+    that keeps points in front, and its covariance.
 
     Raises GeometryError for too few points seen by two cameras, and where they leave the map open.
     """

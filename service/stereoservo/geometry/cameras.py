@@ -1,4 +1,5 @@
-"""Projective cameras: canonical pair, projection and its Jacobian, triangulation, resection.
+"""Projective cameras: projection and its Jacobian, reprojection residuals, triangulation with covariance, canonical
+pair of a fundamental matrix, resection from known points.
 
 Cameras are stacked first: ``Ps`` (c, 3, 4), pixels (c, n, 2) [px]. A missing pixel is NaN.
 """

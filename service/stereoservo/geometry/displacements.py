@@ -1,4 +1,5 @@
-"""Projective displacements: normal form, generators, closed-form exponentials and logarithms (thesis 3, 4).
+"""Projective displacements of revolute and prismatic joints: exponentials of their generators in closed form, the
+exact generator nearest to a measured matrix, change of frame (thesis 3, 4).
 
 A revolute generator ``Ĥ`` (4, 4) has eigenvalues (0, 0, i, −i): ``Ĥ³ = −Ĥ``. A prismatic one is nilpotent:
 ``Ĥ² = 0``. Displacements act on points from the left; conjugates in a projective frame of Euclidean ones.

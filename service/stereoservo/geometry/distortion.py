@@ -1,4 +1,5 @@
-"""Radial lens distortion with one parameter and its own centre: ideal (pinhole) pixels to raw pixels and back.
+"""Radial lens distortion with one parameter and its own centre: ideal (pinhole) pixels to raw pixels and back, with
+derivatives; and its estimation from images of straight lines.
 
 A ``lens`` is ``(k, cu, cv, r0)``: the raw pixel of an ideal one ``p`` is ``c + (p - c)(1 + k |p - c|² / r0²)``
 with the centre ``c = (cu, cv)`` [px] and the reference radius ``r0`` [px], half the image width. With square

@@ -1,4 +1,5 @@
-"""The fundamental matrix: linear, robust and refined; epipolar distances.
+"""The fundamental matrix from matched pixels: linear, robust and refined; epipolar distances; a test of parallax
+against one homography.
 
 Convention: ``m'ᵀ F m = 0`` with ``m`` left, ``m'`` right, in pixels (the thesis's F of (2.10) is the
 transpose).

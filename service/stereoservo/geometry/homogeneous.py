@@ -1,4 +1,5 @@
-"""Points and planes of projective space: homogeneous coordinates, joins and meets, oriented planes.
+"""Points and planes of projective space: homogeneous coordinates, joins and meets, oriented planes, normalising maps;
+and the error of degenerate geometric input.
 
 Points are rows ``(n, 4)``; a plane is a 4-vector ``a`` used as ``aᵀM`` (thesis 2.5). Points that enter one
 construction keep their orbital heights: nothing here renormalises a vector whose sign or scale is an

@@ -1,5 +1,5 @@
-"""4x4 homographies between projective point sets: from a basis, linear from many points, refined in the
-images (thesis 2.2). :mod:`stereoservo.geometry.incidences` has those from lines and planes.
+"""4x4 homographies between projective point sets: linear from five points or more, scaled to unit determinant, and the
+whitening of pixels for their refinement in the images (thesis 2.2).
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Change of the projective frame when cameras are moved, from static scene points (2.19-2.21).
+"""Static scene points while cameras move (thesis 2.19 to 2.21): resection of one moved camera with covariance, the
+struct of a change of the projective frame, covariances of transformed points, test for coplanar points.
 
 Five points of which no four are coplanar are a frame of space. When cameras have moved, their new canonical frame
 differs from the old one by one homography ``H``, which the points' images give; what was known moves with it: points

@@ -1,7 +1,7 @@
-"""Projective rotations: Jordan frames and their geometry, generators from homographies, minimal parameters
-(thesis 4).
+"""Projective rotations: Jordan frames and their geometry, and minimal parameters of rotation generators with
+derivatives (thesis 4).
 
-Exponential, logarithm and single generators are in `displacements`; the fit to pixels in `rotation_fit`.
+Exponential and single generators are in `displacements`; the fit to pixels in `rotation_fit`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RotationFrame:
         return self.planes[:2]
 
     def changed(self, C: FloatArray) -> RotationFrame:
-        """The frame ``C S`` of the same rotation (4.11), ``C`` (4, 4) of `rotation_commutator`."""
+        """The frame ``C S`` of the same rotation (4.11), ``C`` (4, 4) commuting with ``J_R(θ)``."""
         S = np.asarray(C, dtype=np.float64) @ self.planes
         return RotationFrame(S, np.asarray(np.linalg.inv(S).T, dtype=np.float64))
 

@@ -1,9 +1,9 @@
-"""General screws in any frame: exponential and logarithm in closed form, pitch, axis, split into commuting rotation
-and translation (thesis appendix A.1).
+"""Screw motions in any projective frame: twist of an axis with a pitch, its angle, exponential in closed form, and
+conversion of Euclidean twists to angular and linear velocities (thesis appendix A.1).
 
 A twist ``X`` (4, 4) is the logarithm of a displacement ``H_RT``: ``X = θĜ + N``, Ĝ a revolute generator, N nilpotent
-(the translation along the same axis), ``ĜN = NĜ = 0``, so that ``X⁴ = -θ²X²``. Displacements are normalised
-(`stereoservo.geometry.displacements.normalise_displacement`).
+(the translation along the same axis), ``ĜN = NĜ = 0``, so that ``X⁴ = -θ²X²``. Displacements are scaled
+to ``det H = 1``.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Stratification: projective, affine and Euclidean frames, the maps between them, and what is absolute in each
-(thesis 2.2, (2.7)-(2.18)).
+"""Stratification: maps between projective, affine and Euclidean frames, decomposition of cameras, orientation of
+planes (thesis 2.2, (2.7)-(2.18)).
 
 Frames: projective ``P`` with a first camera ``[N⁻¹ | 0]`` (the thesis takes N = I), affine ``A`` with the same camera
 and the plane at infinity (0, 0, 0, 1), Euclidean ``E`` with ``[K | 0]``. ``plane`` (4,) is the plane at infinity in P,
 scaled as the caller wants heights to be: ``plane @ M`` becomes the fourth coordinate. ``intrinsics`` (3, 3) is
-``K̃ = N K``, which is K where N = I. Objects follow by `stereoservo.geometry.homogeneous.move_points`, `move_planes`,
-`move_cameras` and `stereoservo.geometry.displacements.conjugate` (generators and displacements).
+``K̃ = N K``, which is K where N = I. Points follow by `homogeneous.move_points`, planes by ``aᵀH⁻¹``, cameras
+by ``P H⁻¹``, generators and displacements by `displacements.conjugate`.
 """
 
 from __future__ import annotations

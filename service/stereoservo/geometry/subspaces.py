@@ -1,4 +1,5 @@
-"""Linear subspaces of projective space as multi-columns and multi-rows: join, meet, incidence (thesis 2.5.3, 2.6.2).
+"""Linear subspaces of projective space as spans of points or meets of hyperplanes: basis, dual, dimension, incidence,
+relative position (thesis 2.5.3, 2.6.2).
 
 A k-dimensional subspace of ``P^n`` (N = n + 1) is either the span of K = k + 1 points, a multi-column, or the
 meet of L = n - k hyperplanes, a multi-row. Both are stored one vector a row: ``(K, N)`` and ``(L, N)``. The

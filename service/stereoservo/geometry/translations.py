@@ -1,7 +1,8 @@
-"""Projective translations: Jordan frames, and direction and plane at infinity from homographies (thesis 3).
+"""Projective translations: linear estimates of their homography from points and pixels, and of their direction and the
+plane at infinity from homographies, by SVD (thesis 3).
 
 A projective translation is ``H = I + k hᵀ`` with ``hᵀk = 0``: ``k`` (4,) the direction of translation at
-infinity, ``h`` (4,) the plane at infinity (3.13, 3.14). Exponential, logarithm and generators are in
+infinity, ``h`` (4,) the plane at infinity (3.13, 3.14). Exponential and generators are in
 `displacements`; the fits to pixels in `translation_fit`.
 """
 

@@ -1,4 +1,6 @@
-"""Joint axes of a model, as lines of the Euclidean (or affine) frame of its stratum."""
+"""Joint axes of a calibrated model as directions and points in its Euclidean (or affine) frame, with their angles and
+common normals; camera centres and intrinsics in that frame.
+"""
 
 from __future__ import annotations
 

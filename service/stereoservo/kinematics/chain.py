@@ -1,5 +1,5 @@
-"""Forward kinematics and Jacobians in the cameras' projective frame: a product of exponentials (thesis 5).
-Reference in numpy.
+"""Forward kinematics and Jacobians of an arm in the cameras' projective frame, as a product of exponentials (thesis
+5); reference implementation in numpy.
 
 The loop itself runs on :mod:`stereoservo.kinematics.kernels`, which are tested against this module.
 """

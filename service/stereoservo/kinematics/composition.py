@@ -1,4 +1,5 @@
-"""Composition of joint displacements: the effect of a small motion of all joints on points and on the operators.
+"""Composition of joint displacements, in numpy and as kernels: the effect of a small motion of all joints on points
+and on the joint operators; and a basis of the rigid motions of points.
 
 An arm re-zeroed at its present configuration (Theorem 10) needs no more than its operators there: ``H(q+Δq)
 H(q)⁻¹`` is their product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the

@@ -1,4 +1,5 @@
-"""Propagation of a model's covariance to quantities that do not depend on the choice of its projective frame.
+"""Propagation of a model's covariance to quantities that do not depend on its projective frame, such as axis angles,
+intrinsics or predicted pixels: covariances and standard deviations.
 
 A quantity is a function of the model: an angle between axes, an intrinsic parameter through
 ``projective_to_euclidean``, a predicted pixel. Its derivative is taken along the principal axes of the covariance, a

@@ -1,4 +1,5 @@
-"""Denavit-Hartenberg parameters of a metric model, scaled by one known length (5.1, 5.2; thesis 5.5.2).
+"""Denavit-Hartenberg parameters of a calibrated metric model with standard deviations, scaled by one known length
+(thesis 5.1, 5.2, 5.5.2).
 
 Row j, base first, is what joint j does and the link behind it: ``Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β)``, with ``θ = q +
 theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j precedes joint j: its r_j,

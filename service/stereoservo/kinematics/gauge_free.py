@@ -1,4 +1,5 @@
-"""Gauge-invariant quantities of a model (independent of frame and scale), named, with their standard deviations.
+"""List of a model's gauge-invariant quantities (independent of frame and scale), named and with standard deviations,
+and of those that its stratum does not determine, with the reason.
 
 What a stratum does not determine is listed, too, with the reason. In every stratum: where a marker is seen at the
 zero, how each joint moves it in each image, and where the axes are seen. Affine: coordinates in units of prismatic

@@ -1,4 +1,5 @@
-"""Joint angles estimated from images: homing and encoder zeros (thesis 4.5.4, (4.45)).
+"""Joint angles estimated from images of known points without an initial guess: all configurations that fit, homing
+displacements, and encoder zeros, with covariances (thesis 4.5.4, (4.45)).
 
 No initial guess is asked for: the search starts all over joint space, and every configuration that the pixels
 leave possible is told. Angles of revolute joints are modulo 2π, nearest the centre of their limits.

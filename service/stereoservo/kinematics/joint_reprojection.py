@@ -1,5 +1,5 @@
-"""Reprojection error of known points as a function of the joints: residuals and derivatives, for many
-configurations at once.
+"""Reprojection error of known points as a function of the joint angles, for many configurations at once: residuals,
+derivatives, predicted pixels; and the known points, triangulated from images.
 
 The thesis's objective (4.42) over the joint angles (4.45), for any chain, mount and number of cameras. Points may
 carry a covariance; the residuals are then whitened by what pixels and points leave open together.

@@ -1,5 +1,5 @@
-"""The loop's kinematics in numba: the same as `chain` and `geometry.cameras`, without BLAS, LAPACK or
-fastmath.
+"""Numba kernels for the control loop: forward kinematics, projection, image Jacobian, triangulation, lens distortion.
+The same as `chain` and `geometry.cameras`, without BLAS, LAPACK or fastmath.
 
 Explicit loops in a fixed order: the same input gives the same bits on one machine. All arrays are float64 and
 C-contiguous; joint kinds are uint8, 0 revolute, 1 prismatic. The ``*_into`` forms write into arrays of the

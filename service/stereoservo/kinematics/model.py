@@ -1,4 +1,6 @@
-"""The calibrated model of a cell, and its versioned file: joints, cameras, lenses, markers, covariance."""
+"""The calibrated model of a cell (joints, cameras, lenses, markers, covariance, statistics of the fit) with its
+checks, and its versioned JSON file.
+"""
 
 from __future__ import annotations
 

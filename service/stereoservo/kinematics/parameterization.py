@@ -1,4 +1,5 @@
-"""Minimal local parameters of generators, cameras, lenses and points, without gauge freedoms (thesis 4.4, 5.4.2).
+"""Minimal local parameters of joint generators, cameras, lenses and points for least squares, without gauge freedoms
+(thesis 4.4, 5.4.2); exponentials of the joints' generators.
 
 A generator keeps its spectrum when it is conjugated, so its neighbours are ``T Ĥ₀ T⁻¹`` with ``T`` from the
 structure group of the stratum: GL(4), the affine or the similarity group. Directions of the group's algebra

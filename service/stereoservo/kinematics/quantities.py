@@ -1,5 +1,5 @@
-"""Gauge-invariant quantities of a calibrated model: those of the images (markers, axes, lenses), and those of each
-stratum.
+"""Functions of a calibrated model that give its gauge-invariant quantities, with names and units: images of markers
+and axes, lenses, and the affine or metric quantities of its stratum.
 """
 
 from __future__ import annotations

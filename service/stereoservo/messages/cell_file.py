@@ -1,4 +1,6 @@
-"""The cell file: TOML, ``schema = 1``, decoded strictly."""
+"""The cell file, the TOML configuration of a cell: structs of its sections (drivers, cameras, servo loop, safety,
+calibration, zenoh), strictly decoded and validated.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Report of a model check: residuals, what has changed, and drifts."""
+"""Report of a model check as structs: residuals, detected changes, estimates of drifts, and joint zeros that were
+reset.
+"""
 
 from __future__ import annotations
 

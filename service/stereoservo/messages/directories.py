@@ -1,4 +1,6 @@
-"""Paths of a cell: its runtime directory (sockets, slots, locks; gone with the daemon) and its state directory."""
+"""Paths of a cell: its runtime directory (sockets, slots, locks; removed with the daemon) and its state directory
+(models, taught goals).
+"""
 
 from __future__ import annotations
 

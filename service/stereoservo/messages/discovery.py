@@ -1,4 +1,4 @@
-"""Discovery of running daemons, and a daemon as a child process."""
+"""Discovery of the daemons that run for this user, and start of a cell's daemon as a child process."""
 
 from __future__ import annotations
 

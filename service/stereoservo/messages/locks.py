@@ -1,5 +1,5 @@
-"""File locks (``flock``): one daemon per cell, one per hardware channel; the kernel releases them when the holder
-dies.
+"""File locks (``flock``), one for each cell's daemon and one for each hardware channel, which the kernel releases when
+the holder dies; and the process that holds one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The struct `Reason`: why the arm is slow, held or in fault, as code, value, threshold, unit and a hint as text."""
+"""The struct `Reason`, an entry of a cell's status: why the arm is slow, held or in fault, as code, value, threshold,
+unit and a hint as text.
+"""
 
 from __future__ import annotations
 

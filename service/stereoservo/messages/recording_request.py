@@ -1,4 +1,4 @@
-"""Request to the vision processes to record their images, and their reports of what was recorded.
+"""Request to the vision processes to record their images, passed by a file, and their reports of what was recorded.
 
 The order is a small file in the cell's runtime directory, replaced as a whole and looked at a few times a second: a
 vision process that starts late, or again, finds it there.

@@ -1,4 +1,4 @@
-"""Type aliases of numpy arrays."""
+"""Type aliases of numpy arrays: floating point, integer, boolean, joint kinds, images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decorator that compiles kernels with numba: cached on disk, without fastmath."""
+"""Decorators that compile functions with numba as kernels of the control loop, cached on disk, without fastmath."""
 
 from __future__ import annotations
 

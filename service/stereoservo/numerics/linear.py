@@ -1,4 +1,5 @@
-"""Small dense linear algebra in numba: without BLAS, LAPACK or fastmath. Tested against numpy.
+"""Numba kernels of small dense linear algebra without BLAS, LAPACK or fastmath: Cholesky, normal equations, damped
+least squares, singular vectors.
 
 Explicit loops in a fixed order: the same input gives the same bits on one machine. Arrays are float64.
 """

@@ -1,4 +1,5 @@
-"""Cartesian trajectories of three components, from a decomposition by mobility (7.4.3).
+"""Cartesian path of a body in three components (translation, hinge, planar turn) with their time profiles, from the
+decomposition of its displacement (thesis 7.4.3).
 
 ``H_c(σ) = exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p)``: the translation leftmost, so that no rotation changes its
 line; the hinge second, so that the planar rotation changes no plane.

@@ -1,4 +1,5 @@
-"""Inverse kinematics along a path of an arm's body: damped Gauss-Newton steps on its points, sample by sample. Kernels.
+"""Numba kernels of inverse kinematics along a path of the body, by damped Gauss-Newton steps sample by sample, with
+checks of all limits; and of joints for a goal pose from many start values.
 
 The operators are those at the present joints (Theorem 10), moved along with the arm; so any arm of
 `kinematics.composition` can be used, whatever its number of joints. The self-motion of a redundant arm keeps its joints

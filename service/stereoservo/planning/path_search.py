@@ -1,4 +1,5 @@
-"""Search for a feasible path among alternatives: a state machine whose stages can stop after any sample.
+"""Search for a feasible path among alternatives (time profiles, senses of rotation, bent paths, straight lines in
+joint space): a state machine that evaluates a given number of samples a call.
 
 The alternatives, cheapest first: other profiles, senses and kinds of turning, bent centre lines. A bend takes the
 centre aside by ``4σ(1 − σ) b``, ``b`` a displacement (a point of the plane at infinity): away from the cameras or

@@ -1,4 +1,5 @@
-"""A plan and its request: the path of a marker body with the arm's joints in time, or why there is none.
+"""Data types of path planning: the request with its limits, the closest approach of a path to each limit, and the
+plan, a path of the marker body and the arm's joints in time.
 
 Plain data; `planner` makes it, a slice of work at a time, so that a loop may plan while it runs.
 """

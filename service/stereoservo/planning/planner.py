@@ -1,4 +1,5 @@
-"""Path planner: the path of a body and of the joints, before anything moves, in slices of work that a loop can afford.
+"""Path planner: plans the path of a marker body and of the arm's joints before the arm moves, in slices of work short
+enough for a control loop; checks the request and prepares the search.
 
 `start_planning` checks a request, converts it into a motion frame and decides what can be decided at once: a goal out
 of view, or hidden, or the present pose itself. `plan_on` then tries one candidate path after the other

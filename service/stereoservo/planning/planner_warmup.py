@@ -1,4 +1,6 @@
-"""Compilation of all planning kernels before a loop needs them, by planning in an example cell."""
+"""Compilation of the path planner's numba kernels by planning example paths (straight, around a keep-out,
+unreachable), so that the servo loop compiles none.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Primitive motions of an arm from its projective operators: a translation, two kinds of revolution (thesis
-7.3).
+"""Primitive motions of an arm from its projective joint operators: joint velocities of a translation, a revolution
+about an axis, and a revolution of a plane in itself (thesis 7.3).
 
 Each is the kernel of an (8, n) system in the operators ``Ĥ_j|_Q`` (n, 4, 4) at the current configuration. The
 systems are not solved in joint velocities but in an orthonormal basis of the operators that the arm can make

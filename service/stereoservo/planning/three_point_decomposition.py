@@ -1,4 +1,5 @@
-"""Decomposition of a displacement of three points into a translation and two revolutions (thesis 7.4.1, 7.4.2).
+"""Decomposition of the displacement of three points of a body into a translation, a hinge rotation that aligns their
+plane, and a rotation in that plane, each with the arm's joint velocity (thesis 7.4.1, 7.4.2).
 
 The three are meant to be driven together: each leaves alone what the others align. All points, the camera
 centres too, have orbital height ``a∞ᵀM = 1``; then their differences are displacements, and a translated

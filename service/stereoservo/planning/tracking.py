@@ -1,4 +1,6 @@
-"""Tracking of a plan: reference pose, joints and their rates at a time, and how fast the plan's time advances."""
+"""Tracking of a planned path: reference pose, joints and their rates at a given time, and the advance of the plan's
+time, slower when the body lags behind.
+"""
 
 from __future__ import annotations
 

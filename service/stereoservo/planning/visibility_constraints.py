@@ -1,4 +1,5 @@
-"""Constraints of a path in a `motion_frame`: images, faces, depth, joints, keep-outs; clearance of a pose to them.
+"""Constraints of a path (image borders, visible faces, depth, joint limits, keep-outs) and the clearance of one pose
+to each of them; also the pull of joints away from their limits.
 
 Margins hold along the path. Where the present pose or the goal itself has less, they are lowered to that: a pose that
 is allowed may be left and reached.

@@ -1,4 +1,4 @@
-"""Clocks: the monotonic clock of this host and the virtual clock of lockstep."""
+"""Clocks of drivers and loops: the monotonic clock of this host, and a virtual clock that simulations set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The ports: protocols of joint drivers, camera drivers and detectors, their descriptions and samples.
+"""Interfaces to hardware: protocols of joint drivers, camera drivers and detectors, with their descriptions, samples
+(joint states, frames, marker observations) and errors.
 
 All stamps are ``CLOCK_MONOTONIC`` nanoseconds of this host (in lockstep: the virtual clock), taken from
 ``DriverContext.clock``. Every sample carries a stamp and a sequence number. Joint quantities are [rad], [rad/s]

@@ -1,5 +1,5 @@
-"""Self-identifying planar dot patterns: pure data, shared by the detector, the simulation and the plate
-printer.
+"""Layout of self-identifying planar dot patterns (seven dots a face) as pure data, shared by the detector, the
+simulation and the plate printer.
 
 A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on
 the edge from corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly

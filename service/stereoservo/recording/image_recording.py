@@ -1,4 +1,6 @@
-"""Recording of a camera's frames in a thread; frames that it cannot keep up with are left out and counted."""
+"""Recording of one camera's frames into a video file by a thread, on request; frames that it cannot keep up with are
+left out and counted.
+"""
 
 from __future__ import annotations
 

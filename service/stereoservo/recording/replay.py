@@ -1,4 +1,6 @@
-"""Replay of a flight recording: the recorded inputs through the same core, with the outputs compared bit for bit."""
+"""Replay of a flight recording: runs the recorded inputs through the same control core and compares the outputs bit
+for bit; and the reader of a recording's messages.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Step records and checkpoints: their encoding, and the stream of them from the servo loop to a recorder."""
+"""Step records (inputs, velocity and output checksum of one control step) and state checkpoints: their encoding, the
+software versions on which replay depends, and their stream from the servo loop to a recorder.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Detection of a changed camera, marker or joint zero from one set of innovations; interface to the compiled
-kernel.
+"""Detection of a changed camera, marker or joint zero from the innovations (observed less predicted pixels) of one
+moment: result types and the call of the numba kernel.
 
 Innovations are observed less predicted pixels. Hypotheses, each a change of few parameters:
 

@@ -1,5 +1,5 @@
-"""Kernels of `change_detection`: estimates of all hypotheses for the innovations of one moment, and the choice among
-them.
+"""Numba kernels of change detection: least-squares estimates of all hypothetical changes (camera, marker, joint zero,
+…) from the innovations of one moment, and the choice among them.
 
 Explicit loops in a fixed order, no LAPACK: the results are part of recordings.
 """

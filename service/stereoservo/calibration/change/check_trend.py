@@ -1,5 +1,5 @@
-"""Trends over successive checks: a weighted straight line through each change's estimates, and when it crosses the
-limit.
+"""Trends of a model over successive checks: weighted straight lines through the estimates of each change, the most
+significant one, and the time when it reaches the limit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Statistical test of which of several hypothetical changes explains the residuals; shared by all tests of a model.
+"""Statistical test of which of several hypothetical changes of a model explains its residuals: chi-square thresholds,
+candidates, Schwarz's criterion, significance.
 
 Used on-line, for the innovations of one moment (`change_detection_kernel`), and off-line, for the pixels of a check
 motion (`model_check`). Each hypothesis is a change of ``size`` parameters. Those of the largest first-order gain are

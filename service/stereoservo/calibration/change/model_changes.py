@@ -1,4 +1,5 @@
-"""Hypothetical changes of a calibrated cell, and their least-squares estimates from the pixels of a check motion.
+"""Hypothetical changes of a calibrated cell (camera, cameras, marker body, marker, joint zero), and their
+least-squares estimates from the pixels of a check motion.
 
 A camera moved, the cameras moved together, the marker body moved, one marker slipped, the zero of a joint drifted:
 each is a change of few parameters. Its estimate takes the pixels of many poses and the covariance of the model itself

@@ -1,4 +1,5 @@
-"""Chi-square test of a model against a short check motion; identifies and estimates what has changed.
+"""Chi-square test of a calibrated model against the pixels of a short check motion: which camera, marker or joint zero
+has changed and by how much, as a report.
 
 Under a valid model the residuals are Gaussian with the stated noise and the model's own uncertainty. A chi-square test
 rejects the model; likelihood ratios, by the decision that the on-line monitor uses too (`hypothesis_test`), name what

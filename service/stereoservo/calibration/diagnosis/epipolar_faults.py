@@ -1,5 +1,5 @@
-"""Input faults that show in the epipolar geometry of trials: exchanged views or marker ids, planar scenes, no
-baseline.
+"""Faults of calibration data that show in the epipolar geometry of two cameras: exchanged views or marker ids,
+unrelated views, planar scenes, no baseline; and data corrected for an exchange.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Diagnosis of a failed calibration: names the cause where it can be identified, not the stage that failed.
+"""Diagnosis of a failed calibration, naming its cause (exchanged views or ids, wrong joint kind, order or scale, …)
+where it can be identified; and notes on a fit that succeeded.
 
 Each cause is a correction of the trials: with the views of some stops exchanged back, two ids exchanged, an angle
 divided by a factor, the fit must succeed, or the cause is not reported.

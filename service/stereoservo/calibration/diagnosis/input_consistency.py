@@ -1,4 +1,6 @@
-"""Consistency checks of the stated detector noise and of the joints' scales with the trials."""
+"""Consistency checks of calibration input: whether the stated detector noise is too small, and whether revolute joints
+report their angles at a wrong scale.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Hypothetical corrections of the trials that may make them fit: views, ids, joint kinds or joint order exchanged
-back.
+"""Hypothetical corrections of calibration data that may make the model fit: views, marker ids, joint kinds or the
+order of joints exchanged back; and the fit of each.
 """
 
 from __future__ import annotations

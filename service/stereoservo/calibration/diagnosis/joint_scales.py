@@ -1,4 +1,5 @@
-"""Scale factors of joint readings: of a revolute joint from the images, of a prismatic one relative to another.
+"""Estimated scale factors of joint readings (reported over true motion): of a revolute joint from the images, of a
+prismatic one relative to another.
 
 A revolute joint that reports its angle times a factor (counts, degrees, a wrong gear) is no projective rotation by the
 reported positions: the spectrum of its generator is ±i times the factor. The factor is estimated first from the

@@ -1,4 +1,5 @@
-"""Input faults that the markers' tracks show without a model: collinear markers, frozen encoders, steps.
+"""Faults of calibration data that show without a model in the markers' image tracks: collinear markers, frozen
+encoders, steps of a camera or marker, noise of the tracks.
 
 Markers of a moving joint draw smooth tracks, and equal positions give equal images.
 """

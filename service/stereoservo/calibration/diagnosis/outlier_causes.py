@@ -1,4 +1,5 @@
-"""Causes of a fit's outliers: exchanged views or ids, wrong joint positions at a stop, a moved camera or marker.
+"""Causes of the outliers of a calibration's fit: exchanged views or marker ids, wrong joint positions at a stop, a
+moved camera or marker.
 
 The model that fits the other pixels predicts where the outliers should be, which identifies the cause.
 """

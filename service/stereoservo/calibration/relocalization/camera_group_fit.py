@@ -1,4 +1,6 @@
-"""Fit of one moved camera, or a rig of cameras, to known points: kind of motion, inliers, covariance."""
+"""Fit of one moved camera, or of a rig of cameras, to the images of known points: the kind of motion, new camera
+matrices, inliers, covariance.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""``stereoservo calibrate``: calibration by the daemon (one is started if needed), model check, or fit of stored
-trials.
+"""Command ``stereoservo calibrate``: calibrates a cell through its daemon (started if needed), checks its model by a
+short motion, or fits stored trial data or recorded images.
 """
 
 from __future__ import annotations

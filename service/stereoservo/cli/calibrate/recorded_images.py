@@ -1,4 +1,6 @@
-"""Calibration from recorded images, for ``stereoservo calibrate CELL.toml --images DIR``."""
+"""Calibration from recorded images for ``stereoservo calibrate CELL.toml --images DIR``: extracts the trial data,
+stores and fits them, and formats the result.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Fit of stored trial data, for ``stereoservo calibrate CELL --trials FILE.npz``."""
+"""Calibration from stored trial data for ``stereoservo calibrate CELL --trials FILE.npz``: lenses from a file of
+straight lines, fit, stored model, and the result as a table.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Findings of ``stereoservo doctor`` on each camera: sharpness of markers, exposure, rate, noise.
+"""Findings of ``stereoservo doctor`` on each camera from its detections and newest frame: sharpness and contrast of
+markers, exposure, frame rate, noise, time between the cameras' shutters.
 
 Pure: records in, findings out. The arm rests meanwhile, or nearly so. Pixels are raw ones.
 """

@@ -1,4 +1,6 @@
-"""Examination of the cameras for ``stereoservo doctor``: opened, observed for some seconds, and released."""
+"""Examination of the cameras for ``stereoservo doctor``: opens them, records detections for some seconds, collects the
+findings, and writes annotated pictures.
+"""
 
 from __future__ import annotations
 

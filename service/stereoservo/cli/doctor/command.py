@@ -1,4 +1,6 @@
-"""``stereoservo doctor``: examines a cell before it moves."""
+"""Command ``stereoservo doctor``: checks cell file, drivers, drives, cameras, directories, network, model and
+scheduling of a cell before it runs, and prints the findings.
+"""
 
 from __future__ import annotations
 

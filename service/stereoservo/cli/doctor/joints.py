@@ -1,4 +1,6 @@
-"""Examination of the joint driver for ``stereoservo doctor``."""
+"""Examination of the arm by its joint driver for ``stereoservo doctor``, which moves a joint only with the user's
+permission.
+"""
 
 from __future__ import annotations
 

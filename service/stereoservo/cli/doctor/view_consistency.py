@@ -1,4 +1,6 @@
-"""Consistency of simultaneous views: by the cell's model, or by the epipolar constraint alone."""
+"""Checks of ``stereoservo doctor`` on pairs of cameras: whether simultaneous observations fit the cell's model or the
+epipolar constraint, and how much of the calibration motion lies inside the images.
+"""
 
 from __future__ import annotations
 

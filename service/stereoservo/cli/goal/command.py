@@ -1,4 +1,6 @@
-"""``stereoservo goal``: sends a goal and waits for its end."""
+"""Command ``stereoservo goal``: sends a goal to a cell (or asks whether it would be accepted), streams set-points to
+it, prints its plan and progress, and waits for its end.
+"""
 
 from __future__ import annotations
 

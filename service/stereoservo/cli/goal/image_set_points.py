@@ -1,4 +1,6 @@
-"""Set-points from recorded images, for ``goal CELL --images DIR``."""
+"""Set-points of a goal from recorded images, for ``stereoservo goal CELL --images DIR``: mean marker pixels of every
+recorded camera, checked against the live cell.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Conversion of the options of ``stereoservo goal`` to a goal. Raises CommandError, MessageError."""
+"""Conversion of the options of ``stereoservo goal`` to a goal message: target, adaptive gain, and streamed set-points
+from JSON lines. Raises CommandError, MessageError.
+"""
 
 from __future__ import annotations
 

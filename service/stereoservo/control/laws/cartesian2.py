@@ -1,4 +1,6 @@
-"""Cartesian control in two components (thesis 8.55): translation of the centre, and one rotation about it."""
+"""Control law ``cartesian2``: Cartesian servoing in two components (thesis 8.55), straight translation of the body's
+centre and one rotation about it.
+"""
 
 from __future__ import annotations
 

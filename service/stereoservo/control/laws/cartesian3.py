@@ -1,4 +1,5 @@
-"""Cartesian control in three components (thesis 8.42): translation, hinge, and turn of the face in its plane.
+"""Control law ``cartesian3``: Cartesian servoing in three components (thesis 8.42), translation of the centre, hinge
+that aligns the plane of a marker face, turn of the face in its plane. Also the step that ``cartesian2`` shares.
 
 The centre goes on a straight line while the face is turned about it. `cartesian2` shares what is here; it makes hinge
 and turn one rotation (8.55). A component that would turn the face out of a camera's view waits for the other

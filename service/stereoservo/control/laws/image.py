@@ -1,4 +1,4 @@
-"""Image-based servoing in the cameras that see (thesis 8.26): one camera is enough.
+"""Control law ``image``: image-based servoing in any number of cameras, one is enough (thesis 8.26).
 
 The Jacobian is developed around points that the kinematics carry along (8.29, 8.30), so that control goes on where
 a camera drops out.

@@ -1,4 +1,5 @@
-"""The law on points in space (8.13 to 8.17, 8.34): their differences from the goal's, measured in pixels.
+"""Control law ``points``: servoes the triangulated marker points to their goal points in projective space (thesis 8.13
+to 8.17, 8.34), differences measured in pixels.
 
 A projective frame has no lengths of its own: a displacement of a point counts as what it moves in the images of all
 cameras. The command then does not depend on the frame.
@@ -45,7 +46,7 @@ def points_step(
     choice: int,
     damping: float,
 ) -> tuple[FloatArray, float]:
-    """`points.points_velocity` as a kernel: joint velocity (n,) and conditioning."""
+    """The law's step as a kernel: joint velocity (n,) and conditioning."""
     n, markers, rows = operators.shape[0], points.shape[0], metrics.shape[1]
     N = np.zeros((n, n))
     b = np.zeros(n)

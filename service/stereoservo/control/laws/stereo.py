@@ -1,4 +1,5 @@
-"""Image-based stereo servoing: the pixel errors of all cameras stacked (thesis 8.26 to 8.36).
+"""Control law ``stereo``: image-based servoing on the pixel errors of all cameras, stacked (thesis 8.26 to 8.36). Also
+the damped least-squares step in the images, with rate limits, which the other laws in the images share.
 
 The damped least-squares step in the images is here, which `image`, `points` and `trajectory` share.
 """

@@ -1,4 +1,6 @@
-"""Tracking of set-points that move along a planned path, in the images of all cameras that see (thesis 8, 9.3)."""
+"""Control law ``trajectory``: tracks the moving set-points and joints of a planned path in the images of all cameras,
+by feed-forward and feedback (thesis 8, 9.3).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What clients ask of goals: run, check, queue, renew, move, cancel, acknowledge."""
+"""Handles clients' requests on goals (run, check, queue, renew the lease, move set-points, cancel, acknowledge):
+accepts each, or refuses it with a reason.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""How goals begin and end: the active source, the queue behind it and the plans of both."""
+"""Start and end of goals: activates a goal's motion source, ends it with exactly one terminal event, and cancels
+queued goals and pending plans.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The marker body of a goal: where it is, its pose at the goal, and whether the cameras can see it there.
+"""The marker body of a goal: its current points, its pose at the goal (rigid displacement fitted to the set-points),
+and checks that the cameras can see it there, from its front and not mirrored.
 
 Three triangulated points would do for (7.21)-(7.24), but every marker of the goal says something. The displacement from
 the present to the goal is found by integrating the Cartesian law itself, which converges from anywhere, and refined on

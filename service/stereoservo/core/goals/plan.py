@@ -1,4 +1,4 @@
-"""Goals are planned before anything moves: a slice of work a step, while the arm goes on with what it does.
+"""Plans the path to a goal in slices over control steps before the arm moves; reports the path or refuses the goal.
 
 What comes out is told with the reply. Planned laws follow the plan; straight ones drive the straight way that was
 planned; free ones go their own way, so that only the goal itself can be refused.

@@ -1,4 +1,6 @@
-"""What a goal asks for, in the model's frame: set-points, body at the goal, centre, options; its law's first state."""
+"""Resolves a goal's target in the model's frame into set-points, body pose at the goal, centre and options, and
+creates the initial state of its control law. Refuses invalid targets.
+"""
 
 from __future__ import annotations
 

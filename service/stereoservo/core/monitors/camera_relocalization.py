@@ -1,10 +1,11 @@
-"""Cameras that have moved are found anew while the goal waits: brake, look at rest, ask for a model, verify, go on.
+"""Relocalization of moved cameras while the goal waits: brakes, averages observations at rest, requests a model with
+new camera matrices, verifies it, reprojects the goals' set-points and resumes.
 
-That it was the cameras, and not the arm, must be proven at rest (`diagnosis.doubt`); else nothing is found anew, no
-goal is carried over, and the goal stays held with what is known.
+That it was the cameras, and not the arm, must be proven at rest (`fault_isolation.doubt`); else no camera is
+relocalized, no goal is reprojected, and the goal stays held.
 
-The core only looks; `kinematics.calibration.reanchoring` makes the model, outside the servo process. What stands at
-rest keeps its innovation: where that changes, a camera was moved again, and all begins anew.
+The core only observes; `calibration.relocalization` makes the model, outside the servo process. What is static at rest
+keeps its innovation: where that changes, a camera was moved again, and all begins anew.
 """
 
 from __future__ import annotations

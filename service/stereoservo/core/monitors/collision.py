@@ -1,4 +1,5 @@
-"""Collision thresholds of efforts and following errors: stated in the cell file, or learnt from the trial motions.
+"""Collision thresholds of joint efforts and following errors, stated in the cell file or learnt from the calibration
+motion, and the test of the current loads against them.
 
 What `core.monitor` watches, joint by joint, while the arm moves by itself:
 

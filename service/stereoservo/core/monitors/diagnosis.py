@@ -1,4 +1,6 @@
-"""What follows from a diagnosis of the images: its event and reason, a marker left out, cameras relocalized."""
+"""Consequences of a fault diagnosis from the images: its event and status reason, exclusion of a slipped marker,
+relocalization of moved cameras. Also the initial state of the model monitor.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""One round of frames that the model does not explain: which change does, in the cell's names and in words.
+"""Fault isolation from frames that contradict the model: which change (camera, marker, joint zero, marker body)
+explains the innovations best, and whether moved cameras can be distinguished from a moved arm.
 
 All cameras moved as one, and an arm that stands elsewhere than its joints say (play, a zero, the marker body), look
 alike in the images of the arm. `doubt` says whether something else tells them apart.
@@ -76,7 +77,7 @@ def diagnosed(bench: Bench) -> ModelDiagnosis:
 class Bench:
     """One moment, with the arm at ``q`` (n,), as the cameras ``known`` saw it, for several questions.
 
-    ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `estimate.FrameSights`.
+    ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `prediction.FrameResiduals`.
     """
 
     def __init__(

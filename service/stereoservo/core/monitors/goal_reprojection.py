@@ -1,4 +1,5 @@
-"""What goals say in the pixels of cameras that have moved, said again in their new pixels.
+"""Reprojection of the set-points of running and waiting goals into relocalized cameras, so that the goals remain the
+same poses of the body.
 
 A re-anchored model keeps the frame, so what is stated in points stays true. Set-points are intersected with the cameras
 they were meant for, as the pose that they all fix where they fix one, and projected with the new ones (thesis 8.6).

@@ -1,4 +1,5 @@
-"""Cameras that move for good, adjusted on-line against the tool that the others see (thesis 9, fig. 9.1).
+"""Cameras declared mobile: re-estimated but unused while they move (from tool and other cameras), used again at rest
+(thesis 9, fig. 9.1).
 
 One that stands is a camera like any other. While it moves, laws go on without it: the model keeps it where it stood
 last, as after a drop-out, and in every frame a displacement of it is fitted to the markers where the joints, corrected

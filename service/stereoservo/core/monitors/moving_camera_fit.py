@@ -1,4 +1,6 @@
-"""The displacement of one camera that explains one of its frames, though some of its sights may be wrong."""
+"""Robust fit of the rigid displacement of one camera to one of its frames, with outliers rejected; and a test whether
+the innovations are those of a frame with a wrong time stamp.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""The calibration programme as a motion source: each joint alone, stop after stop.
+"""Motion source of calibration: moves each joint alone from a base posture, chooses its range by the images of a small
+first motion, and averages the markers' pixels at every stop.
 
 From the base, joint l goes in equal steps to one side, then to the other (thesis 5.4.1, fig. 5.13). How far it goes is
-stated in the cell file, or found out on the way (`trial_planning`): as far as the markers stay in every view. At a stop
+stated in the cell file, or found out on the way (`plan_sides`): as far as the markers stay in every view. At a stop
 the pixels are averaged at rest; a spread joint, where there is one, visits several positions there (fig. 5.16). A step
 that loses the markers is taken back and that side is closed.
 """

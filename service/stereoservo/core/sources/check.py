@@ -1,7 +1,8 @@
-"""The check motion as a motion source: a few stops around the base, evaluated against the model in use without a fit.
+"""Motion source of the model check: a few stops around the base posture at which the markers' pixels are averaged, to
+be tested against the model in use without a fit.
 
 At stop l joint l stands above, and the joint after it below its base, so that every joint is seen on both sides and
-against the others, with one stop a joint and the base. `kinematics.calibration.check` says what the pixels mean.
+against the others, with one stop a joint and the base. `calibration.change.model_check` evaluates the pixels.
 """
 
 from __future__ import annotations

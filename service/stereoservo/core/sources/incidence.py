@@ -1,4 +1,6 @@
-"""Incidences as a goal: points, lines and planes of the body onto ones of the scene (2.5.3), as a motion source."""
+"""Motion source of incidence goals, which bring points, lines and planes of the body onto ones of the scene (thesis
+2.5.3): start, joint velocity and end of the motion, and reasons why it stops short.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Goals in joint space: a straight line there, checked against limits and keep-outs before anything moves."""
+"""Motion source of goals in joint space: a straight line to target joints, checked against limits and keep-outs
+beforehand, at a velocity from which the arm can brake. Also its report, progress and predicted pixels.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A law as a motion source: from a goal's set-points to a joint velocity, until the error holds below its tolerance."""
+"""Motion source of visual servoing: drives the arm by a control law from a goal's set-points to joint velocities, with
+adaptive gain and tracking of a plan, until the error stays below its tolerance or the goal fails.
+"""
 
 from __future__ import annotations
 

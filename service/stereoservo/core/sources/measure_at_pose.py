@@ -1,4 +1,5 @@
-"""Measurement at a pose: move there, settle, and average the pixels of every marker; for calibration and taught goals.
+"""Measurement at joint positions, shared by calibration, model check and teaching: moves there, settles, and averages
+the raw pixels of every marker, with covariances.
 
 Pixels here are raw: no model is needed, and what is kept stays true when the lens becomes better known.
 """

@@ -1,4 +1,5 @@
-"""A goal that moves: set-points streamed by a client, filtered, carried on between messages, and fed forward.
+"""Moving goals: set-points streamed by a client, filtered, extrapolated between messages, and fed forward to the
+control law as a joint velocity.
 
 The client's stamps order its messages and give the target's velocity (`control.filters`); between two messages, and for
 a short while after the last, the target goes on as it went. A target that cannot be is refused and the former one kept.

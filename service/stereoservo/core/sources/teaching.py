@@ -1,4 +1,6 @@
-"""Showing the cell a goal: what the cameras see at rest, averaged, becomes an event with samples."""
+"""Teaching of a goal: averages the markers' pixels in all cameras while the arm rests, and emits them as an event for
+the gateway, which stores the goal.
+"""
 
 from __future__ import annotations
 

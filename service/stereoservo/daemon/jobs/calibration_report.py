@@ -1,4 +1,5 @@
-"""Report of a calibration as one self-contained HTML page: measurements, fit, and assessment.
+"""Report of a calibration as one self-contained HTML page: marker tracks, residuals by joint and camera, fit
+statistics, and assessment.
 
 A folder beside the model file, written whole or not at all, by the fit process once the model is safe.
 """

@@ -1,4 +1,5 @@
-"""Check process: evaluates the pixels of a check motion and reports on the model; short-lived and niced like a fit.
+"""Check job (own process): tests the model on a check motion, reports, and can save a model with zeros reset. Keeps
+the history of checks.
 
 ``python -m stereoservo.daemon.jobs.check_job CHECK.npz MODEL.json HISTORY.jsonl --limit-px X`` prints one JSON object:
 ``{"check": …}`` with the report, or ``{"error": …}`` with exit code 1. The report is added to the history. With

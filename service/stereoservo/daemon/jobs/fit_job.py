@@ -1,5 +1,5 @@
-"""Fit process: fits trial data and writes model and report; short-lived and niced, so that the loop is not
-disturbed.
+"""Fit job (own process, low priority): fits a model to trial data, prints progress, and writes the model file and its
+report.
 
 ``python -m stereoservo.daemon.jobs.fit_job TRIALS.npz MODEL.json --epoch N`` prints one JSON object a line:
 ``{"progress": …, "message": …}``, then ``{"model": …, "verdict": …}`` or ``{"error": …}``, and last ``{"report": …}``

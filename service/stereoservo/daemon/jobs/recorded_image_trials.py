@@ -1,4 +1,6 @@
-"""Trial data from a recording with images: the cell's detectors run on the frames taken while the arm was at rest."""
+"""Trial data from a recording with images: runs the cell's detectors on the frames taken at rest and averages the
+marker pixels of each stop, for a calibration without the arm.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Set-points from recorded images: means over a few frames of each camera, at rest."""
+"""Set-points of a goal from recorded images: mean pixel and standard deviation of each marker over a few frames of
+each camera, at rest.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Relocalization process: computes a model with relocalized cameras from observations at rest; short-lived and
-niced.
+"""Relocalization job (own process, low priority): computes a model with new matrices of moved cameras from
+observations at rest; and the collection of these observations for it.
 
 ``python -m stereoservo.daemon.jobs.relocalization_job SIGHTS.msgpack MODEL.json NEW.json --epoch N`` prints one JSON
 object: ``{"reanchored": …}`` once the new model is saved, or ``{"error": …}`` with exit code 1.

@@ -1,4 +1,6 @@
-"""Collection of ``calibration_sample`` events of the trial motions into trial data."""
+"""Collects the ``calibration_sample`` events of the calibration motion (mean marker pixels at each stop) into trial
+data for the fit.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Closed-form solutions of inverse kinematics subproblems: candidates per joint, not yet checked against the whole
-chain.
+"""Closed-form solutions of inverse kinematics subproblems: angles or positions of a few joints that bring points to
+targets (thesis 6), not yet checked against the whole chain.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Normal form of the goals of inverse kinematics: points at the zero, and targets scaled alike.
+"""Normal form of the goals of inverse kinematics: points at the joints' zero, and targets of the same homogeneous
+scale; planes that all joints leave fixed, and the Lie algebra of their motions.
 
 All displacements of a chain fix some plane, ``aᵀĤ_j = 0``: that at infinity, or one of a pencil where all axes are
 parallel. Either gives the scales that they preserve; which one it is does not matter here.

@@ -1,4 +1,6 @@
-"""Numerical inverse kinematics of chains without a closed form: descent from many start configurations."""
+"""Numerical inverse kinematics of chains without a closed form: descent from many start configurations to all isolated
+solutions, or to some of a continuum.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Recognition of the structure of a chain with a closed form: parallel axes, concurrent axes (thesis 6.3 to 6.7).
+"""Recognition of chains with closed-form inverse kinematics by chi-square tests: parallel axes, axes through a common
+point, prismatic joints (thesis 6.3 to 6.7).
 
 A calibrated chain is so only within its covariance. Each condition is a set of incidences that vanish: they are tested
 by chi-square against the covariance propagated to them. A small deviation that the calibration cannot distinguish

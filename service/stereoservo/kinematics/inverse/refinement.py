@@ -1,4 +1,6 @@
-"""Refinement of inverse kinematics solutions by the reprojection error over the joints (thesis 6.8)."""
+"""Refinement of inverse kinematics solutions over the joints by least squares of the reprojection error in the images,
+with covariance (thesis 6.8).
+"""
 
 from __future__ import annotations
 

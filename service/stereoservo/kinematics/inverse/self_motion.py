@@ -1,4 +1,6 @@
-"""Self-motions: joint motions that leave the goal reached, at singular configurations and of redundant arms."""
+"""Self-motions, joint motions that leave the goal reached, of redundant arms and at singular configurations: their
+directions, and the solution along them that is nearest to a seed or inside the joint limits.
+"""
 
 from __future__ import annotations
 

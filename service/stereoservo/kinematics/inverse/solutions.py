@@ -1,4 +1,6 @@
-"""Results of inverse kinematics: all solutions, a continuum of them, or the distance to an unreachable goal."""
+"""Results of inverse kinematics (all solutions, a continuum of them, or the distance to an unreachable goal), and the
+choice of whole joint turns near a seed and within limits.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Inverse kinematics of a projective chain: structure recognition, closed-form or numerical candidates, refinement,
-checks.
+"""Inverse kinematics of an arm in the cameras' projective frame, all configurations that reach a goal: recognition of
+the arm's structure, closed-form or numerical candidates, refinement, checks.
 
 In every stratum: operators and points suffice (thesis 6). Neither a metric nor the plane at infinity is used.
 """
