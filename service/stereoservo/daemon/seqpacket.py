@@ -1,4 +1,4 @@
-"""Message channels between processes: non-blocking unix SEQPACKET sockets, bounded, with record boundaries.
+"""Unix SEQPACKET sockets between processes: non-blocking, whole messages of bounded size, a server for many peers.
 
 A :class:`ChannelServer` accepts any number of peers or, with ``single=True``, keeps only the newest (a
 restarted gateway replaces the one that died). Nothing here blocks; a full socket is reported to the

@@ -1,5 +1,5 @@
-"""Robust estimation of translations from images of a moved scene, with outlier motions rejected (thesis 3.2.2,
-3.2.3).
+"""Plane at infinity and translation directions from images of a moved scene, with disagreeing motions rejected (thesis
+3.2.2, 3.2.3).
 
 Every motion is judged by itself, and then by the plane at infinity that most of them agree on. All thresholds
 follow from the noise of the pixels.

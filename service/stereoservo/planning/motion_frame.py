@@ -1,5 +1,5 @@
-"""Coordinate frame in which all motions of an arm are Euclidean rotations and translations, computed from its joint
-operators alone; and poses on closed-form paths in it.
+"""Frame in which the motions of an uncalibrated arm are Euclidean, from its joint operators and the plane at infinity;
+and the pose at each parameter of a path in it.
 
 The operators leave the plane at infinity and, in it, one quadratic form: ``SᵀQ + QS = 0`` for their action ``S`` on
 displacements (5.59). Its square root makes the frame. Nothing else is known or needed: the length of its unit is chosen

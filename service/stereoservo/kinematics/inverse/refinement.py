@@ -1,4 +1,4 @@
-"""Refinement of inverse kinematics solutions over the joints by least squares of the reprojection error in the images,
+"""Joint angles for the images of a goal: each start from inverse kinematics is refined to the least reprojection error,
 with covariance (thesis 6.8).
 """
 
