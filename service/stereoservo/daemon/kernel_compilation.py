@@ -27,6 +27,7 @@ from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.kernels import distort_pixel
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
 from stereoservo.messages.goals import (
     DEFAULT_LAW,
@@ -62,6 +63,7 @@ def warm_up() -> None:
         [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
     )
     seven = np.ones(7)  # a redundant arm's self-motion
+    distort_pixel(LENS, 1.0, 1.0)  # for the reported path of a joint goal
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
     runs: list[tuple[str, PointSource]] = [(DEFAULT_LAW, "triangulated")]
     runs.extend((law, "predicted") for law in LAWS)

@@ -30,6 +30,9 @@ def warm_up_planner() -> None:
     beyond = np.full(6, np.inf)
     beyond[0] = 0.7 * AWAY
     plan(_limited(request, position_max=beyond))
+    gantry = request.operators.copy()
+    gantry[3:] = 0.0  # it cannot turn: the refusal says which freedom it lacks
+    plan(msgspec.structs.replace(request, operators=gantry))
     plan(msgspec.structs.replace(request, targets=request.points, centre_target=request.centre))
 
 
