@@ -16,7 +16,7 @@ from .conftest import at_rest, eventually, processes
 
 pytestmark = pytest.mark.process
 
-FAKE_ARM = '[joints]\ndriver = "fake"\n'
+FAKE_ARM = '[joints]\ndriver = "fake"\n\n[joints.options]\ncommand_timeout_s = 0.4\n'
 """The cameras are under test: the arm behind them may be a light one."""
 
 
