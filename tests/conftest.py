@@ -1,8 +1,14 @@
 """Settings of the whole suite."""
 
 import os
+import subprocess
+import sys
+import tempfile
+import time
+from functools import partial
 from pathlib import Path
 
+import machine_stalls
 import pytest
 from hypothesis import settings
 
@@ -65,10 +71,47 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the fast ones before ``-m`` chooses."""
+    """Mark the fast ones before ``-m`` chooses. A test that failed runs again, three times at most, where the machine
+    stalled while it ran, and only there.
+    """
     for item in items:
         if is_fast(item.path) and item.get_closest_marker("slow") is None:
             item.add_marker("fast")
+        if item.config.getoption("--hil") is None:
+            item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=partial(machine_stalled, item)))
+
+
+STALLS = "STEREOSERVO_TESTS_STALLS"
+"""Environment variable of the file of this machine's stalls, for the workers of pytest-xdist."""
+RERUNS = 3
+STARTED_NS = pytest.StashKey[int]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """One process watches for stalls of the machine, for all workers."""
+    if hasattr(config, "workerinput"):
+        return
+    folder = tempfile.TemporaryDirectory(prefix="ssstalls")
+    os.environ[STALLS] = str(Path(folder.name) / "stalls")
+    watch = subprocess.Popen(
+        [sys.executable, machine_stalls.__file__, os.environ[STALLS]], stdin=subprocess.PIPE
+    )
+
+    def end() -> None:
+        watch.communicate(timeout=10.0)
+        folder.cleanup()
+
+    config.add_cleanup(end)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    item.stash[STARTED_NS] = time.monotonic_ns()
+
+
+def machine_stalled(item: pytest.Item) -> bool:
+    """Whether the machine stalled since a test's last start."""
+    return machine_stalls.longest_stall(Path(os.environ[STALLS]), item.stash[STARTED_NS]) > 0.0
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

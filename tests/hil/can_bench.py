@@ -20,7 +20,7 @@ from stereoservo_sim.demonstration.emulated import ANY_PORT, ANY_SERVER, move_to
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
 
-from .conftest import at_rest, eventually
+from .conftest import at_rest, eventually, recover
 
 RESTS_S = 0.2
 STANDS = 2e-4
@@ -161,15 +161,6 @@ def codes(client: Client) -> str:
 def lifecycle(client: Client, wanted: str) -> Callable[[], bool]:
     """Whether the cell is in that state."""
     return lambda: client.status().lifecycle == wanted
-
-
-def recover(client: Client) -> None:
-    """Reset where there is a fault, then enable: two acts, by an operator."""
-    if client.status().lifecycle == "fault":
-        client.reset()
-        eventually(f"reset: {codes(client)}", lifecycle(client, "inactive"))
-    if client.status().lifecycle != "active":
-        client.enable()
 
 
 def moving(bench: CanBench, client: Client) -> None:

@@ -177,8 +177,19 @@ def own(live: DaemonProcess) -> Iterator[Client]:
         yield _ready(client)
 
 
+def recover(client: Client) -> None:
+    """Reset where there is a fault, enable, resume where the arm is held: acts of an operator, one by one."""
+    if client.status().lifecycle == "fault":
+        client.reset()
+        eventually("the reset", lambda: client.status().lifecycle == "inactive")
+    if client.status().lifecycle != "active":
+        client.enable()
+    if {reason.code for reason in client.status().reasons} & {"HELD", "STOPPED"}:
+        client.resume()
+
+
 def _ready(client: Client) -> Client:
-    client.enable()
+    recover(client)
     goal = client.status().goal
     if goal:
         client.cancel(goal)

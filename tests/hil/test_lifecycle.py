@@ -65,7 +65,7 @@ def changed(cell_file: Path, old: str, new: str) -> Path:
     ("old", "new", "message"),
     [
         ("[servo]", "[servo]\nspeed = 1", "unknown field `speed`"),
-        ('driver = "fake"\n#', 'driver = "kuka"\n#', "no joint driver 'kuka'; there are:"),
+        ('driver = "fake"\n[joints', 'driver = "kuka"\n[joints', "no joint driver 'kuka'; there are:"),
         ('joint = "j6"', 'joint = "j7"', "j6"),
         (
             'driver = "fake"\nmount',
@@ -217,8 +217,8 @@ def test_ctrl_c_while_it_starts_leaves_nothing(start: Start, directories: CellDi
 # -- modes --------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_replays_bit_for_bit(calibrated: Path, start: Start, roots: Path) -> None:
-    path = roots / "flight.mcap"
+def test_a_recording_replays_bit_for_bit(calibrated: Path, start: Start, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
     daemon = start(calibrated, "--record", str(path))
     with Client(CELL) as client:
         client.enable()
@@ -249,15 +249,15 @@ def test_a_live_cell_is_recorded_on_demand(own: Client) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("[camera.options]\nmarker_drop_rate = 1.0\n", r"shows 0 markers .* at the base"),
-        ("[joints.options]\nfaults = { drop_writes_after = 40 }\n", r"j\d"),
+        ("[camera.options]\nmarker_drop_rate = 1.0", r"shows 0 markers .* at the base"),
+        ("faults = { drop_writes_after = 40 }", r"j\d"),
     ],
 )
 def test_a_calibration_that_cannot_succeed_ends_with_its_reason_and_the_arm_at_rest(
     options: str, message: str, cell_file: Path, start: Start
 ) -> None:
-    old = "# [joints.options]" if options.startswith("[joints") else "[servo]"
-    start(changed(cell_file, old, options + old))
+    old = "[servo]" if options.startswith("[") else "command_timeout_s"
+    start(changed(cell_file, old, f"{options}\n{old}"))
     with Client(CELL) as client:
         client.enable()
         with pytest.raises((FailedError, RefusedError), match=message):
@@ -292,7 +292,7 @@ def test_commissioning_caps_the_speed(calibrated: Path, start: Start) -> None:
 
 def test_a_daemon_that_does_not_start_tells_its_starter(cell_file: Path, start: Start) -> None:
     daemon = start(
-        changed(cell_file, 'driver = "fake"\n#', 'driver = "fake"\noptions = { colour = "red" }\n#'),
+        changed(cell_file, "command_timeout_s = 0.4", "colour = 'red'"),
         ready=False,
     )
     with pytest.raises(DaemonError, match="colour") as caught:
