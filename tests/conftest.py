@@ -8,9 +8,10 @@ import time
 from functools import partial
 from pathlib import Path
 
-import machine_stalls
 import pytest
 from hypothesis import settings
+
+import machine_stalls
 
 # Before numpy is loaded: on two shared cores the threads of OpenBLAS only wait for one another.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -4,8 +4,9 @@ import shutil
 import time
 from pathlib import Path
 
-import machine_stalls
 import pytest
+
+import machine_stalls
 
 pytest_plugins = ["pytester"]
 

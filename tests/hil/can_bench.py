@@ -20,7 +20,7 @@ from stereoservo_sim.demonstration.emulated import ANY_PORT, ANY_SERVER, move_to
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
 
-from .conftest import at_rest, eventually, recover
+from .conftest import at_rest, eventually
 
 RESTS_S = 0.2
 STANDS = 2e-4

@@ -11,8 +11,8 @@ import pytest
 from stereoservo.client import Client, GoalHandle
 from stereoservo.messages.wire import EventMessage
 
-from .can_bench import CanBench, codes, recover
-from .conftest import at_rest, eventually, processes
+from .can_bench import CanBench, codes
+from .conftest import at_rest, eventually, processes, recover
 
 pytestmark = pytest.mark.process
 

@@ -16,8 +16,8 @@ import pytest
 
 from stereoservo.client import Client, RefusedError
 
-from .can_bench import CanBench, codes, lifecycle, moving, recover, reset_is_refused
-from .conftest import at_rest, eventually, processes
+from .can_bench import CanBench, codes, lifecycle, moving, reset_is_refused
+from .conftest import at_rest, eventually, processes, recover
 
 pytestmark = pytest.mark.process
 
