@@ -80,25 +80,14 @@ def warm_up() -> None:
         )
         goal_id = "00000000-0000"
         for step in range(1, STEPS):
-            now_ns = 1_000_000_000 + step * PERIOD_NS
             command: Command | None = None
             if step == 5:
                 command = RunGoal(Goal(goal_id, target, law=law, points=points))
             elif step == STEPS - 5:
                 command = UpdateGoal(goal_id, target)
-            core.step(
-                StepInputs(
-                    now_ns=now_ns,
-                    period_ns=PERIOD_NS,
-                    joints=JointState(step, now_ns, np.zeros(6), np.zeros(6)),
-                    observations=tuple(
-                        _observation(name, pixels[c], step, now_ns) for c, name in enumerate(CAMERAS)
-                    ),
-                    requests=() if command is None else (Request(1, "warmup", command),),
-                    model_update=ModelUpdate(model) if step == 2 else None,
-                    driver_active=True,
-                )
-            )
+            requests = () if command is None else (Request(1, "warmup", command),)
+            inputs = _inputs(step, pixels, model)
+            core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
     _warm_up_fault_isolation(model, pixels)
 
 
@@ -109,21 +98,22 @@ def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
     core = ServoCore(msgspec.structs.replace(settings, cameras=static_cameras))
     moved = pixels + np.array([30.0, 0.0]) * np.array([1.0, 0.0])[:, None, None]
     for step in range(1, 12):
-        now_ns = 1_000_000_000 + step * PERIOD_NS
-        seen = moved if step > 6 else pixels
-        core.step(
-            StepInputs(
-                now_ns=now_ns,
-                period_ns=PERIOD_NS,
-                joints=JointState(step, now_ns, np.zeros(6), np.zeros(6)),
-                observations=tuple(
-                    _observation(name, seen[c], step, now_ns) for c, name in enumerate(CAMERAS)
-                ),
-                model_update=ModelUpdate(model) if step == 2 else None,
-            )
-        )
+        core.step(_inputs(step, moved if step > 6 else pixels, model))
     if core.state.reanchoring is None:
         raise AssertionError("the example cell's camera was moved, and the core did not detect it")
+
+
+def _inputs(step: int, pixels: FloatArray, model: CellModel) -> StepInputs:
+    """Inputs of a step: the arm at rest, a frame (c, m, 2) of every camera, the model in the second step."""
+    now_ns = 1_000_000_000 + step * PERIOD_NS
+    frames = tuple(_observation(name, seen, step, now_ns) for name, seen in zip(CAMERAS, pixels, strict=True))
+    return StepInputs(
+        now_ns=now_ns,
+        period_ns=PERIOD_NS,
+        joints=JointState(step, now_ns, np.zeros(6), np.zeros(6)),
+        observations=frames,
+        model_update=ModelUpdate(model) if step == 2 else None,
+    )
 
 
 def _observation(camera: str, pixels: FloatArray, step: int, now_ns: int) -> CameraObservation:

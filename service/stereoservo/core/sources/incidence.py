@@ -36,9 +36,9 @@ from stereoservo.core.goals.resolve import (
     run_fields,
     used_cameras,
 )
-from stereoservo.core.model_arrays import ModelArrays, with_unit_height
-from stereoservo.core.prediction import composition_of, points_now
-from stereoservo.core.sources.law import options, run_ended
+from stereoservo.core.model_arrays import with_unit_height
+from stereoservo.core.prediction import points_now
+from stereoservo.core.sources.law import options, run_ended, scene_of
 from stereoservo.core.state import IncidenceGoal
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.kernels import project_points, triangulate
@@ -199,7 +199,7 @@ def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> 
     """Raises RefusalError for incidences that no motion of the arm brings nearer."""
     assert context.weights is not None
     assert context.pixels is not None
-    scene = _scene(source, context, place.arrays, place.points, context.weights)
+    scene = scene_of(context, place.arrays, place.points, context.weights)
     step = incidence_step(scene, _task(source), options(source, context, None))
     if step.share < MAKEABLE:
         _has_freedoms(source, scene, place)
@@ -242,7 +242,7 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     points = points_now(
         arrays, context.q, prediction, pixels, usable, context.state.correction, source.points
     )
-    scene = _scene(source, context, arrays, points, usable)
+    scene = scene_of(context, arrays, points, usable)
     task, how = _task(source), options(source, context, source.error_px)
     second = _second(source, context, scene, how.gain)
     step = incidence_step(scene, task, how, second)
@@ -263,23 +263,6 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
 
 def _task(source: IncidenceGoal) -> IncidenceTask:
     return IncidenceTask(source.kinds, source.markers, source.fixed, source.tolerance_px)
-
-
-def _scene(
-    source: IncidenceGoal, context: StepContext, arrays: ModelArrays, points: FloatArray, weights: FloatArray
-) -> Scene:
-    prediction, pixels = context.prediction, context.pixels
-    assert prediction is not None
-    assert pixels is not None
-    return Scene(
-        prediction.operators,
-        composition_of(arrays),
-        arrays.matrices,
-        arrays.camera_centres,
-        points,
-        pixels,
-        weights,
-    )
 
 
 def _second(source: IncidenceGoal, context: StepContext, scene: Scene, gain: float) -> SecondTask:

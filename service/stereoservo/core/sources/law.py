@@ -119,6 +119,15 @@ def run_ended(
     return None
 
 
+def scene_of(context: StepContext, arrays: ModelArrays, points: FloatArray, weights: FloatArray) -> Scene:
+    """The present as laws take it: operators, cameras, points (m, 4), pixels and their weights (c, m)."""
+    prediction, pixels = context.prediction, context.pixels
+    assert prediction is not None
+    assert pixels is not None
+    matrices, centres = arrays.matrices, arrays.camera_centres
+    return Scene(prediction.operators, composition_of(arrays), matrices, centres, points, pixels, weights)
+
+
 def scene_and_task(
     source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray
 ) -> tuple[Scene, Task]:
@@ -129,15 +138,7 @@ def scene_and_task(
     points = points_now(
         arrays, context.q, prediction, pixels, weights, context.state.correction, source.points
     )
-    scene = Scene(
-        prediction.operators,
-        composition_of(arrays),
-        arrays.matrices,
-        arrays.camera_centres,
-        points,
-        pixels,
-        weights,
-    )
+    scene = scene_of(context, arrays, points, weights)
     task = Task(
         source.set_points,
         source.wanted,
