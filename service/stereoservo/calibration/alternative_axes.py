@@ -1,5 +1,5 @@
-"""Alternative joint axes as new start values for a metric bundle adjustment in a local minimum (which planar targets
-cause).
+"""New start values for a metric bundle adjustment in a local minimum (which planar targets cause): joint axes refitted,
+each to its own joint's trial from 26 directions, kept where the fit is significantly better.
 
 A plate that rotates nearly in its own plane determines its axis by small perspective effects only, and two axes may
 explain it almost alike. With cameras and markers known, each joint's trial is searched over all directions.

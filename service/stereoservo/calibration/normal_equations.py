@@ -1,5 +1,5 @@
-"""Normal equations of the calibration's bundle adjustment by blocks, for its steps; their triangular factor by QR and
-the leverages of measurements, for its statistics.
+"""Analytic Jacobian of the calibration's pixels, and from it the normal equations by blocks for the bundle adjustment's
+steps; a triangular factor by QR and the leverages of measurements for its statistics.
 
 A pixel depends on the generators, one camera, one lens and one marker. Rows of the Jacobian are made chunk by chunk, so
 that memory stays bounded and cost grows linearly with the images; markers, which no pixel shares, are eliminated from

@@ -1,5 +1,6 @@
-"""Velocity screws of camera, hand, tool and base: estimated from moving points, transferred between links, and turned
-into joint velocities (thesis 8.2).
+"""Velocity screws of camera, hand, tool and base: from moving points, between links, to and from joint velocities; the
+links between the model's frame, camera, tool and robot base; operators of robots that take Cartesian commands (thesis
+8.2).
 
 A screw is the velocity of a rigid motion: the vector ``(v, w)`` [m/s, rad/s] in a Euclidean frame, ``v`` the velocity
 of what passes the frame's origin; or the operator ``T̂ = [[w]ₓ v; 0 0]``, (4, 4), of which the conjugate ``Ĥ`` exists in
