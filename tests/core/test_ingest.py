@@ -8,9 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Goal, Jog, Resume, RunGoal
+from stereoservo.ports.devices import JointState
 
 HOUR_NS = 3_600_000_000_000
 DISPLACED = np.array([0.25, -0.2, 0.15, 0.4, -0.3, 0.5])
@@ -46,6 +48,14 @@ def servoing(bench: Any) -> Any:
     return bench
 
 
+def next_inputs(bench: Any) -> Any:
+    """What the bench's next step would get, before it is corrupted."""
+    bench.now_ns += 10_000_000
+    bench.seq += 1
+    joints = JointState(bench.seq, bench.now_ns, bench.q.copy(), np.zeros(6))
+    return StepInputs(bench.now_ns, 10_000_000, joints, driver_active=True)
+
+
 def kept(bench: Any) -> tuple[Any, ...]:
     """All that the core remembers of joint samples."""
     state = bench.core.state
@@ -60,6 +70,113 @@ def kept_of_cameras(bench: Any) -> tuple[Any, ...]:
         (e.last_seq, e.seen_ns.tobytes(), e.accepted_ns, e.frames, e.innovation.tobytes())
         for e in bench.core.state.cameras
     )
+
+
+# -- values -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "told"),
+    [
+        ("positions", np.nan, "position of joint j4 is nan"),
+        ("positions", np.inf, "position of joint j4 is inf"),
+        ("positions", 1e9, "position of joint j4 is 1e+09"),
+        ("velocities", np.nan, "velocity of joint j4 is nan"),
+        ("efforts", np.nan, "effort of joint j4 is nan"),
+        ("following_errors", np.inf, "following error of joint j4 is inf"),
+    ],
+)
+def test_a_joint_sample_with_an_impossible_value_stops_the_arm_and_is_not_kept(
+    bench: Any, field: str, value: float, told: str
+) -> None:
+    jogging(bench)
+    before = kept(bench)
+    values = bench.q.copy() if field == "positions" else np.zeros(6)
+    values[3] = value
+    inputs = next_inputs(bench)
+    sample = msgspec.structs.replace(inputs.joints, **{field: values})
+    outputs = bench.core.step(msgspec.structs.replace(inputs, joints=sample))
+    assert kept(bench) == before
+    (reason,) = [r for r in outputs.status.reasons if r.code == "JOINT_VALUE"]
+    assert told in reason.hint
+    assert bench.run(0.5).command.tobytes() == np.zeros(6).tobytes()
+    assert np.isfinite(bench.core.state.velocities).all()
+    assert bench.reply(Resume()).accepted
+    assert bench.reply(Jog({JOINT: -1.0}, 60.0)).accepted
+    assert bench.run(0.4).command[3] == pytest.approx(-1.0)
+
+
+def test_a_sample_of_a_wrong_length_is_refused(bench: Any) -> None:
+    jogging(bench)
+    inputs = next_inputs(bench)
+    sample = msgspec.structs.replace(inputs.joints, positions=np.zeros(5))
+    outputs = bench.core.step(msgspec.structs.replace(inputs, joints=sample))
+    (reason,) = [r for r in outputs.status.reasons if r.code == "JOINT_VALUE"]
+    assert "shape (5,), the cell has 6 joints" in reason.hint
+
+
+def test_a_joint_that_jumps_while_the_drives_are_on_stops_the_arm(bench: Any) -> None:
+    jogging(bench)
+    bench.zero_offset[2] = 0.3
+    (reason,) = [r for r in bench.step().status.reasons if r.code == "JOINT_JUMP"]
+    assert (reason.subject, reason.value) == ("j3", pytest.approx(0.3, abs=0.02))
+    assert reason.threshold == pytest.approx(0.07)
+    rest = bench.run(0.5).command  # None: the drives are off, for the joint is elsewhere than it was sent
+    assert rest is None or not rest.any()
+
+
+def test_an_encoder_that_is_set_while_the_drives_are_off_begins_a_new_history(bench: Any) -> None:
+    bench.run(0.5)
+    bench.zero_offset[2] = 1.5
+    outputs = bench.step()
+    assert bench.core.state.history.count == 1
+    assert not bench.core.state.velocities.any()
+    assert "JOINT_JUMP" not in codes(outputs)
+
+
+@pytest.mark.parametrize("number", [2**62, 2**31])
+def test_a_frame_with_a_wild_number_blinds_no_camera(bench: Any, number: int) -> None:
+    servoing(bench)
+    while not bench.pending or bench.pending[0].t_received_ns > bench.now_ns + 10_000_000:
+        bench.step()
+    bench.pending[0] = msgspec.structs.replace(bench.pending[0], seq=number)
+    bench.step()
+    frames = [estimate.frames for estimate in bench.core.state.cameras]
+    bench.run(0.4)
+    assert all(e.frames >= before + 9 for e, before in zip(bench.core.state.cameras, frames, strict=True))
+    assert bench.ended().kind == "goal_reached"
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"pixels": np.full((8, 2), np.nan)}, "marker 0 is at [nan, nan] in an image of 640x480"),
+        ({"pixels": np.full((8, 2), 1e5)}, "marker 0 is at [100000.0, 100000.0]"),
+        ({"covariances": np.zeros((8, 2, 2))}, "marker 0 has the covariance"),
+        ({"pixels": np.zeros((7, 2))}, "8 markers have pixels (7, 2)"),
+        ({"ids": np.arange(300)}, "300 markers, 256 are allowed"),
+    ],
+)
+def test_a_frame_that_cannot_be_stops_what_works_by_images(
+    bench: Any, change: dict[str, Any], told: str
+) -> None:
+    servoing(bench)
+    while not bench.pending or bench.pending[0].t_received_ns > bench.now_ns + 10_000_000:
+        bench.step()
+    assert len(bench.pending[0].ids) == 8
+    bench.pending[0] = msgspec.structs.replace(bench.pending[0], **change)
+    (reason,) = [r for r in bench.step().status.reasons if r.code == "CAMERA_VALUE"]
+    assert told in reason.hint
+    assert bench.core.state.stopped
+
+
+def test_a_model_that_is_not_finite_is_refused(bench: Any) -> None:
+    bench.ready()
+    model = bench.truth.model
+    wrong = msgspec.structs.replace(model, marker_points=np.where(model.marker_points > 1e9, 0.0, np.nan))
+    outputs = bench.step(model_update=ModelUpdate(wrong))
+    assert "model has marker points that are not finite" in outputs.events[0].message
+    assert bench.core.state.model is model
 
 
 # -- joints -------------------------------------------------------------------------------------------------

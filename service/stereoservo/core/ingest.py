@@ -1,8 +1,8 @@
-"""Stage 1 of a core step: accepts or rejects joint samples and camera frames by time stamp and sequence number, keeps
-the history of the joints, and follows the lifecycle of the joint driver. Also the time-outs of these inputs.
+"""Stage 1 of a core step: accepts or rejects joint samples and camera frames by time stamp, sequence number and values,
+keeps the history of the joints, and follows the lifecycle of the joint driver. Also the time-outs of these inputs.
 
 Stamps and ``now_ns`` are of one clock, and the servo process takes ``now_ns`` after it has read everything: a sample
-of the future is wrong, however little.
+of the future is wrong, however little. What is refused is not stored, so that one wrong sample spoils no later one.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.core.context import Ingested, StepContext
-from stereoservo.core.cycle import StepInputs
 from stereoservo.core.move import MOTION_SOURCES
-from stereoservo.core.settings import CoreSettings
+from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.core.state import HISTORY, CoreState, JointHistory, Refused
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
@@ -24,6 +23,15 @@ LONGEST_GAP_S = 0.5
 """Without a step for so long the arm stops, however patient its drives are: it moves unwatched meanwhile."""
 LEAST_GAP_PERIODS = 2
 """A step that comes one period late is no gap, however impatient the drives are."""
+FASTEST = 2.0
+"""Times its ``velocity_max`` a joint cannot move."""
+STAMP_JITTER_S = 0.05
+"""By which the stamps of two joint samples may be off, on top of which a jump counts as one."""
+FARTHEST = 1e6
+"""[rad or m] No joint is so far from its zero."""
+MAX_MARKERS = 256
+"""Of one frame, at most."""
+LARGEST_SIGMA_PX = 1e4
 FRESH_S = 0.15
 FRESH_FRAMES = 2.5  # without a frame for so many periods a law is said to coast
 
@@ -34,12 +42,14 @@ def ingest(context: StepContext) -> Ingested:
     Of what is refused nothing is kept but the count and the reason. After a gap the drives were left alone, and the
     last command is not what they do: commands begin from rest.
     """
+    if context.inputs.now_ns < context.state.last_step_ns:
+        _forget_stamps(context.state)
     ingested = context.ingested = _passed(context)
     _count_refused(ingested, context)
     if ingested.gap is not None:
         context.state.command = np.zeros_like(context.state.command)
         forget_travel(context.state)
-    context.q = _append_joints(ingested.joints, context.state)
+    context.q = _append_joints(ingested.joints, context)
     _follow_driver(context)
     return ingested
 
@@ -51,11 +61,11 @@ def _passed(context: StepContext) -> Ingested:
         inputs.now_ns - state.last_step_ns if state.last_step_ns else context.derived.nominal_period_ns
     )
     gap = _gap(elapsed_ns * 1e-9, context)
-    joints, refused_joints = _joints(inputs, state, context.settings)
+    joints, refused_joints = _joints(context)
     observations, refused_frames = _observations(context)
     stops = [reason for reason in (gap, refused_joints) if reason is not None]
     if MOTION_SOURCES[type(state.source)].by_images:
-        stops.extend(reason for _, reason in refused_frames if reason.code == "CAMERA_STAMP")
+        stops.extend(reason for _, reason in refused_frames if reason.level == "hold")
     return Ingested(
         joints=joints,
         observations=observations,
@@ -81,10 +91,26 @@ def _count_refused(ingested: Ingested, context: StepContext) -> None:
         _count(state.refused_frames[camera], reason)
 
 
-def _append_joints(sample: JointState | None, state: CoreState) -> FloatArray:
-    """Append a new joint sample to the history; return the newest positions (zero before the first)."""
+def _forget_stamps(state: CoreState) -> None:
+    """The clock went back: what was stamped before is of a time to come, and would refuse all that is new."""
+    state.history.count = 0
+    state.last_joints_ns, state.last_joints_seq = 0, -1
+    for estimate in state.cameras:
+        estimate.last_seq, estimate.accepted_ns = -1, 0
+        estimate.seen_ns[:] = 0
+
+
+def _append_joints(sample: JointState | None, context: StepContext) -> FloatArray:
+    """Append a new joint sample to the history; return the newest positions (zero before the first).
+
+    The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
+    """
+    state = context.state
     history = state.history
     if sample is not None:
+        if _jump(sample, context) is not None:
+            history.count = 0
+            state.velocities = np.zeros_like(state.velocities)
         if history.count > 0:
             elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
             previous = history.positions[(history.count - 1) % HISTORY]
@@ -175,23 +201,71 @@ def _gap(gap_s: float, context: StepContext) -> Reason | None:
     )  # fmt: skip
 
 
-def _joints(
-    inputs: StepInputs, state: CoreState, settings: CoreSettings
-) -> tuple[JointState | None, Reason | None]:
+def _joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
     """The joint sample, or why it is refused; neither where there is none or it was here before."""
+    inputs, state = context.inputs, context.state
     sample = inputs.joints
     if sample is None or sample.seq == state.last_joints_seq or sample.t_ns <= state.last_joints_ns:
         return None, None
     age_s = (inputs.now_ns - sample.t_ns) * 1e-9
-    timeout_s = settings.limits.joint_timeout_s
-    if 0.0 <= age_s <= timeout_s:
-        return sample, None
-    what = (
-        f"{age_s:.3f} s old, {timeout_s:g} s is allowed" if age_s > 0.0 else f"{-age_s:.6g} s in the future"
-    )
-    return None, Reason(
-        "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
-        f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then resume",
+    timeout_s = context.settings.limits.joint_timeout_s
+    if not 0.0 <= age_s <= timeout_s:
+        what = (
+            f"{age_s:.3f} s old, {timeout_s:g} s is allowed"
+            if age_s > 0.0
+            else f"{-age_s:.6g} s in the future"
+        )
+        return None, Reason(
+            "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
+            f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then "
+            "resume",
+        )  # fmt: skip
+    wrong = _wrong_values(sample, context.settings.joint_names)
+    if wrong:
+        return None, Reason(
+            "JOINT_VALUE", "hold", "", None, None, "",
+            f"joint sample {sample.seq} is refused: {wrong}: check the drive, its encoder and the joint driver; then "
+            "resume",
+        )  # fmt: skip
+    reason = _jump(sample, context) if state.lifecycle == Lifecycle.ACTIVE else None
+    return (sample, None) if reason is None else (None, reason)
+
+
+def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
+    """What cannot be in the values of a joint sample; empty where they may be right."""
+    for what, values in (
+        ("position", sample.positions),
+        ("velocity", sample.velocities),
+        ("effort", sample.efforts),
+        ("following error", sample.following_errors),
+    ):
+        if values is None:
+            continue
+        if values.shape != (len(names),):
+            return f"it has {what} values of shape {values.shape}, the cell has {len(names)} joints"
+        possible = np.abs(values) <= FARTHEST if what == "position" else np.isfinite(values)
+        if not possible.all():
+            j = int(np.flatnonzero(~possible)[0])
+            return f"the {what} of joint {names[j]} is {values[j]:g}"
+    return ""
+
+
+def _jump(sample: JointState, context: StepContext) -> Reason | None:
+    """The reason where a joint cannot have come from its last position to this one in the time between."""
+    state, settings = context.state, context.settings
+    if state.history.count == 0:
+        return None
+    elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
+    travel = np.abs(sample.positions - state.history.positions[(state.history.count - 1) % HISTORY])
+    possible = settings.limits.velocity_max * (FASTEST * elapsed_s + STAMP_JITTER_S)
+    if (travel <= possible).all():
+        return None
+    j = int((travel / possible).argmax())
+    name, value, limit = settings.joint_names[j], float(travel[j]), float(possible[j])
+    return Reason(
+        "JOINT_JUMP", "hold", name, value, limit, "",
+        f"the position of joint {name} changed by {value:.4g} within {elapsed_s * 1e3:.3g} ms, {limit:.4g} is "
+        "possible: check its encoder, cable and coupling; then resume",
     )  # fmt: skip
 
 
@@ -200,25 +274,63 @@ def _observations(
 ) -> tuple[tuple[tuple[int, CameraObservation], ...], tuple[tuple[int, Reason], ...]]:
     """New observations with the index of their camera, and the reasons of refused ones.
 
-    A frame that is too old stops nothing: the law coasts as if it had been lost, and brakes in time.
+    A frame that is too old stops nothing: the law coasts as if it had been lost, and brakes in time. A camera that
+    counts its frames anew is known by their stamps, which are checked; numbers alone are not trusted.
     """
     inputs = context.inputs
     cameras = {camera.name: k for k, camera in enumerate(context.settings.cameras)}
-    newest = [estimate.last_seq for estimate in context.state.cameras]
+    newest = [(estimate.last_seq, estimate.accepted_ns) for estimate in context.state.cameras]
     timeout_s = context.derived.frame_timeout_s
     passed: list[tuple[int, CameraObservation]] = []
     refused: list[tuple[int, Reason]] = []
     for observation in inputs.observations:
         camera = cameras.get(observation.camera)
-        if camera is None or observation.seq <= newest[camera]:
+        if camera is None or observation.seq == newest[camera][0]:
+            continue
+        if observation.seq < newest[camera][0] and observation.t_shutter_ns <= newest[camera][1]:
             continue
         age_s = (inputs.now_ns - observation.t_shutter_ns) * 1e-9
-        if 0.0 <= age_s <= timeout_s:
-            newest[camera] = observation.seq
-            passed.append((camera, observation))
-        else:
+        if not 0.0 <= age_s <= timeout_s:
             refused.append((camera, _refused_frame(observation, age_s, timeout_s)))
+            continue
+        wrong = _wrong_sights(observation, context.settings.cameras[camera])
+        if wrong:
+            refused.append((camera, _impossible_frame(observation, wrong)))
+            continue
+        newest[camera] = observation.seq, max(newest[camera][1], observation.t_shutter_ns)
+        passed.append((camera, observation))
     return tuple(passed), tuple(refused)
+
+
+def _wrong_sights(observation: CameraObservation, camera: CameraSettings) -> str:
+    """What cannot be in the markers of a frame; empty where they may be right."""
+    count = len(observation.ids)
+    if count > MAX_MARKERS:
+        return f"it has {count} markers, {MAX_MARKERS} are allowed"
+    pixels, covariances = observation.pixels, observation.covariances
+    if pixels.shape != (count, 2) or covariances.shape != (count, 2, 2):
+        return f"{count} markers have pixels {pixels.shape} and covariances {covariances.shape}"
+    inside = np.abs(pixels / (camera.width, camera.height) - 0.5).max(axis=1, initial=0.0) <= 1.5
+    largest = np.abs(covariances).reshape(count, 4).max(axis=1, initial=0.0).reshape(count, 1, 1)
+    known = np.where(largest <= LARGEST_SIGMA_PX**2, covariances, 0.0)
+    determinants = known[:, 0, 0] * known[:, 1, 1] - known[:, 0, 1] * known[:, 1, 0]
+    precise = (known[:, 0, 0] > 0.0) & (determinants > 0.0)
+    outside, vague = np.flatnonzero(~inside), np.flatnonzero(~precise)
+    if not outside.size + vague.size:
+        return ""
+    k = int(outside[0] if outside.size else vague[0])
+    marker = observation.ids[k]
+    if outside.size:
+        return f"marker {marker} is at {pixels[k].tolist()} in an image of {camera.width}x{camera.height}"
+    return f"marker {marker} has the covariance {covariances[k].tolist()}"
+
+
+def _impossible_frame(observation: CameraObservation, wrong: str) -> Reason:
+    return Reason(
+        "CAMERA_VALUE", "hold", observation.camera, None, None, "",
+        f"frame {observation.seq} of camera {observation.camera} is refused: {wrong}: check its detector and driver; "
+        "then resume",
+    )  # fmt: skip
 
 
 def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: float) -> Reason:

@@ -70,7 +70,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
     centres = np.array([camera_centre(P) for P in matrices])
     scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
     scene_pixels, _ = project_points(matrices, scene)
-    return ModelArrays(
+    arrays = ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
         zero=np.ascontiguousarray(model.zero, dtype=np.float64),
@@ -88,6 +88,18 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         scene_pixels=scene_pixels,
         rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
     )
+    for name in (
+        "generators",
+        "zero",
+        "matrices",
+        "lenses",
+        "marker_points",
+        "plane_at_infinity",
+        "camera_centres",
+    ):
+        if not np.isfinite(getattr(arrays, name)).all():
+            raise ValueError(f"model has {name.replace('_', ' ')} that are not finite: calibrate again")
+    return arrays
 
 
 def _metric_basis(model: CellModel) -> FloatArray | None:

@@ -1,4 +1,4 @@
-"""Cartesian path of a body: its displacement (4, 4) at a path parameter in [0, 1], composed of the translation, hinge and
+"""Cartesian path of a body: displacement (4, 4) at a path parameter in [0, 1], composed of the translation, hinge and
 planar turn of a decomposition made beforehand, each with its own profile (thesis 7.4.3).
 
 ``H_c(σ) = exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p)``: the translation leftmost, so that no rotation changes its
