@@ -140,3 +140,15 @@ def test_a_driver_error_is_a_failed_check(doctor: Doctor, examination: Examinati
     assert code == 1
     assert checks[-1]["message"] == "no adapter at /dev/ttyACM0"
     assert checks[-1]["ok"] is False
+
+
+def test_a_cell_with_one_camera_fails(cell: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    first, found, _second = cell.read_text().partition("[[camera]]")
+    one, again, _rest = _second.partition("[[camera]]")
+    assert found
+    assert again
+    cell.write_text(f"{first}{found}{one}")
+    capfd.readouterr()
+    assert cli.invoke(["doctor", str(cell), "--seconds", "0", "--json"]) == 1
+    checks = json.loads(capfd.readouterr().out)["error"]["checks"]
+    assert [check["name"] for check in checks if check["ok"] is False] == ["stereo"]

@@ -103,6 +103,10 @@ def test_trial_motions_that_end_early_say_the_code_of_their_reason(
     path.write_text(text.replace("[calibration]\n", "[calibration]\nmin_markers = 90\n"))
     start(path)
     code, result = run("calibrate", CELL)
+    assert (code, result["error"]["code"]) == (1, "not_enabled")
+    with Client(CELL) as client:
+        assert client.status().lifecycle == "inactive"
+    code, result = run("calibrate", CELL, "--enable")
     assert (code, result["error"]["code"]) == (1, "MARKERS_NOT_SEEN")
     (reason,) = result["error"]["reasons"]
     assert reason["threshold"] == 90

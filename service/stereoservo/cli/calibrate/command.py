@@ -76,6 +76,12 @@ LinesOption = Annotated[
     ),
 ]
 LinesSigmaOption = Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")]
+EnableOption = Annotated[
+    bool,
+    typer.Option(
+        "--enable", help="Switch the drives on first; else a cell whose drives are off is left alone."
+    ),
+]
 OutputOption = Annotated[
     Path | None,
     typer.Option("--output", metavar="FILE.json", help="With --trials, --images: where the model goes."),
@@ -92,13 +98,15 @@ def calibrate(
     lines: LinesOption = None,
     lines_sigma: LinesSigmaOption = 0.3,
     output: OutputOption = None,
+    enable: EnableOption = False,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:
     """Move each joint alone, watch the markers, fit the cell's model. Ctrl-C stops the arm.
 
-    With the path of a cell file and no daemon running, one is started for the time of it.
+    With the path of a cell file and no daemon running, one is started for the time of it, and its drives are switched
+    on. Of a daemon that runs, a person has enabled the drives before, or gives ``--enable``.
     """
     if (reset_zeros or unattended) and not check:
         raise CommandError("argument", "--reset-zeros and --unattended go with --check")
@@ -127,15 +135,16 @@ def calibrate(
             try:
                 find_daemon(cell)
             except NotRunningError:
-                note("no daemon runs for this cell: starting one")
+                note("no daemon runs for this cell: starting one, and switching the drives on")
+                enable = True
                 stack.enter_context(DaemonProcess(Path(cell))).wait_ready()
         client = stack.enter_context(
             Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check)
         )
         if unattended:
             _must_be_idle(client)
-        elif client.status().lifecycle == "inactive":
-            client.enable()
+        else:
+            _enabled(client, enable)
         try:
             if reset_zeros:
                 _reset_zeros(client, json)
@@ -162,6 +171,20 @@ def _failure(error: FailedError, **data: Any) -> CommandError:
     if error.event.reasons:
         data["reasons"] = msgspec.to_builtins(error.event.reasons)
     return CommandError(error.code, str(error), **data)
+
+
+def _enabled(client: Client, enable: bool) -> None:
+    """See that the drives are on. Raises CommandError where they are off and nobody said to enable them."""
+    if client.status().lifecycle != "inactive":
+        return
+    if not enable:
+        raise CommandError(
+            "not_enabled",
+            f"the drives of cell {client.cell!r} are off, and calibrating moves the arm: see that nobody is near it, "
+            f"then `stereoservo enable {client.cell}`, or calibrate with --enable",
+            lifecycle="inactive",
+        )
+    client.enable()
 
 
 def _must_be_idle(client: Client) -> None:

@@ -121,6 +121,19 @@ def _rates(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     )
 
 
+def _stereo(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
+    """Finding on the number of cameras: one alone tells nothing of depth, so that no model can be learnt."""
+    count = len(plan.cell.camera)
+    if count > 1:
+        return ExaminationFinding("stereo", True, f"{count} cameras")
+    return ExaminationFinding(
+        "stereo",
+        False,
+        "the cell has 1 camera, two are needed: it can never be calibrated, and without a model only joint goals run",
+        "another [[camera]] that sees the markers, mounted as the first one",
+    )
+
+
 def _wire(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     try:
         config = gateway_config(plan.cell, Path(plan.cell_path).parent, directories.zenoh_socket)
@@ -183,6 +196,7 @@ def _disk(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
 CHECKS: tuple[Callable[[RunPlan, CellDirectories], ExaminationFinding], ...] = (
     _daemon,
     _rates,
+    _stereo,
     _wire,
     _model,
     _taught,
