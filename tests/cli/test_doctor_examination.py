@@ -13,6 +13,7 @@ from stereoservo.cli import main as cli
 from stereoservo.cli.doctor import joints as examination_module
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.servo import make_driver
+from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
 from stereoservo.ports.devices import Clock, DriverError, ExaminationFinding
@@ -143,11 +144,9 @@ def test_a_driver_error_is_a_failed_check(doctor: Doctor, examination: Examinati
 
 
 def test_a_cell_with_one_camera_fails(cell: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    first, found, _second = cell.read_text().partition("[[camera]]")
-    one, again, _rest = _second.partition("[[camera]]")
-    assert found
-    assert again
-    cell.write_text(f"{first}{found}{one}")
+    first, _, rest = cell.read_text().rpartition("[[camera]]")
+    cell.write_text(first + rest[rest.index("\n[") :])
+    assert len(load_cell_file(cell).camera) == 1
     capfd.readouterr()
     assert cli.invoke(["doctor", str(cell), "--seconds", "0", "--json"]) == 1
     checks = json.loads(capfd.readouterr().out)["error"]["checks"]
