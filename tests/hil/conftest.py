@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import tempfile
 import time
@@ -16,6 +15,7 @@ from stereoservo.cli import main as cli
 from stereoservo.client import Client
 from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import DaemonProcess
+from stereoservo_sim.benchmarks.faults_service import processes_of
 
 CELL = "hil"
 QUICK_CALIBRATION = """
@@ -36,26 +36,8 @@ def eventually(what: str, wanted: Callable[[], object], timeout_s: float = 20.0)
 
 
 def processes(directories: CellDirectories) -> dict[str, int]:
-    """Live processes of a cell by what they are, found by its runtime directory on their command lines."""
-    found = {}
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            words = (entry / "cmdline").read_bytes().decode().split("\0")
-            state = re.search(r"^State:\s+(\w)", (entry / "status").read_text(), re.MULTILINE)
-        except OSError:
-            continue
-        if str(directories.runtime) in words and state is not None and state[1] not in "ZX":
-            module = next((word for word in words if word.startswith("stereoservo.")), "?").rpartition(".")[2]
-            module = "gateway" if module == "process" else module
-            name = (
-                f"{module}-{words[words.index(str(directories.runtime)) + 2]}"
-                if module == "vision"
-                else module
-            )
-            found[name] = int(entry.name)
-    return found
+    """Live processes of a cell by what they are."""
+    return processes_of(directories.runtime)
 
 
 @pytest.fixture(scope="session")

@@ -1,13 +1,17 @@
-"""``bench faults``: injects every fault of the CAN arm and measures the time to detection and to rest."""
+"""``bench faults``: injects every fault of the CAN arm and of the service, and measures the time to detection and to
+rest.
+"""
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import msgspec
 from rich.console import Console
 from rich.table import Table
 
+from stereoservo_sim.benchmarks.faults_service import run_service
 from stereoservo_sim.benchmarks.faults_wall import run_wall
 from stereoservo_sim.emulators.bus.fault_cases import CASES
 from stereoservo_sim.emulators.bus.fault_table import run_row
@@ -26,9 +30,10 @@ WALL_SHARE = 3
 
 
 def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``rows``: in the emulator's bit time, ``repetitions`` trials a fault, alike for one seed. ``wall``: in real time.
+    """``rows``: of the drives in the emulator's bit time, ``repetitions`` trials a fault, alike for one seed. ``wall``:
+    of the drives in real time. ``service``: of the whole daemon in real time.
 
-    Raises ExperimentError where a trial cannot begin or the emulated drives end.
+    Raises ExperimentError where a trial cannot begin, or the emulated drives or a daemon end.
     """
     cases = [(protocol, case) for protocol, those in CASES.items() for case in those]
     rows = []
@@ -41,6 +46,7 @@ def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
     wall = run_wall(
         max(repetitions // WALL_SHARE, 1), lambda done, total: progress("faults in real time", done, total)
     )
+    service = run_service(max(repetitions // WALL_SHARE, 1), _tell_row)
     return {
         "axes": AXES,
         "rate_hz": RATE_HZ,
@@ -48,7 +54,17 @@ def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
         "ok": all(row.ok for row in rows),
         "rows": [msgspec.to_builtins(row) for row in rows],
         "wall": wall,
+        "service": service,
     }
+
+
+def _tell_row(row: dict[str, Any]) -> None:
+    """One row of the service as it comes, on stderr."""
+    print(
+        f"{row['fault']}: rest {_summary(row['rest_ms'])} ms of {row['bound_ms']}, within {row['within']} of "
+        f"{row['trials']}, after {', '.join(row['after'])}",
+        file=sys.stderr,
+    )
 
 
 def show_faults(figures: dict[str, Any], console: Console) -> None:
@@ -58,6 +74,7 @@ def show_faults(figures: dict[str, Any], console: Console) -> None:
         for problem in row["problems"]:
             console.print(f"{row['protocol']}, {row['fault']}: {problem}")
     console.print(_wall_table(figures["wall"]))
+    console.print(_service_table(figures["service"]))
     loop = figures["wall"]["emulator_loop"]
     if loop is not None:
         console.print(
@@ -123,6 +140,36 @@ def _wall_table(wall: dict[str, Any]) -> Table:
             ", ".join(row["codes"]) or "-",
             str(row["restarts"]),
             str(len(row["stalled"])),
+        )
+    return table
+
+
+def _service_table(rows: list[dict[str, Any]]) -> Table:
+    title = "the whole service in real time: emulated drives on slcan, a joint goal; [ms], median / max"
+    table = Table(title=title, title_justify="left")
+    for name in (
+        "fault",
+        "all at rest",
+        "bound",
+        "within",
+        "after",
+        "status right",
+        "status says",
+        "ends of the goal",
+        "void",
+    ):
+        table.add_column(name)
+    for row in rows:
+        table.add_row(
+            row["fault"],
+            _summary(row["rest_ms"]) if row["rest_ms"] else "goes on",
+            "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
+            f"{row['within']} of {row['trials']}",
+            ", ".join(row["after"]),
+            f"{row['status_right']} of {row['trials']}",
+            " | ".join(row["status_says"]),
+            ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"]),
+            str(len(row["void"])),
         )
     return table
 

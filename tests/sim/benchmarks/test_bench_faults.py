@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.benchmarks import faults, faults_wall
+from stereoservo_sim.benchmarks import faults, faults_service, faults_wall
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 
@@ -37,9 +37,24 @@ WALL = {
 }
 
 
+SERVICE = {
+    "fault": "servo killed",
+    "bound_ms": 180.0,
+    "rest_ms": {"repetitions": 1, "median": 23.3, "max": 23.3},
+    "within": 1,
+    "after": ["gone"],
+    "status_right": 1,
+    "status_says": ["no daemon runs"],
+    "terminal_events": [1],
+    "trials": 1,
+    "void": [],
+}
+
+
 def test_rows_and_tables(one_case, monkeypatch):
     asked = []
     monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: asked.append(repetitions) or WALL)
+    monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [SERVICE])
     figures = faults.run_faults(2, 5, lambda stage, done, total: None)
     (row,) = figures["rows"]
     assert asked == [1]
@@ -50,7 +65,15 @@ def test_rows_and_tables(one_case, monkeypatch):
     console = Console(width=200, file=io.StringIO(), markup=False)
     faults.show_faults(figures, console)
     text = console.file.getvalue()
-    for word in ("drive error", "drive_fault 2", "31.5 / 33.2", "2.50 ms late", "12.5 ms"):
+    for word in (
+        "drive error",
+        "drive_fault 2",
+        "31.5 / 33.2",
+        "2.50 ms late",
+        "12.5 ms",
+        "servo killed",
+        "no daemon runs",
+    ):
         assert word in text
 
 
@@ -58,10 +81,31 @@ def test_a_problem_is_printed_and_the_table_not_ok(one_case, monkeypatch):
     impossible = FaultCase(name="too strict", orders=("fault 3 0x20",), codes=("drive_fault",), bound_ms=1.0)
     monkeypatch.setattr(faults, "CASES", {"odrive": (impossible,)})
     monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: WALL)
+    monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [])
     figures = faults.run_faults(1, 0, lambda stage, done, total: None)
     assert not figures["ok"]
     (problem,) = figures["rows"][0]["problems"]
     assert problem.startswith("at rest after")
+
+
+FEW = ("stop slot raised", "servo killed", "vision killed", "client killed while it jogs")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("names", [FEW, pytest.param((), marks=pytest.mark.slow)])
+def test_faults_of_the_service(names):
+    chosen = tuple(fault for fault in faults_service.FAULTS if not names or fault.name in names)
+    assert len(chosen) >= len(FEW)
+    told = []
+    rows = faults_service.run_service(1, told.append, chosen)
+    assert told == rows
+    for fault, row in zip(chosen, rows, strict=True):
+        assert row["trials"] == 1, row
+        assert row["after"] == [fault.after], row
+        assert row["status_right"] == 1, row
+        assert (row["rest_ms"] is None) == (fault.bound_ms is None), row
+        if not fault.jogs:
+            assert row["terminal_events"] == [1], row
 
 
 @pytest.mark.slow
@@ -69,6 +113,7 @@ def test_a_fault_in_real_time_is_measured(one_case, monkeypatch, capsys):
     ordered = [case for case in faults_wall.ORDERED if case[0] == "node silent"]
     monkeypatch.setattr(faults_wall, "ORDERED", tuple(ordered))
     monkeypatch.setattr(faults_wall, "DONE_TO_THE_MASTER", ("master killed",))
+    monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [])
     assert cli.invoke(["bench", "faults", "--repetitions", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     silent, killed = answer["wall"]["rows"]
