@@ -47,12 +47,19 @@ def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     return run_features(repetitions, seed, progress)
 
 
+def _soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.soak import run_soak
+
+    return run_soak(repetitions, seed, progress)
+
+
 BENCHES: dict[str, Bench] = {
     "calibration": _calibration,
     "can": _can,
     "cycle": _cycle,
     "faults": _faults,
     "features": _features,
+    "soak": _soak,
 }
 """By the name given on the command line."""
 
@@ -62,7 +69,9 @@ def bench(
     repetitions: Annotated[
         int,
         typer.Option(
-            min=1, help="Timed fits of `calibration`, trials of each of `faults`; the others take a multiple."
+            min=1,
+            help="Timed fits of `calibration`, trials of each of `faults`, two virtual minutes of `soak`; the others "
+            "take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,

@@ -1,0 +1,277 @@
+"""``bench soak``: virtual hours of goals, with a random fault in each, on a cell in lockstep; what grows, what is lost.
+
+Every goal must end in exactly one terminal event, the arm must rest after each fault and go on after an operator acts,
+no command may pass the velocity limits, and memory, descriptors and the residual of goals must stay where they were.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from stereoservo.core.cycle import StepInputs, StepOutputs
+from stereoservo.daemon.lockstep import LockstepCell, LockstepTimeoutError
+from stereoservo.messages.cell_file import CellFile, check_cell
+from stereoservo.messages.goals import Enable, FeatureTarget, Goal, JointTarget, Reset, Resume, RunGoal
+from stereoservo.messages.status import Lifecycle
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.demonstration.lockstep_operator import TERMINAL, LockstepOperator
+from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.history import TrueJointHistory
+from stereoservo_sim.world.simulated_cell import demo_cell
+
+CAMERAS = ("left", "right")
+NEAR = 0.15
+"""[rad] About the base, in which postures of goals are drawn: the markers stay in view."""
+GOALS = 12
+LAWS = ("stereo", "image", "cartesian3", "joints")
+LIMIT_S = 20.0
+"""Of virtual time, for a goal."""
+RESTS_S = 1.5
+"""Coasting, braking from full speed and the drives' time-out, generously."""
+MOVING = 1e-3
+"""[rad/s] Of any joint, by the truth."""
+QUIET = 0.4
+"""Share of goals without a fault."""
+TRUTH_SAMPLES = 4096
+VIRTUAL_MINUTES = 2.0
+"""For each repetition that is asked for."""
+
+Act = Callable[[LockstepCell], None]
+
+
+def _fault(name: str) -> Act:
+    def inject(cell: LockstepCell) -> None:
+        setattr(cell.joints.faults, name, 1)  # type: ignore[attr-defined]
+
+    return inject
+
+
+def _dark(cell: LockstepCell) -> None:
+    for camera in cell.cameras:
+        camera.blackout = True  # type: ignore[attr-defined]
+
+
+def _stop(cell: LockstepCell) -> None:
+    cell.raise_stop()
+
+
+def _standstill(cell: LockstepCell) -> None:
+    cell.clock.advance_to(cell.clock.now_ns() + 600_000_000)
+
+
+def _silent_gateway(cell: LockstepCell) -> None:
+    cell.links.gateway_alive = False  # type: ignore[attr-defined]
+
+
+FAULTS: dict[str, Act] = {
+    "write fails": _fault("fail_write"),
+    "read fails": _fault("fail_read"),
+    "no feedback": _fault("freeze_encoder_after"),
+    "encoder stuck": _fault("stuck_encoder_after"),
+    "commands lost": _fault("drop_writes_after"),
+    "cameras dark": _dark,
+    "stop": _stop,
+    "loop stands still": _standstill,
+    "gateway silent": _silent_gateway,
+}
+
+
+def run_soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """``repetitions`` times two virtual minutes of goals and faults; memory, descriptors, events and residuals.
+
+    Raises ExperimentError where a goal has no end or two, or the cell cannot be operated again.
+    """
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory(prefix="sssoak") as name:
+        folder = Path(name)
+        truth = TrueJointHistory.in_memory(len(demo_cell().robot.joints), TRUTH_SAMPLES)
+        services = {"world": truth}
+        with LockstepCell(_cell(), cell_dir=folder, runtime_dir=folder, seed=seed, services=services) as cell:
+            return _Soak(cell, truth, rng).run(repetitions * VIRTUAL_MINUTES * 60.0, progress)
+
+
+def _cell() -> CellFile:
+    """A cell of the fake arm and fake cameras, which has no images to render."""
+    world = demo_cell()
+    names = [joint.name for joint in world.robot.joints]
+    limits = [
+        {
+            "joint": joint.name,
+            "min": joint.position_min,
+            "max": joint.position_max,
+            "velocity": 1.0,
+            "acceleration": 4.0,
+        }
+        for joint in world.robot.joints
+    ]
+    return check_cell(
+        {
+            "schema": 1,
+            "cell": {"name": "soak"},
+            "joints": {"driver": "fake"},
+            "camera": [{"name": name, "driver": "fake"} for name in CAMERAS],
+            "servo": {"tolerance_px": 0.2, "hold_frames": 5},
+            "safety": {"limit": limits},
+            "calibration": {
+                "base": dict(zip(names, world.base.tolist(), strict=True)),
+                "range": dict.fromkeys(names, 0.3),
+                "stops": 7, "frames": 2, "settle_s": 0.05, "speed_scale": 1.0,
+            },
+        }
+    )  # fmt: skip
+
+
+class _Soak:
+    """The cell, what it was sent, and what came of it."""
+
+    def __init__(self, cell: LockstepCell, truth: TrueJointHistory, rng: np.random.Generator) -> None:
+        self.cell = cell
+        self.truth = truth
+        self.rng = rng
+        self.operator = LockstepOperator(cell)
+        self.names = cell.settings.joint_names
+        self.velocity_max = cell.settings.limits.velocity_max
+        self.fastest = 0.0
+        self.steps = 0
+        self.outcomes: Counter[str] = Counter()
+        self.faults: Counter[str] = Counter()
+        self.last_fault = ""
+        self.residuals: list[tuple[float, float]] = []
+        self.sizes: list[tuple[float, float, float]] = []
+        cell.on_step = self._count
+
+    def _count(self, _inputs: StepInputs, outputs: StepOutputs) -> None:
+        self.steps += 1
+        if outputs.command is not None:
+            self.fastest = max(self.fastest, float((np.abs(outputs.command) / self.velocity_max).max()))
+
+    def run(self, seconds: float, progress: ProgressCall) -> dict[str, Any]:
+        """The figures, after so much virtual time."""
+        self.cell.run_for(0.5)
+        self.operator.enable()
+        self.operator.calibrate()
+        targets = [self._taught(f"g{k}") for k in range(GOALS)]
+        start_s, started = self.cell.clock.now_ns() * 1e-9, time.monotonic()
+        while (passed := self.cell.clock.now_ns() * 1e-9 - start_s) < seconds:
+            progress("virtual seconds", int(passed), int(seconds))
+            self._one_goal(targets[int(self.rng.integers(GOALS))], passed)
+            self.cell.events.clear()
+            gc.collect()
+            self.sizes.append((passed / 3600.0, _resident_mb(), float(len(os.listdir("/proc/self/fd")))))
+        return self._figures(passed / 3600.0, time.monotonic() - started)
+
+    def _taught(self, name: str) -> tuple[FeatureTarget, dict[str, float]]:
+        """A posture as the cameras see it, and its joints."""
+        base = demo_cell().base
+        q: FloatArray = base + self.rng.uniform(-NEAR, NEAR, len(base))
+        joints = dict(zip(self.names, q.tolist(), strict=True))
+        self.operator.goal(JointTarget(joints))
+        self.cell.run_for(0.3)
+        self.operator.teach(name)
+        return self.operator.taught[name], joints
+
+    def _one_goal(self, target: tuple[FeatureTarget, dict[str, float]], passed_s: float) -> None:
+        law = LAWS[int(self.rng.integers(len(LAWS)))]
+        identity = f"{int(self.rng.integers(1 << 62)):016x}"
+        goal = (
+            Goal(identity, JointTarget(target[1]), time_limit_s=LIMIT_S)
+            if law == "joints"
+            else Goal(identity, target[0], law=law, time_limit_s=LIMIT_S)
+        )
+        reply = self.cell.submit(RunGoal(goal))
+        if not reply.accepted:
+            raise ExperimentError("refused", f"a goal of law {law} was refused: {reply.message}")
+        if self.rng.random() > QUIET:
+            self.cell.run_for(float(self.rng.uniform(0.0, 1.0)))
+            self._struck(law)
+        try:
+            end = self.cell.wait_for(lambda e: e.id == identity and e.kind in TERMINAL, LIMIT_S + 5.0)
+        except LockstepTimeoutError as error:
+            status = self.cell.status
+            hints = "; ".join(f"{reason.code} {reason.hint}" for reason in status.reasons) if status else ""
+            told = ", ".join(event.kind for event in self.cell.events)
+            raise ExperimentError(
+                "no_end",
+                f"a goal of law {law} has no end (the last fault was {self.last_fault!r}); {hints}; events: {told}",
+            ) from error
+        self.cell.run_for(0.3)
+        ends = [event.kind for event in self.cell.events if event.id == identity and event.kind in TERMINAL]
+        if len(ends) != 1:
+            raise ExperimentError("ends", f"goal {identity} ended {len(ends)} times: {', '.join(ends)}")
+        self.outcomes[end.kind] += 1
+        if end.kind == "goal_reached" and end.error_px is not None:
+            self.residuals.append((passed_s / 3600.0, end.error_px))
+
+    def _struck(self, law: str) -> None:
+        """A random fault; the arm rests, its cause goes, and an operator goes on."""
+        name = list(FAULTS)[int(self.rng.integers(len(FAULTS)))]
+        self.faults[name] += 1
+        self.last_fault = name
+        FAULTS[name](self.cell)
+        self.cell.run_for(RESTS_S)
+        newest = self.truth.newest()
+        assert newest is not None
+        blind = name == "cameras dark" and law == "joints"  # which no camera concerns
+        if np.abs(newest[2]).max() > MOVING and not blind:
+            raise ExperimentError("moves", f"{name}: the arm moves {RESTS_S:g} s after the fault, law {law}")
+        self.cell.joints.faults = type(self.cell.joints.faults)()  # type: ignore[attr-defined]
+        for camera in self.cell.cameras:
+            camera.blackout = False  # type: ignore[attr-defined]
+        self.cell.links.gateway_alive = True  # type: ignore[attr-defined]
+        self.cell.run_for(0.2)
+        self._operated(name)
+
+    def _operated(self, name: str) -> None:
+        assert self.cell.status is not None
+        if self.cell.status.lifecycle == Lifecycle.FAULT:
+            self.cell.submit(Reset())
+            self.cell.run_for(0.3)
+        if self.cell.status.lifecycle != Lifecycle.ACTIVE:
+            self.cell.submit(Enable())
+            self.cell.run_for(0.3)
+        if {"STOPPED", "HELD", "CAMERAS_OR_ARM"} & {reason.code for reason in self.cell.status.reasons}:
+            self.cell.submit(Resume())
+        if self.cell.status.lifecycle != Lifecycle.ACTIVE:
+            reasons = msgspec.to_builtins(self.cell.status.reasons)
+            raise ExperimentError(
+                "not_active", f"after {name} the cell is {self.cell.status.lifecycle}: {reasons}"
+            )
+
+    def _figures(self, hours: float, seconds: float) -> dict[str, Any]:
+        sizes = np.array(self.sizes[len(self.sizes) // 4 :])  # caches are warm after a quarter
+        residuals = np.array(self.residuals)
+        early, late = np.array_split(residuals[:, 1], 2)
+        deviation = float(np.hypot(early.std() / np.sqrt(len(early)), late.std() / np.sqrt(len(late))))
+        return {
+            "virtual_hours": hours,
+            "seconds": seconds,
+            "steps": self.steps,
+            "goals": sum(self.outcomes.values()),
+            "outcomes": dict(self.outcomes),
+            "faults": dict(self.faults),
+            "fastest_of_limit": self.fastest,
+            "memory_mb": float(sizes[-1, 1]),
+            "memory_slope_mb_per_virtual_hour": float(np.polyfit(sizes[:, 0], sizes[:, 1], 1)[0]),
+            "descriptors": [int(sizes[:, 2].min()), int(sizes[:, 2].max())],
+            "residual_px": {
+                "first_half": float(early.mean()),
+                "second_half": float(late.mean()),
+                "difference_in_sigma": float((late.mean() - early.mean()) / deviation),
+            },
+        }
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
