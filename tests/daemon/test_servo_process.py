@@ -4,7 +4,9 @@ import ast
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -35,6 +37,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import (
     CameraDescription,
+    CameraObservation,
     CommandReport,
     DriverError,
     JointDriverDescription,
@@ -432,4 +435,35 @@ def test_what_another_process_wrote_wrongly_is_left_out_and_told_and_the_loop_go
     assert from_gateway.startswith(f"messages of the gateway: {len(damaged)} records left out")
     assert observations.startswith(f"observation-left.slot: {len(damaged)} records left out")
     control.close()
+    bench.links.close()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ids": np.array(3)},
+        {"ids": np.arange(3)[:, None]},
+        {"ids": np.arange(7)},
+        {"ids": np.arange(3.0)},
+        {"pixels": np.zeros(6)},
+        {"pixels": np.zeros((3, 3))},
+        {"pixels": np.zeros((3, 2), np.int64)},
+        {"covariances": np.zeros((2, 2, 2))},
+        {"covariances": np.zeros(3)},
+        {"covariances": np.zeros((3, 2, 2), np.float32)},
+    ],
+    ids=lambda change: ", ".join(f"{key} {array.dtype} {array.shape}" for key, array in change.items()),
+)
+def test_an_observation_of_wrong_shapes_never_reaches_the_core(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    bench = Bench(tmp_path)
+    now = bench.clock.now_ns()
+    good = CameraObservation("left", 1, now, now, np.arange(3), np.zeros((3, 2)), np.zeros((3, 2, 2)))
+    slot = bench.directories.observation_slot("left")
+    with SlotWriter(slot, OBSERVATION_CAPACITY, OBSERVATION_LAYOUT) as writer:
+        writer.write(encode(msgspec.structs.replace(good, **change)))
+        assert bench.links.observations() == ()
+        writer.write(encode(good))
+        assert len(bench.links.observations()) == 1
     bench.links.close()

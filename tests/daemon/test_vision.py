@@ -235,3 +235,15 @@ def test_whatever_a_frame_raises_is_a_lost_camera_and_ends_nothing(tmp_path: Pat
     assert [kind for kind, _ in bench.reports] == ["camera_lost", "camera_back"]
     assert "a frame cannot be used" in bench.reports[0][1]
     assert bench.seen() == 9
+
+
+def test_a_driver_whose_arrays_do_not_fit_is_a_lost_camera(bench: Bench) -> None:
+    bench.camera.arriving = [
+        CameraObservation("left", 1, 1, 1, np.array([1, 2]), np.zeros((1, 2)), np.zeros((2, 2, 2)))
+    ]
+    with pytest.raises(
+        DriverError, match=r"pixels are float64 of shape \(1, 2\); float64 \(2, 2\) are needed"
+    ) as error:
+        bench.pipeline.poll()
+    assert error.value.code == "frame"
+    assert bench.seen() is None

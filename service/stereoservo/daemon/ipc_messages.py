@@ -25,6 +25,7 @@ from stereoservo.ports.devices import (
     DriverContext,
     JointDriverDescription,
     Prior,
+    check_observation,
 )
 from stereoservo.recording.step_records import StepMessage
 
@@ -129,6 +130,13 @@ class Report(msgspec.Struct, frozen=True):
     t_ns: int
     images: RecordedImages | None = None
     """Of a recording of images that has ended."""
+
+
+def decode_observation(data: bytes) -> CameraObservation:
+    """An observation with arrays of the right shapes. Raises msgspec.MsgspecError, ValueError."""
+    observation = observation_decoder.decode(data)
+    check_observation(observation)
+    return observation
 
 
 class PlanError(DamagedError):

@@ -20,7 +20,7 @@ from stereoservo.daemon.ipc_messages import (
     NewModel,
     ServoState,
     ToServo,
-    observation_decoder,
+    decode_observation,
     to_servo_decoder,
 )
 from stereoservo.daemon.links import GatewayMessages
@@ -120,7 +120,7 @@ class ProcessLinks:
             data = reader.poll()
             if data is not None:
                 with boundary:
-                    found.append(observation_decoder.decode(data))
+                    found.append(decode_observation(data))
         return tuple(found)
 
     def stop_raised(self) -> bool:

@@ -46,6 +46,7 @@ from stereoservo.ports.devices import (
     DriverError,
     Frame,
     Prior,
+    check_observation,
 )
 
 if TYPE_CHECKING:
@@ -166,6 +167,7 @@ class CameraPipeline:
                 return False
             self.frames += len(arrived)
             observation = self._observed(arrived[-1])
+            check_observation(observation)
         self._links.publish_observation(observation)
         self.written += 1
         if self._images is not None:

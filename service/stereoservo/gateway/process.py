@@ -28,8 +28,8 @@ from stereoservo.daemon.ipc_messages import (
     PlanError,
     Report,
     RunPlan,
+    decode_observation,
     load_plan,
-    observation_decoder,
     report_decoder,
 )
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
@@ -318,7 +318,7 @@ class Gateway:
             if data is None:
                 continue
             with boundary:
-                observation = observation_decoder.decode(data)
+                observation = decode_observation(data)
                 payload = encode(features_message(observation))
                 publisher = self._publishers.features[observation.camera]
                 self._marker_cache.add(observation)
