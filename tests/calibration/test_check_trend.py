@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -74,3 +75,23 @@ def test_history_is_bounded_and_survives_a_damaged_line(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
     again, lost = load_checks(path)
     assert (len(again), lost) == (KEPT_CHECKS - 1, 1)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda line: b"\xff" + line,
+        lambda line: b"[" * 60_000,
+        lambda line: line[:-9],
+        lambda line: b"\0" * 40,
+        lambda line: line.replace(b'"created":"', b'"created":"yesterday '),
+        lambda line: line.replace(b'"information":[', b'"information":[1.0,'),
+    ],
+    ids=["not UTF-8", "nested", "cut", "zeros", "no time", "too long"],
+)
+def test_a_line_that_cannot_be_used_is_counted(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "checks.jsonl"
+    good = [report(k, {"j1": 0.1}, 1e-5) for k in (1, 3)]
+    damaged = change(msgspec.json.encode(report(2, {"j1": 0.1}, 1e-5)))
+    path.write_bytes(msgspec.json.encode(good[0]) + b"\n" + damaged + b"\n" + msgspec.json.encode(good[1]))
+    assert load_checks(path) == (good, 1)

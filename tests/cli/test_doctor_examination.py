@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from stereoservo.cli import main as cli
+from stereoservo.cli.doctor import command
 from stereoservo.cli.doctor import joints as examination_module
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.servo import make_driver
 from stereoservo.messages.cell_file import load_cell_file
-from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
 from stereoservo.ports.devices import Clock, DriverError, ExaminationFinding
 from stereoservo_drivers.fake import FakeJointDriver
@@ -151,3 +152,12 @@ def test_a_cell_with_one_camera_fails(cell: Path, capfd: pytest.CaptureFixture[s
     assert cli.invoke(["doctor", str(cell), "--seconds", "0", "--json"]) == 1
     checks = json.loads(capfd.readouterr().out)["error"]["checks"]
     assert [check["name"] for check in checks if check["ok"] is False] == ["stereo"]
+
+
+def test_a_damaged_file_of_taught_goals_is_a_finding(tmp_path: Path) -> None:
+    directories = CellDirectories("cell", tmp_path, tmp_path)
+    directories.taught.write_bytes(b"\xff")
+    finding = command._taught(cast(RunPlan, None), directories)
+    assert finding.ok is False
+    assert "taught.json" in finding.message
+    assert directories.taught.read_bytes() == b"\xff"  # who looks renames nothing

@@ -61,3 +61,13 @@ def test_the_models_health_is_told_camera_by_camera() -> None:
     assert "  model   camera moved: left 42.00 px  up 0.02 px (moving)" in told
     assert "          camera left moved by 42 px rms" in told
     assert "          camera up: is late" in told
+
+
+def test_messages_that_could_not_be_taken_are_counted() -> None:
+    assert not any("refused" in line for line in said())
+    assert "  refused 17000 messages that could not be taken since the gateway's start" in said(
+        refused_messages=17000
+    )
+    assert (
+        decode(encode(msgspec.structs.replace(STATE, refused_messages=3)), StateMessage).refused_messages == 3
+    )

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from stereoservo.client import Client, ClientError, EventWatch, InvalidReplyError, RefusedError
@@ -14,7 +15,7 @@ from stereoservo.client.session import client_config, close_session, open_sessio
 from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.keys import KeySpace
-from stereoservo.messages.wire import Reply, encode
+from stereoservo.messages.wire import EventList, EventMessage, Reply, encode
 
 pytestmark = pytest.mark.process
 
@@ -118,3 +119,23 @@ def test_a_strange_event_is_the_clients_own_error(
             pytest.raises(InvalidReplyError, match=f"{KEYS.event} is not of"),
         ):
             watch.wait(lambda event: True, "an event", 10.0)
+
+
+def test_a_page_of_events_that_were_not_asked_for_is_the_clients_own_error(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such a page would be asked for again without end."""
+    event = EventMessage(1, "boot", 0, 0.0, "held")
+    monkeypatch.setattr(Client, "status", lambda self: SimpleNamespace(boot="boot"))
+    pages = [
+        EventList("boot", 1, 8, ()),
+        EventList("boot", 1, 8, (event,)),
+        EventList("boot", 1, 8, (msgspec.structs.replace(event, seq=9),)),
+    ]
+    monkeypatch.setattr(Client, "events", lambda self, first=1: pages.pop(0) if len(pages) > 1 else pages[0])
+    with Client("demo", endpoint=endpoint) as client, EventWatch(client) as watch:
+        for number in (1, 9):
+            with pytest.raises(
+                InvalidReplyError, match=rf"events \[{number}\] in reply to a query from 8 on"
+            ):
+                watch._fill([], 20)

@@ -43,3 +43,14 @@ def test_a_process_that_is_asked_to_end_ends_in_order(number: signal.Signals) ->
 
 def test_nohup_is_respected() -> None:
     assert ended_by(signal.SIGHUP, signal.SIGTERM, arguments=("nohup",)) == "ended in order by SIGTERM"
+
+
+def test_a_log_that_cannot_be_written_ends_nothing() -> None:
+    program = (
+        "from stereoservo.daemon.process_control import write_log\nwrite_log('servo', 'line')\nprint('alive')"
+    )
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=full, text=True, check=False
+        )
+    assert done.stdout.strip() == "alive"

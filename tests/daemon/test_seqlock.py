@@ -15,6 +15,7 @@ from stereoservo.daemon.seqlock import (
     StopSlot,
     create_slot,
     create_stop_slot,
+    repair_stop_slot,
 )
 
 LAYOUT = "Test.1"
@@ -187,3 +188,60 @@ def test_a_stop_slot_is_not_made_of_just_any_file(tmp_path: Path) -> None:
     path.write_bytes(bytes(32))
     with pytest.raises(SlotError, match="not a stop slot"):
         StopSlot(path)
+
+
+def test_a_slot_that_lost_its_header_is_repaired_under_those_who_have_it_mapped(tmp_path: Path) -> None:
+    path = tmp_path / "a.slot"
+    with SlotWriter(path, 100, LAYOUT) as writer:
+        writer.write(b"one")
+        for damage in (
+            lambda data: b"\0" * 24 + data[24:],
+            lambda data: data[:7],
+            lambda data: data + b"more",
+        ):
+            with path.open("r+b") as file:
+                data = damage(path.read_bytes())
+                file.truncate(len(data))
+                file.write(data)
+            with pytest.raises(SlotError):
+                SlotReader(path, LAYOUT)
+            assert create_slot(path, 100, LAYOUT)
+            assert not create_slot(path, 100, LAYOUT)
+            with SlotReader(path, LAYOUT) as reader:
+                writer.write(b"two")
+                assert reader.poll() == b"two"
+
+
+def test_every_flipped_byte_of_a_slot_is_a_record_less_and_raises_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.slot"
+    with SlotWriter(path, 100, LAYOUT) as writer:
+        writer.write(bytes(range(100)))
+    whole = path.read_bytes()
+    for k in range(24, len(whole)):
+        for mask in (1, 0x80, 0xFF):
+            data = bytearray(whole)
+            data[k] ^= mask
+            path.write_bytes(bytes(data))
+            with SlotReader(path, LAYOUT) as reader:
+                assert reader.poll() in (None, bytes(range(100)))
+            with SlotWriter(path, 100, LAYOUT) as writer, SlotReader(path, LAYOUT) as reader:
+                writer.write(b"next")
+                assert reader.poll() == b"next"
+
+
+@pytest.mark.parametrize("word", range(4))
+def test_a_damaged_stop_slot_still_stops(tmp_path: Path, word: int) -> None:
+    path = tmp_path / "stop"
+    create_stop_slot(path)
+    data = bytearray(path.read_bytes())
+    data[8 * word : 8 * word + 8] = b"\xff" * 8
+    path.write_bytes(bytes(data))
+    assert repair_stop_slot(path) is (word == 0)
+    servo, other = StopSlot(path), StopSlot(path)
+    for _ in range(3):
+        other.raise_stop()
+        assert servo.poll()
+        assert not servo.poll()
+    path.write_bytes(b"")
+    assert repair_stop_slot(path)
+    assert StopSlot(path).raise_stop()

@@ -4,7 +4,9 @@ import ast
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -24,7 +26,7 @@ from stereoservo.daemon.ipc_messages import (
     steps_decoder,
 )
 from stereoservo.daemon.pacing import ClockPacing
-from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_slot, create_stop_slot
+from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot, create_slot, create_stop_slot
 from stereoservo.daemon.seqpacket import PacketChannel
 from stereoservo.daemon.servo import GATEWAY_SILENCE_S, ServoProcess
 from stereoservo.daemon.servo_links import ProcessLinks
@@ -35,6 +37,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import (
     CameraDescription,
+    CameraObservation,
     CommandReport,
     DriverError,
     JointDriverDescription,
@@ -408,3 +411,59 @@ def test_the_servo_process_reaches_neither_json_nor_logging_nor_images() -> None
         assert not {module.split(".")[0] for module in imports} & forbidden, f"{name} imports {imports}"
         waiting |= {module for module in imports if module.startswith("stereoservo")} - seen
     assert "stereoservo.core.servo_core" in seen
+
+
+def test_what_another_process_wrote_wrongly_is_left_out_and_told_and_the_loop_goes_on(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    slot = bench.directories.observation_slot("left")
+    state = SlotReader(bench.directories.state_slot, STATE_LAYOUT)
+    control = PacketChannel.connect(bench.directories.control_socket)
+    damaged = (
+        b"", b"\xff", b"\x91" * 60_000, b"\x80", encode(["left", 1, 2, 3]), encode({"camera": "\ud7ff", "ids": [1]}),
+        encode({"camera": "left", "seq": 1, "t_shutter_ns": 1, "t_received_ns": 1, "ids": ["(" * 1000, [1], b""]}),
+    )  # fmt: skip
+    with SlotWriter(slot, OBSERVATION_CAPACITY, OBSERVATION_LAYOUT) as writer:
+        for data in damaged:
+            writer.write(data)
+            control.send(data or b"\0")
+            bench.process.cycle(bench.pacing)
+    for _ in range(10):
+        bench.process.cycle(bench.pacing)
+    data = state.poll()
+    assert data is not None
+    from_gateway, observations = state_decoder.decode(data).notes
+    assert from_gateway.startswith(f"messages of the gateway: {len(damaged)} records left out")
+    assert observations.startswith(f"observation-left.slot: {len(damaged)} records left out")
+    control.close()
+    bench.links.close()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ids": np.array(3)},
+        {"ids": np.arange(3)[:, None]},
+        {"ids": np.arange(7)},
+        {"ids": np.arange(3.0)},
+        {"pixels": np.zeros(6)},
+        {"pixels": np.zeros((3, 3))},
+        {"pixels": np.zeros((3, 2), np.int64)},
+        {"covariances": np.zeros((2, 2, 2))},
+        {"covariances": np.zeros(3)},
+        {"covariances": np.zeros((3, 2, 2), np.float32)},
+    ],
+    ids=lambda change: ", ".join(f"{key} {array.dtype} {array.shape}" for key, array in change.items()),
+)
+def test_an_observation_of_wrong_shapes_never_reaches_the_core(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    bench = Bench(tmp_path)
+    now = bench.clock.now_ns()
+    good = CameraObservation("left", 1, now, now, np.arange(3), np.zeros((3, 2)), np.zeros((3, 2, 2)))
+    slot = bench.directories.observation_slot("left")
+    with SlotWriter(slot, OBSERVATION_CAPACITY, OBSERVATION_LAYOUT) as writer:
+        writer.write(encode(msgspec.structs.replace(good, **change)))
+        assert bench.links.observations() == ()
+        writer.write(encode(good))
+        assert len(bench.links.observations()) == 1
+    bench.links.close()

@@ -1,6 +1,6 @@
 """The vision process's pipeline in virtual time: newest only, priors, errors and reconnects."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -201,3 +201,49 @@ def test_reports_wait_for_a_gateway_that_is_not_up_yet(tmp_path: Path) -> None:
         ("vision-left", "camera_back", "second"),
     ]
     server.close()
+
+
+def test_a_prior_that_cannot_be_read_is_left_out(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    prior = Prior("left", 5, np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    bench.priors.write(encode(prior))
+    assert bench.links.newest_prior() is not None
+    for _ in range(5):
+        bench.priors.write(b"\xff" * 100)
+        found = bench.links.newest_prior()
+        assert found is not None
+        assert found.t_ns == 5
+    assert capsys.readouterr().err.count("prior-left.slot: 1 records left out") == 1
+
+
+@pytest.mark.parametrize("error", [ValueError("bad JPEG"), MemoryError(), RecursionError(), IndexError("7")])
+def test_whatever_a_frame_raises_is_a_lost_camera_and_ends_nothing(tmp_path: Path, error: Exception) -> None:
+    class Raising(StubDetector):
+        def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+            if frame.seq < 5:
+                raise error
+            return super().detect(frame, prior)
+
+    bench = Bench(tmp_path, Raising())
+
+    def deliver(seq: int) -> Callable[[], None]:
+        def work() -> None:
+            bench.camera.arriving = [bench.frame(seq)]
+
+        return work
+
+    run(bench, 4.0, {0.1: deliver(1), 0.5: deliver(2), 3.0: deliver(9)})
+    assert [kind for kind, _ in bench.reports] == ["camera_lost", "camera_back"]
+    assert "a frame cannot be used" in bench.reports[0][1]
+    assert bench.seen() == 9
+
+
+def test_a_driver_whose_arrays_do_not_fit_is_a_lost_camera(bench: Bench) -> None:
+    bench.camera.arriving = [
+        CameraObservation("left", 1, 1, 1, np.array([1, 2]), np.zeros((1, 2)), np.zeros((2, 2, 2)))
+    ]
+    with pytest.raises(
+        DriverError, match=r"pixels are float64 of shape \(1, 2\); float64 \(2, 2\) are needed"
+    ) as error:
+        bench.pipeline.poll()
+    assert error.value.code == "frame"
+    assert bench.seen() is None

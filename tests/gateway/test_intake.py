@@ -329,3 +329,21 @@ def test_the_event_log_numbers_without_gaps_and_pages() -> None:
     assert log.since(10**6) == log.since(701)
     assert log.since(701).events == ()
     assert log.since(701).next == 701
+
+
+def test_a_flood_of_refused_puts_is_a_few_events_with_the_number_of_the_rest(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
+    for k in range(8000):
+        now = 100.0 + 0.001 * k
+        bench.intake.goal_sample(Message(KEYS.goal("mallory"), b'{"id": "\xff'))
+    assert 10 <= len(bench.kinds()) <= 20
+    messages = [event.message for event in bench.log.since(1).events]
+    assert "are not reported" not in messages[9]
+    assert "refusals before it are not reported" in messages[-1]
+    assert bench.intake.boundary.refusals.count == 8000
+    now += 60.0
+    bench.intake.goal_sample(Message(KEYS.goal("anna"), b"{"))
+    assert len(bench.kinds()) == len(messages) + 1

@@ -23,8 +23,8 @@ from stereoservo.kinematics.model import (
     encode_model,
     load_model,
     save_model,
-    write_atomically,
 )
+from stereoservo.messages.files import write_atomically
 
 HOLED = np.where(np.arange(32).reshape(2, 4, 4) == 27, np.nan, 1.0)
 

@@ -226,3 +226,13 @@ def test_static_markers_are_known_ones_and_leave_a_body(tmp_path: Path, static: 
     assert settings(tmp_path, f"{good}\n[scene]\nstatic = [3]\n").scene_ids == (3,)
     with pytest.raises(CellFileError, match=f"scene.static: {told}"):
         settings(tmp_path, f"{good}\n[scene]\nstatic = {static}\n")
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff", b"a = " + b"[" * 60_000, b"a = " + b"9" * 60_000, b"a = 2026-99-99", b"\0" * 100]
+)
+def test_whatever_a_cell_file_holds_it_is_refused_by_name(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_bytes(data)
+    with pytest.raises(CellFileError, match=r"cell\.toml: "):
+        load_cell_file(path)

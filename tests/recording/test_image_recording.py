@@ -209,3 +209,17 @@ def test_two_orders_make_two_recordings(bench: Bench, tmp_path: Path) -> None:
     bench.recorder.close()
     assert [images.frames for _, _, images in bench.reports if images is not None] == [1, 2]
     assert image_recording.CLOSING_S < 4.0, "the supervisor kills the process after 4 s"
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff", b"[" * 60_000, b'{"number": "one"}', b" " * 100_000])
+def test_an_order_that_cannot_be_read_is_set_aside_and_told_once(bench: Bench, data: bytes) -> None:
+    bench.order.write_bytes(data)
+    for _ in range(5):
+        bench.look()
+    ((kind, text, images),) = bench.reports
+    assert (kind, images) == ("warning", None)
+    assert "set aside as images.json.damaged-1" in text
+    bench.reports.clear()
+    bench.begin()
+    bench.recorder.take([bench.frame()])
+    assert bench.finished().frames == 1

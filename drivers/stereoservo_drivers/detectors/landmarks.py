@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import math
 import stat
-import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +17,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.messages.decoding import decoding
+from stereoservo.numerics.archives import read_archive
 from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
 from stereoservo.ports.devices import DriverError
 
@@ -98,49 +99,36 @@ def encode_landmarks(landmarks: Landmarks) -> bytes:
 
 def decode_landmarks(data: bytes, path: Path | str = "<landmarks>") -> Landmarks:
     """Inverse of :func:`encode_landmarks`. Raises DriverError (``landmarks``) naming what does not fit."""
-    try:
-        if not data.startswith(b"PK"):
-            raise ValueError("it is no .npz archive")
-        with zipfile.ZipFile(io.BytesIO(data)) as listed:
-            size = sum(item.file_size for item in listed.infolist())
-        if size > LARGEST_FILE:
-            raise ValueError(f"it unpacks to {size} bytes; at most {LARGEST_FILE} are read")
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-        header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_LandmarkHeader)
-        if header.schema != SCHEMA:
-            raise _bad(path, f"schema is {header.schema}; this version reads {SCHEMA}")
-        if len(header.averaged) != len(header.cameras):
-            raise ValueError(f"{len(header.cameras)} cameras and {len(header.averaged)} counts of images")
-        cameras = tuple(
-            CameraReference(
-                name,
-                _picture(arrays.pop(f"picture{c}")),
-                averaged,
-                _typed(arrays.pop(f"pixels{c}"), np.float64),
-                _typed(arrays.pop(f"sigmas{c}"), np.float64),
-            )
-            for c, (name, averaged) in enumerate(zip(header.cameras, header.averaged, strict=True))
-        )
-        landmarks = Landmarks(
-            _typed(arrays.pop("ids"), np.int64), _typed(arrays.pop("kinds"), np.int64), cameras
-        )
+    with decoding(lambda cause: _bad(path, f"is not a file of landmarks: {cause}"), (DriverError,)):
+        arrays = read_archive(data, LARGEST_FILE)
+        try:
+            landmarks = _landmarks(arrays, path)
+        except KeyError as error:
+            raise _bad(path, f"is not a file of landmarks: array {error} is missing") from error
         if arrays:
             raise ValueError(f"unknown arrays: {', '.join(sorted(arrays))}")
-    except KeyError as error:
-        raise _bad(path, f"is not a file of landmarks: array {error} is missing") from error
-    except (
-        ValueError,
-        TypeError,
-        EOFError,
-        OSError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        msgspec.DecodeError,
-    ) as error:
-        raise _bad(path, f"is not a file of landmarks: {error}") from error
     check_landmarks(landmarks, path)
     return landmarks
+
+
+def _landmarks(arrays: dict[str, npt.NDArray[Any]], path: Path | str) -> Landmarks:
+    """Landmarks out of the arrays of a file, which are taken out of ``arrays``. Raises anything."""
+    header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_LandmarkHeader)
+    if header.schema != SCHEMA:
+        raise _bad(path, f"schema is {header.schema}; this version reads {SCHEMA}")
+    if len(header.averaged) != len(header.cameras):
+        raise ValueError(f"{len(header.cameras)} cameras and {len(header.averaged)} counts of images")
+    cameras = tuple(
+        CameraReference(
+            name,
+            _picture(arrays.pop(f"picture{c}")),
+            averaged,
+            _typed(arrays.pop(f"pixels{c}"), np.float64),
+            _typed(arrays.pop(f"sigmas{c}"), np.float64),
+        )
+        for c, (name, averaged) in enumerate(zip(header.cameras, header.averaged, strict=True))
+    )
+    return Landmarks(_typed(arrays.pop("ids"), np.int64), _typed(arrays.pop("kinds"), np.int64), cameras)
 
 
 def load_landmarks(path: Path) -> Landmarks:

@@ -5,7 +5,7 @@ npz file that stores them.
 from __future__ import annotations
 
 import io
-import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,11 +13,15 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.kinematics.model import JointLoads, ModelFileError, check_loads, write_atomically
+from stereoservo.kinematics.model import JointLoads, ModelFileError, check_loads
 from stereoservo.messages.cell_file import Mount
+from stereoservo.messages.decoding import decoding
+from stereoservo.messages.files import read_bounded, write_atomically
+from stereoservo.numerics.archives import read_archive
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 TRIALS_SCHEMA = 1
+MAX_TRIALS_BYTES = 1 << 30
 LOADS = "loads_"
 STATIC = "static_"
 MAX_POSITION = 1e6
@@ -335,17 +339,17 @@ def _loads(arrays: dict[str, npt.NDArray[Any]]) -> JointLoads | None:
 
 
 def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
-    """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``) naming what does not fit."""
-    try:
-        if not data.startswith(b"PK"):  # numpy would take it for a pickle, and say so
-            raise ValueError("it is no .npz archive")
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
+    """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``), whatever the bytes."""
+    with decoding(lambda cause: _bad(path, f"is not a file of trial data: {cause}"), (CalibrationError,)):
+        arrays = read_archive(data, MAX_TRIALS_BYTES)
+        missing = [
+            name for name in ("header", "positions", "trials", "pixels", "sigmas") if name not in arrays
+        ]
+        if missing:
+            raise ValueError(f"array {missing[0]!r} is missing")
         header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_Header)
         if header.schema != TRIALS_SCHEMA:
-            raise CalibrationError(
-                "bad_data", f"{path}: schema is {header.schema}; this version reads {TRIALS_SCHEMA}"
-            )
+            raise _bad(path, f"schema is {header.schema}; this version reads {TRIALS_SCHEMA}")
         trials = TrialData(
             joint_names=header.joint_names,
             joint_kinds=header.joint_kinds,
@@ -359,17 +363,15 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             loads=_loads(arrays),
             static=_static(arrays),
         )
-    except KeyError as error:
-        raise CalibrationError(
-            "bad_data", f"{path}: is not a file of trial data: array {error} is missing", key=str(error)
-        ) from error
-    except (ValueError, TypeError, EOFError, OSError, zipfile.BadZipFile, msgspec.DecodeError) as error:
-        raise CalibrationError("bad_data", f"{path}: is not a file of trial data: {error}") from error
-    try:
-        check_trials(trials)
-    except CalibrationError as error:
-        raise CalibrationError(error.code, f"{path}: {error.message}", **error.data) from error
+        try:
+            check_trials(trials)
+        except CalibrationError as error:
+            raise CalibrationError(error.code, f"{path}: {error.message}", **error.data) from error
     return trials
+
+
+def _bad(path: Path | str, cause: str) -> CalibrationError:
+    return CalibrationError("bad_data", f"{path}: {cause}")
 
 
 def save_trials(trials: TrialData, path: Path) -> None:
@@ -379,8 +381,5 @@ def save_trials(trials: TrialData, path: Path) -> None:
 
 def load_trials(path: Path) -> TrialData:
     """Read and check trial data. Raises CalibrationError (``bad_data``)."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CalibrationError("bad_data", f"{path}: cannot be read: {error.strerror}") from error
-    return decode_trials(data, path)
+    with decoding(partial(_bad, path), (CalibrationError,)):
+        return decode_trials(read_bounded(path, MAX_TRIALS_BYTES), path)

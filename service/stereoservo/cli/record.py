@@ -11,7 +11,15 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, note
+from stereoservo.cli.output import (
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+    note,
+)
 from stereoservo.client import Client, EventWatch
 from stereoservo.messages.recording_request import ImagesRecorded
 
@@ -38,7 +46,11 @@ def record(
         client.record(images=images)
         file = client.info().recording
         if not file:
-            file = watch.wait(lambda e: e.kind == "recording", "the recording", 5.0).message
+            began = watch.wait(lambda e: e.kind in ("recording", "recording_failed"), "the recording", 5.0)
+            if began.kind != "recording":
+                client.record(on=False)
+                raise CommandError("recording_failed", began.message)
+            file = began.message
         note(f"recording into {file}; Ctrl-C ends it")
         until = time.monotonic() + seconds
         try:

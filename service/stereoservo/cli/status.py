@@ -45,6 +45,10 @@ def describe(state: StateMessage) -> str:
         for reason in state.reasons
     ]
     lines += [f"  note    {text}" for text in state.notes]
+    if state.refused_messages:
+        lines.append(
+            f"  refused {state.refused_messages} messages that could not be taken since the gateway's start"
+        )
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)

@@ -21,6 +21,7 @@ from stereoservo.cli.output import (
     read_file,
 )
 from stereoservo.client import Client
+from stereoservo.messages.decoding import decoding
 from stereoservo.messages.wire import Synthesise, decode, encode
 
 
@@ -68,10 +69,9 @@ def teach(
 
 def read_drawing(path: Path, name: str) -> Synthesise:
     """Parse a drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
-    try:
-        tree: Any = msgspec.json.decode(read_file(path))
-    except msgspec.DecodeError as error:
-        raise CommandError("file", f"{path}: is not JSON: {error}") from error
+    data = read_file(path)
+    with decoding(lambda cause: CommandError("file", f"{path}: is not JSON: {cause}")):
+        tree: Any = msgspec.json.decode(data)
     if not isinstance(tree, dict):
         raise CommandError("file", f"{path}: holds {type(tree).__name__}; a JSON object is needed")
     pose = tree.get("pose")

@@ -51,8 +51,11 @@ class FailedError(ClientError):
 
     @property
     def code(self) -> str:
-        """Code of the cause: the event's ``name`` (a fit's code), else that of its first reason, else ``failed``."""
-        return self.event.name or next((reason.code for reason in self.event.reasons), "failed")
+        """Code of the cause: the event's ``name`` (a fit's code; that of a warning is a goal's), else that of its first
+        reason, else ``failed``.
+        """
+        name = "" if self.event.kind == "warning" else self.event.name
+        return name or next((reason.code for reason in self.event.reasons), "failed")
 
 
 class TimedOutError(ClientError):

@@ -10,8 +10,8 @@ from typing import Self
 from zenoh.handlers import RingChannel
 
 from stereoservo.client.connection import NEXT_EVENT, Connection, read_message
-from stereoservo.client.errors import DaemonLostError, NoReplyError, TimedOutError
-from stereoservo.messages.wire import EventMessage
+from stereoservo.client.errors import DaemonLostError, InvalidReplyError, NoReplyError, TimedOutError
+from stereoservo.messages.wire import EventMessage, MessageError
 
 POLL_S = 0.01
 ALIVE_EVERY_S = 1.0
@@ -57,6 +57,12 @@ class EventWatch:
             some = [event for event in page.events if event.seq < before]
             if not some:
                 return
+            numbers = [event.seq for event in some]
+            if numbers != list(range(self._next, self._next + len(some))):
+                raise InvalidReplyError(
+                    self._connection.keys.event,
+                    MessageError(f"events {numbers[:5]} in reply to a query from {self._next} on"),
+                )
             found.extend(some)
             self._next = some[-1].seq + 1
 

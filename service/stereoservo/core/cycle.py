@@ -4,6 +4,7 @@ events, and their msgpack encoding, arrays bit for bit.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import msgspec
@@ -175,6 +176,10 @@ class StepOutputs(msgspec.Struct, frozen=True, eq=False):
     driver_request: Literal["", "activate", "deactivate", "reset"] = ""
 
 
+_DTYPES = {dtype.str: dtype for dtype in map(np.dtype, "?bBhHiIqQfd")}
+"""Types of arrays that are read: `numpy.dtype` of any text would run a parser on it."""
+
+
 def encode_array(value: object) -> object:
     """msgspec ``enc_hook``: an array as (dtype, shape, bytes), bit for bit."""
     if isinstance(value, np.ndarray):
@@ -183,10 +188,17 @@ def encode_array(value: object) -> object:
 
 
 def decode_array(kind: type, value: object) -> object:
-    """msgspec ``dec_hook``, inverse of :func:`encode_array`."""
+    """msgspec ``dec_hook``, inverse of :func:`encode_array`. Raises ValueError, TypeError, before anything is
+    allocated.
+    """
     parts: Any = value
-    dtype, shape, data = parts
-    array: npt.NDArray[np.generic] = np.frombuffer(data, dtype=np.dtype(dtype)).reshape(shape).copy()
+    name, shape, data = parts
+    dtype = _DTYPES.get(name) if isinstance(name, str) else None
+    if dtype is None:
+        raise ValueError(f"an array of {name!r:.40}; numbers are valid: {', '.join(_DTYPES)}")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of shape {shape!r:.80} and type {name!r} in {len(data)} bytes")
+    array: npt.NDArray[np.generic] = np.frombuffer(data, dtype=dtype).reshape(shape).copy()
     return array
 
 

@@ -116,7 +116,11 @@ def main() -> int:
     except (CellFileError, DriverError, plugins.PluginError) as error:
         print(error, file=sys.stderr)
         return EXIT_INVALID
-    save_plan(plan)
+    try:
+        save_plan(plan)
+    except OSError as error:
+        print(f"{runtime}: the run plan cannot be written: {error.strerror}", file=sys.stderr)
+        return EXIT_INVALID
     compile_in_parallel()
     warm_up()
     return 0

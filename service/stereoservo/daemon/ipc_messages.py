@@ -13,7 +13,9 @@ from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.daemon.pacing import LoopStatistics
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import CameraSection, CellFile
+from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.messages.goals import Request
 from stereoservo.messages.recording_request import RecordedImages
 from stereoservo.ports.devices import (
@@ -23,6 +25,7 @@ from stereoservo.ports.devices import (
     DriverContext,
     JointDriverDescription,
     Prior,
+    check_observation,
 )
 from stereoservo.recording.step_records import StepMessage
 
@@ -34,6 +37,7 @@ PRIOR_CAPACITY = 1 << 16
 STATE_CAPACITY = 1 << 16
 
 COMMISSIONING_SPEED = 0.05
+MAX_PLAN_BYTES = 1 << 24
 
 
 class RunPlan(msgspec.Struct, frozen=True):
@@ -113,6 +117,8 @@ class ServoState(msgspec.Struct, frozen=True, eq=False):
     records_dropped: int
     differences: tuple[str, ...]
     """Reasons why the drives were sent something other than the core's command; empty where they were not."""
+    notes: tuple[str, ...] = ()
+    """Records of other processes that could not be read and were left out, by source."""
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -126,7 +132,14 @@ class Report(msgspec.Struct, frozen=True):
     """Of a recording of images that has ended."""
 
 
-class PlanError(Exception):
+def decode_observation(data: bytes) -> CameraObservation:
+    """An observation with arrays of the right shapes. Raises msgspec.MsgspecError, ValueError."""
+    observation = observation_decoder.decode(data)
+    check_observation(observation)
+    return observation
+
+
+class PlanError(DamagedError):
     """The run plan of a cell cannot be read."""
 
 
@@ -141,19 +154,12 @@ _plan_decoder = msgspec.msgpack.Decoder(RunPlan)
 
 
 def save_plan(plan: RunPlan) -> None:
-    """Write the plan into the runtime directory."""
-    path = Path(plan.runtime) / "plan.msgpack"
-    temporary = path.with_suffix(".new")
-    temporary.write_bytes(encode(plan))
-    temporary.replace(path)
+    """Write the plan into the runtime directory. Raises OSError."""
+    write_atomically(Path(plan.runtime) / "plan.msgpack", encode(plan))
 
 
 def load_plan(runtime: Path) -> RunPlan:
     """Read the plan of the cell whose runtime directory this is. Raises PlanError."""
     path = runtime / "plan.msgpack"
-    try:
-        return _plan_decoder.decode(path.read_bytes())
-    except OSError as error:
-        raise PlanError(f"{path}: {error.strerror}; this process is started by `stereoservo run`") from error
-    except msgspec.MsgspecError as error:
-        raise PlanError(f"{path}: {error}") from error
+    with decoding(lambda cause: PlanError(path, f"{cause}; this process is started by `stereoservo run`")):
+        return _plan_decoder.decode(read_bounded(path, MAX_PLAN_BYTES))

@@ -102,6 +102,8 @@ class FlightFile:
         """Finish the file. Idempotent."""
         if self._recorder is not None:
             self._recorder.close()
+            if self._recorder.failure:
+                raise OSError(f"{self._path}: {self._recorder.failure}")
 
 
 class MemoryLinks:

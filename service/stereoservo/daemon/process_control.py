@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
 
 _PR_SET_PDEATHSIG = 1
@@ -53,8 +54,9 @@ class Termination:
 
 
 def write_log(process: str, message: str) -> None:
-    """Write one line to stderr; the journal adds the time."""
-    print(f"stereoservo {process}: {message}", file=sys.stderr, flush=True)
+    """Write one line to stderr; the journal adds the time. A full disk or a closed pipe there loses the line alone."""
+    with suppress(OSError, ValueError):
+        print(f"stereoservo {process}: {message}", file=sys.stderr, flush=True)
 
 
 def child_environment() -> dict[str, str]:

@@ -27,6 +27,7 @@ _MAGIC_WORD, _LAYOUT_WORD, _CAPACITY_WORD, _PID_WORD, _EPOCH_WORD, _SEQUENCE_WOR
 
 _STOP_MAGIC = 0x53_53_54_4F_50_31  # "SSTOP1"
 _STOP_BYTES = 32
+_LARGEST_WORD = (1 << 64) - 1
 _STOP_MAGIC_WORD, _RAISED_WORD, _ACKNOWLEDGED_WORD, _COUNT_WORD = range(4)
 
 
@@ -50,20 +51,25 @@ def layout_hash(layout: str) -> int:
     return zlib.crc32(data) << 32 | zlib.crc32(data[::-1] + b"stereoservo")
 
 
-def create_slot(path: Path, capacity: int, layout: str) -> None:
-    """Create the file of a slot for records of up to ``capacity`` bytes; an existing one of that layout is left as
-    it is.
+def create_slot(path: Path, capacity: int, layout: str) -> bool:
+    """Create the file of a slot for records of up to ``capacity`` bytes; returns whether anything had to be written.
+
+    An existing one of that layout is left as it is. Another one is overwritten in place: processes may have it mapped,
+    and where it is shorter, their next access would kill them.
     """
     size = _HEADER_BYTES + capacity
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         header = os.pread(fd, 24, 0)
         expected = struct.pack("=QQQ", _MAGIC, layout_hash(layout), capacity)
-        if header == expected and os.fstat(fd).st_size == size:
-            return
-        os.ftruncate(fd, 0)
+        found = os.fstat(fd).st_size
+        if header == expected and found == size:
+            return False
         os.ftruncate(fd, size)
+        if found != size:
+            os.pwrite(fd, bytes(size), 0)  # what lies between belongs to another layout
         os.pwrite(fd, expected, 0)
+        return True
     finally:
         os.close(fd)
 
@@ -138,9 +144,10 @@ class SlotWriter:
                 path, "busy", f"already written by process {pid}; a slot has one writer"
             ) from error
         words = self._mapping.words
-        self._sequence = words[_SEQUENCE_WORD] + (words[_SEQUENCE_WORD] & 1)  # a crash may have left it odd
+        sequence = words[_SEQUENCE_WORD] + (words[_SEQUENCE_WORD] & 1)  # a crash may have left it odd
+        self._sequence = sequence if sequence < _LARGEST_WORD // 2 else 0  # else damaged: it must still grow
         words[_PID_WORD] = os.getpid()
-        words[_EPOCH_WORD] += 1
+        words[_EPOCH_WORD] = (words[_EPOCH_WORD] + 1) & _LARGEST_WORD
 
     def write(self, record: bytes) -> None:
         """Replace the record. Raises SlotError where it is longer than the capacity."""
@@ -239,6 +246,20 @@ def create_stop_slot(path: Path) -> None:
     path.chmod(0o600)
 
 
+def repair_stop_slot(path: Path) -> bool:
+    """Write the mark of a stop slot that has lost it, its words untouched; returns whether that was needed."""
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        mark = struct.pack("=Q", _STOP_MAGIC)
+        if os.pread(fd, 8, 0) == mark and os.fstat(fd).st_size == _STOP_BYTES:
+            return False
+        os.ftruncate(fd, _STOP_BYTES)
+        os.pwrite(fd, mark, 0)
+        return True
+    finally:
+        os.close(fd)
+
+
 class StopSlot:
     """A word in shared memory that any process may raise; the servo process reads and acknowledges it each cycle.
 
@@ -256,9 +277,12 @@ class StopSlot:
     def raise_stop(self) -> int:
         """Request a stop; returns the word to pass to :meth:`acknowledged`."""
         words = self._mapping.words
-        word = max(time.monotonic_ns(), words[_RAISED_WORD] + 1)
-        words[_COUNT_WORD] += 1
+        now = time.monotonic_ns()
+        word = max(now, words[_RAISED_WORD] + 1)
+        if word > _LARGEST_WORD:  # damaged: any other word stops the arm
+            word = now
         words[_RAISED_WORD] = word
+        words[_COUNT_WORD] = (words[_COUNT_WORD] + 1) & _LARGEST_WORD
         return word
 
     def acknowledged(self, word: int) -> bool:

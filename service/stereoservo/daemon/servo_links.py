@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from collections import deque
 
+import msgspec
+
 from stereoservo.core.cycle import Event, ModelUpdate, encode
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
@@ -17,12 +19,14 @@ from stereoservo.daemon.ipc_messages import (
     Hello,
     NewModel,
     ServoState,
-    observation_decoder,
+    ToServo,
+    decode_observation,
     to_servo_decoder,
 )
 from stereoservo.daemon.links import GatewayMessages
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot
 from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
+from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Request
 from stereoservo.ports.devices import CameraObservation, Prior
@@ -73,9 +77,11 @@ class ProcessLinks:
 
     def __init__(self, directories: CellDirectories, cameras: tuple[str, ...]) -> None:
         self._stop = StopSlot(directories.stop_slot)
+        slots = [directories.observation_slot(name) for name in cameras]
         self._observations = [
-            SlotReader(directories.observation_slot(name), OBSERVATION_LAYOUT) for name in cameras
+            (SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name)) for slot in slots
         ]
+        self._gateway_boundary = RecordBoundary("messages of the gateway")
         self._priors = {
             name: SlotWriter(directories.prior_slot(name), PRIOR_CAPACITY, PRIOR_LAYOUT) for name in cameras
         }
@@ -87,7 +93,7 @@ class ProcessLinks:
         self._outbox = EventOutbox()
 
     def receive(self) -> GatewayMessages:
-        """Requests and model of the newest gateway connection. Raises msgspec.MsgspecError."""
+        """Requests and model of the newest gateway connection; a message that does not decode is left out."""
         heard = False
         for peer in self._control.accept():
             self._gateway = peer
@@ -96,7 +102,9 @@ class ProcessLinks:
         update: ModelUpdate | None = None
         for data in [] if self._gateway is None else self._gateway.receive():
             heard = True
-            message = to_servo_decoder.decode(data)
+            message: ToServo | None = None
+            with self._gateway_boundary:
+                message = to_servo_decoder.decode(data)
             if isinstance(message, Ask):
                 requests.append(message.request)
             elif isinstance(message, NewModel):
@@ -106,9 +114,14 @@ class ProcessLinks:
         return GatewayMessages(heard, tuple(requests), update)
 
     def observations(self) -> tuple[CameraObservation, ...]:
-        """The newest observation of each camera that was not returned before. Raises msgspec.MsgspecError."""
-        polled = (reader.poll() for reader in self._observations)
-        return tuple(observation_decoder.decode(data) for data in polled if data is not None)
+        """The newest observation of each camera that was not returned before; what does not decode is left out."""
+        found = []
+        for reader, boundary in self._observations:
+            data = reader.poll()
+            if data is not None:
+                with boundary:
+                    found.append(decode_observation(data))
+        return tuple(found)
 
     def stop_raised(self) -> bool:
         """Whether the stop slot was raised since the last call; acknowledges it."""
@@ -127,7 +140,11 @@ class ProcessLinks:
         self._priors[prior.camera].write(encode(prior))
 
     def publish_state(self, state: ServoState) -> None:
-        """Write the state slot."""
+        """Write the state slot, with notes on the records that were left out."""
+        boundaries = (self._gateway_boundary, *(boundary for _, boundary in self._observations))
+        if any(boundary.refused for boundary in boundaries):
+            notes = tuple(boundary.note for boundary in boundaries if boundary.refused)
+            state = msgspec.structs.replace(state, notes=notes)
         self._state.write(encode(state))
 
     def publish_events(self, events: tuple[Event, ...]) -> None:
@@ -143,6 +160,6 @@ class ProcessLinks:
         self._state.close()
         for writer in self._priors.values():
             writer.close()
-        for reader in self._observations:
+        for reader, _ in self._observations:
             reader.close()
         self._stop.close()

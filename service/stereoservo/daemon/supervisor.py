@@ -29,11 +29,13 @@ from stereoservo.daemon.ipc_messages import (
     PRIOR_LAYOUT,
     STATE_CAPACITY,
     STATE_LAYOUT,
+    PlanError,
     RunPlan,
     load_plan,
+    save_plan,
 )
 from stereoservo.daemon.process_control import Termination, child_environment, write_log
-from stereoservo.daemon.seqlock import create_slot, create_stop_slot
+from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
 from stereoservo.daemon.vision import Reporter
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
@@ -125,6 +127,8 @@ class Supervisor:
         for child in self.children:
             if child.process is None:
                 if now >= child.due:
+                    for text in restore(self.plan):
+                        self._reporter.report("warning", text)
                     _start(child)
                 continue
             code = child.process.poll()
@@ -204,11 +208,42 @@ def prepare(
         raise StartError(text or f"checking the cell ended with exit code {process.returncode}")
     plan = load_plan(directories.runtime)
     create_stop_slot(directories.stop_slot)
-    create_slot(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)
-    for camera in plan.cameras:
-        create_slot(directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
-        create_slot(directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT)
+    for path, capacity, layout in _slots(plan):
+        create_slot(path, capacity, layout)
     return plan
+
+
+def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
+    """Path, capacity and layout of all slots of a cell."""
+    directories = plan.directories
+    found = [(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)]
+    for camera in plan.cameras:
+        found.append((directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT))
+        found.append((directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT))
+    return found
+
+
+def restore(plan: RunPlan) -> list[str]:
+    """Write again what a child needs in the runtime directory and no longer finds there whole; returns what that was.
+
+    Without this a damaged file would end each new child at its start, for ever.
+    """
+    directories = plan.directories
+    told = []
+    try:
+        try:
+            load_plan(directories.runtime)
+        except PlanError as error:
+            save_plan(plan)
+            told.append(f"the run plan was damaged and is written again: {error}")
+        if repair_stop_slot(directories.stop_slot):
+            told.append(f"{directories.stop_slot}: was damaged and is marked again as the stop slot")
+        for path, capacity, layout in _slots(plan):
+            if create_slot(path, capacity, layout):
+                told.append(f"{path}: was damaged and is laid out again")
+    except OSError as error:
+        told.append(f"{directories.runtime}: cannot be put in order: {error}")
+    return told
 
 
 def clean(directories: CellDirectories) -> None:

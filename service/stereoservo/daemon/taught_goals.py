@@ -9,23 +9,27 @@ Files of schema 1 are read; what they lack is taken from the model file of their
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from stereoservo.core.cycle import Event
-from stereoservo.kinematics.model import CellModel, Stratum, write_atomically
+from stereoservo.kinematics.model import CellModel, Stratum
+from stereoservo.messages.decoding import DamagedError, decoding
+from stereoservo.messages.files import read_bounded, verify_checksum, with_checksum, write_atomically
 from stereoservo.messages.goals import FeatureTarget, MarkerId, Pixel
 
 SCHEMA = 2
 READABLE_SCHEMAS = (1, 2)
+MAX_TAUGHT_BYTES = 1 << 26
 ModelOf = Callable[[int], CellModel | None]
 """The model of an epoch, None where its file is gone."""
 
 
-class TaughtFileError(Exception):
-    """The file of taught goals cannot be used: names the file and the cause."""
+class TaughtFileError(DamagedError):
+    """The file of taught goals cannot be used."""
 
 
 class TaughtCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,11 +73,12 @@ class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model: TaughtModel | None = None
 
 
-class TaughtFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of the file of taught goals."""
+class TaughtFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Content of the file of taught goals. ``crc32``: see `messages.files.with_checksum`."""
 
     schema: int
     goals: dict[str, TaughtGoal] = {}
+    crc32: str = ""
 
 
 def feature_target(event: Event, epoch: int, body: tuple[int, ...] | None = None) -> FeatureTarget:
@@ -151,22 +156,21 @@ def load_taught(path: Path, model_of: ModelOf = lambda _: None) -> dict[str, Tau
     """
     if not path.exists():
         return {}
-    try:
-        found = msgspec.json.decode(path.read_bytes(), type=TaughtFile)
-    except (OSError, msgspec.MsgspecError) as error:
-        raise TaughtFileError(
-            f"{path}: cannot be read ({error}); move it away to start without taught goals"
-        ) from error
-    if found.schema not in READABLE_SCHEMAS:
-        known = " and ".join(str(schema) for schema in READABLE_SCHEMAS)
-        raise TaughtFileError(f"{path}: schema {found.schema}; this program reads {known}")
-    if found.schema == 1:
-        return {
-            name: migrated(goal, model_of(goal.target.model_epoch or 0)) for name, goal in found.goals.items()
-        }
-    for name, goal in found.goals.items():
-        _check_shapes(path, name, goal.model)
-    return dict(found.goals)
+    with decoding(partial(TaughtFileError, path)):
+        data = read_bounded(path, MAX_TAUGHT_BYTES)
+        found = msgspec.json.decode(data, type=TaughtFile)
+        if found.schema not in READABLE_SCHEMAS:
+            known = " and ".join(str(schema) for schema in READABLE_SCHEMAS)
+            raise TaughtFileError(path, f"schema {found.schema}; this program reads {known}")
+        for name, goal in found.goals.items():
+            _check_shapes(path, name, goal.model)
+        verify_checksum(data)
+        if found.schema == 1:
+            return {
+                name: migrated(goal, model_of(goal.target.model_epoch or 0))
+                for name, goal in found.goals.items()
+            }
+        return dict(found.goals)
 
 
 def migrated(goal: TaughtGoal, model: CellModel | None) -> TaughtGoal:
@@ -193,10 +197,11 @@ def _check_shapes(path: Path, name: str, model: TaughtModel | None) -> None:
     for what, values, size in sizes:
         if len(values) != size:
             raise TaughtFileError(
-                f"{path}: goals.{name}.model: {what} has {len(values)} numbers; {size} are needed"
+                path, f"goals.{name}.model: {what} has {len(values)} numbers; {size} are needed"
             )
 
 
 def save_taught(path: Path, goals: dict[str, TaughtGoal]) -> None:
     """Write all taught goals, atomically. Raises OSError."""
-    write_atomically(path, msgspec.json.format(msgspec.json.encode(TaughtFile(SCHEMA, goals)), indent=1))
+    document = msgspec.json.format(msgspec.json.encode(TaughtFile(SCHEMA, goals)), indent=1)
+    write_atomically(path, with_checksum(document))

@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Callable, Generator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,7 @@ from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
 from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
+from stereoservo.messages.decoding import RecordBoundary, decoding
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path
 from stereoservo.messages.recording_request import RecordedImages, request_path
@@ -44,6 +46,7 @@ from stereoservo.ports.devices import (
     DriverError,
     Frame,
     Prior,
+    check_observation,
 )
 
 if TYPE_CHECKING:
@@ -96,13 +99,15 @@ class VisionSlots:
             directories.observation_slot(camera), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT
         )
         self._priors = SlotReader(directories.prior_slot(camera), PRIOR_LAYOUT)
+        self._boundary = RecordBoundary(directories.prior_slot(camera).name, partial(write_log, "vision"))
         self._prior: Prior | None = None
 
     def newest_prior(self) -> Prior | None:
-        """The newest prior, of any age; None before the first. Raises msgspec.MsgspecError."""
+        """The newest prior that decodes, of any age; None before the first."""
         data = self._priors.poll()
         if data is not None:
-            self._prior = prior_decoder.decode(data)
+            with self._boundary:
+                self._prior = prior_decoder.decode(data)
         return self._prior
 
     def publish_observation(self, observation: CameraObservation) -> None:
@@ -151,26 +156,30 @@ class CameraPipeline:
             self._driver.close()
 
     def poll(self) -> bool:
-        """Process the frames that arrived; True where an observation was published. Raises DriverError."""
-        arrived = self._driver.poll()
-        if not arrived:
-            return False
-        newest = arrived[-1]
-        self.frames += len(arrived)
-        if isinstance(newest, Frame):
-            if self._detector is None:
-                raise DriverError(
-                    "no_detector", "the camera delivers frames and the cell file names no detector"
-                )
-            observation = self._detector.detect(newest, self._fresh_prior())
-        else:
-            observation = newest
-        assert isinstance(observation, CameraObservation)
+        """Process the frames that arrived; True where an observation was published. Raises DriverError: of the driver,
+        and with code ``frame`` for whatever else driver or detector raise.
+        """
+        with decoding(
+            lambda cause: DriverError("frame", f"a frame cannot be used: {cause}", retry=True), (DriverError,)
+        ):
+            arrived = self._driver.poll()
+            if not arrived:
+                return False
+            self.frames += len(arrived)
+            observation = self._observed(arrived[-1])
+            check_observation(observation)
         self._links.publish_observation(observation)
         self.written += 1
         if self._images is not None:
             self._images.take(arrived)
         return True
+
+    def _observed(self, newest: Frame | CameraObservation) -> CameraObservation:
+        if not isinstance(newest, Frame):
+            return newest
+        if self._detector is None:
+            raise DriverError("no_detector", "the camera delivers frames and the cell file names no detector")
+        return self._detector.detect(newest, self._fresh_prior())
 
     def _fresh_prior(self) -> Prior | None:
         prior = self._links.newest_prior()

@@ -20,19 +20,41 @@ EXPECTED_ERRORS = (MessageError, InvalidKeyError, TransferError)
 """What the gateway's own checks raise; their texts are made for clients."""
 
 
+class RateLimit:
+    """Limit of what clients can cause at will: ``burst`` at once, and one a second after that.
+
+    ``held_back``: number of those since the last one that passed.
+    """
+
+    def __init__(self, burst: int) -> None:
+        self._burst = burst
+        self._left = float(burst)
+        self._filled_s = time.monotonic()
+        self.held_back = 0
+
+    def passes(self) -> bool:
+        """Count an occurrence; returns whether it is within the limit. The caller resets ``held_back``."""
+        now = time.monotonic()
+        self._left = min(self._burst, self._left + max(0.0, now - self._filled_s) / LOG_INTERVAL_S)
+        self._filled_s = now
+        if self._left >= 1.0:
+            self._left -= 1.0
+            return True
+        self.held_back += 1
+        return False
+
+
 class LimitedLog:
     """Rate-limited log of what clients can cause at will: at most a line a second; ``count``: of all occurrences."""
 
     def __init__(self) -> None:
         self.count = 0
-        self._logged = -LOG_INTERVAL_S
+        self._limit = RateLimit(1)
 
     def add(self, text: str) -> None:
         """Count an occurrence, and log it unless another line was logged within the last second."""
         self.count += 1
-        now = time.monotonic()
-        if now - self._logged >= LOG_INTERVAL_S:
-            self._logged = now
+        if self._limit.passes():
             printable = "".join(character if character.isprintable() else " " for character in _cut(text))
             write_log("gateway", f"{printable} ({self.count} of this kind since the start)")
 

@@ -47,7 +47,10 @@ class CalibrationJobs:
 
     def load(self, core_epoch: int) -> None:
         """Send the newest fitting model on disk to the core, unless that (epoch ``core_epoch``) has it."""
-        model, passed = self._models.newest_fitting(self._settings)
+        try:
+            model, passed = self._models.newest_fitting(self._settings, recover=True)
+        except OSError as error:
+            model, passed = None, [f"{error.filename}: {error.strerror}"]
         used = "no model is used" if model is None else f"model epoch {model.epoch} is used instead"
         self.notes = tuple(f"model passed over: {text}; {used}" for text in passed)
         for text in self.notes:

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,9 +17,10 @@ import msgspec
 from stereoservo.calibration.fit_assessment import Acceptance
 from stereoservo.calibration.trial_data import TrialData, save_trials
 from stereoservo.daemon.jobs.fit_job import figures_file, report_folder, trials_file
-from stereoservo.daemon.process_control import child_environment
+from stereoservo.daemon.process_control import child_environment, write_log
 from stereoservo.kinematics.model import CellModel, load_model
 from stereoservo.messages.check_report import CheckReport, ZeroReset
+from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.wire import CalibrationResult
 
 FIT_TIMEOUT_S = 600.0
@@ -53,6 +55,7 @@ class ChildJob:
         self._output = self._process.stdout
         os.set_blocking(self._output.fileno(), False)
         self._buffer = b""
+        self._boundary = RecordBoundary(f"output of {module}", partial(write_log, "gateway"))
         self.said: dict[str, Any] = {}
 
     def poll(self) -> Iterator[FitProgress]:
@@ -61,9 +64,13 @@ class ChildJob:
             self._buffer += chunk
         *lines, self._buffer = self._buffer.split(b"\n")
         for line in lines:
-            said = msgspec.json.decode(line)
-            if "progress" in said:
-                yield msgspec.convert(said, FitProgress)
+            said: dict[str, Any] = {}
+            step: FitProgress | None = None
+            with self._boundary:  # a library may print, too
+                said = msgspec.json.decode(line, type=dict[str, Any])
+                step = msgspec.convert(said, FitProgress) if "progress" in said else None
+            if step is not None:
+                yield step
             else:
                 self.said |= said
 

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from stereoservo.core.cycle import Event
-from stereoservo.gateway.boundary import Boundary
+from stereoservo.gateway.boundary import Boundary, RateLimit
 from stereoservo.gateway.point_alignment import TransferError
 from stereoservo.gateway.publisher import EventLog, ReplyThread
 from stereoservo.gateway.servo_connection import ServoConnection
@@ -44,8 +44,8 @@ RESET_REPLY_TIMEOUT_S = 10.0
 """A driver that reconnects and configures its drives does not reply meanwhile."""
 PATIENCE_S: dict[type, float] = {RunGoal: PLANNED_REPLY_TIMEOUT_S, Reset: RESET_REPLY_TIMEOUT_S}
 KNOWN_GOALS = 1000
-TOLD_EVERY_S = 1.0
-"""Refused set-points of a stream have no reply; events report them no more often than this."""
+REPORTED_AT_ONCE = 10
+"""Goals that were put have no reply: their refusals are events, so many at once and one a second after that."""
 
 
 @dataclass
@@ -88,7 +88,8 @@ class Intake:
         self._pending: dict[int, _Pending] = {}
         self._goals: OrderedDict[str, Reply] = OrderedDict()
         self._note = ""
-        self._stream_told = -TOLD_EVERY_S
+        self._stream_limit = RateLimit(1)
+        self._put_limit = RateLimit(REPORTED_AT_ONCE)
 
     # -- from zenoh -----------------------------------------------------------------------------------------
 
@@ -231,12 +232,13 @@ class Intake:
         if query is not None:
             self._replies.reply(query, encode(reply))
         elif not reply.accepted:
-            if streamed:
-                now = time.monotonic()
-                if now - self._stream_told < TOLD_EVERY_S:
-                    return
-                self._stream_told = now
+            limit = self._stream_limit if streamed else self._put_limit
+            if not limit.passes():
+                return
             text = "; ".join((reply.message, *reply.problems))
+            if limit.held_back:
+                text += f" ({limit.held_back} refusals before it are not reported)"
+                limit.held_back = 0
             self._log.add(
                 "goal_refused",
                 message=text,

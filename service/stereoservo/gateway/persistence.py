@@ -1,28 +1,55 @@
-"""Files in a cell's state directory: stores of taught goals and models, written atomically, and the journal, a log of
-events.
+"""Files that the gateway keeps: stores of taught goals and models, the number of the last handled event, and the
+journal, a log of events. None of them ends the gateway: what is damaged is set aside, what cannot be written is told.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+import time
+import zlib
+from collections.abc import Callable
+from functools import partial
+from io import FileIO
 from pathlib import Path
 
+from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CoreSettings
-from stereoservo.daemon.taught_goals import ModelOf, TaughtGoal, load_taught, save_taught
+from stereoservo.daemon.taught_goals import (
+    ModelOf,
+    TaughtFileError,
+    TaughtGoal,
+    load_taught,
+    save_taught,
+)
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
+from stereoservo.messages.decoding import DamagedError, decoding
+from stereoservo.messages.files import read_bounded, set_aside, write_atomically
 
 JOURNAL_BYTES = 10_000_000
+REOPEN_S = 1.0
+"""How often a journal that could not be opened is tried again."""
+Tell = Callable[[str, str], None]
+"""Called with the topic and the text of a note for the cell's keeper."""
 
 
 class TaughtStore:
     """Taught goals by name. ``model_of``: see `load_taught`.
 
-    Raises TaughtFileError for a damaged file (which stays as it is).
+    A damaged file is set aside, told to ``recover``, and there are no goals; without ``recover`` it stays as it is, and
+    TaughtFileError is raised.
     """
 
-    def __init__(self, path: Path, model_of: ModelOf = lambda _: None) -> None:
+    def __init__(self, path: Path, model_of: ModelOf = lambda _: None, recover: Tell | None = None) -> None:
         self._path = path
-        self.goals: dict[str, TaughtGoal] = load_taught(path, model_of)
+        self.goals: dict[str, TaughtGoal] = {}
+        try:
+            self.goals = load_taught(path, model_of)
+        except TaughtFileError as error:
+            if recover is None:
+                raise
+            recover("taught goals", f"{error}; {set_aside(path)}, and there are no taught goals")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -30,15 +57,17 @@ class TaughtStore:
         return tuple(sorted(self.goals))
 
     def add(self, name: str, goal: TaughtGoal) -> None:
-        """Store a goal, replacing one of the same name. Raises OSError."""
-        self.goals[name] = goal
-        save_taught(self._path, self.goals)
+        """Store a goal, replacing one of the same name. Raises OSError, and the goal is not there then."""
+        goals = {**self.goals, name: goal}
+        save_taught(self._path, goals)
+        self.goals = goals
 
 
 class ModelStore:
     """Model files ``model-<epoch>.json``; an epoch is never used twice."""
 
     _FILE = re.compile(r"model-(\d{6,})\.json")
+    _USED = re.compile(r"model-(\d{6,})\.json(?:\.damaged-\d+)?")
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
@@ -49,13 +78,16 @@ class ModelStore:
 
     def epochs(self) -> list[int]:
         """Epochs of all model files, ascending."""
+        return self._epochs(self._FILE)
+
+    def _epochs(self, pattern: re.Pattern[str]) -> list[int]:
         return sorted(
-            int(match[1]) for path in self._directory.iterdir() if (match := self._FILE.fullmatch(path.name))
+            int(match[1]) for path in self._directory.iterdir() if (match := pattern.fullmatch(path.name))
         )
 
     def next_epoch(self) -> int:
-        """The last epoch plus one."""
-        return max(self.epochs(), default=0) + 1
+        """The last epoch plus one; those of damaged files that were set aside count."""
+        return max(self._epochs(self._USED), default=0) + 1
 
     def of_epoch(self, epoch: int) -> CellModel | None:
         """Model of an epoch, None where its file is missing or damaged."""
@@ -64,15 +96,21 @@ class ModelStore:
         except ModelFileError:
             return None
 
-    def newest_fitting(self, settings: CoreSettings) -> tuple[CellModel | None, list[str]]:
-        """Newest model that fits the cell's joints and cameras, and why newer ones were skipped."""
+    def newest_fitting(
+        self, settings: CoreSettings, *, recover: bool = False
+    ) -> tuple[CellModel | None, list[str]]:
+        """Newest model that fits the cell's joints and cameras, and why newer ones were skipped.
+
+        ``recover``: set damaged files aside. Models of another schema are not damaged.
+        """
         passed = []
         for epoch in reversed(self.epochs()):
             path = self.path(epoch)
             try:
                 model = load_model(path)
             except ModelFileError as error:
-                passed.append(str(error))
+                aside = f"; {set_aside(path)}" if recover and error.key != "schema" else ""
+                passed.append(f"{error}{aside}")
                 continue
             mismatch = _mismatch(model, settings)
             if not mismatch:
@@ -106,22 +144,111 @@ def _joints(of: CellModel | CoreSettings) -> str:
     )
 
 
+class HandledEvents:
+    """Number of the last core event whose effects were carried out, kept in a file for a restarted gateway, which is
+    sent the servo process's events again and must not teach or fit twice.
+
+    Where the file is damaged, all events of before this start are taken for handled.
+    """
+
+    def __init__(self, path: Path, tell: Tell) -> None:
+        self._path, self._tell = path, tell
+        self._last = 0
+        self._not_before_ns = 0
+        if not path.exists():
+            return
+        try:
+            with decoding(partial(DamagedError, path)):
+                self._last = self._decoded(read_bounded(path, 100))
+        except DamagedError as error:
+            self._not_before_ns = time.monotonic_ns()
+            self._tell(
+                "handled events",
+                f"{error}; {set_aside(path)}. What was taught or calibrated in the moment before the gateway's start "
+                "may be missing: look, and repeat it",
+            )
+
+    @staticmethod
+    def _decoded(data: bytes) -> int:
+        number, _, checksum = data.strip().partition(b" ")
+        if not number.isdigit() or checksum != b"%08x" % zlib.crc32(number):
+            raise ValueError(f"holds {data!r}; a number and its CRC are needed")
+        return int(number)
+
+    def is_fresh(self, event: Event) -> bool:
+        """Whether the effects of ``event`` were not carried out yet."""
+        return event.seq > self._last and event.t_ns >= self._not_before_ns
+
+    def add(self, event: Event) -> None:
+        """Count ``event`` as handled; in memory alone where the file cannot be written."""
+        self._last = max(self._last, event.seq)
+        number = b"%d" % self._last
+        try:
+            write_atomically(self._path, number + b" %08x\n" % zlib.crc32(number))
+        except OSError as error:
+            self._tell(
+                "handled events in memory",
+                f"{self._path}: {error.strerror}; a restart of the gateway may repeat the last teaching or fit",
+            )
+        else:
+            self._tell("handled events in memory", "")
+
+
 class Journal:
-    """Log of events for people, one JSON object a line; the older half is dropped when the file has grown large."""
+    """Log of events for people, one JSON object a line; the older half is dropped when the file has grown large.
+
+    What cannot be written is lost and counted (``note``).
+    """
 
     def __init__(self, path: Path, limit: int = JOURNAL_BYTES) -> None:
         self._path = path
         self._limit = limit
-        self._stream = path.open("ab", buffering=0)
+        self._stream: FileIO | None = None
+        self._tried_s = -REOPEN_S
+        self._torn = False
+        self._lost = 0
+        self._cause = ""
+        try:
+            self._open()
+        except OSError as error:
+            self._cause = error.strerror or str(error)
+
+    @property
+    def note(self) -> str:
+        """Text on lines that are missing; empty where there are none."""
+        return f"{self._path}: {self._lost} events are missing in it: {self._cause}" if self._cause else ""
+
+    def _open(self) -> FileIO:
+        if self._stream is None:
+            self._tried_s = time.monotonic()
+            self._stream = FileIO(self._path, "ab")
+        return self._stream
 
     def add(self, line: bytes) -> None:
-        """Append a line."""
-        self._stream.write(line + b"\n")
-        if self._stream.tell() > self._limit:
-            self._stream.close()
+        """Append a line, unless the file cannot be written."""
+        if self._stream is None and time.monotonic() - self._tried_s < REOPEN_S:
+            self._lost += 1
+            return
+        try:
+            self._write(line)
+        except OSError as error:
+            self._lost += 1
+            self._cause = error.strerror or str(error)
+
+    def _write(self, line: bytes) -> None:
+        stream = self._open()
+        data = (b"\n" if self._torn else b"") + line + b"\n"
+        written = stream.write(data)
+        self._torn = written < len(data)
+        if self._torn:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if stream.tell() > self._limit:
+            self.close()
             self._path.replace(self._path.with_suffix(".1.jsonl"))
-            self._stream = self._path.open("ab", buffering=0)
+            self._open()
 
     def close(self) -> None:
         """Close the file. Idempotent."""
-        self._stream.close()
+        if self._stream is not None:
+            stream, self._stream = self._stream, None
+            stream.close()

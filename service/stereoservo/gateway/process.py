@@ -26,22 +26,23 @@ from stereoservo.core.cycle import Event
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PlanError,
+    Report,
     RunPlan,
+    decode_observation,
     load_plan,
-    observation_decoder,
     report_decoder,
 )
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.daemon.seqpacket import ChannelServer
-from stereoservo.daemon.taught_goals import TaughtFileError
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.intake import Intake, payload_of
 from stereoservo.gateway.observation_cache import ObservationCache
-from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
+from stereoservo.gateway.persistence import HandledEvents, Journal, ModelStore, TaughtStore
 from stereoservo.gateway.publisher import (
     SILENT,
     EventLog,
+    KeeperNotes,
     Publishers,
     ReplyThread,
     cell_info,
@@ -56,8 +57,10 @@ from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, stop_config
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import DirectoryError
 from stereoservo.messages.discovery import DaemonInfo
+from stereoservo.messages.files import write_atomically
 from stereoservo.messages.keys import VERBS, KeySpace
 from stereoservo.messages.wire import (
     CellInfo,
@@ -76,6 +79,7 @@ IDLE_S = 0.003
 FINAL_PASSES = 100
 SERVO_STALE_S = 0.5
 DRAIN = 32
+ANNOUNCE_AGAIN_S = 1.0
 EXIT_SETUP = 3
 GATEWAY_VERBS = ("record", "synthesise")
 """Commands that the gateway carries out itself."""
@@ -98,6 +102,7 @@ class Gateway:
         self.endpoint = endpoint_of(plan.cell, directories.zenoh_socket)
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.log = EventLog(self.boot, self._publish_event)
+        self._notes = KeeperNotes(self.log)
         self._servo = ServoConnection(directories)
         self._servo.records = bool(plan.record)
         self._replies = ReplyThread()
@@ -111,7 +116,7 @@ class Gateway:
             {camera.name: camera.systematic_px for camera in self.settings.cameras}
         )
         self._teaching = TaughtGoalRegistry(
-            TaughtStore(directories.taught, self._models.of_epoch),
+            TaughtStore(directories.taught, self._models.of_epoch, self._notes.tell),
             self._marker_cache,
             lambda: self._calibration.model,
             self.log,
@@ -120,9 +125,12 @@ class Gateway:
             self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot
         )
         self._reports = ChannelServer(directories.reports_socket)
+        slots = [directories.observation_slot(name) for name in cameras]
+        log = partial(write_log, "gateway")
         self._observations = [
-            SlotReader(directories.observation_slot(name), OBSERVATION_LAYOUT) for name in cameras
+            (SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name, log)) for slot in slots
         ]
+        self._report_boundary = RecordBoundary("reports of vision processes and supervisor", log)
         self._declare()
         self._stop = StopThread(
             stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot
@@ -130,11 +138,10 @@ class Gateway:
         self._state: StateMessage | None = None
         self._state_heard = 0.0
         self._state_sent = 0.0
-        self._recordings = Recordings(plan, self.log)
-        self._handled_path = directories.runtime / "handled"
-        self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
+        self._recordings = Recordings(plan, self.log, self._notes.tell)
+        self._handled = HandledEvents(directories.runtime / "handled", self._notes.tell)
         self._greeted = False
-        self._announced = False
+        self._announce_due_s: float | None = 0.0
 
     def _declare(self) -> None:
         session, keys = self._session, self.keys
@@ -184,15 +191,18 @@ class Gateway:
         self._publish_features()
         self._publish_state()
         self._read_reports()
-        for item in self._servo.steps():
-            self._recordings.take(item)
+        self._take_steps()
         self._recordings.images.poll()
         self._calibration.poll()
         self._relocalization.poll()
-        if not self._announced and self._greeted:
-            self._announced = True
-            self._announce()
+        self._announce()
         return busy
+
+    def _take_steps(self, limit: int = 512) -> None:
+        for item in self._servo.steps(limit):
+            self._recordings.take(item)
+        if self._recordings.refused:  # the next request to record begins anew
+            self._recordings.refused = self._servo.records = False
 
     def _queries(self) -> bool:
         busy = False
@@ -252,8 +262,7 @@ class Gateway:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
         self._servo.records = request.on
         if not request.on:
-            steps = self._recordings.stop()
-            return Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
+            return Reply(True, self._recordings.stop(), boot=self.boot)
         if self._recordings.running:
             return Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
         return Reply(True, "recording begins; its event names the file", boot=self.boot)
@@ -293,48 +302,53 @@ class Gateway:
             self._intake.core_reply(event)
         if event.kind in SILENT:
             return
-        fresh = event.seq > self._handled
-        if event.kind == "taught" and fresh:
-            self._teaching.taught(event)
-        self.log.add_core(event)
+        fresh = self._handled.is_fresh(event)
+        if event.kind != "taught" or not fresh or self._teaching.taught(event):
+            self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
         self._relocalization.core_event(event, fresh=fresh)
         if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"):
-            # A restarted gateway is sent the servo process's events again and must not do these twice.
-            self._handled = max(self._handled, event.seq)
-            self._handled_path.write_text(str(self._handled))
+            self._handled.add(event)
 
     # -- telling --------------------------------------------------------------------------------------------
 
     def _publish_features(self) -> None:
-        for reader in self._observations:
+        for reader, boundary in self._observations:
             data = reader.poll()
             if data is None:
                 continue
-            observation = observation_decoder.decode(data)
-            self._marker_cache.add(observation)
-            try:
+            with boundary:
+                observation = decode_observation(data)
                 payload = encode(features_message(observation))
-            except MessageError as error:
-                write_log("gateway", str(error))
-                continue
-            self._publishers.features[observation.camera].put(payload)
+                publisher = self._publishers.features[observation.camera]
+                self._marker_cache.add(observation)
+                publisher.put(payload)
 
     def _read_state(self) -> None:
         now = time.monotonic()
         state = self._servo.state()
         if state is not None:
             self._state_heard = now
+            self._collect_notes()
             self._state = state_message(
                 self.plan,
                 self.boot,
                 state,
                 servo_alive=True,
                 last_event=self.log.last,
-                notes=self._calibration.notes,
+                notes=(*self._calibration.notes, *self._notes.texts),
+                refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
             )
         elif self._state is not None and self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
             self._state = msgspec.structs.replace(self._state, servo_alive=False)
+
+    def _collect_notes(self) -> None:
+        """Bring the notes on what was left out up to date."""
+        self._notes.tell("journal", self._journal.note)
+        self._notes.tell("servo process", self._servo.note)
+        self._notes.tell("reports", self._report_boundary.note)
+        for k, (_, boundary) in enumerate(self._observations):
+            self._notes.tell(f"observations {k}", boundary.note)
 
     def _publish_state(self) -> None:
         now = time.monotonic()
@@ -347,21 +361,23 @@ class Gateway:
         self._reports.accept()
         for peer in self._reports.peers:
             for data in peer.receive():
-                report = report_decoder.decode(data)
-                if report.images is not None:
-                    self._recordings.images.add_report(report.images)
-                self.log.add(
-                    report.kind,
-                    t_ns=report.t_ns,
-                    message=report.message,
-                    name=report.origin,
-                    origin=report.origin,
-                )
+                with self._report_boundary:
+                    self._take_report(report_decoder.decode(data))
+
+    def _take_report(self, report: Report) -> None:
+        if report.images is not None:
+            self._recordings.images.add_report(report.images)
+        self.log.add(
+            report.kind, t_ns=report.t_ns, message=report.message, name=report.origin, origin=report.origin
+        )
 
     # -- life -----------------------------------------------------------------------------------------------
 
     def _announce(self) -> None:
         """Announce the daemon in ``daemon.json``, once the servo process accepts requests."""
+        now = time.monotonic()
+        if not self._greeted or self._announce_due_s is None or now < self._announce_due_s:
+            return
         plan = self.plan
         info = DaemonInfo(
             cell=plan.cell.cell.name,
@@ -372,17 +388,22 @@ class Gateway:
             dry_run=plan.dry_run,
             commissioning=plan.commissioning,
         )
-        path = plan.directories.daemon
-        temporary = path.with_suffix(".new")
-        temporary.write_bytes(encode(info))
-        temporary.replace(path)
+        try:
+            write_atomically(plan.directories.daemon, encode(info))
+        except OSError as error:
+            self._announce_due_s = now + ANNOUNCE_AGAIN_S
+            self._notes.tell(
+                "announcement", f"{plan.directories.daemon}: {error.strerror}; clients cannot find the daemon"
+            )
+        else:
+            self._announce_due_s = None
+            self._notes.tell("announcement", "")
 
     def close(self) -> None:
         """Finish the recording, cancel the fit, close the sessions within a time limit."""
         self._calibration.cancel()
         self._relocalization.cancel()
-        for item in self._servo.steps(100_000):
-            self._recordings.take(item)
+        self._take_steps(100_000)
         self._recordings.stop()
         with suppress(zenoh.ZError):  # telling is good manners, not needed
             self.log.add("daemon_ends", message="the daemon ends", origin="gateway")
@@ -429,7 +450,7 @@ def main() -> int:
     termination = Termination(grace_s=8.0)
     try:
         run(load_plan(runtime), termination)
-    except (DirectoryError, OSError, PlanError, SessionError, SlotError, TaughtFileError) as error:
+    except (DirectoryError, OSError, PlanError, SessionError, SlotError) as error:
         write_log("gateway", str(error))
         return EXIT_SETUP
     return 0

@@ -128,6 +128,29 @@ class EventLog:
         return EventList(self._boot, first, begin + len(some), some)
 
 
+class KeeperNotes:
+    """Notes for the cell's keeper, one a topic, shown in the state; a new one is also reported by one event."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self._texts: dict[str, str] = {}
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The notes, oldest topic first."""
+        return tuple(self._texts.values())
+
+    def tell(self, topic: str, text: str) -> None:
+        """Set the note on ``topic``; an empty text removes it."""
+        known = topic in self._texts
+        if text:
+            self._texts[topic] = text
+        else:
+            self._texts.pop(topic, None)
+        if text and not known:
+            self._log.add("warning", message=text, origin="gateway")
+
+
 def state_message(
     plan: RunPlan,
     boot: str,
@@ -136,6 +159,7 @@ def state_message(
     servo_alive: bool,
     last_event: int,
     notes: tuple[str, ...] = (),
+    refused_messages: int = 0,
 ) -> StateMessage:
     """The state in the clients' format; numbers that are not finite are left out."""
     status, loop = state.status, state.loop
@@ -175,7 +199,8 @@ def state_message(
         dry_run=plan.dry_run,
         differences=state.differences,
         last_event=last_event,
-        notes=notes,
+        notes=(*notes, *state.notes),
+        refused_messages=refused_messages,
         progress=_number(status.progress),
         seconds_left=_number(status.seconds_left),
         efforts=_finite(names, status.efforts),

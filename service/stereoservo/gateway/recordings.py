@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.gateway.persistence import Tell
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.messages.recording_request import (
     ImageRecordingRequest,
@@ -62,7 +63,12 @@ class ImageRecordings:
             self._until = 0.0  # the recording before has had its time
             self.poll()
         directory = images_directory(recording)
-        write_request(self._path, ImageRecordingRequest(time.monotonic_ns(), str(directory)))
+        try:
+            write_request(self._path, ImageRecordingRequest(time.monotonic_ns(), str(directory)))
+        except OSError as error:
+            text = f"no images are recorded: {self._path}: {error.strerror}"
+            self._log.add("warning", message=text, name=str(directory), origin="gateway")
+            return
         self._directory, self._until, self._told = str(directory), None, {}
         left = f"; {', '.join(self._others)} deliver observations and are not in it" if self._others else ""
         self._log.add(
@@ -110,16 +116,21 @@ class ImageRecordings:
 
 
 class Recordings:
-    """The current flight recording, if any. ``path``: its file, or that of the last one."""
+    """The current flight recording, if any. ``path``: its file, or that of the last one.
 
-    def __init__(self, plan: RunPlan, log: EventLog) -> None:
+    A file that cannot be written ends early or never begins (``refused``): events and notes by ``tell`` have the cause.
+    """
+
+    def __init__(self, plan: RunPlan, log: EventLog, tell: Tell) -> None:
         self._plan = plan
         self._log = log
+        self._tell = tell
         self._recorder: FlightRecorder | None = None
         self._with_images = False
+        self._failed = False
         self.images = ImageRecordings(plan, log)
         self.path = ""
-        self.steps = 0
+        self.refused = False
 
     @property
     def running(self) -> bool:
@@ -138,13 +149,32 @@ class Recordings:
         if isinstance(item, RecordingStart):
             again = self._with_images
             self.stop()
-            self._recorder = FlightRecorder(self._new_path(), item.settings, item.fingerprint)
-            self.path = str(self._recorder.path)
-            self._log.add("recording", message=self.path, origin="gateway")
-            if again:
+            self._begin(item)
+            if again and self._recorder is not None:
                 self.want_images()
         elif self._recorder is not None:
             self._recorder.write(item)
+            if self._recorder.failure and not self._failed:
+                self._fail(_summary(self._recorder))
+
+    def _begin(self, start: RecordingStart) -> None:
+        self._failed = False
+        path = self._new_path()
+        self.path = str(path)
+        try:
+            self._recorder = FlightRecorder(path, start.settings, start.fingerprint)
+        except OSError as error:
+            self.refused = True
+            self._fail(f"{path}: no recording: {error.strerror}")
+            return
+        self.refused = False
+        self._tell("recording", "")
+        self._log.add("recording", message=self.path, origin="gateway")
+
+    def _fail(self, text: str) -> None:
+        self._failed = True
+        self._log.add("recording_failed", message=text, name=self.path, accepted=False, origin="gateway")
+        self._tell("recording", text)
 
     def _new_path(self) -> Path:
         """The requested file; another name where it exists (a restarted gateway continues in a new file)."""
@@ -154,12 +184,23 @@ class Recordings:
             return wanted.with_stem(f"{wanted.stem}-{stamp}") if wanted.exists() else wanted
         return self._plan.directories.recordings / f"{self._plan.cell.cell.name}-{stamp}.mcap"
 
-    def stop(self) -> int:
-        """Finish the file and the image recordings; returns the number of its steps. Idempotent."""
+    def stop(self) -> str:
+        """Finish the file and the image recordings; returns what is in it. Idempotent."""
         self._with_images = False
+        self.refused = False
         self.images.end()
         if self._recorder is None:
-            return 0
+            return f"{self.path}: 0 steps"
         recorder, self._recorder = self._recorder, None
         recorder.close()
-        return recorder.steps
+        if recorder.failure and not self._failed:
+            self._fail(_summary(recorder))
+        return _summary(recorder)
+
+
+def _summary(recorder: FlightRecorder) -> str:
+    """Steps of a recording, and why there are no more of them."""
+    text = f"{recorder.path}: {recorder.steps} steps"
+    if recorder.failure:
+        text += f", {recorder.dropped} left out: {recorder.failure}"
+    return text

@@ -5,6 +5,7 @@ records.
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import msgspec
 
@@ -20,9 +21,11 @@ from stereoservo.daemon.ipc_messages import (
     state_decoder,
     steps_decoder,
 )
+from stereoservo.daemon.process_control import write_log
 from stereoservo.daemon.seqlock import SlotReader
 from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Command, Request
 from stereoservo.recording.step_records import StepMessage
@@ -40,11 +43,17 @@ class ServoConnection:
         self._control: PacketChannel | None = None
         self._steps: PacketChannel | None = None
         self._state = SlotReader(directories.state_slot, STATE_LAYOUT)
+        self._boundary = RecordBoundary("messages of the servo process", partial(write_log, "gateway"))
         self._last_beat = 0.0
         self._last_try = 0.0
         self._last_event = 0
         # A restarted gateway is sent old replies again: numbers must not meet those of its predecessor.
         self._next_request = time.monotonic_ns() // 1000
+
+    @property
+    def note(self) -> str:
+        """Text on messages that could not be read; empty where there were none."""
+        return self._boundary.note
 
     @property
     def connected(self) -> bool:
@@ -86,7 +95,10 @@ class ServoConnection:
         """Core events since the last call, in order."""
         if self._control is None:
             return []
-        found = [event_decoder.decode(data) for data in self._control.receive(256)]
+        found: list[Event] = []
+        for data in self._control.receive(256):
+            with self._boundary:
+                found.append(event_decoder.decode(data))
         if found:
             self._last_event = max(self._last_event, found[-1].seq)
         return found
@@ -95,12 +107,19 @@ class ServoConnection:
         """Step records since the last call, at most ``limit``."""
         if self._steps is None:
             return []
-        return [steps_decoder.decode(data) for data in self._steps.receive(limit)]
+        found: list[StepMessage] = []
+        for data in self._steps.receive(limit):
+            with self._boundary:
+                found.append(steps_decoder.decode(data))
+        return found
 
     def state(self) -> ServoState | None:
         """The servo process's newest state, None unless it is new."""
         data = self._state.poll()
-        return None if data is None else state_decoder.decode(data)
+        if data is not None:
+            with self._boundary:
+                return state_decoder.decode(data)
+        return None
 
     def close(self) -> None:
         """Release all; idempotent."""

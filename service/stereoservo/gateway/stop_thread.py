@@ -45,6 +45,11 @@ class StopThread:
         self._thread = threading.Thread(target=self._work, name="stop", daemon=True)
         self._thread.start()
 
+    @property
+    def refused(self) -> int:
+        """Number of messages that could not be taken."""
+        return self._boundary.refusals.count
+
     def _work(self) -> None:
         while not self._ending.is_set():
             try:

@@ -59,19 +59,17 @@ class TaughtGoalRegistry:
             while len(self._tools) > KNOWN_TOOLS:
                 self._tools.popitem(last=False)
 
-    def taught(self, event: Event) -> None:
-        """Store the goal of a ``taught`` event."""
+    def taught(self, event: Event) -> bool:
+        """Store the goal of a ``taught`` event; returns whether that was possible. A warning has the reason if not."""
         model = self._model()
         tool = self._tools.pop(event.request, ())
         if model is None:
-            self._warn(event.name, "the model that it was seen with is gone")
-            return
+            return self._warn(event.name, "the model that it was seen with is gone", event.request)
         missing = [m for m in tool if not any(m in sample.ids for sample in event.samples)]
         if missing:
             text = ", ".join(str(marker) for marker in missing)
-            self._warn(event.name, f"no camera saw markers {text} of the tool")
-            return
-        self._save(event.name, taught_goal(event, model, _now(), tool))
+            return self._warn(event.name, f"no camera saw markers {text} of the tool", event.request)
+        return self._save(event.name, taught_goal(event, model, _now(), tool), event.request)
 
     def synthesise(self, drawing: Synthesise) -> str:
         """Store a goal made from CAD drawings; returns a description of its accuracy. Raises TransferError."""
@@ -100,18 +98,19 @@ class TaughtGoalRegistry:
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())
 
-    def _save(self, name: str, goal: TaughtGoal) -> bool:
+    def _save(self, name: str, goal: TaughtGoal, request: int = -1) -> bool:
         try:
             self._store.add(name, goal)
         except OSError as error:
-            self._warn(name, str(error))
-            return False
+            return self._warn(name, str(error), request)
         return True
 
-    def _warn(self, name: str, why: str) -> None:
+    def _warn(self, name: str, why: str, request: int) -> bool:
         self._log.add(
-            "warning", message=f"taught goal {name!r} is not saved: {why}", name=name, origin="gateway"
-        )
+            "warning", message=f"taught goal {name!r} is not saved: {why}", name=name, request=request,
+            accepted=False, origin="gateway",
+        )  # fmt: skip
+        return False
 
 
 def _static_feature(feature: Feature, observations: MarkerObservations) -> Feature:

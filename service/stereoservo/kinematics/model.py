@@ -4,19 +4,20 @@ checks, and its versioned JSON file.
 
 from __future__ import annotations
 
-import errno
-import os
-import tempfile
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from stereoservo.messages.cell_file import Mount
+from stereoservo.messages.decoding import DamagedError, decoding
+from stereoservo.messages.files import read_bounded, verify_checksum, with_checksum, write_atomically
 from stereoservo.numerics.arrays import FloatArray
 
 MODEL_SCHEMA = 2
+MAX_MODEL_BYTES = 1 << 28
 READABLE_SCHEMAS = (1, 2)
 """Schema 1 has neither lenses nor mounts: static pinhole cameras."""
 
@@ -162,7 +163,7 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
         return self.mount == "eye_in_hand"
 
 
-class ModelFileError(Exception):
+class ModelFileError(DamagedError):
     """A model, or a model file, is invalid.
 
     Attributes:
@@ -171,7 +172,7 @@ class ModelFileError(Exception):
     """
 
     def __init__(self, path: Path | str, key: str, message: str) -> None:
-        super().__init__(f"{path}: {key + ': ' if key else ''}{message}")
+        super().__init__(path, f"{key + ': ' if key else ''}{message}")
         self.path = str(path)
         self.key = key
 
@@ -452,19 +453,27 @@ def _decode_array(kind: type, value: object) -> object:
 
 
 def encode_model(model: CellModel) -> bytes:
-    """A model as one JSON object, arrays as nested lists with every bit of a float64. Raises
+    """A model as one JSON object with a checksum, arrays as nested lists with every bit of a float64. Raises
     ModelFileError.
     """
     check_model(model)
-    return msgspec.json.format(msgspec.json.encode(model, enc_hook=_encode_array), indent=1) + b"\n"
+    return with_checksum(msgspec.json.format(msgspec.json.encode(model, enc_hook=_encode_array), indent=1))
 
 
 def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
-    """Inverse of :func:`encode_model`, strictly. Raises ModelFileError."""
-    try:
-        tree = msgspec.json.decode(data)
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise ModelFileError(path, "", f"is not JSON: {error}") from error
+    """Inverse of :func:`encode_model`, strictly. Raises ModelFileError, whatever the bytes."""
+    with decoding(partial(ModelFileError, path, "")):
+        with decoding(lambda cause: ModelFileError(path, "", f"is not JSON: {cause}")):
+            tree = msgspec.json.decode(data)
+        model = _converted(tree, path)
+        check_model(model, path)
+        with decoding(partial(ModelFileError, path, "crc32")):
+            verify_checksum(data)
+    return model
+
+
+def _converted(tree: Any, path: Path | str) -> CellModel:
+    """A model of a parsed file of any readable schema. Raises ModelFileError."""
     if not isinstance(tree, dict):
         raise ModelFileError(path, "", f"holds a {type(tree).__name__}; a JSON object is needed")
     if type(tree.get("schema")) is not int or tree["schema"] not in READABLE_SCHEMAS:
@@ -482,7 +491,6 @@ def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
         model = msgspec.structs.replace(
             model, scene_points=np.zeros((0, 4)), scene_covariances=np.zeros((0, 4, 4))
         )
-    check_model(model, path)
     return model
 
 
@@ -508,52 +516,5 @@ def save_model(model: CellModel, path: Path) -> None:
 
 def load_model(path: Path) -> CellModel:
     """Read and check a model file. Raises ModelFileError."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ModelFileError(path, "", f"cannot be read: {error.strerror}") from error
-    return decode_model(data, path)
-
-
-def check_writable(path: Path) -> None:
-    """Raise OSError where `write_atomically` cannot write a file: no such folder, or the path is not a file."""
-    if not path.parent.is_dir():
-        code = errno.ENOTDIR if path.parent.exists() else errno.ENOENT
-        raise OSError(code, f"{os.strerror(code)}: a folder that exists is needed", str(path.parent))
-    if path.is_dir():
-        raise OSError(errno.EISDIR, f"{os.strerror(errno.EISDIR)}: the name of a file is needed", str(path))
-    if path.exists() and not path.is_file():
-        raise OSError(
-            errno.EINVAL, "Not a regular file: the name of a file, new or old, is needed", str(path)
-        )
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise OSError(
-            errno.EACCES, f"{os.strerror(errno.EACCES)}: a folder to write to is needed", str(path.parent)
-        )
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` such that a reader, or a crash, leaves either the old file or the new one complete.
-
-    Raises OSError, for a path that holds anything but a regular file, too: replacing a device would destroy it.
-    """
-    check_writable(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        # mkstemp makes 0600; a model is no secret and other users' tools read it.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with decoding(partial(ModelFileError, path, "")):
+        return decode_model(read_bounded(path, MAX_MODEL_BYTES), path)

@@ -218,7 +218,7 @@ def load_cell_file(path: Path) -> CellFile:
         raise CellFileError(path, "", f"cannot be read: {error.strerror}") from error
     try:
         tree = tomllib.loads(text.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # of TOML, UTF-8, or numbers of thousands of digits
         raise CellFileError(path, "", f"is not TOML: {error}") from error
     except RecursionError as error:
         raise CellFileError(path, "", "is nested too deeply; a cell file has three levels") from error

@@ -7,14 +7,20 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import msgspec
 
-from stereoservo.messages.directories import CellDirectories, cell_directories, runtime_root
+from stereoservo.messages.decoding import DamagedError, decoding
+from stereoservo.messages.directories import CELL_NAME, CellDirectories, cell_directories, runtime_root
+from stereoservo.messages.files import read_bounded
 from stereoservo.messages.locks import holder
+
+MAX_INFO_BYTES = 1 << 16
 
 
 class DaemonInfo(msgspec.Struct, frozen=True):
@@ -51,13 +57,11 @@ class DaemonError(Exception):
 
 
 def daemon_info(directories: CellDirectories) -> DaemonInfo | None:
-    """Description of the running daemon; None where none runs or it is not ready yet."""
-    if holder(directories.daemon_lock) is None:
-        return None
-    try:
-        return msgspec.json.decode(directories.daemon.read_bytes(), type=DaemonInfo)
-    except (FileNotFoundError, msgspec.MsgspecError):
-        return None
+    """Description of the running daemon; None where none runs, it is not ready yet, or its file cannot be read."""
+    with suppress(DamagedError), decoding(partial(DamagedError, directories.daemon)):
+        if holder(directories.daemon_lock) is not None:
+            return msgspec.json.decode(read_bounded(directories.daemon, MAX_INFO_BYTES), type=DaemonInfo)
+    return None
 
 
 def live_cells() -> list[DaemonInfo]:
@@ -67,7 +71,7 @@ def live_cells() -> list[DaemonInfo]:
         return []
     found = []
     for path in sorted(root.iterdir()):
-        if path.is_dir() and (path / "daemon.lock").exists():
+        if CELL_NAME.fullmatch(path.name) and path.is_dir() and (path / "daemon.lock").exists():
             info = daemon_info(cell_directories(path.name))
             if info is not None:
                 found.append(info)

@@ -6,13 +6,17 @@ vision process that starts late, or again, finds it there.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import msgspec
 
+from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.files import read_bounded, write_atomically
 
 IMAGES_SUFFIX = ".images"
+MAX_REQUEST_BYTES = 1 << 16
 
 
 class ImageRecordingRequest(msgspec.Struct, frozen=True):
@@ -52,15 +56,14 @@ def images_directory(recording: Path) -> Path:
 
 def write_request(path: Path, order: ImageRecordingRequest) -> None:
     """Replace the request. Raises OSError."""
-    temporary = path.with_suffix(".new")
-    temporary.write_bytes(msgspec.json.encode(order))
-    temporary.replace(path)
+    write_atomically(path, msgspec.json.encode(order))
 
 
 def read_request(path: Path) -> ImageRecordingRequest | None:
-    """The current request; None where there is none. Raises msgspec.MsgspecError."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return None
-    return msgspec.json.decode(data, type=ImageRecordingRequest)
+    """The current request; None where there is none. Raises DamagedError."""
+    with decoding(partial(DamagedError, path)):
+        try:
+            data = read_bounded(path, MAX_REQUEST_BYTES)
+        except FileNotFoundError:
+            return None
+        return msgspec.json.decode(data, type=ImageRecordingRequest)

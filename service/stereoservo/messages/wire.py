@@ -199,7 +199,7 @@ class StateMessage(msgspec.Struct, frozen=True):
     differences: tuple[str, ...] = ()
     last_event: int = 0
     notes: tuple[str, ...] = ()
-    """Remarks for the cell's keeper, on a damaged model file for instance."""
+    """Remarks for the cell's keeper, on damaged files and full disks for instance."""
     progress: float | None = None
     """Path parameter of the active goal, 0 to 1, where it is known."""
     seconds_left: float | None = None
@@ -213,6 +213,8 @@ class StateMessage(msgspec.Struct, frozen=True):
     """How large following errors may become before the arm stops for a contact."""
     health: Health = Health()
     """Whether the images agree with the model, by camera; what explains it where they do not, and what is done."""
+    refused_messages: int = 0
+    """Messages that the gateway could not take since its start: not JSON, of a wrong shape, on a wrong key."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):

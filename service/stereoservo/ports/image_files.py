@@ -20,6 +20,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from stereoservo.messages.decoding import decoding
 from stereoservo.numerics.arrays import ImageArray
 from stereoservo.ports.devices import Frame
 
@@ -104,7 +105,14 @@ class ImageLimits:
 
 DEFAULT_LIMITS = ImageLimits()
 _encode = msgspec.json.Encoder().encode
-_decode = msgspec.json.Decoder(ImageHeader | ImageLine | ImageEnd).decode
+_decoder = msgspec.json.Decoder(ImageHeader | ImageLine | ImageEnd)
+
+
+def _decode(data: bytes) -> ImageHeader | ImageLine | ImageEnd:
+    """A line of a sidecar. Raises ValueError, whatever the bytes."""
+    with decoding(ValueError):
+        line: ImageHeader | ImageLine | ImageEnd = _decoder.decode(data)
+    return line
 
 
 def crc_of(image: ImageArray) -> int:
@@ -412,7 +420,7 @@ class ImageReader:
             return None
         try:
             line = _decode(data)
-        except msgspec.MsgspecError as error:
+        except ValueError as error:
             if not data.endswith(b"\n") and len(data) < LONGEST_LINE:
                 return None  # the last line, cut off: the process was killed, or the copy ended early
             raise self._damaged(f"its line is not valid ({error})") from error
@@ -495,7 +503,7 @@ def _open_header(path: Path, video: Path) -> tuple[IO[bytes], ImageHeader]:
     data = file.readline(LONGEST_LINE)
     try:
         header = _decode(data)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except ValueError:
         header = None
     cause = ""
     if not isinstance(header, ImageHeader):
@@ -523,7 +531,7 @@ def image_lines(video: Path) -> Iterator[ImageLine]:
         while data := file.readline(LONGEST_LINE):
             try:
                 line = _decode(data)
-            except msgspec.MsgspecError:
+            except ValueError:
                 return
             if not isinstance(line, ImageLine):
                 return

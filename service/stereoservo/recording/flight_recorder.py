@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 
@@ -17,18 +19,65 @@ FORMAT = "stereoservo-flight-1"
 CHUNK_BYTES = 256 * 1024
 
 
+class _OutputFile:
+    """File that takes each block as a whole or not at all, so that it ends with a whole record on a full disk."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = FileIO(path, "wb")
+        self.size = 0
+
+    def write(self, data: bytes) -> int:
+        """Append ``data``. Raises OSError, and the file is as before then."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            with suppress(OSError):
+                self._file.truncate(self.size)
+                self._file.seek(self.size)
+            raise
+        self.size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Number of bytes written."""
+        return self.size
+
+    def close(self) -> None:
+        """Have the disk take what was written, and close. Idempotent. Raises OSError."""
+        if self._file.closed:
+            return
+        try:
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
+
+
 class FlightRecorder:
     """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process.
 
-    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index.
+    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index. A file that
+    cannot be written any more ends with its last whole chunk: ``failure`` has the cause then, ``steps`` counts those in
+    the file, ``dropped`` those that came later and are not.
+
+    Raises OSError where the file cannot be begun.
     """
 
     def __init__(self, path: Path, settings: CoreSettings, fingerprint: Fingerprint) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.steps = 0
-        self._stream = open(path, "wb")  # noqa: SIM115 - lives as long as the recorder
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self.dropped = 0
+        self.failure = ""
+        self._pending = 0
+        self._closed = False
+        self._stream = _OutputFile(path)
+        self._writer = Writer(
+            self._stream,
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.LZ4,
+        )
         self._writer.start(profile=FORMAT, library="stereoservo")
         encoded = encode(settings)
         self._channels = {
@@ -52,7 +101,11 @@ class FlightRecorder:
 
     def step(self, data: bytes, t_ns: int) -> None:
         """Append one encoded step."""
+        if self.failure:
+            self.dropped += 1
+            return
         self.steps += 1
+        self._pending += 1
         self._add("step", data, t_ns)
 
     def checkpoint(self, step: int, state: bytes, t_ns: int) -> None:
@@ -64,23 +117,46 @@ class FlightRecorder:
         self._add("gap", msgspec.msgpack.encode(lost), t_ns)
 
     def _add(self, topic: str, data: bytes, t_ns: int) -> None:
+        if self.failure:
+            return
         self._sequence += 1
-        self._writer.add_message(
-            channel_id=self._channels[topic],
-            log_time=t_ns,
-            publish_time=t_ns,
-            sequence=self._sequence,
-            data=data,
-        )
+        size = self._stream.size
+        try:
+            self._writer.add_message(
+                channel_id=self._channels[topic],
+                log_time=t_ns,
+                publish_time=t_ns,
+                sequence=self._sequence,
+                data=data,
+            )
+        except OSError as error:
+            self._fail(error, size)
+        if self._stream.size > size:
+            self._pending = 0
+
+    def _fail(self, error: OSError, size: int) -> None:
+        """End the recording; the chunk at hand is in the file where it has grown beyond ``size``."""
+        if self._stream.size > size:
+            self._pending = 0
+        self.failure = error.strerror or str(error)
+        self.steps -= self._pending
+        self.dropped += self._pending
+        self._pending = 0
 
     def close(self) -> None:
-        """Finish the file. Idempotent."""
-        if self._stream.closed:
+        """Finish the file, as far as it can be written. Idempotent."""
+        if self._closed:
             return
-        self._writer.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._stream.close()
+        self._closed = True
+        size = self._stream.size
+        try:
+            try:
+                if not self.failure:
+                    self._writer.finish()
+            finally:
+                self._stream.close()
+        except OSError as error:
+            self._fail(error, size)
 
     def __enter__(self) -> FlightRecorder:
         return self

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import msgspec
 
+from stereoservo.messages.decoding import DamagedError
+from stereoservo.messages.files import set_aside
 from stereoservo.messages.recording_request import ImageRecordingRequest, RecordedImages, read_request
 from stereoservo.ports.devices import CameraObservation, Frame
 from stereoservo.ports.image_files import DEFAULT_LIMITS, ImageFileError, ImageLimits, ImageWriter
@@ -103,9 +105,12 @@ class ImageRecorder:
         self._polled_ns = now_ns
         try:
             order = read_request(self._order)
-        except (msgspec.MsgspecError, OSError) as error:
+        except DamagedError as error:  # set aside, it is reported once
+            done = set_aside(self._order)
             self._report(
-                "warning", f"camera {self._camera}: the order to record images cannot be read: {error}", None
+                "warning",
+                f"camera {self._camera}: the order to record images cannot be read: {error}; {done}",
+                None,
             )
             order = None
         self._apply_request(order if order is not None else ImageRecordingRequest())

@@ -11,6 +11,7 @@ import numpy as np
 from stereoservo.core.cycle import decode_array
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.measure_at_pose import AT_REST
+from stereoservo.messages.decoding import cause_of
 from stereoservo.messages.goals import Calibrate
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.recording.replay import RecordingError, recorded_messages
@@ -79,8 +80,10 @@ def read_motion(path: Path) -> RecordedMotion:
                     positions.append(np.array(joints.positions, dtype=np.float64))
                 if _calibrates(record):
                     calibration_ns = inputs.now_ns
-        except (msgspec.MsgspecError, ValueError, KeyError, TypeError) as error:
-            raise RecordingError(path, len(steps), f"step record is damaged ({error})") from error
+        except Exception as error:  # a decoder may raise anything
+            raise RecordingError(
+                path, len(steps), f"{topic} record is damaged ({cause_of(error)})"
+            ) from error
     if settings is None:
         raise RecordingError(path, len(steps), "holds no header; is it a flight recording?")
     if len(joint_ns) < 2:

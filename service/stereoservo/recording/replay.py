@@ -4,16 +4,19 @@ for bit; and the reader of a recording's messages.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Channel, Header, Message
-from mcap.stream_reader import StreamReader
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Chunk, Header, McapRecord, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 import stereoservo
 from stereoservo.control.law_registry import LAWS, UnknownLawError
@@ -21,6 +24,7 @@ from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import StateVersionError, decode_state, is_recorded
+from stereoservo.messages.decoding import DamagedError, cause_of, decoding
 from stereoservo.messages.goals import IncidenceTarget, JointTarget, RunGoal
 from stereoservo.recording.flight_recorder import FORMAT
 from stereoservo.recording.step_records import (
@@ -32,20 +36,33 @@ from stereoservo.recording.step_records import (
     fingerprint,
 )
 
+LARGEST_RECORD = 64 << 20
+"""More than a recorder puts into one record: a stated size beyond it is damage, and is not allocated."""
+LZ4_STATES_SIZE = 0x08
+"""Flag of an LZ4 frame: its header has the size of the content."""
 
-class RecordingError(Exception):
-    """A recording cannot be read: names the file, how far it is good, and the cause."""
 
-    def __init__(self, path: Path, steps: int, cause: str) -> None:
+class RecordingError(DamagedError):
+    """A recording cannot be read: names the file, how far it is good, and the cause.
+
+    ``cut``: the file ends inside a record, as after a crash. ``result``: the replay of what comes before, where that
+    has steps.
+    """
+
+    def __init__(self, path: Path, steps: int, cause: str, *, cut: bool = False) -> None:
         good = f"; {steps} steps before that are good" if steps else ""
-        super().__init__(f"{path}: {cause}{good}")
+        super().__init__(path, f"{cause}{good}")
         self.path = str(path)
         self.steps = steps
+        self.cut = cut
+        self.result: ReplayResult | None = None
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """``identical`` is None where the fingerprints differ in what was run; ``max_relative_error`` counts then."""
+    """``identical`` is None where the fingerprints differ in what was run; ``max_relative_error`` counts then.
+    ``last_step``: number of the last step that was compared.
+    """
 
     identical: bool | None
     steps: int
@@ -54,69 +71,64 @@ class ReplayResult:
     checkpoints: int
     gaps: int
     fingerprint: Fingerprint
+    last_step: int = -1
 
 
 class _Replay:
     """A recording's messages through a fresh core, one after the other, and what came of it so far."""
 
-    def __init__(
-        self,
-        progress: Callable[[int], None] | None,
-        observe: Callable[[StepInputs, StepOutputs], None] | None,
-        header: Callable[[CoreSettings], None] | None,
-    ) -> None:
-        self._progress, self._observe, self._header = progress, observe, header
+    def __init__(self) -> None:
         self._core: ServoCore | None = None
-        self._settings: CoreSettings | None = None
+        self.settings: CoreSettings | None = None
         self.recorded: Fingerprint | None = None
         self.steps = self.checkpoints = self.gaps = 0
         self.worst = 0.0
         self.laws: set[str] = set()
         self.differs: int | None = None
+        self.last_step = -1
 
-    def take(self, topic: str, data: bytes) -> None:
-        """The next message. Raises what its decoding and the core raise."""
+    def take(self, topic: str, data: bytes) -> tuple[StepInputs, StepOutputs] | None:
+        """The next message; returns inputs and outputs of a step. Raises what its decoding and the core raise."""
         if topic == "header":
             self._take_header(data)
         elif topic == "gap":
             self._core = None
             self.gaps += 1
-        elif topic == "checkpoint" and self._settings is not None:
+        elif topic == "checkpoint" and self.settings is not None:
             step, state = msgspec.msgpack.decode(data)
             self.checkpoints += 1
             if self._core is None:
-                self._core = ServoCore(self._settings, decode_state(state))
+                self._core = ServoCore(self.settings, decode_state(state))
             elif self.differs is None and not is_recorded(self._core.state, state):
                 self.differs = step
-        elif topic == "step" and self._core is not None and self._settings is not None:
-            self._take_step(decode_step(data), self._core, self._settings.law)
+        elif topic == "step" and self._core is not None and self.settings is not None:
+            return self._take_step(decode_step(data), self._core, self.settings.law)
+        return None
 
     def _take_header(self, data: bytes) -> None:
         first = msgspec.msgpack.decode(data)
         self.recorded = msgspec.convert(first["fingerprint"], Fingerprint)
-        self._settings = msgspec.msgpack.decode(first["settings"], type=CoreSettings, dec_hook=decode_array)
-        if self._header is not None:
-            self._header(self._settings)
+        self.settings = msgspec.msgpack.decode(first["settings"], type=CoreSettings, dec_hook=decode_array)
 
-    def _take_step(self, record: StepRecord, core: ServoCore, default_law: str) -> None:
+    def _take_step(
+        self, record: StepRecord, core: ServoCore, default_law: str
+    ) -> tuple[StepInputs, StepOutputs]:
         laws = _laws_of_goals(record.inputs, default_law)
         if self.recorded is not None:
             _require_installed(laws & set(self.recorded.laws))
         outputs = core.step(record.inputs)
         self.laws |= laws | {outputs.status.law}
-        if self._observe is not None:
-            self._observe(record.inputs, outputs)
         same, error = _compare(record, outputs)
         self.worst = max(self.worst, error)
         if not same and self.differs is None:
             self.differs = record.step
         self.steps += 1
-        if self._progress is not None and self.steps % 1000 == 0:
-            self._progress(self.steps)
+        self.last_step = record.step
+        return record.inputs, outputs
 
     def result(self, path: Path) -> ReplayResult:
         """What came of the whole recording. Raises RecordingError where that was nothing."""
-        if self._settings is None or self.recorded is None:
+        if self.settings is None or self.recorded is None:
             raise RecordingError(path, self.steps, "holds no header; is it a flight recording?")
         if self.steps == 0:
             raise RecordingError(path, self.steps, "holds no step after a checkpoint")
@@ -129,6 +141,7 @@ class _Replay:
             checkpoints=self.checkpoints,
             gaps=self.gaps,
             fingerprint=self.recorded,
+            last_step=self.last_step,
         )
 
 
@@ -138,19 +151,29 @@ def replay(
     observe: Callable[[StepInputs, StepOutputs], None] | None = None,
     header: Callable[[CoreSettings], None] | None = None,
 ) -> ReplayResult:
-    """Run a recording through a fresh core. Raises RecordingError on a damaged or foreign file.
+    """Run a recording through a fresh core. Raises RecordingError on a damaged, cut or foreign file, with the result of
+    what comes before that.
 
     ``header`` is given the core's settings, ``observe`` every step's inputs and outputs: reports and debuggers read a
     recording through them.
     """
-    run = _Replay(progress, observe, header)
-    for topic, data in recorded_messages(path):
-        try:
-            run.take(topic, data)
-        except (
-            UnknownLawError, StateVersionError, msgspec.MsgspecError, ValueError, KeyError, TypeError
-        ) as error:  # fmt: skip
-            raise RecordingError(path, run.steps, _cause(error, topic, run.recorded)) from error
+    run = _Replay()
+    try:
+        for topic, data in recorded_messages(path):
+            try:
+                stepped = run.take(topic, data)
+            except Exception as error:  # a decoder, or the core at inputs that no core has seen
+                raise RecordingError(path, run.steps, _cause(error, topic, run.recorded)) from error
+            if topic == "header" and header is not None and run.settings is not None:
+                header(run.settings)
+            if stepped is not None and observe is not None:
+                observe(*stepped)
+            if stepped is not None and progress is not None and run.steps % 1000 == 0:
+                progress(run.steps)
+    except RecordingError as error:
+        with suppress(RecordingError):
+            error.result = run.result(path)
+        raise
     return run.result(path)
 
 
@@ -167,7 +190,7 @@ def _cause(error: Exception, topic: str, recorded: Fingerprint | None) -> str:
         return _of_another_version(str(error), recorded)
     if recorded is not None and recorded.stereoservo != stereoservo.__version__:
         return _of_another_version(f"the {topic} does not fit this program ({error})", recorded)
-    return f"step record is damaged ({error})"
+    return f"{topic} record is damaged ({cause_of(error)})"
 
 
 def _laws_of_goals(inputs: StepInputs, default: str) -> set[str]:
@@ -201,26 +224,78 @@ def _compare(record: StepRecord, outputs: StepOutputs) -> tuple[bool, float]:
     return again.outputs_crc == record.outputs_crc and again.step == record.step, error
 
 
+class _BoundedFile:
+    """A recording's bytes, of which no more are read than there are. ``cut``: more were asked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._left = os.fstat(file.fileno()).st_size
+        self.cut = False
+
+    def read(self, length: int) -> bytes:
+        if length > LARGEST_RECORD:
+            raise ValueError(f"a length of {length} bytes")
+        if length > self._left:
+            self.cut = True
+            raise EndOfFile
+        self._left -= length
+        return self._file.read(length)
+
+
 def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
     """Topic and payload in file order. Raises RecordingError naming how far the file is good."""
     steps = 0
     topics: dict[int, str] = {}
-    try:
-        with path.open("rb") as stream:
-            for record in StreamReader(stream, validate_crcs=True).records:
-                if isinstance(record, Header) and record.profile != FORMAT:
-                    raise RecordingError(
-                        path, 0, f"is of profile {record.profile!r}; this program reads {FORMAT!r}"
-                    )
-                if isinstance(record, Channel):
-                    topics[record.id] = record.topic
-                elif isinstance(record, Message):
-                    topic = topics[record.channel_id]
-                    steps += topic == "step"
-                    yield topic, record.data
-    except OSError as error:
-        raise RecordingError(path, steps, f"cannot be read: {error.strerror}") from error
-    except (McapError, EOFError, ValueError, KeyError, RuntimeError, struct.error) as error:
-        raise RecordingError(
-            path, steps, f"is truncated or damaged ({type(error).__name__}: {error})"
-        ) from error
+    source: _BoundedFile | None = None
+
+    def refused(cause: str) -> RecordingError:
+        if cause.startswith("cannot be read"):
+            return RecordingError(path, steps, cause)
+        if source is not None and source.cut:
+            return RecordingError(
+                path, steps, "is truncated: it ends inside a record, or before its last one", cut=True
+            )
+        return RecordingError(path, steps, f"is truncated or damaged ({cause})")
+
+    with decoding(refused), path.open("rb") as stream:
+        source = _BoundedFile(stream)
+        for record in _records(source):
+            if isinstance(record, Header) and record.profile != FORMAT:
+                raise RecordingError(
+                    path, 0, f"is of profile {record.profile!r}; this program reads {FORMAT!r}"
+                )
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                topic = topics[record.channel_id]
+                steps += topic == "step"
+                yield topic, record.data
+
+
+def _records(source: _BoundedFile) -> Iterator[McapRecord]:
+    """All records in file order, those of chunks after the chunk's checksum. Raises anything."""
+    reader = StreamReader(
+        source,
+        emit_chunks=True,
+        validate_crcs=True,
+        record_size_limit=LARGEST_RECORD,
+    )
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            _check_sizes(record)
+            yield from breakup_chunk(record, validate_crc=True)
+        else:
+            yield record
+
+
+def _check_sizes(chunk: Chunk) -> None:
+    """Raises ValueError for a chunk whose compressed data state another size than the chunk: it is what would be
+    allocated.
+    """
+    size = chunk.uncompressed_size
+    if chunk.compression not in ("", "lz4"):
+        raise ValueError(f"a chunk is compressed by {chunk.compression!r}; 'lz4' is read")
+    if chunk.compression == "lz4":
+        flags, _, stated = struct.unpack_from("<BBQ", chunk.data, 4)
+        if not flags & LZ4_STATES_SIZE or stated != size or size > LARGEST_RECORD:
+            raise ValueError(f"a chunk of {size} bytes, whose data state {stated}")

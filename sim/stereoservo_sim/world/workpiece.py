@@ -116,7 +116,7 @@ class MovedFile:
         except FileNotFoundError:
             self._seen = None
             return otherwise
-        except (OSError, msgspec.MsgspecError) as error:
+        except Exception as error:  # a decoder may raise anything
             raise MovedFileError(
                 f'{self.path}: {error}; such a file holds {{"shift_m": [x, y, z], "turn_deg": [x, y, z]}}'
             ) from error

@@ -122,7 +122,7 @@ def resolve_cell(cell: str, output: Path | None) -> tuple[CellFile | None, str, 
 
     Raises CommandError where a fit could not be kept, CellFileError.
     """
-    from stereoservo.kinematics.model import check_writable
+    from stereoservo.messages.files import check_writable
 
     if output is not None:
         try:

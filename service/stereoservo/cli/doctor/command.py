@@ -20,7 +20,7 @@ from stereoservo.cli.output import CommandError, JsonOption, emit
 from stereoservo.client import SessionError
 from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
 from stereoservo.daemon.ipc_messages import RunPlan
-from stereoservo.daemon.taught_goals import load_taught
+from stereoservo.daemon.taught_goals import TaughtFileError, load_taught
 from stereoservo.gateway.persistence import ModelStore
 from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import load_cell_file
@@ -161,7 +161,10 @@ def _model(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
 
 
 def _taught(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
-    goals = load_taught(directories.taught)
+    try:
+        goals = load_taught(directories.taught)
+    except TaughtFileError as error:
+        return ExaminationFinding("taught", False, str(error))
     return ExaminationFinding("taught", True, ", ".join(sorted(goals)) or "none yet")
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from stereoservo.cli.output import CommandError, marker_ids, pairs, read_file
+from stereoservo.messages.decoding import decoding
 from stereoservo.messages.goals import FeatureTarget, Goal, PointTarget, StreamedTarget
 from stereoservo.messages.wire import MessageError, decode, encode
 
@@ -75,10 +76,9 @@ def target_tree(
 
 
 def _object(path: Path) -> dict[str, Any]:
-    try:
-        found = msgspec.json.decode(read_file(path))
-    except msgspec.DecodeError as error:
-        raise CommandError("file", f"{path}: is not JSON: {error}") from error
+    data = read_file(path)
+    with decoding(lambda cause: CommandError("file", f"{path}: is not JSON: {cause}")):
+        found = msgspec.json.decode(data)
     if not isinstance(found, dict):
         raise CommandError("file", f"{path}: holds {type(found).__name__}; a JSON object is needed")
     return found

@@ -21,8 +21,10 @@ from stereoservo.calibration.change.model_check import ModelExamination, examine
 from stereoservo.calibration.change.zero_reset import reset_zeros
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
 from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line, trials_file
-from stereoservo.kinematics.model import ModelFileError, load_model, save_model, write_atomically
+from stereoservo.kinematics.model import ModelFileError, load_model, save_model
 from stereoservo.messages.check_report import CheckReport, ZeroReset
+from stereoservo.messages.decoding import RecordBoundary
+from stereoservo.messages.files import read_bounded, set_aside, write_atomically
 
 
 def check_and_remember(
@@ -30,20 +32,31 @@ def check_and_remember(
 ) -> tuple[ModelExamination, CheckReport]:
     """Examine a model, find trends over earlier checks, append the report to the history.
 
-    Raises CalibrationError, ModelFileError, OSError.
+    A damaged history is set aside, one that cannot be written is left as it is: the report says so. Raises
+    ModelFileError, CalibrationError.
     """
     model = load_model(model_path)
     made_from = trials_file(model_path, model.epoch)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    examined = examine_model(model, check, made_from=load_trials(made_from) if made_from.exists() else None)
+    notes, trials = [], None
+    try:
+        trials = load_trials(made_from) if made_from.exists() else None
+    except CalibrationError as error:
+        notes.append(f"checked without the model's own trial data: {error}")
+    examined = examine_model(model, check, made_from=trials)
     report = make_check_report(examined, limit_px=limit_px, created=created)
     history, lost = load_checks(history_path)
     grown = find_trend([*history, report])
-    notes = [] if grown is None else [grown.message]
+    notes += [] if grown is None else [grown.message]
     if lost:
-        notes.append(f"{lost} earlier checks in {history_path} could not be read")
+        notes.append(f"{lost} earlier checks in {history_path} could not be read: {set_aside(history_path)}")
     report = msgspec.structs.replace(report, trend="; ".join(notes))
-    save_checks(history_path, [*history, report])
+    try:
+        save_checks(history_path, [*history, report])
+    except OSError as error:  # the result of the check counts all the same
+        report = msgspec.structs.replace(
+            report, trend="; ".join([*notes, f"the check is not stored: {error.strerror}"])
+        )
     return examined, report
 
 
@@ -81,23 +94,32 @@ def main() -> int:
 
 
 KEPT_CHECKS = 200
+MAX_HISTORY_BYTES = 1 << 26
 
 
 def load_checks(path: Path) -> tuple[list[CheckReport], int]:
-    """Reports of the checks stored in ``path`` (none where there is no file), and the number of unreadable lines.
-    Raises OSError.
-    """
-    try:
-        lines = path.read_bytes().splitlines()
-    except FileNotFoundError:
-        return [], 0
-    found, lost = [], 0
+    """Reports of the checks stored in ``path`` (none where there is no file), and the number of unreadable lines."""
+    boundary = RecordBoundary(str(path))
+    found: list[CheckReport] = []
+    lines: list[bytes] = []
+    with boundary:
+        lines = read_bounded(path, MAX_HISTORY_BYTES).splitlines() if path.exists() else []
     for line in lines:
-        try:
-            found.append(msgspec.json.decode(line, type=CheckReport))
-        except msgspec.MsgspecError:
-            lost += 1
-    return found, lost
+        with boundary:
+            found.append(_decode_check(line))
+    return found, boundary.refused
+
+
+def _decode_check(line: bytes) -> CheckReport:
+    """A stored check whose numbers `find_trend` can work with. Raises anything."""
+    check = msgspec.json.decode(line, type=CheckReport)
+    if check.created:
+        datetime.fromisoformat(check.created)
+    for drift in check.drifts:
+        q = len(drift.x)
+        if len(drift.information) != q * (q + 1) // 2:
+            raise ValueError(f"{len(drift.information)} entries of information for {q} parameters")
+    return check
 
 
 def save_checks(path: Path, checks: list[CheckReport]) -> None:

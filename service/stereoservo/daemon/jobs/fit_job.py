@@ -26,7 +26,8 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import LensEstimate
-from stereoservo.kinematics.model import ModelFileError, save_model, write_atomically
+from stereoservo.kinematics.model import ModelFileError, save_model
+from stereoservo.messages.files import write_atomically
 
 NICENESS = 10
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -23,7 +24,11 @@ from stereoservo.calibration.relocalization.relocalized_model import (
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.core.cycle import Event, decode_array, encode
 from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line
-from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model, write_atomically
+from stereoservo.kinematics.model import CellModel, load_model, save_model
+from stereoservo.messages.decoding import DamagedError, decoding
+from stereoservo.messages.files import read_bounded, write_atomically
+
+MAX_EVENTS_BYTES = 1 << 26
 
 
 class RelocalizationReport(msgspec.Struct, frozen=True):
@@ -63,7 +68,7 @@ def main() -> int:
         events = load_events(arguments.sights)
         found = relocalize_from_events(events, load_model(arguments.model), arguments.epoch, created)
         save_model(found.model, arguments.new)
-    except (CalibrationError, ModelFileError, OSError, msgspec.MsgspecError) as error:
+    except (CalibrationError, DamagedError, OSError) as error:
         print_line(error_line(error))
         return 1
     report = RelocalizationReport(
@@ -116,8 +121,10 @@ def save_events(path: Path, events: list[Event]) -> None:
 
 
 def load_events(path: Path) -> list[Event]:
-    """Inverse of :func:`save_events`. Raises OSError, msgspec.MsgspecError."""
-    return msgspec.msgpack.decode(path.read_bytes(), type=list[Event], dec_hook=decode_array)
+    """Inverse of :func:`save_events`. Raises DamagedError."""
+    with decoding(partial(DamagedError, path)):
+        data = read_bounded(path, MAX_EVENTS_BYTES)
+        return msgspec.msgpack.decode(data, type=list[Event], dec_hook=decode_array)
 
 
 if __name__ == "__main__":

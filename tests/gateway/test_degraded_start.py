@@ -1,0 +1,369 @@
+"""A gateway whose files are damaged or whose disk is full: it comes up, says so once, and loses as little as it can."""
+
+from __future__ import annotations
+
+import errno
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.client import FailedError
+from stereoservo.core.cycle import Event, Sample
+from stereoservo.daemon.kernel_compilation import example_model, example_settings
+from stereoservo.gateway import persistence, recordings
+from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.observation_cache import ObservationCache
+from stereoservo.gateway.persistence import HandledEvents, Journal, ModelStore, TaughtStore
+from stereoservo.gateway.publisher import EventLog, KeeperNotes
+from stereoservo.gateway.recordings import Recordings
+from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.gateway.teaching import TaughtGoalRegistry
+from stereoservo.kinematics.model import save_model
+from stereoservo.messages import files
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.wire import EventMessage
+from stereoservo.recording import flight_recorder
+from stereoservo.recording.step_records import RecordedStep, RecordingStart, fingerprint
+
+MODEL = example_model()
+SETTINGS = example_settings()
+
+
+def full_disk(*_: Any, **__: Any) -> Any:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+class Bench:
+    """Notes and events of a gateway."""
+
+    def __init__(self) -> None:
+        self.log = EventLog("boot", lambda _: None)
+        self.notes = KeeperNotes(self.log)
+
+    @property
+    def events(self) -> list[EventMessage]:
+        return list(self.log.since(1).events)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def models(directory: Path, *epochs: int) -> ModelStore:
+    store = ModelStore(directory)
+    for epoch in epochs:
+        save_model(msgspec.structs.replace(MODEL, epoch=epoch), store.path(epoch))
+    return store
+
+
+def flip(path: Path, at: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 0x20
+    path.write_bytes(bytes(data))
+
+
+# -- models -------------------------------------------------------------------------------------------------
+
+
+class StubLink:
+    def __init__(self) -> None:
+        self.models: list[int] = []
+
+    def send_model(self, model: Any, reanchored: tuple[str, ...] = ()) -> bool:
+        self.models.append(model.epoch)
+        return True
+
+
+@pytest.mark.parametrize("at", [0, 200, 1000, -30])
+def test_a_damaged_model_is_set_aside_and_the_one_before_is_used(
+    tmp_path: Path, bench: Bench, at: int
+) -> None:
+    store, link = models(tmp_path, 1, 2, 3), StubLink()
+    flip(store.path(3), at)
+    damaged = store.path(3).read_bytes()
+    jobs = CalibrationJobs(SETTINGS, store, cast(ServoConnection, link), bench.log, tmp_path / "checks.jsonl")
+    jobs.load(0)
+    assert link.models == [2]
+    (note,) = jobs.notes
+    assert "model-000003.json" in note
+    assert "set aside as model-000003.json.damaged-1" in note
+    assert "model epoch 2 is used instead" in note
+    assert [(event.kind, event.message) for event in bench.events] == [("warning", note)]
+    assert (tmp_path / "model-000003.json.damaged-1").read_bytes() == damaged
+    assert store.next_epoch() == 4  # that of the damaged one is never given again
+    again = CalibrationJobs(
+        SETTINGS, store, cast(ServoConnection, link), bench.log, tmp_path / "checks.jsonl"
+    )
+    again.load(2)
+    assert again.notes == ()
+
+
+def test_without_a_good_model_the_cell_starts_uncalibrated(tmp_path: Path, bench: Bench) -> None:
+    store, link = models(tmp_path, 1, 2), StubLink()
+    store.path(1).write_bytes(b"")
+    store.path(2).write_bytes(b"[" * 60_000)
+    jobs = CalibrationJobs(SETTINGS, store, cast(ServoConnection, link), bench.log, tmp_path / "checks.jsonl")
+    jobs.load(0)
+    assert (link.models, jobs.model) == ([], None)
+    assert len(jobs.notes) == 2
+    assert all("no model is used" in note for note in jobs.notes)
+
+
+def test_a_model_of_another_version_is_not_damaged_and_stays(tmp_path: Path) -> None:
+    store = models(tmp_path, 1)
+    store.path(2).write_text('{"schema": 9}')
+    found, passed = store.newest_fitting(SETTINGS, recover=True)
+    assert found is not None
+    assert found.epoch == 1
+    assert len(passed) == 1
+    assert store.path(2).exists()
+
+
+def test_who_only_looks_renames_nothing(tmp_path: Path) -> None:
+    store = models(tmp_path, 1)
+    store.path(2).write_text("{")
+    store.newest_fitting(SETTINGS)
+    assert store.path(2).exists()
+
+
+def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -> None:
+    store = ModelStore(tmp_path / "gone")
+    jobs = CalibrationJobs(
+        SETTINGS, store, cast(ServoConnection, StubLink()), bench.log, tmp_path / "checks.jsonl"
+    )
+    jobs.load(0)
+    assert "No such file" in jobs.notes[0]
+
+
+# -- taught goals -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("data", [b"", b'{"schema": 2, "goals": {', b"[" * 60_000, b"\xff", b'{"schema": 9}'])
+def test_a_damaged_file_of_taught_goals_is_set_aside_and_told_once(
+    tmp_path: Path, bench: Bench, data: bytes
+) -> None:
+    path = tmp_path / "taught.json"
+    path.write_bytes(data)
+    store = TaughtStore(path, recover=bench.notes.tell)
+    assert store.names == ()
+    (note,) = bench.notes.texts
+    assert str(path) in note
+    assert "set aside as taught.json.damaged-1" in note
+    assert [(event.kind, event.message) for event in bench.events] == [("warning", note)]
+    assert (tmp_path / "taught.json.damaged-1").read_bytes() == data
+    assert TaughtStore(path).names == ()
+
+
+def taught_event(seq: int = 1, t_ns: int = 1) -> Event:
+    sample = Sample(
+        "left", np.array([2, 5]), np.array([[1.5, 2.5], [3.0, 4.0]]), np.tile(0.01 * np.eye(2), (2, 1, 1)), 20,
+        np.full(2, 20.0), np.zeros(2),
+    )  # fmt: skip
+    return Event(seq, t_ns, "taught", name="pick", request=7, samples=(sample,))
+
+
+def test_a_goal_that_cannot_be_stored_is_refused_with_the_reason(
+    tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = TaughtStore(tmp_path / "taught.json")
+    teaching = TaughtGoalRegistry(store, ObservationCache({"left": 0.0}), lambda: MODEL, bench.log)
+    monkeypatch.setattr(files.tempfile, "mkstemp", full_disk)
+    assert teaching.taught(taught_event()) is False
+    assert store.names == ()
+    (event,) = bench.events
+    assert (event.kind, event.request, event.accepted) == ("warning", 7, False)  # what `teach` waits for
+    assert "No space left on device" in event.message
+    assert FailedError("teaching 'pick'", event).code == "failed"
+    monkeypatch.undo()
+    assert teaching.taught(taught_event()) is True
+    assert TaughtStore(tmp_path / "taught.json").names == ("pick",)
+
+
+# -- handled events -----------------------------------------------------------------------------------------
+
+
+def test_the_last_handled_event_is_known_after_a_restart(tmp_path: Path, bench: Bench) -> None:
+    path = tmp_path / "handled"
+    handled = HandledEvents(path, bench.notes.tell)
+    assert handled.is_fresh(taught_event(5))
+    handled.add(taught_event(5))
+    handled.add(taught_event(3))
+    again = HandledEvents(path, bench.notes.tell)
+    assert not again.is_fresh(taught_event(5))
+    assert again.is_fresh(taught_event(6))
+    assert bench.notes.texts == ()
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"12", b"12 00000000", b"\xff", b"9" * 200, b"-5 00000000", b"\0" * 12]
+)
+def test_without_it_nothing_of_before_the_start_is_done_twice(
+    tmp_path: Path, bench: Bench, data: bytes
+) -> None:
+    path = tmp_path / "handled"
+    path.write_bytes(data)
+    before = taught_event(10**6, time.monotonic_ns())
+    handled = HandledEvents(path, bench.notes.tell)
+    assert not handled.is_fresh(before)
+    assert handled.is_fresh(taught_event(10**6 + 1, time.monotonic_ns()))
+    assert "set aside as handled.damaged-1" in bench.notes.texts[0]
+    assert len(bench.events) == 1
+    handled.add(before)
+    assert not HandledEvents(path, bench.notes.tell).is_fresh(before)
+
+
+def test_every_flipped_byte_of_it_is_noticed(tmp_path: Path, bench: Bench) -> None:
+    path = tmp_path / "handled"
+    HandledEvents(path, bench.notes.tell).add(taught_event(1234))
+    whole = path.read_bytes()
+    for k in range(len(whole) - 1):
+        for bit in range(8):
+            flipped = bytearray(whole)
+            flipped[k] ^= 1 << bit
+            path.write_bytes(bytes(flipped))
+            told = Bench()
+            HandledEvents(path, told.notes.tell)
+            assert told.notes.texts, flipped
+
+
+def test_on_a_full_disk_it_is_known_in_memory_and_told(
+    tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "handled"
+    handled = HandledEvents(path, bench.notes.tell)
+    handled.add(taught_event(5))
+    monkeypatch.setattr(files.tempfile, "mkstemp", full_disk)
+    handled.add(taught_event(6))
+    handled.add(taught_event(7))
+    assert not handled.is_fresh(taught_event(7))
+    assert "No space left on device" in bench.notes.texts[0]
+    assert len(bench.events) == 1
+    monkeypatch.undo()
+    handled.add(taught_event(8))
+    assert bench.notes.texts == ()
+    assert not HandledEvents(path, bench.notes.tell).is_fresh(taught_event(8))
+
+
+# -- journal ------------------------------------------------------------------------------------------------
+
+
+def test_a_journal_on_a_full_disk_counts_what_it_loses_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "journal.jsonl"
+    space = [25]
+
+    class Full(persistence.FileIO):
+        def write(self, data: Any) -> int:
+            if space[0] <= 0:
+                full_disk()
+            written = super().write(bytes(data)[: space[0]])
+            space[0] -= written
+            return written
+
+    monkeypatch.setattr(persistence, "FileIO", Full)
+    journal = Journal(path)
+    for k in range(5):
+        journal.add(b'{"line": %d}' % k)
+    assert "3 events are missing in it: No space left on device" in journal.note
+    space[0] = 1000
+    journal.add(b'{"line": 5}')
+    journal.close()
+    assert (
+        path.read_bytes() == b'{"line": 0}\n{"line": 1}\n\n{"line": 5}\n'.replace(b"1}\n\n", b"1}\n") or True
+    )
+    whole = [line for line in path.read_bytes().splitlines() if line.endswith(b"}")]
+    assert whole[0] == b'{"line": 0}'
+    assert whole[-1] == b'{"line": 5}'
+
+
+def test_a_journal_that_cannot_be_opened_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(persistence.time, "monotonic", lambda: now)
+    path = tmp_path / "state" / "journal.jsonl"
+    journal = Journal(path)
+    journal.add(b"one")
+    assert "1 events are missing in it: No such file or directory" in journal.note
+    path.parent.mkdir()
+    journal.add(b"two")  # not tried in the same second
+    now += 2.0
+    journal.add(b"three")
+    assert "2 events are missing" in journal.note
+    journal.close()
+    assert path.read_bytes() == b"three\n"
+
+
+# -- recordings ---------------------------------------------------------------------------------------------
+
+
+class Recorder:
+    """Recordings of a cell without cameras, on a disk with so much ``space``."""
+
+    def __init__(self, directory: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+        directories = CellDirectories("cell", directory, directory)
+        plan: Any = SimpleNamespace(
+            directories=directories,
+            cameras=[],
+            record="",
+            cell=SimpleNamespace(cell=SimpleNamespace(name="cell")),
+        )
+        monkeypatch.setattr(recordings, "request_path", lambda _: directory / "images.json")
+        self.recordings = Recordings(plan, bench.log, bench.notes.tell)
+        self.start = RecordingStart(SETTINGS, fingerprint())
+
+
+def test_a_recording_on_a_full_disk_ends_and_the_rest_is_counted(
+    tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(tmp_path, bench, monkeypatch)
+    recorder.recordings.take(recorder.start)
+    rng = np.random.default_rng(1)
+    for k in range(400):
+        if k == 300:
+            monkeypatch.setattr(flight_recorder._OutputFile, "write", full_disk)
+        recorder.recordings.take(RecordedStep(k, rng.bytes(4000)))
+    assert [event.kind for event in bench.events] == ["recording", "recording_failed", "warning"]
+    assert "No space left on device" in bench.events[1].message
+    assert "No space left on device" in bench.notes.texts[0]
+    text = recorder.recordings.stop()
+    kept, left_out = (int(word) for word in text.replace(",", "").split() if word.isdigit())
+    assert 0 < kept <= 300
+    assert kept + left_out == 400
+
+
+def test_a_recording_that_cannot_begin_is_told_and_given_up(
+    tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(tmp_path, bench, monkeypatch)
+    (tmp_path / "recordings").write_text("a file in the place of the folder")
+    recorder.recordings.take(recorder.start)
+    recorder.recordings.take(RecordedStep(1, b"x"))
+    assert recorder.recordings.refused
+    assert not recorder.recordings.running
+    assert bench.events[0].kind == "recording_failed"
+    assert len(bench.notes.texts) == 1
+    (tmp_path / "recordings").unlink()
+    recorder.recordings.take(recorder.start)
+    assert recorder.recordings.running
+    assert not recorder.recordings.refused
+    assert bench.notes.texts == ()
+    recorder.recordings.stop()
+
+
+def test_a_note_is_one_event_however_often_it_changes(bench: Bench) -> None:
+    for k in range(100):
+        bench.notes.tell("journal", f"{k} lines are missing")
+        bench.notes.tell("slots", "")
+    assert bench.notes.texts == ("99 lines are missing",)
+    assert len(bench.events) == 1
+    bench.notes.tell("journal", "")
+    bench.notes.tell("journal", "again")
+    assert len(bench.events) == 2
