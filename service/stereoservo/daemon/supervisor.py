@@ -2,8 +2,9 @@
 owns its lock and runtime directory.
 
 A gateway or vision process that ends is started again after a growing pause. The servo process is never
-started again: when it ends, everything stops. Children die with the supervisor, whatever kills it (the
-servo process in good order).
+started again: when it ends, everything stops. A process that hangs (its heartbeat is late) is killed, and
+counts as one that ended. Children die with the supervisor, whatever kills it (the servo process in good
+order).
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
 import msgspec
 
 from stereoservo.daemon.cell_preparation import PlanOptions
+from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT, HangWatch
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -38,6 +41,7 @@ from stereoservo.daemon.vision import Reporter
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock, holder
+from stereoservo.messages.run_record import begin_run, end_run
 from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 60.0
@@ -45,6 +49,13 @@ SERVO_END_S = 6.0
 OTHERS_END_S = 4.0
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 10.0
+WATCH_EVERY_S = 0.05
+LATE_S = 0.25
+"""A supervisor that looks so late was itself without a processor: what it did not see it counts against nobody."""
+AFTER_SERVO = (
+    "The drives stop by themselves without its commands. See what it logged last, and `stereoservo doctor` on the "
+    "drives, before you run the cell again"
+)
 STEADY_S = 30.0
 """A process that lived for so long starts again after the shortest pause."""
 
@@ -54,15 +65,17 @@ class StartError(Exception):
 
 
 class ServoDiedError(Exception):
-    """The servo process ended by itself; everything was stopped."""
+    """The servo process ended by itself or hung; everything was stopped."""
 
 
 @dataclass
 class Child:
-    """One supervised process."""
+    """One supervised process. ``hung``: how, where it was killed for that."""
 
     name: str
     arguments: list[str]
+    watch: HangWatch
+    hung: str = ""
     process: subprocess.Popen[bytes] | None = None
     started: float = 0.0
     pause_s: float = FIRST_PAUSE_S
@@ -78,18 +91,19 @@ class Supervisor:
     children: list[Child] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        runtime = self.plan.runtime
-        self.servo = Child("servo", ["stereoservo.daemon.servo", runtime, str(os.getpid())])
-        self.gateway = Child("gateway", ["stereoservo.gateway.process", runtime, str(os.getpid())])
+        self.servo = self._child("servo", "stereoservo.daemon.servo")
+        self.gateway = self._child("gateway", "stereoservo.gateway.process")
         cameras = [
-            Child(
-                f"vision-{camera.name}",
-                ["stereoservo.daemon.vision", runtime, str(os.getpid()), camera.name],
-            )
+            self._child(f"vision-{camera.name}", "stereoservo.daemon.vision", camera.name)
             for camera in self.plan.cameras
         ]
         self.children = [self.servo, self.gateway, *cameras]
         self._reporter = Reporter(self.plan.directories.reports_socket, "supervisor", MonotonicClock())
+        self._looked_s = 0.0
+
+    def _child(self, name: str, module: str, *arguments: str) -> Child:
+        watch = HangWatch(self.plan.directories.heartbeat_slot(name))
+        return Child(name, [module, self.plan.runtime, str(os.getpid()), *arguments], watch)
 
     def run(self, termination: Termination, on_ready: Callable[[], None]) -> None:
         """Start all processes, monitor them until terminated, stop them. Raises StartError, ServoDiedError."""
@@ -100,8 +114,11 @@ class Supervisor:
             if not termination.asked:
                 on_ready()
             while not termination.asked:
-                self._watch()
-                time.sleep(0.05)
+                self.look(time.monotonic())
+                time.sleep(WATCH_EVERY_S)
+        except (StartError, ServoDiedError) as error:
+            record_end(self.plan.directories, str(error))  # before the gateway ends, which tells it
+            raise
         finally:
             self.stop()
 
@@ -120,29 +137,44 @@ class Supervisor:
                 raise StartError(f"the processes were not ready within {READY_TIMEOUT_S:g} s")
             time.sleep(0.02)
 
-    def _watch(self) -> None:
-        now = time.monotonic()
+    def look(self, now: float) -> None:
+        """Start what is due, and take note of what has ended or hangs. Raises ServoDiedError."""
+        late = now - self._looked_s > LATE_S
+        self._looked_s = now
         for child in self.children:
             if child.process is None:
                 if now >= child.due:
                     _start(child)
                 continue
+            hung = child.watch.look(now, late=late)
+            if hung and not child.hung:
+                child.hung = f"hung: {hung}; it was killed"
+                child.process.kill()
+                if child is self.servo:
+                    self._servo_ended(child.hung)
             code = child.process.poll()
-            if code is None:
-                continue
-            how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-            if child is self.servo:
-                raise ServoDiedError(f"the servo process ended {how}; everything is stopped")
-            child.process = None
-            child.restarts += 1
-            child.pause_s = (
-                FIRST_PAUSE_S if now - child.started > STEADY_S else min(2 * child.pause_s, LONGEST_PAUSE_S)
-            )
-            child.due = now + child.pause_s
-            self._reporter.report(
-                "process_ended", f"{child.name} ended {how}; starting again in {child.pause_s:g} s"
-            )
+            if code is not None:
+                self._ended(child, child.hung or _how(code), now)
         self._reporter.flush()
+
+    def _ended(self, child: Child, how: str, now: float) -> None:
+        """A process has ended: it is started again after a pause, unless it is the servo process."""
+        if child is self.servo:
+            self._servo_ended(how)
+        kind = "process_hung" if child.hung else "process_ended"
+        child.process = None
+        child.hung = ""
+        child.restarts += 1
+        child.pause_s = (
+            FIRST_PAUSE_S if now - child.started > STEADY_S else min(2 * child.pause_s, LONGEST_PAUSE_S)
+        )
+        child.due = now + child.pause_s
+        self._reporter.report(kind, f"{child.name} {how}; starting again in {child.pause_s:g} s")
+
+    def _servo_ended(self, how: str) -> NoReturn:
+        message = f"the servo process {how}; everything is stopped"
+        self._reporter.report("process_hung" if self.servo.hung else "process_ended", message)
+        raise ServoDiedError(f"{message}. {AFTER_SERVO}")
 
     def stop(self) -> None:
         """Stop the arm first, then the processes; every child is reaped."""
@@ -150,7 +182,15 @@ class Supervisor:
         _end([child for child in self.children if child is not self.servo], OTHERS_END_S)
 
 
+def _how(code: int) -> str:
+    """How a process ended, by its exit code."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    return f"ended by signal {signal.Signals(-code).name} (signal {-code})"
+
+
 def _start(child: Child) -> None:
+    child.watch.begin()
     child.process = subprocess.Popen(
         [sys.executable, "-m", *child.arguments],
         stdin=subprocess.DEVNULL,
@@ -205,10 +245,28 @@ def prepare(
     plan = load_plan(directories.runtime)
     create_stop_slot(directories.stop_slot)
     create_slot(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)
+    for name in ("servo", "gateway", *(f"vision-{camera.name}" for camera in plan.cameras)):
+        create_slot(directories.heartbeat_slot(name), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT)
     for camera in plan.cameras:
         create_slot(directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
         create_slot(directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT)
     return plan
+
+
+def record_begin(directories: CellDirectories, boot: str) -> None:
+    """Record that a run begins; a disk that does not take it holds up nothing."""
+    try:
+        begin_run(directories, boot, os.getpid())
+    except OSError as error:
+        write_log("supervisor", f"{directories.run_record}: {error.strerror}")
+
+
+def record_end(directories: CellDirectories, cause: str, *, in_order: bool = False) -> None:
+    """Record why a run ended; a disk that does not take it holds up nothing."""
+    try:
+        end_run(directories, cause, in_order=in_order)
+    except OSError as error:
+        write_log("supervisor", f"{directories.run_record}: {error.strerror}")
 
 
 def clean(directories: CellDirectories) -> None:
@@ -241,14 +299,20 @@ def run_cell(
     directories = cell_directories(cell.cell.name)
     create_directories(directories)
     options = PlanOptions(secrets.token_hex(4), seed, dry_run, commissioning, record)
-    with FileLock(directories.daemon_lock, f"cell {cell.cell.name!r}"):
+    what = f"cell {cell.cell.name!r}"
+    with FileLock(directories.daemon_lock, what), FileLock(directories.state_lock, what):
         termination = Termination(grace_s=0.0)
         clean(directories)
+        record_begin(directories, options.boot)
         try:
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")
                 Supervisor(plan).run(termination, lambda: on_ready(plan))
+            record_end(directories, f"ended by {signal.Signals(termination.first).name}", in_order=True)
+        except Exception as error:
+            record_end(directories, str(error))
+            raise
         finally:
             clean(directories)
         return termination.first
