@@ -17,7 +17,7 @@ from stereoservo.cli import main as cli
 from stereoservo.client import InvalidReplyError
 from stereoservo.daemon.seqlock import StopSlot, create_stop_slot
 from stereoservo.messages.cell_file import load_cell_file
-from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
 from stereoservo.messages.wire import MessageError
 
@@ -155,6 +155,17 @@ def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: R
     assert "no daemon runs for cell 'nowhere'; running: none" in result["error"]["message"]
     assert run("stop", "nowhere")[0] == 1
     assert run("ls") == (0, {"cells": []}, "")
+
+
+def test_a_cell_has_one_daemon_whatever_the_runtime_directories_are(
+    cell: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directories = cell_directories(load_cell_file(cell).cell.name)
+    create_directories(directories)
+    with FileLock(directories.state_lock, "as its daemon does"):
+        monkeypatch.setenv("STEREOSERVO_RUNTIME_DIR", str(tmp_path / "elsewhere"))
+        code, result, _ = run("run", str(cell))
+    assert (code, result["error"]["code"]) == (1, "already_running")
 
 
 def test_stop_takes_the_stop_slot_where_something_strange_answers(

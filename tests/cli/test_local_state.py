@@ -41,9 +41,11 @@ def daemon(directories: CellDirectories) -> Iterator[CellDirectories]:
         yield directories
 
 
-def beat(directories: CellDirectories, age_s: float, limit_s: float = SERVO_HANG_S) -> None:
-    """The servo process's newest heartbeat."""
-    with SlotWriter(directories.heartbeat_slot("servo"), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT) as slot:
+def beat(
+    directories: CellDirectories, age_s: float, limit_s: float = SERVO_HANG_S, of: str = "servo"
+) -> None:
+    """A process's newest heartbeat."""
+    with SlotWriter(directories.heartbeat_slot(of), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT) as slot:
         slot.write(struct.pack("=qd", time.monotonic_ns() - round(age_s * 1e9), limit_s))
 
 
@@ -72,16 +74,31 @@ def test_a_gateway_that_does_not_answer_is_told_from_a_servo_process_that_is_sil
     assert "the gateway does not answer" in error["message"]
 
 
+def test_a_gateway_that_hangs_is_not_waited_for(
+    daemon: CellDirectories, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(*_: object, **__: object) -> None:
+        raise AssertionError("the gateway is asked")
+
+    monkeypatch.setattr("stereoservo.cli.status.Client", asked)
+    beat(daemon, 0.0, DRIVER_CALL_S)
+    beat(daemon, 4.0, of="gateway")
+    code, error = status(capfd)
+    assert (code, error["code"]) == (1, "no_reply")
+    assert "the gateway has given no sign of life for 4." in error["message"]
+    assert "`stereoservo stop` works" in error["message"]
+
+
 def test_a_daemon_that_died_leaves_its_cause(
     directories: CellDirectories, capfd: pytest.CaptureFixture[str]
 ) -> None:
     begin_run(directories, "a", 7)
     assert "(process 7) was killed (signal 9)" in status(capfd)[1]["message"]
-    end_run(directories, "the servo process hung: no sign of life")
+    end_run(directories, "the servo process hung: no sign of life", "See its log")
     code, error = status(capfd)
     assert (code, error["code"]) == (1, "not_running")
     assert "Its last run ended at 20" in error["message"]
-    assert "the servo process hung: no sign of life" in error["message"]
+    assert "the servo process hung: no sign of life. See its log. Start it" in error["message"]
 
 
 def test_a_daemon_that_starts_is_told_from_none(

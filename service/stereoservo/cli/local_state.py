@@ -1,57 +1,68 @@
-"""State of a cell of this host without its gateway: heartbeat and state of the servo process, from shared memory."""
+"""State of a cell of this host without its gateway: heartbeats, and the servo process's state, from shared memory."""
 
 from __future__ import annotations
 
 import time
+from contextlib import closing
 
 import msgspec
 
-from stereoservo.daemon.heartbeat import SERVO_HANG_S, Beat, HeartbeatReader
+from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, SERVO_HANG_S, Beat, HeartbeatReader
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.discovery import daemon_info
 from stereoservo.messages.wire import StateMessage
 
 SILENT_S = 0.5
-"""A servo process beats each 20 ms; what is shorter may be a stall of the machine."""
+"""A process beats each 20 ms; what is shorter may be a stall of the machine."""
 AGAIN_S = 0.2
-WHAT_TO_DO = (
+SERVO_SILENT = (
     "Its drives stop by themselves without its commands, and the supervisor ends a daemon whose servo process is "
     f"silent for {SERVO_HANG_S:g} s; positions and progress are those of before. Where the arm still moves, use the "
     "emergency stop; then see the daemon's log and run the cell again"
 )
 
 
+GATEWAY_SILENT = (
+    "Without it the arm is held, and `stereoservo stop` works. The supervisor kills a gateway that hangs for "
+    f"{GATEWAY_HANG_S:g} s and starts it again: ask once more"
+)
+
+
 def servo_silence(directories: CellDirectories) -> str:
-    """Words on a servo process that gives no sign of life although its daemon is up; else ''."""
-    info = daemon_info(directories)
-    if info is None:
-        return ""
+    """Words on a servo process that gives no sign of life; '' where it does, or where nothing is known."""
+    silent = _silent(directories, "servo", SERVO_HANG_S)
+    return "" if silent == "" else f"the servo process {silent}: it hangs or was stopped. {SERVO_SILENT}"
+
+
+def gateway_silence(directories: CellDirectories) -> str:
+    """Likewise of the gateway."""
+    silent = _silent(directories, "gateway", GATEWAY_HANG_S)
+    return "" if silent == "" else f"the gateway {silent}. {GATEWAY_SILENT}"
+
+
+def _silent(directories: CellDirectories, process: str, usual_s: float) -> str:
     try:
-        reader = HeartbeatReader(directories.heartbeat_slot("servo"))
+        reader = HeartbeatReader(directories.heartbeat_slot(process))
     except SlotError:  # of a version without one
         return ""
-    beat = reader.newest()
-    if beat is not None and _age_s(beat) > _allowed_s(beat):
-        time.sleep(AGAIN_S)  # this process itself may have stood
+    with closing(reader):
         beat = reader.newest()
-    reader.close()
-    if beat is None or _age_s(beat) <= _allowed_s(beat):
+        if beat is not None and _age_s(beat) > _allowed_s(beat, usual_s):
+            time.sleep(AGAIN_S)  # this process itself may have stood
+            beat = reader.newest()
+    if beat is None or _age_s(beat) <= _allowed_s(beat, usual_s):
         return ""
     since = time.strftime("%H:%M:%S", time.localtime(time.time() - _age_s(beat)))
-    return (
-        f"the servo process of cell {info.cell!r} has given no sign of life for {_age_s(beat):.1f} s, since {since}: "
-        f"it hangs or was stopped. {WHAT_TO_DO}"
-    )
+    return f"has given no sign of life for {_age_s(beat):.1f} s, since {since}"
 
 
 def _age_s(beat: Beat) -> float:
     return (time.monotonic_ns() - beat.t_ns) * 1e-9
 
 
-def _allowed_s(beat: Beat) -> float:
-    """How long a beat lasts: where drives are configured the servo process has said so, and how long that may take."""
-    return SILENT_S if beat.limit_s <= SERVO_HANG_S else beat.limit_s
+def _allowed_s(beat: Beat, usual_s: float) -> float:
+    """How long a beat lasts. A process that does something longer, such as configuring drives, has said so."""
+    return SILENT_S if beat.limit_s <= usual_s else beat.limit_s
 
 
 def newest_state(directories: CellDirectories) -> StateMessage | None:

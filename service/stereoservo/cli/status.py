@@ -6,18 +6,18 @@ from __future__ import annotations
 
 import math
 
-from stereoservo.cli.local_state import WHAT_TO_DO, newest_state, servo_silence
+from stereoservo.cli.local_state import (
+    GATEWAY_SILENT,
+    SERVO_SILENT,
+    gateway_silence,
+    newest_state,
+    servo_silence,
+)
 from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, code_of, emit
 from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionError
-from stereoservo.daemon.heartbeat import GATEWAY_HANG_S
 from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import find_daemon
 from stereoservo.messages.wire import StateMessage
-
-GATEWAY_SILENT = (
-    "the gateway does not answer; without it the arm is held, and `stereoservo stop` works. The supervisor kills a "
-    f"gateway that hangs for {GATEWAY_HANG_S:g} s and starts it again: ask once more"
-)
 
 
 def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
@@ -25,16 +25,18 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
     directories = cell_directories(find_daemon(cell).cell) if endpoint is None else None
     if directories is not None and (silence := servo_silence(directories)):
         raise _failure("servo_silent", silence, newest_state(directories), json)
+    if directories is not None and (silence := gateway_silence(directories)):
+        raise _failure("no_reply", silence, newest_state(directories), json)
     try:
         with Client(cell, endpoint=endpoint) as client:
             state = client.status()
     except (InvalidReplyError, NoReplyError, SessionError) as error:
         if directories is None:
             raise
-        silence = servo_silence(directories) or f"{GATEWAY_SILENT} ({error})"
+        silence = servo_silence(directories) or f"the gateway does not answer ({error}). {GATEWAY_SILENT}"
         raise _failure(code_of(error), silence, newest_state(directories), json) from error
     if not state.servo_alive:
-        raise _failure("servo_silent", f"the servo process is silent. {WHAT_TO_DO}", state, json)
+        raise _failure("servo_silent", f"the servo process is silent. {SERVO_SILENT}", state, json)
     emit(state, describe(state), json)
 
 

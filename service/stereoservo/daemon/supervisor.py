@@ -65,7 +65,11 @@ class StartError(Exception):
 
 
 class ServoDiedError(Exception):
-    """The servo process ended by itself or hung; everything was stopped."""
+    """The servo process ended by itself or hung, which is the ``cause``; everything was stopped."""
+
+    def __init__(self, cause: str) -> None:
+        super().__init__(f"{cause}. {AFTER_SERVO}")
+        self.cause = cause
 
 
 @dataclass
@@ -116,8 +120,10 @@ class Supervisor:
             while not termination.asked:
                 self.look(time.monotonic())
                 time.sleep(WATCH_EVERY_S)
-        except (StartError, ServoDiedError) as error:
-            record_end(self.plan.directories, str(error))  # before the gateway ends, which tells it
+        except ServoDiedError as error:
+            record_end(
+                self.plan.directories, error.cause, AFTER_SERVO
+            )  # before the gateway ends, which tells it
             raise
         finally:
             self.stop()
@@ -174,7 +180,7 @@ class Supervisor:
     def _servo_ended(self, how: str) -> NoReturn:
         message = f"the servo process {how}; everything is stopped"
         self._reporter.report("process_hung" if self.servo.hung else "process_ended", message)
-        raise ServoDiedError(f"{message}. {AFTER_SERVO}")
+        raise ServoDiedError(message)
 
     def stop(self) -> None:
         """Stop the arm first, then the processes; every child is reaped."""
@@ -261,10 +267,10 @@ def record_begin(directories: CellDirectories, boot: str) -> None:
         write_log("supervisor", f"{directories.run_record}: {error.strerror}")
 
 
-def record_end(directories: CellDirectories, cause: str, *, in_order: bool = False) -> None:
+def record_end(directories: CellDirectories, cause: str, remedy: str = "", *, in_order: bool = False) -> None:
     """Record why a run ended; a disk that does not take it holds up nothing."""
     try:
-        end_run(directories, cause, in_order=in_order)
+        end_run(directories, cause, remedy, in_order=in_order)
     except OSError as error:
         write_log("supervisor", f"{directories.run_record}: {error.strerror}")
 
@@ -309,7 +315,8 @@ def run_cell(
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")
                 Supervisor(plan).run(termination, lambda: on_ready(plan))
-            record_end(directories, f"ended by {signal.Signals(termination.first).name}", in_order=True)
+            asked = signal.Signals(termination.first).name
+            record_end(directories, f"somebody asked for it ({asked})", in_order=True)
         except Exception as error:
             record_end(directories, str(error))
             raise

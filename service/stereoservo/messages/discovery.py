@@ -100,7 +100,8 @@ def last_words(directories: CellDirectories) -> str:
     if run is None:
         return ""
     when = "" if run.ended is None else time.strftime(" at %Y-%m-%d %H:%M:%S", time.localtime(run.ended))
-    return f"Its last run ended{when}: {how_it_ended(run).removesuffix('.')}. "
+    words = f"Its last run ended{when}: {how_it_ended(run).removesuffix('.')}. "
+    return f"{words}{run.remedy}. " if run.remedy else words
 
 
 class DaemonProcess:

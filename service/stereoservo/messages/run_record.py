@@ -21,7 +21,7 @@ class RunRecord(msgspec.Struct, frozen=True):
 
     ``pid`` of the supervisor; ``machine``: the start of the computer that it ran in. ``cause`` of its end: empty while
     it runs, and for good where nobody was left to write it. ``in_order``: somebody asked for the end. ``previous``: how
-    the run before it ended, empty where that was in order.
+    the run before it ended, empty where that was in order. ``remedy``: what to do, where the cause does not say so.
     """
 
     boot: str
@@ -32,6 +32,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     cause: str = ""
     in_order: bool = False
     previous: str = ""
+    remedy: str = ""
 
 
 class OpenGoal(msgspec.Struct, frozen=True):
@@ -56,11 +57,11 @@ def begin_run(directories: CellDirectories, boot: str, pid: int) -> None:
     _replace(directories.run_record, msgspec.json.encode(run))
 
 
-def end_run(directories: CellDirectories, cause: str, *, in_order: bool = False) -> None:
+def end_run(directories: CellDirectories, cause: str, remedy: str = "", *, in_order: bool = False) -> None:
     """Record the cause of a run's end, unless there is one already. Raises OSError."""
     run = read_run(directories)
     if run is not None and not run.cause:
-        ended = msgspec.structs.replace(run, ended=time.time(), cause=cause, in_order=in_order)
+        ended = msgspec.structs.replace(run, ended=time.time(), cause=cause, remedy=remedy, in_order=in_order)
         _replace(directories.run_record, msgspec.json.encode(ended))
 
 
