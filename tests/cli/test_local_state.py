@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import time
 from collections.abc import Iterator
@@ -61,7 +62,7 @@ def test_a_servo_process_that_is_silent_is_an_error(
     beat(daemon, 40.0)
     code, error = status(capfd)
     assert (code, error["code"]) == (1, "servo_silent")
-    assert "no sign of life for 40." in error["message"]
+    assert re.search(r"the servo process has given no sign of life for 4\d\.\d s, since", error["message"])
     assert "emergency stop" in error["message"]
 
 
@@ -82,10 +83,10 @@ def test_a_gateway_that_hangs_is_not_waited_for(
 
     monkeypatch.setattr("stereoservo.cli.status.Client", asked)
     beat(daemon, 0.0, DRIVER_CALL_S)
-    beat(daemon, 4.0, of="gateway")
+    beat(daemon, 40.0, of="gateway")
     code, error = status(capfd)
     assert (code, error["code"]) == (1, "no_reply")
-    assert "the gateway has given no sign of life for 4." in error["message"]
+    assert re.search(r"the gateway has given no sign of life for 4\d\.\d s, since", error["message"])
     assert "`stereoservo stop` works" in error["message"]
 
 

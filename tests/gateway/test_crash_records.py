@@ -9,7 +9,7 @@ import pytest
 from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.run_record import begin_run, end_run, read_goals
+from stereoservo.messages.run_record import begin_run, end_run, read_goals, run_is_up
 
 
 class Gateway:
@@ -33,6 +33,7 @@ def directories(tmp_path: Path) -> CellDirectories:
 
 def test_the_next_run_ends_the_goals_of_one_that_was_killed_once(directories: CellDirectories) -> None:
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     first = Gateway(directories, "a")
     for kind, goal in (
         ("goal_accepted", "queued"), ("goal_accepted", "done"), ("goal_started", "done"), ("goal_reached", "done"),
@@ -55,6 +56,7 @@ def test_the_next_run_ends_the_goals_of_one_that_was_killed_once(directories: Ce
 
 def test_the_gateway_that_is_left_tells_why(directories: CellDirectories) -> None:
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     gateway = Gateway(directories, "a")
     gateway.log.add("goal_accepted", id="g")
     assert gateway.goals.any_of_this_run
@@ -68,6 +70,7 @@ def test_the_gateway_that_is_left_tells_why(directories: CellDirectories) -> Non
 
 def test_a_gateway_started_again_in_the_same_run_ends_nothing(directories: CellDirectories) -> None:
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     Gateway(directories, "a").log.add("goal_accepted", id="g")
     again = Gateway(directories, "a")
     assert again.ends == []

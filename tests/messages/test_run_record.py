@@ -16,6 +16,7 @@ from stereoservo.messages.run_record import (
     how_it_ended,
     read_goals,
     read_run,
+    run_is_up,
     write_goals,
 )
 
@@ -28,6 +29,7 @@ def directories(tmp_path: Path) -> CellDirectories:
 def test_the_first_cause_stays_and_the_next_run_knows_it(directories: CellDirectories) -> None:
     assert read_run(directories) is None
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     end_run(directories, "the servo process hung")
     end_run(directories, "what came of it")
     run = read_run(directories)
@@ -41,6 +43,7 @@ def test_the_first_cause_stays_and_the_next_run_knows_it(directories: CellDirect
 
 def test_an_end_in_order_is_nothing_to_speak_of(directories: CellDirectories) -> None:
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     end_run(directories, "ended by SIGTERM", in_order=True)
     begin_run(directories, "b", 8)
     run = read_run(directories)
@@ -48,10 +51,25 @@ def test_an_end_in_order_is_nothing_to_speak_of(directories: CellDirectories) ->
     assert run.previous == ""
 
 
+def test_a_start_that_failed_hides_no_cause_of_the_run_before_it(directories: CellDirectories) -> None:
+    begin_run(directories, "a", 7)
+    run_is_up(directories)
+    end_run(directories, "the servo process hung")
+    begin_run(directories, "b", 8)
+    end_run(directories, "unknown field `speed`")
+    begin_run(directories, "c", 9)
+    end_run(directories, "somebody asked for it (SIGINT)", in_order=True)
+    begin_run(directories, "d", 10)
+    run = read_run(directories)
+    assert run is not None
+    assert run.previous == "the servo process hung"
+
+
 def test_a_cause_that_nobody_could_write_is_concluded(
     directories: CellDirectories, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     run = read_run(directories)
     assert run is not None
     assert "(process 7) was killed (signal 9)" in how_it_ended(run)
@@ -68,6 +86,7 @@ def test_a_damaged_record_is_none(content: bytes, directories: CellDirectories) 
     assert read_run(directories) is None
     assert read_goals(directories) == ()
     begin_run(directories, "a", 7)
+    run_is_up(directories)
     assert read_run(directories) is not None
 
 

@@ -7,21 +7,17 @@ from contextlib import closing
 
 import msgspec
 
-from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, SERVO_HANG_S, Beat, HeartbeatReader
+from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.wire import StateMessage
 
-SILENT_S = 0.5
-"""A process beats each 20 ms; what is shorter may be a stall of the machine."""
 AGAIN_S = 0.2
 SERVO_SILENT = (
     "Its drives stop by themselves without its commands, and the supervisor ends a daemon whose servo process is "
     f"silent for {SERVO_HANG_S:g} s; positions and progress are those of before. Where the arm still moves, use the "
     "emergency stop; then see the daemon's log and run the cell again"
 )
-
-
 GATEWAY_SILENT = (
     "Without it the arm is held, and `stereoservo stop` works. The supervisor kills a gateway that hangs for "
     f"{GATEWAY_HANG_S:g} s and starts it again: ask once more"
@@ -47,22 +43,14 @@ def _silent(directories: CellDirectories, process: str, usual_s: float) -> str:
         return ""
     with closing(reader):
         beat = reader.newest()
-        if beat is not None and _age_s(beat) > _allowed_s(beat, usual_s):
+        if beat is not None and beat.silent_s(usual_s):
             time.sleep(AGAIN_S)  # this process itself may have stood
             beat = reader.newest()
-    if beat is None or _age_s(beat) <= _allowed_s(beat, usual_s):
+    silent_s = 0.0 if beat is None else beat.silent_s(usual_s)
+    if not silent_s:
         return ""
-    since = time.strftime("%H:%M:%S", time.localtime(time.time() - _age_s(beat)))
-    return f"has given no sign of life for {_age_s(beat):.1f} s, since {since}"
-
-
-def _age_s(beat: Beat) -> float:
-    return (time.monotonic_ns() - beat.t_ns) * 1e-9
-
-
-def _allowed_s(beat: Beat, usual_s: float) -> float:
-    """How long a beat lasts. A process that does something longer, such as configuring drives, has said so."""
-    return SILENT_S if beat.limit_s <= usual_s else beat.limit_s
+    since = time.strftime("%H:%M:%S", time.localtime(time.time() - silent_s))
+    return f"has given no sign of life for {silent_s:.1f} s, since {since}"
 
 
 def newest_state(directories: CellDirectories) -> StateMessage | None:

@@ -19,6 +19,8 @@ _RECORD = struct.Struct("=qd")
 HEARTBEAT_BYTES = _RECORD.size
 BEAT_EVERY_NS = 20_000_000
 
+SILENT_S = 0.5
+"""A process beats each 20 ms; what is shorter than this may be a stall of the machine."""
 SERVO_HANG_S = 2.0
 """Without its commands the drives stop by themselves within 0.5 s, and from a stall of a shared machine, of up to a
 second, the core recovers (LOOP_GAP): what stands for longer cannot be trusted any more."""
@@ -61,6 +63,13 @@ class Beat(NamedTuple):
 
     t_ns: int
     limit_s: float
+
+    def silent_s(self, usual_s: float) -> float:
+        """For how long the process has been silent, 0 where that is nothing to speak of (``SILENT_S``) or less than
+        it has announced. ``usual_s``: its limit where it announces nothing.
+        """
+        age_s = (time.monotonic_ns() - self.t_ns) * 1e-9
+        return age_s if age_s > (self.limit_s if self.limit_s > usual_s else SILENT_S) else 0.0
 
 
 class HeartbeatReader:

@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -41,7 +42,7 @@ from stereoservo.daemon.vision import Reporter
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock, holder
-from stereoservo.messages.run_record import begin_run, end_run
+from stereoservo.messages.run_record import begin_run, end_run, run_is_up
 from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 60.0
@@ -116,14 +117,14 @@ class Supervisor:
                 _start(child)
             self._await_ready(termination)
             if not termination.asked:
+                record_run(partial(run_is_up, self.plan.directories))
                 on_ready()
             while not termination.asked:
                 self.look(time.monotonic())
                 time.sleep(WATCH_EVERY_S)
         except ServoDiedError as error:
-            record_end(
-                self.plan.directories, error.cause, AFTER_SERVO
-            )  # before the gateway ends, which tells it
+            # Before the gateway ends, which tells it.
+            record_run(partial(end_run, self.plan.directories, error.cause, AFTER_SERVO))
             raise
         finally:
             self.stop()
@@ -259,20 +260,12 @@ def prepare(
     return plan
 
 
-def record_begin(directories: CellDirectories, boot: str) -> None:
-    """Record that a run begins; a disk that does not take it holds up nothing."""
+def record_run(write: Callable[[], None]) -> None:
+    """Write the record of this run by ``write``; a disk that does not take it holds up nothing."""
     try:
-        begin_run(directories, boot, os.getpid())
+        write()
     except OSError as error:
-        write_log("supervisor", f"{directories.run_record}: {error.strerror}")
-
-
-def record_end(directories: CellDirectories, cause: str, remedy: str = "", *, in_order: bool = False) -> None:
-    """Record why a run ended; a disk that does not take it holds up nothing."""
-    try:
-        end_run(directories, cause, remedy, in_order=in_order)
-    except OSError as error:
-        write_log("supervisor", f"{directories.run_record}: {error.strerror}")
+        write_log("supervisor", f"the record of this run: {error}")
 
 
 def clean(directories: CellDirectories) -> None:
@@ -309,16 +302,16 @@ def run_cell(
     with FileLock(directories.daemon_lock, what), FileLock(directories.state_lock, what):
         termination = Termination(grace_s=0.0)
         clean(directories)
-        record_begin(directories, options.boot)
+        record_run(partial(begin_run, directories, options.boot, os.getpid()))
         try:
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")
                 Supervisor(plan).run(termination, lambda: on_ready(plan))
             asked = signal.Signals(termination.first).name
-            record_end(directories, f"somebody asked for it ({asked})", in_order=True)
+            record_run(partial(end_run, directories, f"somebody asked for it ({asked})", in_order=True))
         except Exception as error:
-            record_end(directories, str(error))
+            record_run(partial(end_run, directories, str(error)))
             raise
         finally:
             clean(directories)

@@ -358,7 +358,12 @@ class Gateway:
                 last_event=self.log.last,
                 notes=(*self._calibration.notes, *self._notes),
             )
-        elif self._state is not None and self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
+        elif (
+            self._state is not None
+            and self._state.servo_alive
+            and now - self._state_heard > SERVO_STALE_S
+            and not self._servo.announced_silence()
+        ):
             self._state = msgspec.structs.replace(self._state, servo_alive=False)
 
     def _publish_state(self) -> None:

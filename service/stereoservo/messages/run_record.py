@@ -17,11 +17,12 @@ _T = TypeVar("_T")
 
 
 class RunRecord(msgspec.Struct, frozen=True):
-    """A run of a cell's daemon, written as it begins and again as it ends; times [s since 1970].
+    """A run of a cell's daemon, written as it begins, as it is ``up``, and as it ends; times [s since 1970].
 
     ``pid`` of the supervisor; ``machine``: the start of the computer that it ran in. ``cause`` of its end: empty while
     it runs, and for good where nobody was left to write it. ``in_order``: somebody asked for the end. ``previous``: how
-    the run before it ended, empty where that was in order. ``remedy``: what to do, where the cause does not say so.
+    the last run before it that was up ended, empty where that was in order. ``remedy``: what to do, where the cause
+    does not say so.
     """
 
     boot: str
@@ -33,6 +34,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     in_order: bool = False
     previous: str = ""
     remedy: str = ""
+    up: bool = False
 
 
 class OpenGoal(msgspec.Struct, frozen=True):
@@ -52,9 +54,19 @@ class OpenGoals(msgspec.Struct, frozen=True):
 def begin_run(directories: CellDirectories, boot: str, pid: int) -> None:
     """Record that a run begins. Raises OSError."""
     before = read_run(directories)
-    previous = "" if before is None or before.in_order else how_it_ended(before)
+    if before is None or not before.up:  # a start that failed tells nothing of the goals of the run before it
+        previous = "" if before is None else before.previous
+    else:
+        previous = "" if before.in_order else how_it_ended(before)
     run = RunRecord(boot, pid, machine_start(), time.time(), previous=previous)
     _replace(directories.run_record, msgspec.json.encode(run))
+
+
+def run_is_up(directories: CellDirectories) -> None:
+    """Record that the daemon takes requests. Raises OSError."""
+    run = read_run(directories)
+    if run is not None:
+        _replace(directories.run_record, msgspec.json.encode(msgspec.structs.replace(run, up=True)))
 
 
 def end_run(directories: CellDirectories, cause: str, remedy: str = "", *, in_order: bool = False) -> None:
