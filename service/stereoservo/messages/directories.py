@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import re
 import stat
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -164,6 +163,8 @@ def directories_of(cell: str) -> CellDirectories:
     """
     if not cell.endswith(".toml"):
         return cell_directories(cell)
+    import tomllib  # a stop by the cell's name does not wait for it
+
     try:
         name = tomllib.loads(Path(cell).read_text(encoding="utf-8"))["cell"]["name"]
     except (OSError, ValueError, KeyError, TypeError) as error:
