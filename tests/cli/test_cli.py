@@ -1,18 +1,24 @@
 """The command line's contract: one JSON object, errors as JSON, exit codes, broken plug-ins."""
 
 import json
+import subprocess
+import sys
+import threading
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from stereoservo.cli import dispatch
 from stereoservo.cli import main as cli
 from stereoservo.client import InvalidReplyError
-from stereoservo.daemon.seqlock import create_stop_slot
+from stereoservo.daemon.seqlock import StopSlot, create_stop_slot
 from stereoservo.messages.cell_file import load_cell_file
-from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.locks import FileLock
 from stereoservo.messages.wire import MessageError
 
 Run = Callable[..., tuple[int, Any, str]]
@@ -39,7 +45,7 @@ def cell(tmp_path: Path, run: Run) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", list(cli.COMMANDS))
+@pytest.mark.parametrize("command", list(dispatch.COMMANDS))
 def test_every_command_has_help(command: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.invoke([command, "--help"]) == 0
     out = capfd.readouterr().out
@@ -50,7 +56,7 @@ def test_every_command_has_help(command: str, capfd: pytest.CaptureFixture[str])
 def test_help_lists_all_commands_and_those_of_entry_points(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.invoke(["--help"]) == 0
     out = capfd.readouterr().out
-    for command in (*cli.COMMANDS, "reproduce"):
+    for command in (*dispatch.COMMANDS, "reproduce"):
         assert f"\n  {command} " in out
 
 
@@ -151,6 +157,17 @@ def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: R
     assert run("ls") == (0, {"cells": []}, "")
 
 
+def test_a_cell_has_one_daemon_whatever_the_runtime_directories_are(
+    cell: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directories = cell_directories(load_cell_file(cell).cell.name)
+    create_directories(directories)
+    with FileLock(directories.state_lock, "as its daemon does"):
+        monkeypatch.setenv("STEREOSERVO_RUNTIME_DIR", str(tmp_path / "elsewhere"))
+        code, result, _ = run("run", str(cell))
+    assert (code, result["error"]["code"]) == (1, "already_running")
+
+
 def test_stop_takes_the_stop_slot_where_something_strange_answers(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +182,79 @@ def test_stop_takes_the_stop_slot_where_something_strange_answers(
     assert code == 1
     assert result["error"]["code"] == "not_acknowledged"  # there is no servo process
     assert "raising the stop slot" in err
+
+
+def slot_of(cell: str) -> Path:
+    """The stop slot of a cell that seems to run."""
+    path = cell_directories(cell).stop_slot
+    path.parent.mkdir(parents=True)
+    create_stop_slot(path)
+    return path
+
+
+@contextmanager
+def acknowledging(path: Path) -> Iterator[None]:
+    """A servo process that takes every stop."""
+    slot, ended = StopSlot(path), threading.Event()
+    lock = FileLock(cell_directories("demo").servo_lock, "the cell")
+
+    def work() -> None:
+        while not ended.wait(0.001):
+            slot.poll()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield
+    ended.set()
+    thread.join()
+    lock.release()
+
+
+ONLY_THE_STANDARD_LIBRARY = """
+import sys
+class Refusing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {"typer", "rich", "msgspec", "zenoh", "numpy", "numba"}:
+            raise SystemExit(f"{name} is imported")
+sys.meta_path.insert(0, Refusing())
+from stereoservo.cli import main
+main.invoke(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("written", ["demo", "file"])
+def test_a_stop_is_raised_before_any_library_is_imported(written: str, tmp_path: Path) -> None:
+    slot = StopSlot(slot_of("demo"))
+    path = tmp_path / "half-edited.toml"  # does not pass as a cell, and still names it
+    path.write_text('[cell]\nname = "demo"\n[servo]\nspeeed = 1\n')
+    arguments = ["stop", "demo" if written == "demo" else str(path), "--json"]
+    ended = subprocess.run(
+        [sys.executable, "-c", ONLY_THE_STANDARD_LIBRARY, *arguments],
+        check=False, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert "is imported" in ended.stderr  # afterwards, for the answer
+    assert slot.count == 1
+
+
+def test_a_stop_on_its_host_asks_nobody_but_the_servo_process(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(*_: object, **__: object) -> None:
+        raise AssertionError("the gateway is asked")
+
+    monkeypatch.setattr("stereoservo.cli.stop.Client", asked)
+    path = slot_of("demo")
+    with acknowledging(path):
+        code, result, _ = run("stop", "demo")
+    assert (code, result["accepted"]) == (0, True)
+    assert StopSlot(path).count == 1
+
+
+def test_a_stop_for_another_host_leaves_the_cell_of_this_name_here_alone(run: Run) -> None:
+    path = slot_of("demo")
+    code, result, _ = run("stop", "demo", "--endpoint", f"unixsock-stream/{path.parent}/none.sock")
+    assert (code, result["error"]["code"]) == (1, "session")
+    assert StopSlot(path).count == 0
 
 
 @pytest.mark.parametrize(

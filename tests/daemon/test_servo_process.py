@@ -13,6 +13,7 @@ import pytest
 from stereoservo.core.cycle import Event, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import core_settings
+from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -127,7 +128,11 @@ class Bench:
         camera = CameraDescription("stub", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2))
         core = ServoCore(core_settings(cell, self.arm.describe(), (camera,)))
         self.links = ProcessLinks(self.directories, ("left",))
-        self.process = ServoProcess(core, self.arm, self.links, self.clock, rate_hz=RATE_HZ, dry_run=dry_run)
+        self.beats: list[float] = []
+        """How long the next sign of life may take, each time that one was given."""
+        self.process = ServoProcess(
+            core, self.arm, self.links, self.clock, rate_hz=RATE_HZ, dry_run=dry_run, beat=self.beats.append
+        )
         self.pacing = ClockPacing(round(1e9 / RATE_HZ), now=self.clock.now_ns, sleep=self.clock.sleep)
         self.control: PacketChannel | None = None
         self.events: list[Event] = []
@@ -286,6 +291,26 @@ def test_a_faulty_driver_is_not_hammered_and_reset_reconnects_it(bench: Bench) -
     assert "configure" in bench.arm.calls
     assert bench.state().status.lifecycle == "inactive"
     enabled(bench)
+
+
+def test_each_cycle_is_a_sign_of_life_and_calls_that_take_long_are_announced(bench: Bench) -> None:
+    bench.beats.clear()
+    bench.run(3)
+    assert bench.beats == [SERVO_HANG_S] * 3
+    announced: list[float] = []
+    bench.arm.configure = lambda: announced.append(bench.beats[-1])  # type: ignore[method-assign]
+    bench.arm.activate = lambda: announced.append(bench.beats[-1])  # type: ignore[method-assign]
+    bench.arm.deactivate = lambda: announced.append(bench.beats[-1])  # type: ignore[method-assign]
+    enabled(bench)
+    bench.arm.fail["read_state"] = DriverError("connection_lost", "gone")
+    bench.run(5)
+    bench.arm.fail.clear()
+    assert bench.ask(Reset()).accepted
+    bench.run(3)
+    assert bench.beats[-1] == SERVO_HANG_S
+    bench.process.shut_down()
+    # Enabled; switched off for the fault; switched off and configured by the reset; switched off.
+    assert announced == [DRIVER_CALL_S] * 5
 
 
 def test_a_driver_that_refuses_to_activate_leaves_the_cell_in_fault(bench: Bench) -> None:

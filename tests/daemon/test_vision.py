@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import encode
+from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
@@ -111,6 +112,21 @@ def test_only_the_newest_of_several_frames_is_handed_over(bench: Bench) -> None:
     assert bench.pipeline.poll()
     assert bench.seen() == 3
     assert (bench.pipeline.frames, bench.pipeline.written) == (3, 1)
+
+
+def test_a_camera_may_take_long_to_open_and_to_its_first_image(bench: Bench) -> None:
+    beats: list[float] = []
+    pipeline = CameraPipeline(bench.camera, None, bench.links, bench.clock, None, beats.append)  # type: ignore[arg-type]
+    pipeline.open()
+    pipeline.poll()
+    bench.camera.arriving = [observation(1, 1)]
+    pipeline.poll()
+    assert set(beats) == {CAMERA_OPENS_S}
+    beats.clear()
+    pipeline.poll()
+    assert beats == [VISION_HANG_S]
+    pipeline.close()
+    assert beats[-1] == CAMERA_OPENS_S
 
 
 def test_a_detector_gets_a_fresh_prior_and_no_stale_one(tmp_path: Path) -> None:

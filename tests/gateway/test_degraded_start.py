@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,7 +17,7 @@ from stereoservo.daemon.kernel_compilation import example_model, example_setting
 from stereoservo.gateway import persistence, recordings
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.observation_cache import ObservationCache
-from stereoservo.gateway.persistence import HandledEvents, Journal, ModelStore, TaughtStore
+from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.publisher import EventLog, KeeperNotes
 from stereoservo.gateway.recordings import Recordings
 from stereoservo.gateway.servo_connection import ServoConnection
@@ -183,71 +182,6 @@ def test_a_goal_that_cannot_be_stored_is_refused_with_the_reason(
     monkeypatch.undo()
     assert teaching.taught(taught_event()) is True
     assert TaughtStore(tmp_path / "taught.json").names == ("pick",)
-
-
-# -- handled events -----------------------------------------------------------------------------------------
-
-
-def test_the_last_handled_event_is_known_after_a_restart(tmp_path: Path, bench: Bench) -> None:
-    path = tmp_path / "handled"
-    handled = HandledEvents(path, bench.notes.tell)
-    assert handled.is_fresh(taught_event(5))
-    handled.add(taught_event(5))
-    handled.add(taught_event(3))
-    again = HandledEvents(path, bench.notes.tell)
-    assert not again.is_fresh(taught_event(5))
-    assert again.is_fresh(taught_event(6))
-    assert bench.notes.texts == ()
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"12", b"12 00000000", b"\xff", b"9" * 200, b"-5 00000000", b"\0" * 12]
-)
-def test_without_it_nothing_of_before_the_start_is_done_twice(
-    tmp_path: Path, bench: Bench, data: bytes
-) -> None:
-    path = tmp_path / "handled"
-    path.write_bytes(data)
-    before = taught_event(10**6, time.monotonic_ns())
-    handled = HandledEvents(path, bench.notes.tell)
-    assert not handled.is_fresh(before)
-    assert handled.is_fresh(taught_event(10**6 + 1, time.monotonic_ns()))
-    assert "set aside as handled.damaged-1" in bench.notes.texts[0]
-    assert len(bench.events) == 1
-    handled.add(before)
-    assert not HandledEvents(path, bench.notes.tell).is_fresh(before)
-
-
-def test_every_flipped_byte_of_it_is_noticed(tmp_path: Path, bench: Bench) -> None:
-    path = tmp_path / "handled"
-    HandledEvents(path, bench.notes.tell).add(taught_event(1234))
-    whole = path.read_bytes()
-    for k in range(len(whole) - 1):
-        for bit in range(8):
-            flipped = bytearray(whole)
-            flipped[k] ^= 1 << bit
-            path.write_bytes(bytes(flipped))
-            told = Bench()
-            HandledEvents(path, told.notes.tell)
-            assert told.notes.texts, flipped
-
-
-def test_on_a_full_disk_it_is_known_in_memory_and_told(
-    tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "handled"
-    handled = HandledEvents(path, bench.notes.tell)
-    handled.add(taught_event(5))
-    monkeypatch.setattr(files.tempfile, "mkstemp", full_disk)
-    handled.add(taught_event(6))
-    handled.add(taught_event(7))
-    assert not handled.is_fresh(taught_event(7))
-    assert "No space left on device" in bench.notes.texts[0]
-    assert len(bench.events) == 1
-    monkeypatch.undo()
-    handled.add(taught_event(8))
-    assert bench.notes.texts == ()
-    assert not HandledEvents(path, bench.notes.tell).is_fresh(taught_event(8))
 
 
 # -- journal ------------------------------------------------------------------------------------------------

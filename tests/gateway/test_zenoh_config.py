@@ -1,14 +1,21 @@
 """zenoh configurations: what listens where, and what is refused."""
 
 import json
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
-from stereoservo.client.session import SessionError, client_config, open_session
-from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, stop_config
+from stereoservo.client.session import (
+    MAX_SESSIONS,
+    SessionError,
+    client_config,
+    close_session,
+    open_session,
+)
+from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, split_listeners, stop_config
 from stereoservo.messages.cell_file import CellFile, CellFileError, check_cell
 
 
@@ -125,6 +132,58 @@ def test_a_router_with_endpoints_still_listens_on_its_own_socket_for_this_host()
     config = gateway_config(cell(endpoints=["tcp/127.0.0.1:7447"]), Path("/"), SOCKET)
     assert config["listen"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock", "tcp/127.0.0.1:7447"]
     assert endpoint_of(cell(endpoints=["tcp/127.0.0.1:7447"]), SOCKET) == "unixsock-stream//tmp/x/zenoh.sock"
+
+
+def test_what_is_open_to_others_is_a_router_of_its_own() -> None:
+    endpoints = ["tcp/127.0.0.1:7447", "tls/0.0.0.0:7448"]
+    local, network = split_listeners(gateway_config(cell(endpoints=endpoints, tls=TLS), Path("/"), SOCKET))
+    assert local["listen"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock"]
+    assert local["connect"]["endpoints"] == []
+    assert network is not None
+    assert network["listen"]["endpoints"] == endpoints
+    assert network["connect"]["endpoints"] == ["unixsock-stream//tmp/x/zenoh.sock"]
+    assert network["transport"]["unicast"]["max_sessions"] == local["transport"]["unicast"]["max_sessions"]
+    for config in (local, network):
+        zenoh.Config.from_json5(json.dumps(config))
+    for section in ({}, {"mode": "client", "endpoints": endpoints[:1]}):
+        config = gateway_config(cell(**section), Path("/"), SOCKET)
+        assert split_listeners(config) == (config, None)
+
+
+def unused_port() -> int:
+    """A TCP port of this host that nobody listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@pytest.mark.process
+def test_a_peer_that_takes_all_sessions_of_the_network_locks_out_nobody_on_this_host(tmp_path: Path) -> None:
+    own, endpoint = f"unixsock-stream/{tmp_path}/z", f"tcp/127.0.0.1:{unused_port()}"
+    both = split_listeners(gateway_config(cell(endpoints=[endpoint]), Path("/"), tmp_path / "z"))
+    sessions = [open_session(config) for config in both if config is not None]
+    answers = sessions[0].declare_queryable(
+        "it", zenoh.handlers.Callback(lambda query: query.reply("it", b"yes"))
+    )
+
+    def answered(where: str) -> bool:
+        try:
+            client = open_session(client_config(where))
+        except SessionError:
+            return False
+        sessions.append(client)
+        return any(reply.ok is not None for reply in client.get("it", timeout=2.0))
+
+    try:
+        while not answered(endpoint):  # through both routers, once they know each other
+            close_session(sessions.pop(), [])
+        taken = [answered(endpoint) for _ in range(MAX_SESSIONS + 5)]
+        assert not taken[-1]
+        assert answered(own)
+    finally:
+        answers.undeclare()
+        for session in reversed(sessions):
+            close_session(session, [])
 
 
 def test_tls_paths_are_relative_to_the_cell_file_on_either_side() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from stereoservo.client import (
     NoReplyError,
     RefusedError,
 )
+from stereoservo.client.goal_handle import TERMINAL
 from stereoservo.client.session import SessionError
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.messages.directories import CellDirectories
@@ -183,6 +185,61 @@ def test_a_killed_servo_process_ends_everything_with_an_error(
     assert "the servo process ended by signal SIGKILL" in live.output()
     assert not processes(directories)
     assert live_cells() == []
+
+
+def ends(directories: CellDirectories, goal: str) -> list[dict[str, str]]:
+    """Terminal events of a goal in the cell's journal."""
+    events = [json.loads(line) for line in directories.journal.read_text().splitlines()]
+    return [event for event in events if event["id"] == goal and event["kind"] in TERMINAL]
+
+
+@pytest.mark.parametrize(
+    ("how", "victims", "cause"),
+    [
+        (signal.SIGSTOP, ("servo",), "the servo process hung: it gave no sign of life for"),
+        (signal.SIGKILL, ("servo",), "the servo process ended by signal SIGKILL (signal 9)"),
+        (signal.SIGKILL, (), "the supervisor"),
+    ],
+    ids=["a servo process that hangs", "a killed servo process", "all killed"],
+)
+def test_a_goal_has_one_end_with_its_cause_whatever_dies(
+    how: signal.Signals, victims: tuple[str, ...], cause: str, own: Client, live: DaemonProcess,
+    calibrated: Path, directories: CellDirectories, start: Start,
+) -> None:  # fmt: skip
+    moved_away(own)
+    goal = own.goal("park", gain=0.05, time_limit_s=300.0, tolerance_px=0.01)
+    goal.abandon()
+    eventually("the arm moves", lambda: not at_rest(own))
+    found = processes(directories)
+    pids = [found[name] for name in victims] or [found.pop("gateway"), *found.values(), live.process.pid]
+    for pid in pids:
+        os.kill(pid, how)
+    assert live.process.wait(60.0) == (1 if victims else -signal.SIGKILL)
+    eventually("no process is left", lambda: not processes(directories))
+    with pytest.raises(NotRunningError, match=re.escape(f"{cause}")):
+        find_daemon(CELL)
+    assert len(ends(directories, goal.id)) == (1 if victims else 0)  # told at once, or by the next run
+    assert start(calibrated).stop() == 0
+    (end,) = ends(directories, goal.id)
+    assert end["kind"] == "goal_aborted"
+    assert cause in end["message"]
+
+
+@pytest.mark.parametrize("name", ["gateway", "vision-left"])
+def test_a_process_that_hangs_is_replaced(name: str, own: Client, directories: CellDirectories) -> None:
+    old = processes(directories)[name]
+    os.kill(old, signal.SIGSTOP)
+    eventually("a new one", lambda: processes(directories).get(name, old) != old, 60.0)
+
+    def told() -> bool:
+        try:
+            with Client(CELL) as client:
+                events = client.events(1).events
+        except (NoReplyError, SessionError, NotRunningError, RefusedError):
+            return False
+        return any(e.kind == "process_hung" and e.message.startswith(f"{name} hung") for e in events)
+
+    eventually("it is told", told, 60.0)
 
 
 def test_a_killed_supervisor_leaves_no_orphan(live: DaemonProcess, directories: CellDirectories) -> None:

@@ -1,186 +1,25 @@
-"""Entry point of the command line ``stereoservo``: imports the module of a command on demand, runs it, reports
-failures as text or JSON, and returns the exit code.
+"""Entry point of the command line ``stereoservo``, which imports next to nothing: ``stop`` has raised the stop slot
+before the libraries of the commands are loaded.
 """
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import os
 import signal
 import sys
-import traceback
-from pathlib import Path
-from typing import Any
 
-import typer
-from typer.core import TyperGroup
-from typer.main import get_command
-from typer.models import CommandInfo
-
-import stereoservo
 from stereoservo.cli import interruption
-from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
-from stereoservo.ports import plugins
+from stereoservo.cli.early_stop import raise_stop
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads cost more than they give here
-
-COMMANDS: dict[str, str] = {
-    "run": "run:run",
-    "status": "status:status",
-    "stop": "stop:stop",
-    "goal": "goal.command:goal",
-    "teach": "teach:teach",
-    "jog": "jog:jog",
-    "home": "home:home",
-    "calibrate": "calibrate.command:calibrate",
-    "watch": "watch:watch",
-    "enable": "operator_commands:enable",
-    "disable": "operator_commands:disable",
-    "hold": "operator_commands:hold",
-    "resume": "operator_commands:resume",
-    "reset": "operator_commands:reset",
-    "acknowledge": "operator_commands:acknowledge",
-    "record": "record:record",
-    "replay": "replay:replay",
-    "drivers": "drivers:drivers",
-    "doctor": "doctor.command:doctor",
-    "init": "init:init",
-    "ls": "ls:ls",
-    "warmup": "warmup:warmup",
-}
-"""Commands of the service: name -> module:function below ``stereoservo.cli``."""
-
-_USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
-"""click's UsageError, wherever this version of typer keeps its click."""
-
-
-class LazyGroup(TyperGroup):
-    """The group of commands, each imported when it is called; a broken plug-in is listed with its error and does
-    not affect the others.
-    """
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
-        return [*COMMANDS, *extra]
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if cmd_name not in self.list_commands(ctx):
-            return None
-        try:
-            function = _load(cmd_name)
-        except plugins.PluginError as error:
-            return _command(
-                cmd_name, _broken(error), {"allow_extra_args": True, "ignore_unknown_options": True}
-            )
-        return _command(cmd_name, function)
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The list of ``--help``; the commands of this distribution are not imported for it."""
-        names = self.list_commands(ctx)
-        width = formatter.width - 6 - max(len(name) for name in names)
-        own = {
-            plugin.name: plugin.value
-            for plugin in plugins.list_plugins(plugins.COMMANDS)
-            if plugin.distribution.split()[0] == "stereoservo"
-        } | {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
-        rows = []
-        for name in names:
-            command = _described(name, own[name]) if name in own else self.get_command(ctx, name)
-            rows.append((name, command.get_short_help_str(width)))
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
-
-
-def _described(name: str, where: str) -> Any:
-    """A command that has only its help text, read from the source of ``module:function`` without an import."""
-    module, _, function = where.partition(":")
-    spec = importlib.util.find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
-    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
-    (found,) = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == function)
-
-    def described() -> None: ...
-
-    described.__doc__ = ast.get_docstring(found)
-    return _command(name, described)
-
-
-def _load(name: str) -> Any:
-    where = COMMANDS.get(name)
-    if where is None:
-        return plugins.load(plugins.COMMANDS, name)
-    module, _, function = where.partition(":")
-    return getattr(importlib.import_module(f"stereoservo.cli.{module}"), function)
-
-
-def _broken(error: plugins.PluginError) -> Any:
-    def broken(ctx: typer.Context, json: bool = typer.Option(False, "--json")) -> None:
-        raise CommandError("plugin", str(error), arguments=ctx.args)
-
-    broken.__doc__ = f"(broken) {error}"
-    return broken
-
-
-def _command(name: str, function: Any, context_settings: dict[Any, Any] | None = None) -> Any:
-    """Typer command of one function."""
-    single = typer.Typer(add_completion=False, rich_markup_mode=None)
-    single.registered_commands.append(
-        CommandInfo(name=name, callback=function, context_settings=context_settings)
-    )
-    command = get_command(single)
-    command.name = name
-    return command
-
-
-app = typer.Typer(cls=LazyGroup, add_completion=False, no_args_is_help=True, rich_markup_mode=None)
-
-
-def _version(value: bool) -> None:
-    if value:
-        typer.echo(f"stereoservo {stereoservo.__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def root(
-    version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version."
-    ),
-) -> None:
-    """Closes the loop between two uncalibrated cameras and a robot arm."""
 
 
 def invoke(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Failures are printed, as JSON with ``--json``."""
-    as_json = "--json" in arguments
-    try:
-        code = get_command(app).main(args=arguments, prog_name="stereoservo", standalone_mode=False)
-    except KeyboardInterrupt:
-        fail(CommandError("interrupted", "interrupted"), as_json)
-        return EXIT_INTERRUPTED
-    except typer.Abort:
-        fail(CommandError("interrupted", "interrupted"), as_json)
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()  # whoever read us has gone
-        return EXIT_FAILED
-    except _USAGE_ERROR as error:
-        context = getattr(error, "ctx", None)
-        message = error.format_message() if hasattr(error, "format_message") else str(error)
-        if context is not None and not as_json:
-            note(context.get_usage())
-        fail(CommandError("usage", message), as_json)
-        return EXIT_USAGE
-    except Exception as error:
-        if not known(error):
-            traceback.print_exc()
-        fail(error, as_json)
-        return EXIT_FAILED
-    if code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this
-        fail(CommandError("interrupted", "interrupted"), as_json)
-    return code if isinstance(code, int) else 0
+    raised = raise_stop(arguments)
+    from stereoservo.cli.dispatch import run  # typer and more, which a stop must not wait for
+
+    return run(arguments, raised)
 
 
 def main() -> None:

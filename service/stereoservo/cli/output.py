@@ -56,9 +56,7 @@ def fail(error: BaseException, as_json: bool) -> None:
     message = str(error) or type(error).__name__
     note(f"error: {message}")
     if as_json:
-        given = getattr(error, "code", None)
-        code = given if isinstance(given, str) and given else _snake(type(error).__name__)
-        body: dict[str, Any] = {"code": code, "message": message}
+        body: dict[str, Any] = {"code": code_of(error), "message": message}
         reply = getattr(error, "reply", None)
         if reply is not None:
             body["problems"] = list(reply.problems)
@@ -66,6 +64,12 @@ def fail(error: BaseException, as_json: bool) -> None:
         if isinstance(error, CommandError):
             body |= error.data
         emit({"error": body}, "", True)
+
+
+def code_of(error: BaseException) -> str:
+    """The code of a failure in JSON: the error's own, else the name of its class."""
+    given = getattr(error, "code", None)
+    return given if isinstance(given, str) and given else _snake(type(error).__name__)
 
 
 def known(error: BaseException) -> bool:

@@ -1,21 +1,52 @@
 """Command ``stereoservo status``: prints what a cell does now, the progress of its goal, and the reasons why it is
-slow, held or in fault.
+slow, held or in fault. On the cell's host it believes the servo process itself, whatever becomes of the gateway.
 """
 
 from __future__ import annotations
 
 import math
 
-from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, emit
-from stereoservo.client import Client
+from stereoservo.cli.local_state import (
+    GATEWAY_SILENT,
+    SERVO_SILENT,
+    gateway_silence,
+    newest_state,
+    servo_silence,
+)
+from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, code_of, emit
+from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionError
+from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.discovery import find_daemon
 from stereoservo.messages.wire import StateMessage
 
 
 def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
-    """What the cell does now, and why it does not do more."""
-    with Client(cell, endpoint=endpoint) as client:
-        state = client.status()
+    """What the cell does now, and why it does not do more. Fails where its servo process or its daemon is silent."""
+    directories = cell_directories(find_daemon(cell).cell) if endpoint is None else None
+    if directories is not None and (silence := servo_silence(directories)):
+        raise _failure("servo_silent", silence, newest_state(directories), json)
+    if directories is not None and (silence := gateway_silence(directories)):
+        raise _failure("no_reply", silence, newest_state(directories), json)
+    try:
+        with Client(cell, endpoint=endpoint) as client:
+            state = client.status()
+    except (InvalidReplyError, NoReplyError, SessionError) as error:
+        if directories is None:
+            raise
+        silence = servo_silence(directories) or f"the gateway does not answer ({error}). {GATEWAY_SILENT}"
+        raise _failure(code_of(error), silence, newest_state(directories), json) from error
+    if not state.servo_alive:
+        raise _failure("servo_silent", f"the servo process is silent. {SERVO_SILENT}", state, json)
     emit(state, describe(state), json)
+
+
+def _failure(code: str, words: str, state: StateMessage | None, as_json: bool) -> CommandError:
+    """The failure ``words``, with the last state that is known: printed, or in the JSON object of the error."""
+    if state is None:
+        return CommandError(code, words)
+    if not as_json:
+        emit(None, f"the last that is known:\n{describe(state)}", False)
+    return CommandError(code, words, state=state)
 
 
 def describe(state: StateMessage) -> str:

@@ -1,49 +1,53 @@
-"""Command ``stereoservo stop``: stops the arm over zenoh, or by a word in shared memory where the gateway does not
-reply.
-"""
+"""Command ``stereoservo stop``: stops the arm by a word in shared memory on its host, over zenoh from another."""
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
-from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
-from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionError
-from stereoservo.daemon.seqlock import SlotError, StopSlot
-from stereoservo.messages.cell_file import load_cell_file
-from stereoservo.messages.directories import cell_directories
-from stereoservo.messages.discovery import NotRunningError
+import typer
+
+from stereoservo.cli.early_stop import RaisedStop
+from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit
+from stereoservo.client import Client
+from stereoservo.messages.discovery import daemon_info, last_words
+from stereoservo.messages.locks import holder
+from stereoservo.messages.wire import Reply
 
 ACKNOWLEDGE_S = 1.0
+"""The servo process takes a stop in its next cycle, a few milliseconds later; a busy machine stalls it for tenths."""
+
+NOT_TAKEN = (
+    "Drives stop by themselves without commands; where the arm still moves, use the emergency stop. A servo process "
+    "that starts, or goes on, takes this stop in its first cycle"
+)
 
 
-def stop(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
+def stop(
+    context: typer.Context, cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False
+) -> None:
     """Stop the arm: it brakes and holds until `resume`. Not an emergency stop; see docs/safety.md."""
-    try:
+    raised: RaisedStop | None = context.obj
+    if raised is None:  # another host's cell, or one without a slot
         with Client(cell, endpoint=endpoint, timeout_s=1.0) as client:
             reply = client.stop()
-    except (InvalidReplyError, NoReplyError, SessionError, NotRunningError) as error:
-        if endpoint is not None:
-            raise
-        _raise_slot(cell, error)
-        emit({"accepted": True, "message": "stopped by the stop slot"}, "stopped (by the stop slot)", json)
-        return
+    else:
+        _await_acknowledgement(raised)
+        info = daemon_info(raised.directories)
+        boot = "" if info is None else info.boot
+        reply = Reply(accepted=True, message="the servo process has taken the stop", boot=boot)
     emit(reply, "stopped", json)
 
 
-def _raise_slot(cell: str, cause: Exception) -> None:
-    name = load_cell_file(Path(cell)).cell.name if cell.endswith(".toml") else cell
-    try:
-        slot = StopSlot(cell_directories(name).stop_slot)
-    except SlotError as error:
-        raise cause from error
-    note(f"{cause}; raising the stop slot")
-    word = slot.raise_stop()
+def _await_acknowledgement(raised: RaisedStop) -> None:
+    """Wait until the servo process, which nobody can speak for, has taken the stop. Raises CommandError."""
     until = time.monotonic() + ACKNOWLEDGE_S
-    while not slot.acknowledged(word):
-        if time.monotonic() > until:
-            raise CommandError(
-                "not_acknowledged",
-                f"the servo process did not acknowledge the stop within {ACKNOWLEDGE_S:g} s",
+    while not raised.slot.acknowledged(raised.word):
+        runs = holder(raised.directories.servo_lock) is not None
+        if not runs or time.monotonic() > until:
+            why = (
+                f"the servo process did not acknowledge it within {ACKNOWLEDGE_S:g} s: it hangs"
+                if runs
+                else f"no servo process runs. {last_words(raised.directories)}".rstrip(". ")
             )
-        time.sleep(0.01)
+            raise CommandError("not_acknowledged", f"after raising the stop slot: {why}. {NOT_TAKEN}")
+        time.sleep(0.005)

@@ -18,6 +18,7 @@ import numpy as np
 
 from stereoservo.core.cycle import DriverFault, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
+from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan
 from stereoservo.daemon.kernel_compilation import warm_up
 from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
@@ -28,7 +29,7 @@ from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import CellFileError
 from stereoservo.messages.directories import DirectoryError
 from stereoservo.messages.goals import Hold, Request
-from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path
+from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import Clock, DriverError, JointDriver, JointState
@@ -52,7 +53,8 @@ EXIT_SETUP = 3
 class ServoProcess:
     """The servo loop of one cell, a cycle at a time, on any links, pacing and clock.
 
-    ``dry_run``: the core's commands and requests are computed and never reach the drives.
+    ``dry_run``: the core's commands and requests are computed and never reach the drives. ``beat``: told in every
+    cycle, and before what may take longer, within how many seconds it is told again.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class ServoProcess:
         *,
         rate_hz: float,
         dry_run: bool = False,
+        beat: Callable[[float], None] = lambda limit_s: None,
     ) -> None:
         self.core = core
         self.driver = driver
@@ -71,6 +74,7 @@ class ServoProcess:
         self._clock = clock
         self._period_ns = round(1e9 / rate_hz)
         self._dry_run = dry_run
+        self._beat = beat
         self._stream = StepStream(core.settings, rate_hz)
         self._configured = False
         self._active = False
@@ -94,6 +98,7 @@ class ServoProcess:
 
     def shut_down(self) -> None:
         """Stop the drives, switch off, release."""
+        self._beat(DRIVER_CALL_S)
         self._stop()
         try:
             self._switch_off()
@@ -143,6 +148,7 @@ class ServoProcess:
         request = outputs.driver_request
         if request == "":
             return
+        self._beat(DRIVER_CALL_S)
         try:
             if request == "activate":
                 if not self._dry_run:
@@ -221,6 +227,7 @@ class ServoProcess:
         self._moving = outputs.status.source != "hold" or bool(np.any(outputs.status.command))
         self._publish(outputs, pacing)
         self._stream.after(inputs, outputs)
+        self._beat(SERVO_HANG_S)
         return inputs, outputs
 
     def come_to_rest(self, pacing: Pacing, cut_short: Callable[[], bool]) -> None:
@@ -262,14 +269,17 @@ def run(plan: RunPlan, termination: Termination) -> None:
     )
     locks = [FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}")]
     if hardware is not None:
-        locks.append(FileLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
+        locks.append(ChannelLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
     warm_up()  # compiled kernels are loaded now, not in the middle of a cycle
     core = ServoCore(plan.settings())
     driver = make_driver(plan, clock)
     rate_hz = plan.cell.servo.rate_hz
     links = ProcessLinks(directories, tuple(camera.name for camera in plan.cell.camera))
+    heartbeat = HeartbeatWriter(directories.heartbeat_slot("servo"))
     try:
-        process = ServoProcess(core, driver, links, clock, rate_hz=rate_hz, dry_run=plan.dry_run)
+        process = ServoProcess(
+            core, driver, links, clock, rate_hz=rate_hz, dry_run=plan.dry_run, beat=heartbeat.beat
+        )
         try:
             # Before the drives are asked for: collecting garbage holds up every thread of this process, a driver's too.
             for warning in prepare_realtime(plan.cell.servo.priority):
@@ -283,6 +293,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
         finally:
             process.shut_down()
     finally:
+        heartbeat.close()
         links.close()
         for lock in locks:
             lock.release()

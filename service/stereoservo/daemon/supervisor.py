@@ -2,8 +2,9 @@
 owns its lock and runtime directory.
 
 A gateway or vision process that ends is started again after a growing pause. The servo process is never
-started again: when it ends, everything stops. Children die with the supervisor, whatever kills it (the
-servo process in good order).
+started again: when it ends, everything stops. A process that hangs (its heartbeat is late) is killed, and
+counts as one that ended. Children die with the supervisor, whatever kills it (the servo process in good
+order).
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import msgspec
 
 from stereoservo.daemon.cell_preparation import PlanOptions
+from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT, HangWatch
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -40,6 +44,7 @@ from stereoservo.daemon.vision import Reporter
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock, holder
+from stereoservo.messages.run_record import begin_run, end_run, run_is_up
 from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 60.0
@@ -47,6 +52,13 @@ SERVO_END_S = 6.0
 OTHERS_END_S = 4.0
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 10.0
+WATCH_EVERY_S = 0.05
+LATE_S = 0.25
+"""A supervisor that looks so late was itself without a processor: what it did not see it counts against nobody."""
+AFTER_SERVO = (
+    "The drives stop by themselves without its commands. See what it logged last, and `stereoservo doctor` on the "
+    "drives, before you run the cell again"
+)
 STEADY_S = 30.0
 """A process that lived for so long starts again after the shortest pause."""
 
@@ -56,15 +68,21 @@ class StartError(Exception):
 
 
 class ServoDiedError(Exception):
-    """The servo process ended by itself; everything was stopped."""
+    """The servo process ended by itself or hung, which is the ``cause``; everything was stopped."""
+
+    def __init__(self, cause: str) -> None:
+        super().__init__(f"{cause}. {AFTER_SERVO}")
+        self.cause = cause
 
 
 @dataclass
 class Child:
-    """One supervised process."""
+    """One supervised process. ``hung``: how, where it was killed for that."""
 
     name: str
     arguments: list[str]
+    watch: HangWatch
+    hung: str = ""
     process: subprocess.Popen[bytes] | None = None
     started: float = 0.0
     pause_s: float = FIRST_PAUSE_S
@@ -80,18 +98,19 @@ class Supervisor:
     children: list[Child] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        runtime = self.plan.runtime
-        self.servo = Child("servo", ["stereoservo.daemon.servo", runtime, str(os.getpid())])
-        self.gateway = Child("gateway", ["stereoservo.gateway.process", runtime, str(os.getpid())])
+        self.servo = self._child("servo", "stereoservo.daemon.servo")
+        self.gateway = self._child("gateway", "stereoservo.gateway.process")
         cameras = [
-            Child(
-                f"vision-{camera.name}",
-                ["stereoservo.daemon.vision", runtime, str(os.getpid()), camera.name],
-            )
+            self._child(f"vision-{camera.name}", "stereoservo.daemon.vision", camera.name)
             for camera in self.plan.cameras
         ]
         self.children = [self.servo, self.gateway, *cameras]
         self._reporter = Reporter(self.plan.directories.reports_socket, "supervisor", MonotonicClock())
+        self._looked_s = 0.0
+
+    def _child(self, name: str, module: str, *arguments: str) -> Child:
+        watch = HangWatch(self.plan.directories.heartbeat_slot(name))
+        return Child(name, [module, self.plan.runtime, str(os.getpid()), *arguments], watch)
 
     def run(self, termination: Termination, on_ready: Callable[[], None]) -> None:
         """Start all processes, monitor them until terminated, stop them. Raises StartError, ServoDiedError."""
@@ -100,10 +119,15 @@ class Supervisor:
                 _start(child)
             self._await_ready(termination)
             if not termination.asked:
+                record_run(partial(run_is_up, self.plan.directories))
                 on_ready()
             while not termination.asked:
-                self._watch()
-                time.sleep(0.05)
+                self.look(time.monotonic())
+                time.sleep(WATCH_EVERY_S)
+        except ServoDiedError as error:
+            # Before the gateway ends, which tells it.
+            record_run(partial(end_run, self.plan.directories, error.cause, AFTER_SERVO))
+            raise
         finally:
             self.stop()
 
@@ -122,8 +146,10 @@ class Supervisor:
                 raise StartError(f"the processes were not ready within {READY_TIMEOUT_S:g} s")
             time.sleep(0.02)
 
-    def _watch(self) -> None:
-        now = time.monotonic()
+    def look(self, now: float) -> None:
+        """Start what is due, and take note of what has ended or hangs. Raises ServoDiedError."""
+        late = now - self._looked_s > LATE_S
+        self._looked_s = now
         for child in self.children:
             if child.process is None:
                 if now >= child.due:
@@ -131,22 +157,35 @@ class Supervisor:
                         self._reporter.report("warning", text)
                     _start(child)
                 continue
+            hung = child.watch.look(now, late=late)
+            if hung and not child.hung:
+                child.hung = f"hung: {hung}; it was killed"
+                child.process.kill()
+                if child is self.servo:
+                    self._servo_ended(child.hung)
             code = child.process.poll()
-            if code is None:
-                continue
-            how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-            if child is self.servo:
-                raise ServoDiedError(f"the servo process ended {how}; everything is stopped")
-            child.process = None
-            child.restarts += 1
-            child.pause_s = (
-                FIRST_PAUSE_S if now - child.started > STEADY_S else min(2 * child.pause_s, LONGEST_PAUSE_S)
-            )
-            child.due = now + child.pause_s
-            self._reporter.report(
-                "process_ended", f"{child.name} ended {how}; starting again in {child.pause_s:g} s"
-            )
+            if code is not None:
+                self._ended(child, child.hung or _how(code), now)
         self._reporter.flush()
+
+    def _ended(self, child: Child, how: str, now: float) -> None:
+        """A process has ended: it is started again after a pause, unless it is the servo process."""
+        if child is self.servo:
+            self._servo_ended(how)
+        kind = "process_hung" if child.hung else "process_ended"
+        child.process = None
+        child.hung = ""
+        child.restarts += 1
+        child.pause_s = (
+            FIRST_PAUSE_S if now - child.started > STEADY_S else min(2 * child.pause_s, LONGEST_PAUSE_S)
+        )
+        child.due = now + child.pause_s
+        self._reporter.report(kind, f"{child.name} {how}; starting again in {child.pause_s:g} s")
+
+    def _servo_ended(self, how: str) -> NoReturn:
+        message = f"the servo process {how}; everything is stopped"
+        self._reporter.report("process_hung" if self.servo.hung else "process_ended", message)
+        raise ServoDiedError(message)
 
     def stop(self) -> None:
         """Stop the arm first, then the processes; every child is reaped."""
@@ -154,7 +193,15 @@ class Supervisor:
         _end([child for child in self.children if child is not self.servo], OTHERS_END_S)
 
 
+def _how(code: int) -> str:
+    """How a process ended, by its exit code."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    return f"ended by signal {signal.Signals(-code).name} (signal {-code})"
+
+
 def _start(child: Child) -> None:
+    child.watch.begin()
     child.process = subprocess.Popen(
         [sys.executable, "-m", *child.arguments],
         stdin=subprocess.DEVNULL,
@@ -217,6 +264,8 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
     """Path, capacity and layout of all slots of a cell."""
     directories = plan.directories
     found = [(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)]
+    for name in ("servo", "gateway", *(f"vision-{camera.name}" for camera in plan.cameras)):
+        found.append((directories.heartbeat_slot(name), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT))
     for camera in plan.cameras:
         found.append((directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT))
         found.append((directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT))
@@ -244,6 +293,14 @@ def restore(plan: RunPlan) -> list[str]:
     except OSError as error:
         told.append(f"{directories.runtime}: cannot be put in order: {error}")
     return told
+
+
+def record_run(write: Callable[[], None]) -> None:
+    """Write the record of this run by ``write``; a disk that does not take it holds up nothing."""
+    try:
+        write()
+    except OSError as error:
+        write_log("supervisor", f"the record of this run: {error}")
 
 
 def clean(directories: CellDirectories) -> None:
@@ -276,14 +333,21 @@ def run_cell(
     directories = cell_directories(cell.cell.name)
     create_directories(directories)
     options = PlanOptions(secrets.token_hex(4), seed, dry_run, commissioning, record)
-    with FileLock(directories.daemon_lock, f"cell {cell.cell.name!r}"):
+    what = f"cell {cell.cell.name!r}"
+    with FileLock(directories.daemon_lock, what), FileLock(directories.state_lock, what):
         termination = Termination(grace_s=0.0)
         clean(directories)
+        record_run(partial(begin_run, directories, options.boot, os.getpid()))
         try:
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")
                 Supervisor(plan).run(termination, lambda: on_ready(plan))
+            asked = signal.Signals(termination.first).name
+            record_run(partial(end_run, directories, f"somebody asked for it ({asked})", in_order=True))
+        except Exception as error:
+            record_run(partial(end_run, directories, str(error)))
+            raise
         finally:
             clean(directories)
         return termination.first

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from stereoservo.core.cycle import encode
 from stereoservo.daemon.camera_setup import make_camera
+from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -34,7 +35,7 @@ from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
 from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary, decoding
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path
+from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, hardware_lock_path
 from stereoservo.messages.recording_request import RecordedImages, request_path
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
@@ -122,7 +123,7 @@ class VisionSlots:
 
 class CameraPipeline:
     """Driver and detector of one camera: publishes the observation of the newest frame; ``images`` records all
-    frames.
+    frames. ``beat``: told at every call within how many seconds it is told again.
     """
 
     def __init__(
@@ -132,8 +133,10 @@ class CameraPipeline:
         links: VisionLinks,
         clock: Clock,
         images: ImageRecorder | None = None,
+        beat: Callable[[float], None] = lambda limit_s: None,
     ) -> None:
         self._driver = driver
+        self._beat = beat
         self._images = images
         self._detector = detector
         self._links = links
@@ -143,11 +146,13 @@ class CameraPipeline:
 
     def open(self) -> None:
         """Connect and start. Raises DriverError."""
+        self._beat(CAMERA_OPENS_S)
         self._driver.configure()
         self._driver.activate()
 
     def close(self) -> None:
         """Stop and release; idempotent."""
+        self._beat(CAMERA_OPENS_S)
         try:
             self._driver.deactivate()
         except DriverError as error:
@@ -159,6 +164,7 @@ class CameraPipeline:
         """Process the frames that arrived; True where an observation was published. Raises DriverError: of the driver,
         and with code ``frame`` for whatever else driver or detector raise.
         """
+        self._beat(VISION_HANG_S if self.written else CAMERA_OPENS_S)
         with decoding(
             lambda cause: DriverError("frame", f"a frame cannot be used: {cause}", retry=True), (DriverError,)
         ):
@@ -261,7 +267,9 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     description = next(description for description in plan.cameras if description.name == camera)
     path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
     lock = (
-        FileLock(path, f"camera driver {section.driver!r} with these options") if path is not None else None
+        ChannelLock(path, f"camera driver {section.driver!r} with these options")
+        if path is not None
+        else None
     )
     driver, detector = make_camera(section, plan.driver_context(clock, section))
     reporter = Reporter(directories.reports_socket, f"vision-{camera}", clock)
@@ -280,8 +288,11 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
         reporter.flush()
 
     try:
-        with closing(VisionSlots(directories, camera)) as links:
-            pipeline = CameraPipeline(driver, detector, links, clock, images)
+        with (
+            closing(VisionSlots(directories, camera)) as links,
+            closing(HeartbeatWriter(directories.heartbeat_slot(f"vision-{camera}"))) as heartbeat,
+        ):
+            pipeline = CameraPipeline(driver, detector, links, clock, images, heartbeat.beat)
             loop = camera_loop(
                 pipeline,
                 reporter.report,

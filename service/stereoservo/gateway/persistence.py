@@ -1,5 +1,5 @@
-"""Files that the gateway keeps: stores of taught goals and models, the number of the last handled event, and the
-journal, a log of events. None of them ends the gateway: what is damaged is set aside, what cannot be written is told.
+"""Files that the gateway keeps: stores of taught goals and models, and the journal, a log of events. None of them ends
+the gateway: what is damaged is set aside, what cannot be written is told.
 """
 
 from __future__ import annotations
@@ -8,13 +8,10 @@ import errno
 import os
 import re
 import time
-import zlib
 from collections.abc import Callable
-from functools import partial
 from io import FileIO
 from pathlib import Path
 
-from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.taught_goals import (
     ModelOf,
@@ -24,8 +21,7 @@ from stereoservo.daemon.taught_goals import (
     save_taught,
 )
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
-from stereoservo.messages.decoding import DamagedError, decoding
-from stereoservo.messages.files import read_bounded, set_aside, write_atomically
+from stereoservo.messages.files import set_aside
 
 JOURNAL_BYTES = 10_000_000
 REOPEN_S = 1.0
@@ -142,56 +138,6 @@ def _joints(of: CellModel | CoreSettings) -> str:
         name if kind == "revolute" else f"{name} ({kind})"
         for name, kind in zip(of.joint_names, of.joint_kinds, strict=True)
     )
-
-
-class HandledEvents:
-    """Number of the last core event whose effects were carried out, kept in a file for a restarted gateway, which is
-    sent the servo process's events again and must not teach or fit twice.
-
-    Where the file is damaged, all events of before this start are taken for handled.
-    """
-
-    def __init__(self, path: Path, tell: Tell) -> None:
-        self._path, self._tell = path, tell
-        self._last = 0
-        self._not_before_ns = 0
-        if not path.exists():
-            return
-        try:
-            with decoding(partial(DamagedError, path)):
-                self._last = self._decoded(read_bounded(path, 100))
-        except DamagedError as error:
-            self._not_before_ns = time.monotonic_ns()
-            self._tell(
-                "handled events",
-                f"{error}; {set_aside(path)}. What was taught or calibrated in the moment before the gateway's start "
-                "may be missing: look, and repeat it",
-            )
-
-    @staticmethod
-    def _decoded(data: bytes) -> int:
-        number, _, checksum = data.strip().partition(b" ")
-        if not number.isdigit() or checksum != b"%08x" % zlib.crc32(number):
-            raise ValueError(f"holds {data!r}; a number and its CRC are needed")
-        return int(number)
-
-    def is_fresh(self, event: Event) -> bool:
-        """Whether the effects of ``event`` were not carried out yet."""
-        return event.seq > self._last and event.t_ns >= self._not_before_ns
-
-    def add(self, event: Event) -> None:
-        """Count ``event`` as handled; in memory alone where the file cannot be written."""
-        self._last = max(self._last, event.seq)
-        number = b"%d" % self._last
-        try:
-            write_atomically(self._path, number + b" %08x\n" % zlib.crc32(number))
-        except OSError as error:
-            self._tell(
-                "handled events in memory",
-                f"{self._path}: {error.strerror}; a restart of the gateway may repeat the last teaching or fit",
-            )
-        else:
-            self._tell("handled events in memory", "")
 
 
 class Journal:

@@ -23,6 +23,7 @@ from zenoh.handlers import RingChannel
 from stereoservo.client.session import SessionError, close_session, open_session
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
+from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, REQUEST_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PlanError,
@@ -36,9 +37,10 @@ from stereoservo.daemon.process_control import Termination, die_with_parent, wri
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.daemon.seqpacket import ChannelServer
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
 from stereoservo.gateway.intake import Intake, payload_of
 from stereoservo.gateway.observation_cache import ObservationCache
-from stereoservo.gateway.persistence import HandledEvents, Journal, ModelStore, TaughtStore
+from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.publisher import (
     SILENT,
     EventLog,
@@ -55,15 +57,17 @@ from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.stop_thread import StopThread
 from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.gateway.validation import GoalContext
-from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, stop_config
+from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, split_listeners, stop_config
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import DirectoryError
 from stereoservo.messages.discovery import DaemonInfo
 from stereoservo.messages.files import write_atomically
 from stereoservo.messages.keys import VERBS, KeySpace
+from stereoservo.messages.run_record import read_run
 from stereoservo.messages.wire import (
     CellInfo,
+    EventMessage,
     MessageError,
     Record,
     Reply,
@@ -77,10 +81,14 @@ from stereoservo.messages.wire import (
 STATE_EVERY_S = 0.05
 IDLE_S = 0.003
 FINAL_PASSES = 100
+LAST_EVENTS_S = 3.0
+"""A servo process whose supervisor was killed brings the arm to rest before it ends: its last events are waited for."""
 SERVO_STALE_S = 0.5
 DRAIN = 32
 ANNOUNCE_AGAIN_S = 1.0
 EXIT_SETUP = 3
+ONCE = frozenset({"taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"})
+"""Events of the core whose effects must not come twice."""
 GATEWAY_VERBS = ("record", "synthesise")
 """Commands that the gateway carries out itself."""
 
@@ -98,10 +106,14 @@ class Gateway:
         self._journal = Journal(directories.journal)
         self.keys = KeySpace(plan.cell.cell.name)
         cameras = tuple(camera.name for camera in plan.cameras)
-        self._session = open_session(gateway_config(plan.cell, cell_dir, directories.zenoh_socket))
+        local, network = split_listeners(gateway_config(plan.cell, cell_dir, directories.zenoh_socket))
+        self._session = open_session(local)
+        self._network = None if network is None else open_session(network)
         self.endpoint = endpoint_of(plan.cell, directories.zenoh_socket)
+        self._repeated = False
         self._publishers = Publishers(self._session, self.keys, cameras)
-        self.log = EventLog(self.boot, self._publish_event)
+        self.goals = OpenGoalRecord(directories, plan.boot)
+        self.log = EventLog(self.boot, self._publish_event, self._observe_event)
         self._notes = KeeperNotes(self.log)
         self._servo = ServoConnection(directories)
         self._servo.records = bool(plan.record)
@@ -139,9 +151,14 @@ class Gateway:
         self._state_heard = 0.0
         self._state_sent = 0.0
         self._recordings = Recordings(plan, self.log, self._notes.tell)
-        self._handled = HandledEvents(directories.runtime / "handled", self._notes.tell)
+        self._handled = HandledEvents(directories.runtime / "handled.slot", self._notes.tell)
         self._greeted = False
         self._announce_due_s: float | None = 0.0
+        self._heartbeat = HeartbeatWriter(directories.heartbeat_slot("gateway"))
+        self.goals.end_earlier(self.log)
+        run = read_run(directories)
+        if run is not None and run.boot == plan.boot and run.previous:
+            self._notes.tell("run before", f"the run before this one ended: {run.previous}")
 
     def _declare(self) -> None:
         session, keys = self._session, self.keys
@@ -162,8 +179,13 @@ class Gateway:
         self._alive = session.liveliness().declare_token(keys.alive)
 
     def _publish_event(self, payload: bytes) -> None:
-        self._journal.add(payload)
+        if not self._repeated:
+            self._journal.add(payload)
         self._publishers.event.put(payload)
+
+    def _observe_event(self, message: EventMessage) -> None:
+        if not self._repeated:
+            self.goals.observe(message)
 
     def _use_model(self, model: CellModel) -> None:
         """Use ``model``, made for moved cameras, now that the core has applied it."""
@@ -196,6 +218,8 @@ class Gateway:
         self._calibration.poll()
         self._relocalization.poll()
         self._announce()
+        if self._announce_due_s is None:
+            self._heartbeat.beat(GATEWAY_HANG_S)
         return busy
 
     def _take_steps(self, limit: int = 512) -> None:
@@ -227,6 +251,8 @@ class Gateway:
                 item = source.try_recv()
                 if item is None:
                     break
+                if not busy and self._announced:
+                    self._heartbeat.beat(REQUEST_S)
                 busy = True
                 take(item)
         while self._stop.enables:
@@ -302,13 +328,15 @@ class Gateway:
             self._intake.core_reply(event)
         if event.kind in SILENT:
             return
-        fresh = self._handled.is_fresh(event)
+        # A restarted gateway is sent the servo process's events again.
+        fresh = not self._handled.is_acted_on(event)
+        self._repeated = self._handled.is_journaled(event)
         if event.kind != "taught" or not fresh or self._teaching.taught(event):
             self.log.add_core(event)
+        self._repeated = False
         self._calibration.core_event(event, fresh=fresh)
         self._relocalization.core_event(event, fresh=fresh)
-        if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"):
-            self._handled.add(event)
+        self._handled.mark(event, acted=event.kind in ONCE)
 
     # -- telling --------------------------------------------------------------------------------------------
 
@@ -339,7 +367,12 @@ class Gateway:
                 notes=(*self._calibration.notes, *self._notes.texts),
                 refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
             )
-        elif self._state is not None and self._state.servo_alive and now - self._state_heard > SERVO_STALE_S:
+        elif (
+            self._state is not None
+            and self._state.servo_alive
+            and now - self._state_heard > SERVO_STALE_S
+            and not self._servo.announced_silence()
+        ):
             self._state = msgspec.structs.replace(self._state, servo_alive=False)
 
     def _collect_notes(self) -> None:
@@ -406,6 +439,8 @@ class Gateway:
         self._take_steps(100_000)
         self._recordings.stop()
         with suppress(zenoh.ZError):  # telling is good manners, not needed
+            if not self._servo.connected:  # else the next gateway goes on
+                self.goals.end_current(self.log)
             self.log.add("daemon_ends", message="the daemon ends", origin="gateway")
         self._replies.close()
         self._stop.close()
@@ -421,14 +456,23 @@ class Gateway:
             self._schema_queries,
             *self._publishers.all,
         ]
+        if self._network is not None:
+            close_session(self._network, [])
         close_session(self._session, declared)
         self._servo.close()
         self._reports.close()
         self._journal.close()
+        self._handled.close()
+        self._heartbeat.close()
+
+    @property
+    def owed(self) -> bool:
+        """Whether the servo process, which ends as well, has yet to tell how a goal ended."""
+        return self._servo.connected and self.goals.any_of_this_run
 
 
-def run(plan: RunPlan, termination: Termination) -> None:
-    """Run until terminated."""
+def run(plan: RunPlan, parent: int, termination: Termination) -> None:
+    """Run until terminated; ``parent``: the supervisor."""
     gateway = Gateway(plan)
     try:
         while not termination.asked:
@@ -439,6 +483,10 @@ def run(plan: RunPlan, termination: Termination) -> None:
         ):  # the last events of the servo process, above all that it stopped, are still published
             if not gateway.run_once():
                 break
+        until = time.monotonic() + LAST_EVENTS_S
+        while os.getppid() != parent and gateway.owed and time.monotonic() < until:
+            gateway.run_once()
+            time.sleep(IDLE_S)
     finally:
         gateway.close()
 
@@ -449,7 +497,7 @@ def main() -> int:
     die_with_parent(parent, signal.SIGTERM)
     termination = Termination(grace_s=8.0)
     try:
-        run(load_plan(runtime), termination)
+        run(load_plan(runtime), parent, termination)
     except (DirectoryError, OSError, PlanError, SessionError, SlotError) as error:
         write_log("gateway", str(error))
         return EXIT_SETUP

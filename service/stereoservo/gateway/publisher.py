@@ -78,11 +78,17 @@ class ReplyThread:
 
 
 class EventLog:
-    """Numbers the events of a boot, keeps the last ones, publishes each."""
+    """Numbers the events of a boot, keeps the last ones, publishes each, and then has it observed."""
 
-    def __init__(self, boot: str, publish: Callable[[bytes], None]) -> None:
+    def __init__(
+        self,
+        boot: str,
+        publish: Callable[[bytes], None],
+        observe: Callable[[EventMessage], None] = lambda message: None,
+    ) -> None:
         self._boot = boot
         self._publish = publish
+        self._observe = observe
         self._kept: deque[EventMessage] = deque(maxlen=KEPT_EVENTS)
         self.last = 0
 
@@ -101,6 +107,7 @@ class EventLog:
         )
         self._kept.append(message)
         self._publish(encode(message))
+        self._observe(message)
         return message
 
     def add_core(self, event: Event, kind: str = "", operator: str = "") -> EventMessage:

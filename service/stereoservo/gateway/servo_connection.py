@@ -10,6 +10,7 @@ from functools import partial
 import msgspec
 
 from stereoservo.core.cycle import Event, encode
+from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.ipc_messages import (
     STATE_LAYOUT,
     Ask,
@@ -44,6 +45,7 @@ class ServoConnection:
         self._steps: PacketChannel | None = None
         self._state = SlotReader(directories.state_slot, STATE_LAYOUT)
         self._boundary = RecordBoundary("messages of the servo process", partial(write_log, "gateway"))
+        self._heartbeat = HeartbeatReader(directories.heartbeat_slot("servo"))
         self._last_beat = 0.0
         self._last_try = 0.0
         self._last_event = 0
@@ -121,8 +123,14 @@ class ServoConnection:
                 return state_decoder.decode(data)
         return None
 
+    def announced_silence(self) -> bool:
+        """Whether the servo process writes no state because it configures drives, as it has announced."""
+        beat = self._heartbeat.newest()
+        return beat is not None and beat.limit_s > SERVO_HANG_S and not beat.silent_s(SERVO_HANG_S)
+
     def close(self) -> None:
         """Release all; idempotent."""
+        self._heartbeat.close()
         for channel in (self._control, self._steps):
             if channel is not None:
                 channel.close()

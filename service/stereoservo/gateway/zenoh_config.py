@@ -1,4 +1,4 @@
-"""Zenoh configuration of the gateway's two sessions; endpoints open to the network require TLS."""
+"""Zenoh configuration of the gateway's sessions; endpoints open to the network require TLS."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from stereoservo.messages.directories import check_socket_path
 _NETWORK_ENDPOINT = re.compile(
     r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}"
 )
+
+RECONNECT = {"period_init_ms": 100, "period_max_ms": 500}
 
 
 def endpoint_of(cell: CellFile, socket: Path) -> str:
@@ -51,6 +53,21 @@ def gateway_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, An
     check_socket_path(socket)
     endpoints = [f"unixsock-stream/{socket}", *section.endpoints]
     return config | {"mode": "router", "listen": {"endpoints": endpoints}, "connect": {"endpoints": []}}
+
+
+def split_listeners(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """The gateway's main session, and the router that listens for it on other endpoints than the cell's own socket,
+    None where there are no others or the session is a client.
+
+    The limits of a zenoh router (sessions, sockets that are being accepted) are common to all its endpoints. So
+    strangers on the network, however many, can lock out nobody but others on the network.
+    """
+    own, others = config["listen"]["endpoints"][:1], config["listen"]["endpoints"][1:]
+    if not others:
+        return config, None
+    connect = {"endpoints": own, "timeout_ms": 2000, "exit_on_failure": True, "retry": RECONNECT}
+    local = config | {"listen": {"endpoints": own}}
+    return local, config | {"listen": {"endpoints": others}, "connect": connect}
 
 
 def stop_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:

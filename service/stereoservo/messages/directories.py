@@ -54,6 +54,16 @@ class CellDirectories:
         return self.state / "journal.jsonl"
 
     @property
+    def run_record(self) -> Path:
+        """How the last run of the daemon ended."""
+        return self.state / "run.json"
+
+    @property
+    def open_goals(self) -> Path:
+        """The goals that have not ended."""
+        return self.state / "open-goals.json"
+
+    @property
     def daemon(self) -> Path:
         """Description of the running daemon (pid, endpoint)."""
         return self.runtime / "daemon.json"
@@ -62,6 +72,11 @@ class CellDirectories:
     def daemon_lock(self) -> Path:
         """Lock file that the supervisor holds."""
         return self.runtime / "daemon.lock"
+
+    @property
+    def state_lock(self) -> Path:
+        """Lock file that the supervisor holds, too: one daemon writes models, taught goals and records."""
+        return self.state / "daemon.lock"
 
     @property
     def servo_lock(self) -> Path:
@@ -103,6 +118,10 @@ class CellDirectories:
         """The socket on which the gateway's router listens by default."""
         return self.runtime / "zenoh.sock"
 
+    def heartbeat_slot(self, process: str) -> Path:
+        """Heartbeat of ``process``: ``servo``, ``gateway``, or ``vision-`` and a camera's name."""
+        return self.runtime / f"heartbeat-{process}.slot"
+
     def observation_slot(self, camera: str) -> Path:
         """Newest observation of ``camera``."""
         return self.runtime / f"observation-{camera}.slot"
@@ -135,6 +154,22 @@ def cell_directories(cell: str) -> CellDirectories:
     if not CELL_NAME.fullmatch(cell):
         raise DirectoryError(f"cell name {cell!r}: letters, digits, '_' and '-' are valid, up to 64")
     return CellDirectories(cell, runtime_root() / cell, state_root() / cell)
+
+
+def directories_of(cell: str) -> CellDirectories:
+    """The directories of a cell by its name, or by the path of its file (``*.toml``), of which only the name is read.
+
+    Raises DirectoryError.
+    """
+    if not cell.endswith(".toml"):
+        return cell_directories(cell)
+    import tomllib  # a stop by the cell's name does not wait for it
+
+    try:
+        name = tomllib.loads(Path(cell).read_text(encoding="utf-8"))["cell"]["name"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DirectoryError(f"{cell}: the cell's name cannot be read: {error}") from error
+    return cell_directories(str(name))
 
 
 def create_directories(directories: CellDirectories) -> None:

@@ -19,6 +19,7 @@ from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.directories import CELL_NAME, CellDirectories, cell_directories, runtime_root
 from stereoservo.messages.files import read_bounded
 from stereoservo.messages.locks import holder
+from stereoservo.messages.run_record import how_it_ended, read_run
 
 MAX_INFO_BYTES = 1 << 16
 
@@ -36,11 +37,11 @@ class DaemonInfo(msgspec.Struct, frozen=True):
 
 
 class NotRunningError(Exception):
-    """No daemon runs for a cell; lists those that do."""
+    """No daemon runs for a cell; lists those that do. ``more``: what is known of the one that ran."""
 
-    def __init__(self, cell: str, running: tuple[str, ...]) -> None:
+    def __init__(self, cell: str, running: tuple[str, ...], more: str = "") -> None:
         super().__init__(
-            f"no daemon runs for cell {cell!r}; running: {', '.join(running) or 'none'}. "
+            f"no daemon runs for cell {cell!r}; running: {', '.join(running) or 'none'}. {more}"
             f"Start it with `stereoservo run CELL.toml`"
         )
         self.cell = cell
@@ -85,10 +86,26 @@ def find_daemon(cell: str) -> DaemonInfo:
         from stereoservo.messages.cell_file import load_cell_file  # not for a client that gives a name
 
         name = load_cell_file(Path(cell)).cell.name
-    info = daemon_info(cell_directories(name))
+    directories = cell_directories(name)
+    info = daemon_info(directories)
     if info is None:
-        raise NotRunningError(name, tuple(found.cell for found in live_cells()))
+        raise NotRunningError(name, tuple(found.cell for found in live_cells()), last_words(directories))
     return info
+
+
+def last_words(directories: CellDirectories) -> str:
+    """Sentence on a daemon that is not there, with a space behind it: it takes no requests yet, or how its last run
+    ended; empty where there was none.
+    """
+    pid = holder(directories.daemon_lock)
+    if pid is not None:
+        return f"Process {pid} has the cell and takes no requests: it starts, or ends. "
+    run = read_run(directories)
+    if run is None:
+        return ""
+    when = "" if run.ended is None else time.strftime(" at %Y-%m-%d %H:%M:%S", time.localtime(run.ended))
+    words = f"Its last run ended{when}: {how_it_ended(run).removesuffix('.')}. "
+    return f"{words}{run.remedy}. " if run.remedy else words
 
 
 class DaemonProcess:

@@ -1,12 +1,16 @@
-"""File locks (``flock``), one for each cell's daemon and one for each hardware channel, which the kernel releases when
-the holder dies; and the process that holds one.
+"""Locks, which the kernel releases when the holder dies, and the process that holds one: files (``flock``) for a cell's
+daemon, and for a hardware channel a file and a name that holds on the whole host.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import hashlib
 import os
 import re
+import socket
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -64,6 +68,52 @@ class FileLock:
         self.release()
 
 
+class ChannelLock(FileLock):
+    """An exclusive lock on the hardware channel of `hardware_lock_path`, whoever asks for it: beside the file ``path``
+    it takes the file's name among the abstract unix sockets, which all users of this host have in common, whatever
+    their runtime directories are. Raises AlreadyRunningError.
+
+    Containers: the name holds within one network namespace, the file where the runtime directory is shared.
+    """
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__(path, what)
+        self._name = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        address = _abstract_address(path.name)
+        try:
+            self._name.bind(address)
+            self._name.listen(1)  # only of one who listens can the kernel tell others who it is
+        except OSError as error:
+            self._name.close()
+            self.release()
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise AlreadyRunningError(what, _listener(address), Path(f"@{address[1:].decode()}")) from error
+
+    def release(self) -> None:
+        """Release the lock. Idempotent."""
+        self._name.close()
+        super().release()
+
+
+def _abstract_address(name: str) -> bytes:
+    """Address of an abstract socket: a zero and up to 107 bytes."""
+    digest = hashlib.sha256(name.encode()).hexdigest()[:16]
+    return b"\0" + f"stereoservo/{name[:70]}/{digest}".encode()
+
+
+def _listener(address: bytes) -> int:
+    """The process that listens at an abstract address; 0 where it is gone or not of this host's process table."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        try:
+            asking.connect(address)
+        except OSError:
+            return 0
+        credentials = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+        return int(struct.unpack("3i", credentials)[0])
+
+
 def holder(path: Path) -> int | None:
     """The process that holds the lock ``path`` (0: unknown), or None where nobody does."""
     try:
@@ -82,11 +132,15 @@ def holder(path: Path) -> int | None:
 
 def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> Path | None:
     """The lock file of the hardware channel that ``options`` name, None where they name none (a
-    simulation).
+    simulation). A device has one, whichever of its links it is called by.
     """
     for key in CHANNEL_OPTIONS:
         value = options.get(key)
         if isinstance(value, str | int) and value != "":
+            if key == "device" and isinstance(value, int):  # OpenCV's number of a camera
+                value = f"/dev/video{value}"
+            if isinstance(value, str) and value.startswith("/dev/"):
+                value = os.path.realpath(value)
             safe = re.sub(r"[^A-Za-z0-9]+", "-", f"{driver}-{value}").strip("-")
             return root / f"channel-{safe}.lock"
     return None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stereoservo.cli.main import app
+from stereoservo.cli.dispatch import app
 from stereoservo.geometry.cameras import triangulate
 from stereoservo_sim.experiments.translations.affine_measures import (
     collinear_triplets,

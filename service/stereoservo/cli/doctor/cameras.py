@@ -19,7 +19,7 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path, holder
+from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, hardware_lock_path, holder
 from stereoservo.numerics.arrays import ImageArray
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import (
@@ -127,7 +127,7 @@ def examine_cameras(
                         "camera.options of one of them: each camera has its own",
                     )  # fmt: skip
                     return
-                locks.enter_context(FileLock(path, f"camera {section.name!r}"))
+                locks.enter_context(ChannelLock(path, f"camera {section.name!r}"))
                 owners[path] = section.name
         except AlreadyRunningError as error:
             yield ExaminationFinding("cameras", None, f"not examined: {error}")

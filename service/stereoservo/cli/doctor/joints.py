@@ -14,7 +14,7 @@ from stereoservo.cli.output import CommandError
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.pacing import realtime_for_a_while
 from stereoservo.daemon.servo import make_driver
-from stereoservo.messages.locks import AlreadyRunningError, FileLock, hardware_lock_path, holder
+from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path, holder
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError, ExaminableJointDriver, ExaminationFinding
 
@@ -61,7 +61,7 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFind
         try:
             locks.enter_context(FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}"))
             if hardware is not None:
-                locks.enter_context(FileLock(hardware, f"joint driver {plan.cell.joints.driver!r}"))
+                locks.enter_context(ChannelLock(hardware, f"joint driver {plan.cell.joints.driver!r}"))
         except AlreadyRunningError as error:
             yield ExaminationFinding("drives", None, f"not examined: {error}")
             return
