@@ -251,7 +251,7 @@ class Gateway:
                 item = source.try_recv()
                 if item is None:
                     break
-                if not busy and self._announced:
+                if not busy and self._announce_due_s is None:
                     self._heartbeat.beat(REQUEST_S)
                 busy = True
                 take(item)
