@@ -8,6 +8,7 @@ import time
 
 import msgspec
 
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, encode
 from stereoservo.daemon.ipc_messages import (
     STATE_LAYOUT,
@@ -78,8 +79,11 @@ class ServoConnection:
         return number
 
     def send_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
-        """Send a model to the core, without its covariance: the loop does not use it, and messages are bounded."""
-        bare = msgspec.structs.replace(model, covariance=None)
+        """Send a model to the core, with the coplanar groups of its markers: the loop has no time to look for them.
+
+        Without its covariance, which the loop does not use: messages are bounded.
+        """
+        bare = with_groups(msgspec.structs.replace(model, covariance=None))
         return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
 
     def events(self) -> list[Event]:

@@ -18,6 +18,10 @@ from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
 SCHEMA = 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 LARGEST = 1e9
+MAX_MARKERS = 256
+"""Markers of a cell, on the arm and static: what a step of the loop does grows with them."""
+MAX_CAMERAS = 8
+MAX_JOINTS = 12
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -239,6 +243,8 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
     names = [camera.name for camera in cell.camera]
     if not names:
         raise CellFileError(path, "camera", "no camera; at least one [[camera]] is needed")
+    if len(names) > MAX_CAMERAS:
+        raise CellFileError(path, "camera", f"{len(names)} cameras; a cell has at most {MAX_CAMERAS}")
     for name in names:
         if names.count(name) > 1:
             raise CellFileError(path, "camera.name", f"{name!r} is used twice; camera names must differ")
@@ -352,6 +358,12 @@ def _check_value(key: str, joint: str, value: Any, cell: CellFile, path: Path | 
 def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str = "<cell>") -> None:
     """Check a cell against the joints of its driver. Raises CellFileError."""
     limited = [limit.joint for limit in cell.safety.limit]
+    if len(joint_names) > MAX_JOINTS:
+        raise CellFileError(
+            path,
+            "joints.driver",
+            f"driver {cell.joints.driver!r} has {len(joint_names)} joints; a cell has at most {MAX_JOINTS}",
+        )
     for name in joint_names:
         if name not in limited:
             raise CellFileError(
