@@ -77,6 +77,8 @@ FINAL_PASSES = 100
 SERVO_STALE_S = 0.5
 DRAIN = 32
 EXIT_SETUP = 3
+HANDLED_ONCE = ("taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted", "fault")
+"""Events of the core on which the gateway acts."""
 GATEWAY_VERBS = ("record", "synthesise")
 """Commands that the gateway carries out itself."""
 
@@ -99,7 +101,6 @@ class Gateway:
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.log = EventLog(self.boot, self._publish_event)
         self._servo = ServoConnection(directories)
-        self._servo.records = bool(plan.record)
         self._replies = ReplyThread()
         self._calibration = CalibrationJobs(
             self.settings, self._models, self._servo, self.log, directories.checks
@@ -131,6 +132,7 @@ class Gateway:
         self._state_heard = 0.0
         self._state_sent = 0.0
         self._recordings = Recordings(plan, self.log)
+        self._servo.records = self._recordings.wants_steps
         self._handled_path = directories.runtime / "handled"
         self._handled = int(self._handled_path.read_text()) if self._handled_path.exists() else 0
         self._greeted = False
@@ -186,7 +188,7 @@ class Gateway:
         self._read_reports()
         for item in self._servo.steps():
             self._recordings.take(item)
-        self._recordings.images.poll()
+        self._recordings.poll()
         self._calibration.poll()
         self._relocalization.poll()
         if not self._announced and self._greeted:
@@ -250,12 +252,15 @@ class Gateway:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._servo.records = request.on
         if not request.on:
             steps = self._recordings.stop()
+            self._servo.records = self._recordings.wants_steps
             return Reply(True, f"{self._recordings.path}: {steps} steps", boot=self.boot)
         if self._recordings.running:
             return Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
+        self._recordings.request()
+        self._servo.restart_steps()
+        self._servo.records = True
         return Reply(True, "recording begins; its event names the file", boot=self.boot)
 
     def _events_from(self, query: Any) -> bytes:
@@ -296,10 +301,12 @@ class Gateway:
         fresh = event.seq > self._handled
         if event.kind == "taught" and fresh:
             self._teaching.taught(event)
+        if event.kind == "fault" and fresh:
+            self._recordings.keep_ring(event.t_ns)
         self.log.add_core(event)
         self._calibration.core_event(event, fresh=fresh)
         self._relocalization.core_event(event, fresh=fresh)
-        if event.kind in ("taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"):
+        if event.kind in HANDLED_ONCE:
             # A restarted gateway is sent the servo process's events again and must not do these twice.
             self._handled = max(self._handled, event.seq)
             self._handled_path.write_text(str(self._handled))
@@ -383,7 +390,7 @@ class Gateway:
         self._relocalization.cancel()
         for item in self._servo.steps(100_000):
             self._recordings.take(item)
-        self._recordings.stop()
+        self._recordings.close()
         with suppress(zenoh.ZError):  # telling is good manners, not needed
             self.log.add("daemon_ends", message="the daemon ends", origin="gateway")
         self._replies.close()

@@ -19,6 +19,7 @@ from stereoservo.messages.recording_request import (
     write_request,
 )
 from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.recording.ring import RingLimits, RingThread
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 LAST_WORD_S = 5.0
@@ -110,11 +111,20 @@ class ImageRecordings:
 
 
 class Recordings:
-    """The current flight recording, if any. ``path``: its file, or that of the last one."""
+    """The flight ring, and the current recording on request, if any. ``path``: its file, or that of the last one."""
 
     def __init__(self, plan: RunPlan, log: EventLog) -> None:
         self._plan = plan
         self._log = log
+        self._requested = bool(plan.record)
+        section = plan.cell.recording
+        limits = RingLimits(
+            60.0 * section.ring_minutes,
+            section.ring_mib << 20,
+            section.reserve_mib << 20,
+            section.kept_faults,
+        )
+        self._ring = RingThread(plan.directories.recordings, limits) if limits.bytes else None
         self._recorder: FlightRecorder | None = None
         self._with_images = False
         self.images = ImageRecordings(plan, log)
@@ -126,6 +136,34 @@ class Recordings:
         """Whether a file is being written."""
         return self._recorder is not None
 
+    @property
+    def wants_steps(self) -> bool:
+        """Whether step records are needed at all."""
+        return self._requested or self._ring is not None
+
+    def request(self) -> None:
+        """Record into a file of its own from the next stream of steps on."""
+        self._requested = True
+
+    def keep_ring(self, t_ns: int) -> None:
+        """Keep the ring aside, for a fault at ``t_ns``."""
+        if self._ring is not None:
+            self._ring.keep(t_ns)
+
+    def poll(self) -> None:
+        """Report what the ring has to say; the state of image recordings."""
+        while self._ring is not None and self._ring.said:
+            kind, message = self._ring.said.popleft()
+            self._log.add(kind, message=message, origin="gateway")
+        self.images.poll()
+
+    def close(self) -> None:
+        """Finish the ring's segment and the recording. Idempotent."""
+        self.stop()
+        if self._ring is not None:
+            self._ring.close()
+        self.poll()
+
     def want_images(self) -> None:
         """Also record images: now, or with the recording that is about to begin. Raises CannotRecordError."""
         self.images.check()
@@ -134,16 +172,19 @@ class Recordings:
             self.images.begin(self._recorder.path)
 
     def take(self, item: StepMessage) -> None:
-        """Write messages of the servo process; the first one begins a file."""
-        if isinstance(item, RecordingStart):
+        """Write messages of the servo process; the first one begins a file, where one is requested."""
+        if self._ring is not None:
+            self._ring.take(item)
+        if isinstance(item, RecordingStart) and self._requested:
             again = self._with_images
             self.stop()
+            self._requested = True
             self._recorder = FlightRecorder(self._new_path(), item.settings, item.fingerprint)
             self.path = str(self._recorder.path)
             self._log.add("recording", message=self.path, origin="gateway")
             if again:
                 self.want_images()
-        elif self._recorder is not None:
+        elif self._recorder is not None and not isinstance(item, RecordingStart):
             self._recorder.write(item)
 
     def _new_path(self) -> Path:
@@ -156,7 +197,7 @@ class Recordings:
 
     def stop(self) -> int:
         """Finish the file and the image recordings; returns the number of its steps. Idempotent."""
-        self._with_images = False
+        self._requested = self._with_images = False
         self.images.end()
         if self._recorder is None:
             return 0

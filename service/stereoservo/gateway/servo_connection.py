@@ -70,6 +70,12 @@ class ServoConnection:
             self._last_beat = now
             self._control.send(encode(Heartbeat()))
 
+    def restart_steps(self) -> None:
+        """Begin the stream of step records anew, with a checkpoint, for a recording that begins now."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps = None
+
     def send_command(self, command: Command, operator: str) -> int | None:
         """Send a command; returns its request number, None where the servo process is not connected."""
         number = self._next_request

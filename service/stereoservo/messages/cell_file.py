@@ -196,6 +196,20 @@ class ZenohSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tls: TlsSection | None = None
 
 
+class RecordingSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[recording]``: the flight ring, the last minutes of the loop's steps, which is always recorded.
+
+    In at most ``ring_mib`` of the state directory, 0 switches it off, and only while ``reserve_mib`` of its disk stay
+    free. At a fault the ring is kept aside; of ``kept_faults`` faults, so that all takes up to
+    ``(1 + kept_faults) * ring_mib``.
+    """
+
+    ring_minutes: Annotated[float, Meta(gt=0, le=1440)] = 10.0
+    ring_mib: Annotated[int, Meta(ge=0, le=1 << 20)] = 512
+    reserve_mib: Annotated[int, Meta(ge=0, le=1 << 30)] = 2048
+    kept_faults: Annotated[int, Meta(ge=0, le=100)] = 4
+
+
 class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole cell file."""
 
@@ -208,6 +222,7 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     servo: ServoSection = ServoSection()
     zenoh: ZenohSection = ZenohSection()
     scene: SceneSection = SceneSection()
+    recording: RecordingSection = RecordingSection()
     emulate: dict[str, Any] = {}
     """``[emulate.drives]``, ``[emulate.cameras]``: what `stereoservo emulate` puts in the place of the hardware; the
     daemon does not read it.
@@ -431,7 +446,7 @@ _SECTIONS: dict[str, type[msgspec.Struct]] = {
     "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
     "safety.contact": ContactSection,
     "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
-    "zenoh.tls": TlsSection, "scene": SceneSection,
+    "zenoh.tls": TlsSection, "scene": SceneSection, "recording": RecordingSection,
 }  # fmt: skip
 
 

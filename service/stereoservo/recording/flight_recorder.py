@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -20,13 +21,17 @@ CHUNK_BYTES = 256 * 1024
 class FlightRecorder:
     """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process.
 
-    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index.
+    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index, and, where it
+    is ``durable``, waits until the disk has it all.
     """
 
-    def __init__(self, path: Path, settings: CoreSettings, fingerprint: Fingerprint) -> None:
+    def __init__(
+        self, path: Path, settings: CoreSettings, fingerprint: Fingerprint, *, durable: bool = True
+    ) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.steps = 0
+        self._durable = durable
         self._stream = open(path, "wb")  # noqa: SIM115 - lives as long as the recorder
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
         self._writer.start(profile=FORMAT, library="stereoservo")
@@ -40,6 +45,11 @@ class FlightRecorder:
             {"fingerprint": msgspec.to_builtins(fingerprint), "settings": encoded}
         )
         self._add("header", header, 0)
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far; the last chunk is not in it yet."""
+        return self._stream.tell()
 
     def write(self, message: RecordedStep | RecordedCheckpoint) -> None:
         """Append what the servo loop sent, with the gap before it."""
@@ -79,8 +89,14 @@ class FlightRecorder:
             return
         self._writer.finish()
         self._stream.flush()
-        os.fsync(self._stream.fileno())
+        if self._durable:
+            os.fsync(self._stream.fileno())
         self._stream.close()
+
+    def abandon(self) -> None:
+        """Leave the file as it is: of a disk that takes no more."""
+        with suppress(OSError):
+            self._stream.close()
 
     def __enter__(self) -> FlightRecorder:
         return self
