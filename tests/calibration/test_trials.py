@@ -96,6 +96,12 @@ def wrong(data, /, **fields):
     ("code", "words", "fields"),
     [
         ("too_few_cameras", "1 camera", lambda t: {"cameras": t.cameras[:1]}),
+        ("bad_data", "9 cameras; a cell has at most 8", lambda t: {"cameras": t.cameras[:1] * 9}),
+        ("bad_data", "257 markers; a cell has at most 256", lambda t: {"marker_ids": tuple(range(257))}),
+        (
+            "bad_data", "13 joints; a cell has at most 12",
+            lambda t: {"joint_names": tuple("abcdefghijklm"), "joint_kinds": t.joint_kinds[:1] * 13},
+        ),
         ("bad_data", "kinds", lambda t: {"joint_kinds": t.joint_kinds[:2]}),
         ("bad_data", "not all different", lambda t: {"marker_ids": (10,) * 14}),
         ("bad_data", "not all different", lambda t: {"joint_names": ("a", "a", "b", "c")}),

@@ -117,3 +117,22 @@ def task_of(body, T_star):
         target_points=world.hidden(body.at(T_star)), target_known=np.ones(m), centre=np.zeros(4),
         centre_target=np.zeros(4), face=np.zeros(3, np.int64),
     )  # fmt: skip
+
+
+def many_plates(virtual, rng, count, T0):
+    """Plates of four dots each, tangent to a sphere, evenly around it."""
+    body = Body(virtual, rng, (0,), T0)
+    radius = 0.09 * np.sqrt(count / 6.0)
+    points, normals = [], []
+    for k in range(count):
+        height = 1.0 - 2.0 * (k + 0.5) / count
+        turn = np.pi * (3.0 - np.sqrt(5.0)) * k
+        out = np.array([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height])
+        R = Rotation.align_vectors([out], [[0, 0, -1.0]])[0].as_matrix()
+        R = R @ Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
+        dots = 0.7 * DOTS + rng.uniform(-0.004, 0.004, DOTS.shape)
+        points.append(np.column_stack([dots, np.full(4, -radius)]) @ R.T)
+        normals.append(np.tile(out, (4, 1)))
+    X = np.concatenate(points)
+    body.markers, body.normals = np.column_stack([X, np.ones(len(X))]), np.concatenate(normals)
+    return body

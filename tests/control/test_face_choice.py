@@ -9,10 +9,13 @@ from scipy.spatial.transform import Rotation
 from stereoservo.control.face_choice import (
     CLEARLY_BETTER,
     LASTING,
+    MOST_TRIED,
     NOT_CHOSEN,
     FaceChoice,
     choose_face,
+    choose_triangle,
     law_scene,
+    spread_in_images,
     triangle_sight,
 )
 from stereoservo.control.faces import kept_faces, sights_along
@@ -215,3 +218,26 @@ def test_one_camera_that_keeps_and_one_that_loses_the_face(virtual):
     assert truth.tolist() in ([1.0, 0.0], [0.0, 1.0])
     choice = choose_face(body.find(T), scene_of(body, T), task_of(body, T_star))
     np.testing.assert_array_equal(choice.kept, truth)
+
+
+def test_many_markers_of_a_face_are_tried_by_those_that_are_spread_out(virtual):
+    """Of 400 markers a triangle nearly as large as the largest, and of 24 the largest itself."""
+    rng = np.random.default_rng(17)
+    for count in (MOST_TRIED, 60, 400):
+        pixels = np.stack([rng.uniform(0, 400, (count, 2)), rng.uniform(0, 300, (count, 2))])
+        weights = np.full((2, count), 10.0)
+        tried = spread_in_images(np.arange(count), pixels, weights)
+        assert len(set(tried.tolist())) == min(count, MOST_TRIED)
+        assert (np.diff(tried) > 0).all()
+        members, none = np.ones((1, count)), np.zeros(3, np.int64)
+        _, triple, cameras = choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, -2, none)
+        assert cameras == 2
+        _, area = triangle_sight(*triple, pixels, weights)
+        sides = rng.integers(0, count, (3, 20_000))
+        random = max(triangle_sight(*three, pixels, weights)[1] for three in sides.T)
+        assert area >= (0.999 if count == MOST_TRIED else 0.8) * random
+        weights[:, triple[0]] = 0.0
+        assert (
+            triple[0]
+            not in choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, -2, none)[1]
+        )

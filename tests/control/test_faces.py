@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.faces import (
-    find_faces,
+from oracles.coplanar_groups import faces_of_all_triples
+from stereoservo.control.faces import find_faces, select_faces
+from stereoservo.control.marker_groups import (
+    EXHAUSTIVE,
+    find_groups,
     marker_covariances,
     marker_distances,
     marker_information,
@@ -18,7 +21,7 @@ from stereoservo.control.faces import (
 from stereoservo.control.primitives_kernel import minors
 from stereoservo.geometry.homogeneous import plane_of_points
 
-from .bodies import SIGMA, Body, corner, outward_is_right, six_faces, upright
+from .bodies import SIGMA, Body, corner, many_plates, outward_is_right, six_faces, upright
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -204,3 +207,70 @@ def test_turns_make_lengths_comparable(virtual):
     assert spread(turned_average(information, world.operators())) < 1.02
     assert spread(information.mean(axis=0)) > 3
     assert spread(turned_average(information, world.operators()[:3])) > 3, "translations turn nothing"
+
+
+def cloud(virtual, rng, T, count):
+    """Markers anywhere in a cube."""
+    body = Body(virtual, rng, (0,), T)
+    body.markers = np.column_stack([rng.uniform(-0.08, 0.08, (count, 3)), np.ones(count)])
+    body.normals = np.tile([0, 0, -1.0], (count, 1))
+    return body
+
+
+def same(found, expected):
+    np.testing.assert_array_equal(found.triples, expected.triples)
+    np.testing.assert_array_equal(found.members, expected.members)
+    np.testing.assert_array_equal(found.sided, expected.sided)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_faces_are_those_of_all_triples(virtual, seed):
+    """Bodies of faces, of few markers anywhere, and of both, with noise: as by trying every plane."""
+    rng = np.random.default_rng(200 + seed)
+    T = virtual.pose(Rotation.random(random_state=seed), [0, 0, 1.1])
+    if seed % 3 == 0:
+        body = six_faces(virtual, rng, T)
+    elif seed % 3 == 1:
+        body = cloud(virtual, rng, T, 3 + seed)
+    else:
+        body = Body(virtual, rng, tuple(rng.uniform(0, 360, 3)), T)
+        loose = cloud(virtual, rng, T, 4)
+        body.markers = np.concatenate([body.markers, loose.markers])
+        body.normals = np.concatenate([body.normals, loose.normals])
+    world = body.world
+    pixels = body.pixels(T)
+    points = world.triangulated(pixels + 0.02 * rng.normal(size=pixels.shape))
+    arguments = points, world.matrices, 0.05, world.camera_centres, body.seen(T), world.operators()
+    assert len(points) <= EXHAUSTIVE
+    same(find_faces(*arguments), faces_of_all_triples(*arguments))
+
+
+@pytest.mark.parametrize(("plates", "seed"), [(k, seed) for k in (6, 9, 12, 16) for seed in range(4)])
+def test_planes_of_near_markers_give_the_same_faces(virtual, plates, seed):
+    """Where not every triple is tried: the faces of a body of many plates are those of all triples."""
+    rng = np.random.default_rng(300 + seed)
+    T = virtual.pose(Rotation.random(random_state=seed), [0, 0, 1.2])
+    body = many_plates(virtual, rng, plates, T)
+    world, seen = body.world, body.seen(T)
+    pixels = body.pixels(T)
+    points = world.triangulated(pixels + 0.001 * rng.normal(size=pixels.shape))
+    views = points, world.matrices, 0.002, world.operators()
+    everything = select_faces(find_groups(*views, exhaustive=len(points)), points, world.camera_centres, seen)
+    assert sorted(everything.markers()) == [tuple(range(4 * k, 4 * k + 4)) for k in range(plates)]
+    near = select_faces(find_groups(*views, exhaustive=0), points, world.camera_centres, seen)
+    order = [near.markers().index(face) for face in everything.markers()]
+    assert len(order) == len(near.sided)
+    same(near._replace(triples=near.triples[order], members=near.members[order]), everything)
+
+
+def test_faces_of_256_markers(virtual):
+    rng = np.random.default_rng(310)
+    T = virtual.pose(Rotation.random(random_state=310), [0, 0, 1.2])
+    body = many_plates(virtual, rng, 64, T)
+    faces = body.find(T, noise=0.001, rng=rng, sigma=0.002)
+    # of 174 million fours some are in one plane by chance
+    assert len({tuple(range(4 * k, 4 * k + 4)) for k in range(64)} & set(faces.markers())) >= 62
+    plates = [len({k // 4 for k in face}) == 1 for face in faces.markers()]
+    assert outward_is_right(
+        body, faces._replace(triples=faces.triples[plates], members=faces.members[plates]), T
+    )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, ModelUpdate, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings, TrialSettings
@@ -335,7 +336,7 @@ class Bench:
         from stereoservo.messages.goals import Enable
 
         self.run(0.1)
-        self.step(model_update=ModelUpdate(self.truth.model))
+        self.step(model_update=ModelUpdate(with_groups(self.truth.model)))
         self.step(Enable())
         self.run(0.3)
         return self

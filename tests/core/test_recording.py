@@ -13,8 +13,9 @@ import pytest
 
 from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.state import STATE_VERSION, StateVersionError, decode_state, encode_state
-from stereoservo.messages.goals import DEFAULT_LAW, FeatureTarget, Goal, RunGoal
+from stereoservo.core.cycle import ModelUpdate
+from stereoservo.core.state import STATE_VERSION, StateVersionError, decode_state, encode_state, is_recorded
+from stereoservo.messages.goals import DEFAULT_LAW, Enable, FeatureTarget, Goal, RunGoal
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.step_records import Fingerprint, encode_step, fingerprint
@@ -165,6 +166,45 @@ def test_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
         replay(tmp_path / "x.mcap")
     with pytest.raises(RecordingError, match="cannot be read"):
         replay(tmp_path / "missing.mcap")
+
+
+def without_groups(data: bytes) -> bytes:
+    """A message or state with a model in it, as it was before models had coplanar groups."""
+    tree = msgspec.msgpack.decode(data)
+
+    def strip(value: Any) -> None:
+        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            strip(item)
+        if isinstance(value, dict):
+            value.pop("marker_groups", None)
+
+    strip(tree)
+    return msgspec.msgpack.encode(tree)
+
+
+def test_a_recording_of_before_models_had_groups_replays(benches: Any, tmp_path: Path) -> None:
+    bench = benches(3, noise_px=0.1)
+    bench.truth.model = msgspec.structs.replace(bench.truth.model, marker_groups=None)
+    bench.run(0.1)
+    path = tmp_path / "flight.mcap"
+    goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(bench.q + 0.1)))
+    with FlightRecorder(path, bench.settings, fingerprint()) as recorder:
+        for k in range(300):
+            if k % 100 == 0:
+                state = without_groups(encode_state(bench.core.state))
+                recorder.checkpoint(bench.core.state.step + 1, state, bench.now_ns)
+            update = ModelUpdate(bench.truth.model) if k == 5 else None
+            commands = {10: [Enable()], 60: [RunGoal(goal)]}.get(k, [])
+            outputs = bench.step(*commands, model_update=update)
+            inputs = bench.log[-1][0]
+            recorder.step(without_groups(encode_step(inputs, outputs)), inputs.now_ns)
+    result = replay(path)
+    assert (result.identical, result.steps, result.checkpoints) == (True, 300, 3)
+    assert bench.core.state.source.goal.id == goal.id
+    changed = msgspec.msgpack.decode(without_groups(encode_state(bench.core.state)))
+    assert is_recorded(bench.core.state, msgspec.msgpack.encode(changed))
+    changed["model"]["epoch"] += 1
+    assert not is_recorded(bench.core.state, msgspec.msgpack.encode(changed))
 
 
 def of_version(version: int) -> bytes:

@@ -106,6 +106,7 @@ class Watched:
             child.started = self.now
 
         monkeypatch.setattr("stereoservo.daemon.supervisor._start", start)
+        monkeypatch.setattr("stereoservo.daemon.supervisor.restore", lambda plan: [])
         self.supervisor = Supervisor(cast(Any, plan))
         self.supervisor._reporter = cast(
             Any,

@@ -10,10 +10,12 @@ import pytest
 
 from stereoservo.gateway import recordings
 from stereoservo.gateway.publisher import EventLog
-from stereoservo.gateway.recordings import CannotRecordError, ImageRecordings
+from stereoservo.gateway.recordings import CannotRecordError, ImageRecordings, Recordings
+from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.recording_request import RecordedImages, read_request, request_path
 from stereoservo.messages.wire import EventMessage, decode
+from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, fingerprint
 
 
 class Bench:
@@ -111,3 +113,47 @@ def test_cameras_without_pictures_are_refused_with_the_reason(
         bench.orders.check()
     request_path(bench.directories).write_text('{"number": 1, "directory": "/old"}')
     assert Bench(tmp_path, monkeypatch, left="frames").ordered() is None, "of a gateway that has died"
+
+
+def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_path: Path) -> None:
+    directories = CellDirectories("cell", tmp_path / "run", tmp_path)
+    events: list[EventMessage] = []
+    plan: Any = SimpleNamespace(
+        directories=directories, cameras=[], record="",
+        cell=SimpleNamespace(cell=SimpleNamespace(name="cell"), recording=RecordingSection(reserve_mib=0)),
+    )  # fmt: skip
+    (tmp_path / "run").mkdir()
+    log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
+    both = Recordings(plan, log)
+    assert both.wants_steps
+    begin: Any = RecordingStart({"rate": 1}, fingerprint())  # type: ignore[arg-type]
+
+    def stream(first: int) -> None:
+        both.take(begin)
+        both.take(RecordedCheckpoint(first, first, b"state"))
+        for k in range(first, first + 10):
+            both.take(RecordedStep(k, b"step"))
+
+    stream(1)
+    assert not both.running
+    both.request()
+    stream(11)
+    assert both.running
+    assert [event.kind for event in events] == ["recording"]
+    assert both.stop() == 10
+    assert both.wants_steps
+    both.keep_ring(0)
+    stream(21)
+    both.close()
+    assert [event.kind for event in events] == ["recording", "ring_kept"]
+    assert [path.parent.name for path in directories.recordings.rglob("*.mcap")].count("recordings") == 1
+    assert (
+        len(list((directories.recordings / "kept").rglob("*.mcap")))
+        + len(list((directories.recordings / "ring").glob("*.mcap")))
+        == 3
+    )
+    plan.cell.recording = RecordingSection(ring_mib=0)
+    without = Recordings(plan, log)
+    assert not without.wants_steps
+    without.keep_ring(0)
+    without.close()

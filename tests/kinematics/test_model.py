@@ -17,6 +17,7 @@ from stereoservo.kinematics.model import (
     FitStatistics,
     JointLoads,
     JointStatistics,
+    MarkerGroup,
     ModelFileError,
     check_model,
     decode_model,
@@ -26,6 +27,11 @@ from stereoservo.kinematics.model import (
 )
 from stereoservo.messages.files import write_atomically
 
+SCENE = (901, 902, 903, 904)
+GROUP = MarkerGroup((0, 1, 2), (0, 1, 2, 4), 1, 0, 0.1 + 0.2)
+GROUP_OUTSIDE = MarkerGroup((0, 1, 5), (0, 1, 5), 1, 0, 0.3)
+GROUP_TWICE = MarkerGroup((0, 1, 1), (0, 1, 2), 1, 0, 0.3)
+GROUP_OF_OTHERS = MarkerGroup((0, 1, 3), (0, 1, 2, 4), 1, 0, 0.3)
 HOLED = np.where(np.arange(32).reshape(2, 4, 4) == 27, np.nan, 1.0)
 
 
@@ -128,6 +134,13 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         ("joint_names", "empty", {"joint_names": ()}),
         ("marker_ids", "empty", {"marker_ids": ()}),
         ("cameras", "empty", {"cameras": ()}),
+        ("joint_names", "has 13 entries; a cell has at most 12", {"joint_names": tuple("abcdefghijklm")}),
+        ("marker_ids", "has 257 entries; a cell has at most 256", {"marker_ids": tuple(range(257))}),
+        ("marker_ids", "at most 252 markers beside 4 static", {"marker_ids": tuple(range(253)), "scene_ids": SCENE}),
+        ("cameras", "has 9 entries; a cell has at most 8", {"cameras": (CameraModel("left", np.eye(3, 4), 4, 4),) * 9}),
+        ("marker_groups[1]", "three of them different", {"marker_groups": (GROUP, GROUP_OUTSIDE)}),
+        ("marker_groups[0]", "three of them different", {"marker_groups": (GROUP_TWICE,)}),
+        ("marker_groups[0]", "three of them different", {"marker_groups": (GROUP_OF_OTHERS,)}),
         ("zero", r"shape \(3,\); \(2,\) is needed", {"zero": np.zeros(3)}),
         ("generators", r"entry \(1, 2, 3\) is nan", {"generators": HOLED}),
         ("marker_points", r"shape \(4, 4\)", {"marker_points": np.ones((4, 4))}),
@@ -190,6 +203,14 @@ def test_refuses_what_is_no_json_object(data):
 def test_says_that_a_file_is_missing(tmp_path):
     with pytest.raises(ModelFileError, match="cannot be read: No such file"):
         load_model(tmp_path / "model.json")
+
+
+def test_coplanar_groups_come_back_and_a_file_without_them_is_read():
+    model = make_model(3, marker_groups=(GROUP,))
+    assert decode_model(encode_model(model)).marker_groups == (GROUP,)
+    tree = json.loads(encode_model(model))
+    del tree["marker_groups"]
+    assert decode_model(json.dumps(tree).encode()).marker_groups is None
 
 
 def test_a_newer_reader_tolerates_new_fields():

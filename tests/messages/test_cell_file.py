@@ -236,3 +236,21 @@ def test_whatever_a_cell_file_holds_it_is_refused_by_name(tmp_path: Path, data: 
     path.write_bytes(data)
     with pytest.raises(CellFileError, match=r"cell\.toml: "):
         load_cell_file(path)
+
+
+def test_a_cell_has_limits_of_size(tmp_path: Path) -> None:
+    more = "".join(f'[[camera]]\nname = "c{k}"\ndriver = "fake"\n' for k in range(8))
+    with pytest.raises(CellFileError, match=r"camera: 9 cameras; a cell has at most 8"):
+        settings(tmp_path, GOOD.replace("[safety]\n", f"{more}[safety]\n"))
+    path = tmp_path / "cell.toml"
+    path.write_text(GOOD)
+    cell = load_cell_file(path)
+    many = msgspec.structs.replace(CAMERA, marker_ids=tuple(range(257)))
+    with pytest.raises(
+        CellFileError, match="the detectors report 257 different markers; a cell has at most 256"
+    ):
+        core_settings(cell, DRIVE, (many,))
+    core_settings(cell, DRIVE, (msgspec.structs.replace(many, marker_ids=many.marker_ids[:-1]),))
+    thirteen = msgspec.structs.replace(DRIVE, joints=DRIVE.joints * 13)
+    with pytest.raises(CellFileError, match="driver 'fake' has 13 joints; a cell has at most 12"):
+        core_settings(cell, thirteen, (CAMERA,))

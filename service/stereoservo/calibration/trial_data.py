@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.kinematics.model import JointLoads, ModelFileError, check_loads
-from stereoservo.messages.cell_file import Mount
+from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS, Mount
 from stereoservo.messages.decoding import decoding
 from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.numerics.archives import read_archive
@@ -146,6 +146,7 @@ def check_trials(trials: TrialData) -> None:
             cameras=c,
             minimum=2,
         )
+    _check_counts(trials)
     for what, names in (
         ("joint", trials.joint_names),
         ("camera", tuple(camera.name for camera in trials.cameras)),
@@ -191,6 +192,23 @@ def check_trials(trials: TrialData) -> None:
         )
     _check_sizes(trials)
     _check_pixels(trials)
+
+
+def _check_counts(trials: TrialData) -> None:
+    """A cell has limits of size."""
+    static = 0 if trials.static is None else len(trials.static.ids)
+    for what, count, most in (
+        ("joint", len(trials.joint_names), MAX_JOINTS),
+        ("camera", len(trials.cameras), MAX_CAMERAS),
+        ("marker", len(trials.marker_ids) + static, MAX_MARKERS),
+    ):
+        if count > most:
+            raise CalibrationError(
+                "bad_data",
+                f"trials of {count} {what}s; a cell has at most {most}",
+                key=f"{what}s",
+                maximum=most,
+            )
 
 
 def _check_static(trials: TrialData, static: StaticObservations) -> None:

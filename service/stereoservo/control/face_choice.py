@@ -19,6 +19,8 @@ LEAST_ALTITUDE = 10.0
 """Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
 CLEARLY_BETTER = 2.0
 """Ratio of image areas from which on another triangle takes over."""
+MOST_TRIED = 24
+"""Markers of a face of which every three are tried; of more, so many that are spread out in the images."""
 LASTING = 8.0
 """How many times its area a triangle counts that shows its front at the goal too."""
 
@@ -87,6 +89,38 @@ def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArr
 
 
 @kernel
+def spread_in_images(
+    candidates: IntArray, pixels: FloatArray, weights: FloatArray, count: int = MOST_TRIED
+) -> IntArray:
+    """At most ``count`` of the ``candidates`` (k,), ascending, each the farthest in the images from those before it.
+
+    ``pixels`` (c, m, 2); two markers are apart in the cameras that see both, ``weights`` (c, m) above 0.
+    """
+    k = candidates.shape[0]
+    if k <= count:
+        return candidates.copy()
+    chosen = np.zeros(k, np.bool_)
+    nearest = np.empty(k)
+    latest = 0
+    for nth in range(count + 1):  # the first one only tells which is the farthest from it
+        far = -1
+        for a in range(k):
+            i, j = candidates[latest], candidates[a]
+            apart = 0.0
+            for c in range(weights.shape[0]):
+                if weights[c, i] > 0.0 and weights[c, j] > 0.0:
+                    u, v = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
+                    apart += u * u + v * v
+            nearest[a] = apart if nth < 2 else min(nearest[a], apart)
+            if not chosen[a] and (far < 0 or nearest[a] > nearest[far]):
+                far = a
+        if nth < count:
+            chosen[far] = True
+            latest = far
+    return candidates[chosen]
+
+
+@kernel
 def choose_triangle(
     members: FloatArray,
     lasting: FloatArray,
@@ -103,19 +137,21 @@ def choose_triangle(
     faces, markers = members.shape
     best = np.zeros(3, np.int64)
     best_face, best_count, best_area = -1, 0, 0.0
+    candidates = np.empty(markers, np.int64)
     # faces first; across faces only where none is seen
     for f in range(faces + 1):
         if f == faces and best_count > 0:
             break
+        found = 0
         for i in range(markers):
-            if not (usable[i] > 0.0 and (f == faces or members[f, i] > 0.0)):
-                continue
-            for j in range(i + 1, markers):
-                if not (usable[j] > 0.0 and (f == faces or members[f, j] > 0.0)):
-                    continue
-                for k in range(j + 1, markers):
-                    if not (usable[k] > 0.0 and (f == faces or members[f, k] > 0.0)):
-                        continue
+            if usable[i] > 0.0 and (f == faces or members[f, i] > 0.0):
+                candidates[found] = i
+                found += 1
+        tried = spread_in_images(candidates[:found], pixels, weights)
+        for a in range(tried.shape[0]):
+            for b in range(a + 1, tried.shape[0]):
+                for c in range(b + 1, tried.shape[0]):
+                    i, j, k = tried[a], tried[b], tried[c]
                     count, area = triangle_sight(i, j, k, pixels, weights)
                     if f < faces and lasting[f] > 0.0:
                         area *= LASTING

@@ -11,7 +11,7 @@ import numpy as np
 
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.model_arrays import model_arrays
+from stereoservo.core.model_arrays import model_arrays, require_fitting
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds
 from stereoservo.core.monitors.diagnosis import start_model_monitor
@@ -66,7 +66,7 @@ def _take_model(context: StepContext) -> None:
     state, update = context.state, context.inputs.model_update
     if update is not None:
         try:
-            model_arrays(update.model, context.settings)
+            require_fitting(update.model, context.settings)
         except ValueError as error:
             context.emit("warning", message=f"model refused: {error}")
         else:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereoservo.control.marker_groups import MarkerGroups, groups_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
@@ -38,10 +39,12 @@ class ModelArrays:
     """Static points in the images (c, s, 2): they never move there."""
     rows: dict[int, int]
     """Rows of `FrameResiduals`: the markers, then the static points."""
+    groups: MarkerGroups | None
+    """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
 
 
-def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
-    """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
+def require_fitting(model: CellModel, settings: CoreSettings) -> None:
+    """Raises ValueError naming what of ``model`` does not fit the cell."""
     if model.joint_names != settings.joint_names:
         raise ValueError(
             f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
@@ -64,6 +67,12 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
                 f"model was made with {known.width}x{known.height} images of camera {camera.name!r}; "
                 f"it now delivers {camera.width}x{camera.height}"
             )
+
+
+def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
+    """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
+    require_fitting(model, settings)
+    by_name = {camera.name: camera for camera in model.cameras}
     matrices = np.ascontiguousarray(
         [by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64
     )
@@ -87,6 +96,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         scene_points=scene,
         scene_pixels=scene_pixels,
         rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
+        groups=groups_of(model),
     )
     for name in (
         "generators",

@@ -434,10 +434,10 @@ def _unmask_returned(watching: ModelMonitor, known: list[int], context: StepCont
         seen = [watching.sightings[c] for c in known if watching.sightings[c].seen[i] > 0.0]
         if not seen:
             continue
-        only = np.zeros(len(arrays.rows))
-        only[i] = 1.0
+        only, alone = slice(i, i + 1), np.ones(1)
         good = all(
-            camera_chi2(s.innovation, s.spread, only, MODEL_SIGMA_PX)[0] <= _improbable(2.0) for s in seen
+            camera_chi2(s.innovation[only], s.spread[only], alone, MODEL_SIGMA_PX)[0] <= _improbable(2.0)
+            for s in seen
         )
         watching.back[i] = watching.back[i] + 1 if good else 0
         if watching.back[i] >= BACK_ROUNDS:

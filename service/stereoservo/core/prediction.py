@@ -202,17 +202,15 @@ def frame_sights(
 
     ``speed`` (n,): of the joints then.
     """
-    rows = np.array([arrays.rows.get(int(i), -1) for i in observation.ids], dtype=np.int64)
+    rows = np.array([arrays.rows.get(i, -1) for i in observation.ids.tolist()], dtype=np.int64)
     standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
     innovation, spread, seen, velocity = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
         np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
         np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
     )  # fmt: skip
-    noise = np.ones(seen.size)
-    for k, row in enumerate(rows):
-        if row >= 0:
-            noise[row] = 0.5 * (observation.covariances[k, 0, 0] + observation.covariances[k, 1, 1])
+    noise, known = np.ones(seen.size), rows >= 0
+    noise[rows[known]] = 0.5 * (observation.covariances[known, 0, 0] + observation.covariances[known, 1, 1])
     return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity)
 
 
@@ -267,13 +265,7 @@ def fold_timing(
     The markers of a frame share what the model is off by: they count as one sight, not as k.
     """
     k = variances.shape[0]
-    speed = product = square = 0.0
-    for i in range(k):
-        vu, vv = float(velocities[i, 0]), float(velocities[i, 1])
-        speed += math.sqrt(vu * vu + vv * vv)
-        weight = 1.0 / (float(variances[i]) + MODEL_PX * MODEL_PX)
-        product += weight * (vu * float(innovations[i, 0]) + vv * float(innovations[i, 1]))
-        square += weight * (vu * vu + vv * vv)
+    speed, product, square = _timing_sums(innovations, velocities, variances)
     if k == 0 or speed < MOVING_PX_S * k:
         return
     elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns else 0.0
@@ -281,6 +273,21 @@ def fold_timing(
     timing.product = keep * timing.product + product / k
     timing.square = keep * timing.square + square / k
     timing.seen_ns = t_ns
+
+
+@kernel
+def _timing_sums(
+    innovations: FloatArray, velocities: FloatArray, variances: FloatArray
+) -> tuple[float, float, float]:
+    """Sums over a frame's markers: pixel speeds, and of the weighted fit of innovations to velocities."""
+    speed, product, square = 0.0, 0.0, 0.0
+    for i in range(variances.shape[0]):
+        vu, vv = velocities[i, 0], velocities[i, 1]
+        speed += math.sqrt(vu * vu + vv * vv)
+        weight = 1.0 / (variances[i] + MODEL_PX * MODEL_PX)
+        product += weight * (vu * innovations[i, 0] + vv * innovations[i, 1])
+        square += weight * (vu * vu + vv * vv)
+    return speed, product, square
 
 
 @kernel

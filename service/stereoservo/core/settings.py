@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS, UnknownLawError
-from stereoservo.messages.cell_file import CellFile, CellFileError, Mount, check_joints
+from stereoservo.messages.cell_file import MAX_MARKERS, CellFile, CellFileError, Mount, check_joints
 from stereoservo.messages.goals import LawName, PointSource
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointKindName
@@ -154,6 +154,14 @@ def core_settings(
         )
         for section, description in zip(cell.camera, cameras, strict=True)
     )  # fmt: skip
+    reported = {marker for camera in camera_settings for marker in camera.marker_ids}
+    if len(reported) > MAX_MARKERS:
+        raise CellFileError(
+            cell.cell.name,
+            "camera.detector_options",
+            f"the detectors report {len(reported)} different markers; a cell has at most {MAX_MARKERS}: name those "
+            "that are there",
+        )
     trials = None if cell.calibration is None else _trial_settings(cell, joints)
     home = None
     if cell.joints.home:

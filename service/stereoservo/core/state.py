@@ -510,7 +510,8 @@ def is_recorded(state: CoreState, data: bytes) -> bool:
     """Whether ``data`` is this state bit for bit, in the fields that its version holds."""
     encoded = encode_state(state)
     if msgspec.msgpack.decode(data, type=_Versioned).version == STATE_VERSION:
-        return encoded == data
+        # A field that was added since, with a default, is not in it.
+        return encoded == data or encoded == encode_state(decode_state(data))
     now, recorded = msgspec.msgpack.decode(encoded), _from_version_6(data)
     recorded |= {name: now[name] for name in UNRECORDED}
     return encoded == msgspec.msgpack.encode({name: recorded[name] for name in now})

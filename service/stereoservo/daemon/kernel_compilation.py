@@ -20,6 +20,7 @@ import numpy as np
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.law_warmup import warm_up_incidences, warm_up_laws
 from stereoservo.control.laws.cartesian3 import cartesian_step
+from stereoservo.control.marker_groups import FLAT_PX, find_groups
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.monitors.moving_camera import rehearse as rehearse_mobile
@@ -63,7 +64,7 @@ def warm_up() -> None:
         [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
     )
     seven = np.ones(7)  # a redundant arm's self-motion
-    distort_pixel(LENS, 1.0, 1.0)  # for the reported path of a joint goal
+    distort_pixel(LENS, 1.0, 1.0)  # for set-points that are said anew in a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
     runs: list[tuple[str, PointSource]] = [(DEFAULT_LAW, "triangulated")]
     runs.extend((law, "predicted") for law in LAWS)
@@ -89,6 +90,8 @@ def warm_up() -> None:
             inputs = _inputs(step, pixels, model)
             core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
     _warm_up_fault_isolation(model, pixels)
+    matrices = np.array([camera.matrix for camera in model.cameras])
+    find_groups(model.marker_points, matrices, FLAT_PX, model.generators, exhaustive=0)
 
 
 def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:

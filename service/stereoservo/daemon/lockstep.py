@@ -11,6 +11,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
+import msgspec
+
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, ModelUpdate, Status, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings, core_settings
@@ -342,8 +345,8 @@ class LockstepCell:
         self.links.raise_stop()
 
     def update_model(self, update: ModelUpdate) -> None:
-        """Send a fitted model."""
-        self.links.send_model(update)
+        """Send a fitted model, with the coplanar groups of its markers, as the gateway does."""
+        self.links.send_model(msgspec.structs.replace(update, model=with_groups(update.model)))
 
     def run_for(self, seconds: float) -> None:
         """Step for ``seconds`` of virtual time."""

@@ -25,7 +25,7 @@ from stereoservo.daemon.ipc_messages import (
 )
 from stereoservo.daemon.links import GatewayMessages
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot
-from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
+from stereoservo.daemon.seqpacket import ChannelError, ChannelServer, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Request
@@ -63,13 +63,16 @@ class EventOutbox:
 
 
 class _RecorderPeer:
-    """The gateway's end of the step socket, as a `StepSink`."""
+    """The gateway's end of the step socket, as a `StepSink`; what is too large for a message is not taken."""
 
     def __init__(self, channel: PacketChannel) -> None:
         self.channel = channel
 
     def send(self, message: StepMessage) -> bool:
-        return self.channel.send(encode(message))
+        try:
+            return self.channel.send(encode(message))
+        except ChannelError:
+            return False
 
 
 class ProcessLinks:

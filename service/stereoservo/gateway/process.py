@@ -87,7 +87,7 @@ SERVO_STALE_S = 0.5
 DRAIN = 32
 ANNOUNCE_AGAIN_S = 1.0
 EXIT_SETUP = 3
-ONCE = frozenset({"taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted"})
+ONCE = frozenset({"taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted", "fault"})
 """Events of the core whose effects must not come twice."""
 GATEWAY_VERBS = ("record", "synthesise")
 """Commands that the gateway carries out itself."""
@@ -116,7 +116,6 @@ class Gateway:
         self.log = EventLog(self.boot, self._publish_event, self._observe_event)
         self._notes = KeeperNotes(self.log)
         self._servo = ServoConnection(directories)
-        self._servo.records = bool(plan.record)
         self._replies = ReplyThread()
         self._calibration = CalibrationJobs(
             self.settings, self._models, self._servo, self.log, directories.checks
@@ -151,6 +150,7 @@ class Gateway:
         self._state_heard = 0.0
         self._state_sent = 0.0
         self._recordings = Recordings(plan, self.log, self._notes.tell)
+        self._servo.records = self._recordings.wants_steps
         self._handled = HandledEvents(directories.runtime / "handled.slot", self._notes.tell)
         self._greeted = False
         self._announce_due_s: float | None = 0.0
@@ -214,7 +214,7 @@ class Gateway:
         self._publish_state()
         self._read_reports()
         self._take_steps()
-        self._recordings.images.poll()
+        self._recordings.poll()
         self._calibration.poll()
         self._relocalization.poll()
         self._announce()
@@ -226,7 +226,8 @@ class Gateway:
         for item in self._servo.steps(limit):
             self._recordings.take(item)
         if self._recordings.refused:  # the next request to record begins anew
-            self._recordings.refused = self._servo.records = False
+            self._recordings.refused = False
+            self._servo.records = self._recordings.wants_steps
 
     def _queries(self) -> bool:
         busy = False
@@ -286,11 +287,15 @@ class Gateway:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._servo.records = request.on
         if not request.on:
-            return Reply(True, self._recordings.stop(), boot=self.boot)
+            text = self._recordings.stop()
+            self._servo.records = self._recordings.wants_steps
+            return Reply(True, text, boot=self.boot)
         if self._recordings.running:
             return Reply(True, f"recording into {self._recordings.path}", boot=self.boot)
+        self._recordings.request()
+        self._servo.restart_steps()
+        self._servo.records = True
         return Reply(True, "recording begins; its event names the file", boot=self.boot)
 
     def _events_from(self, query: Any) -> bytes:
@@ -334,6 +339,8 @@ class Gateway:
         if event.kind != "taught" or not fresh or self._teaching.taught(event):
             self.log.add_core(event)
         self._repeated = False
+        if event.kind == "fault" and fresh:
+            self._recordings.keep_ring(event.t_ns)
         self._calibration.core_event(event, fresh=fresh)
         self._relocalization.core_event(event, fresh=fresh)
         self._handled.mark(event, acted=event.kind in ONCE)
@@ -437,7 +444,7 @@ class Gateway:
         self._calibration.cancel()
         self._relocalization.cancel()
         self._take_steps(100_000)
-        self._recordings.stop()
+        self._recordings.close()
         with suppress(zenoh.ZError):  # telling is good manners, not needed
             if not self._servo.connected:  # else the next gateway goes on
                 self.goals.end_current(self.log)

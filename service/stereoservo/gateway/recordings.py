@@ -20,6 +20,7 @@ from stereoservo.messages.recording_request import (
     write_request,
 )
 from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.recording.ring import RingLimits, RingThread
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 LAST_WORD_S = 5.0
@@ -116,7 +117,7 @@ class ImageRecordings:
 
 
 class Recordings:
-    """The current flight recording, if any. ``path``: its file, or that of the last one.
+    """The flight ring, and the current recording on request, if any. ``path``: its file, or that of the last one.
 
     A file that cannot be written ends early or never begins (``refused``): events and notes by ``tell`` have the cause.
     """
@@ -125,6 +126,15 @@ class Recordings:
         self._plan = plan
         self._log = log
         self._tell = tell
+        self._requested = bool(plan.record)
+        section = plan.cell.recording
+        limits = RingLimits(
+            60.0 * section.ring_minutes,
+            section.ring_mib << 20,
+            section.reserve_mib << 20,
+            section.kept_faults,
+        )
+        self._ring = RingThread(plan.directories.recordings, limits) if limits.bytes else None
         self._recorder: FlightRecorder | None = None
         self._with_images = False
         self._failed = False
@@ -137,6 +147,34 @@ class Recordings:
         """Whether a file is being written."""
         return self._recorder is not None
 
+    @property
+    def wants_steps(self) -> bool:
+        """Whether step records are needed at all."""
+        return self._requested or self._ring is not None
+
+    def request(self) -> None:
+        """Record into a file of its own from the next stream of steps on."""
+        self._requested = True
+
+    def keep_ring(self, t_ns: int) -> None:
+        """Keep the ring aside, for a fault at ``t_ns``."""
+        if self._ring is not None:
+            self._ring.keep(t_ns)
+
+    def poll(self) -> None:
+        """Report what the ring has to say; the state of image recordings."""
+        while self._ring is not None and self._ring.said:
+            kind, message = self._ring.said.popleft()
+            self._log.add(kind, message=message, origin="gateway")
+        self.images.poll()
+
+    def close(self) -> None:
+        """Finish the ring's segment and the recording. Idempotent."""
+        self.stop()
+        if self._ring is not None:
+            self._ring.close()
+        self.poll()
+
     def want_images(self) -> None:
         """Also record images: now, or with the recording that is about to begin. Raises CannotRecordError."""
         self.images.check()
@@ -145,14 +183,17 @@ class Recordings:
             self.images.begin(self._recorder.path)
 
     def take(self, item: StepMessage) -> None:
-        """Write messages of the servo process; the first one begins a file."""
-        if isinstance(item, RecordingStart):
+        """Write messages of the servo process; the first one begins a file, where one is requested."""
+        if self._ring is not None:
+            self._ring.take(item)
+        if isinstance(item, RecordingStart) and self._requested:
             again = self._with_images
             self.stop()
+            self._requested = True
             self._begin(item)
             if again and self._recorder is not None:
                 self.want_images()
-        elif self._recorder is not None:
+        elif self._recorder is not None and not isinstance(item, RecordingStart):
             self._recorder.write(item)
             if self._recorder.failure and not self._failed:
                 self._fail(_summary(self._recorder))
@@ -164,7 +205,7 @@ class Recordings:
         try:
             self._recorder = FlightRecorder(path, start.settings, start.fingerprint)
         except OSError as error:
-            self.refused = True
+            self.refused, self._requested = True, False
             self._fail(f"{path}: no recording: {error.strerror}")
             return
         self.refused = False
@@ -186,7 +227,7 @@ class Recordings:
 
     def stop(self) -> str:
         """Finish the file and the image recordings; returns what is in it. Idempotent."""
-        self._with_images = False
+        self._requested = self._with_images = False
         self.refused = False
         self.images.end()
         if self._recorder is None:

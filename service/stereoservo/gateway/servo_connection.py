@@ -9,6 +9,7 @@ from functools import partial
 
 import msgspec
 
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, encode
 from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.ipc_messages import (
@@ -80,6 +81,12 @@ class ServoConnection:
             self._last_beat = now
             self._control.send(encode(Heartbeat()))
 
+    def restart_steps(self) -> None:
+        """Begin the stream of step records anew, with a checkpoint, for a recording that begins now."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps = None
+
     def send_command(self, command: Command, operator: str) -> int | None:
         """Send a command; returns its request number, None where the servo process is not connected."""
         number = self._next_request
@@ -89,8 +96,11 @@ class ServoConnection:
         return number
 
     def send_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
-        """Send a model to the core, without its covariance: the loop does not use it, and messages are bounded."""
-        bare = msgspec.structs.replace(model, covariance=None)
+        """Send a model to the core, with the coplanar groups of its markers: the loop has no time to look for them.
+
+        Without its covariance, which the loop does not use: messages are bounded.
+        """
+        bare = with_groups(msgspec.structs.replace(model, covariance=None))
         return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
 
     def events(self) -> list[Event]:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from stereoservo.messages.cell_file import Mount
+from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS, Mount
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.files import read_bounded, verify_checksum, with_checksum, write_atomically
 from stereoservo.numerics.arrays import FloatArray
@@ -120,6 +120,20 @@ class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
         return self.generators, self.cameras, self.lenses, self.markers
 
 
+class MarkerGroup(msgspec.Struct, frozen=True):
+    """Coplanar markers, by their indices in the model: ``members``, ascending, and the ``triple`` that tells the plane.
+
+    ``above``, ``below``: how many of the other markers lie on either side; ``roundness``: altitude of the triple over
+    the extent of the group. See `control.marker_groups`.
+    """
+
+    triple: tuple[int, int, int]
+    members: tuple[int, ...]
+    above: int
+    below: int
+    roundness: float
+
+
 class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Calibrated model: projective kinematics, cameras and markers in one projective frame.
 
@@ -156,6 +170,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     scene_points: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4)))
     """Static scene points (s, 4) of height 1, with ``scene_covariances`` (s, 4, 4) at that scale, given the cameras."""
     scene_covariances: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4, 4)))
+    marker_groups: tuple[MarkerGroup, ...] | None = None
+    """Coplanar groups of its markers; None where they have not been looked for."""
 
     @property
     def tip_first(self) -> bool:
@@ -199,12 +215,20 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
     if not 0 <= model.epoch < 2**63:
         raise ModelFileError(path, "epoch", f"is {model.epoch}; a model's epoch is 0 or more, and below 2^63")
     n, m = len(model.joint_names), len(model.marker_ids)
-    if n < 1:
-        raise ModelFileError(path, "joint_names", "is empty; a model has at least one joint")
-    if m < 1:
-        raise ModelFileError(path, "marker_ids", "is empty; a model has at least one marker")
-    if not model.cameras:
-        raise ModelFileError(path, "cameras", "is empty; a model has at least one camera")
+    for key, count, most, what in (
+        ("joint_names", n, MAX_JOINTS, "joint"),
+        ("marker_ids", m, MAX_MARKERS - len(model.scene_ids), "marker"),
+        ("cameras", len(model.cameras), MAX_CAMERAS, "camera"),
+    ):
+        if count < 1:
+            raise ModelFileError(path, key, f"is empty; a model has at least one {what}")
+        if count > most:
+            beside = (
+                f" beside {len(model.scene_ids)} static ones"
+                if key == "marker_ids" and model.scene_ids
+                else ""
+            )
+            raise ModelFileError(path, key, f"has {count} entries; a cell has at most {most} {what}s{beside}")
     if len(model.joint_kinds) != n:
         raise ModelFileError(
             path,
@@ -244,6 +268,14 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
     if model.loads is not None:
         check_loads(model.loads, n, path)
     _check_scene(model, path)
+    for k, group in enumerate(model.marker_groups or ()):
+        if len(set(group.triple)) < 3 or not {*group.triple} <= {*group.members} <= {*range(m)}:
+            raise ModelFileError(
+                path,
+                f"marker_groups[{k}]",
+                f"is of markers {group.members}, by {group.triple}: indices from 0 to {m - 1}, three of them "
+                "different, are needed",
+            )
 
 
 def check_loads(loads: JointLoads, n: int, path: Path | str = "<loads>") -> None:

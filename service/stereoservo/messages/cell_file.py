@@ -18,6 +18,10 @@ from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
 SCHEMA = 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 LARGEST = 1e9
+MAX_MARKERS = 256
+"""Markers of a cell, on the arm and static: what a step of the loop does grows with them."""
+MAX_CAMERAS = 8
+MAX_JOINTS = 12
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -192,6 +196,20 @@ class ZenohSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tls: TlsSection | None = None
 
 
+class RecordingSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[recording]``: the flight ring, the last minutes of the loop's steps, which is always recorded.
+
+    In at most ``ring_mib`` of the state directory, 0 switches it off, and only while ``reserve_mib`` of its disk stay
+    free. At a fault the ring is kept aside; of ``kept_faults`` faults, so that all takes up to
+    ``(1 + kept_faults) * ring_mib``.
+    """
+
+    ring_minutes: Annotated[float, Meta(gt=0, le=1440)] = 10.0
+    ring_mib: Annotated[int, Meta(ge=0, le=1 << 20)] = 512
+    reserve_mib: Annotated[int, Meta(ge=0, le=1 << 30)] = 2048
+    kept_faults: Annotated[int, Meta(ge=0, le=100)] = 4
+
+
 class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole cell file."""
 
@@ -204,6 +222,7 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     servo: ServoSection = ServoSection()
     zenoh: ZenohSection = ZenohSection()
     scene: SceneSection = SceneSection()
+    recording: RecordingSection = RecordingSection()
     emulate: dict[str, Any] = {}
     """``[emulate.drives]``, ``[emulate.cameras]``: what `stereoservo emulate` puts in the place of the hardware; the
     daemon does not read it.
@@ -239,6 +258,8 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
     names = [camera.name for camera in cell.camera]
     if not names:
         raise CellFileError(path, "camera", "no camera; at least one [[camera]] is needed")
+    if len(names) > MAX_CAMERAS:
+        raise CellFileError(path, "camera", f"{len(names)} cameras; a cell has at most {MAX_CAMERAS}")
     for name in names:
         if names.count(name) > 1:
             raise CellFileError(path, "camera.name", f"{name!r} is used twice; camera names must differ")
@@ -352,6 +373,12 @@ def _check_value(key: str, joint: str, value: Any, cell: CellFile, path: Path | 
 def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str = "<cell>") -> None:
     """Check a cell against the joints of its driver. Raises CellFileError."""
     limited = [limit.joint for limit in cell.safety.limit]
+    if len(joint_names) > MAX_JOINTS:
+        raise CellFileError(
+            path,
+            "joints.driver",
+            f"driver {cell.joints.driver!r} has {len(joint_names)} joints; a cell has at most {MAX_JOINTS}",
+        )
     for name in joint_names:
         if name not in limited:
             raise CellFileError(
@@ -419,7 +446,7 @@ _SECTIONS: dict[str, type[msgspec.Struct]] = {
     "safety": SafetySection, "safety.limit": JointLimit, "safety.keep_out": KeepOut,
     "safety.contact": ContactSection,
     "calibration": CalibrationSection, "calibration.spread": SpreadSection, "zenoh": ZenohSection,
-    "zenoh.tls": TlsSection, "scene": SceneSection,
+    "zenoh.tls": TlsSection, "scene": SceneSection, "recording": RecordingSection,
 }  # fmt: skip
 
 

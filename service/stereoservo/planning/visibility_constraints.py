@@ -345,8 +345,10 @@ def _required_visibility(
     """Sides (f, c) of the faces and least elevations (f, c) [rad]; side 0 where a camera has no sight at both ends."""
     sides, grazing = np.zeros((len(faces), len(camera_centres))), np.zeros((len(faces), len(camera_centres)))
     elevations = _elevations(body, faces, camera_centres), _elevations(goal, faces, camera_centres)
+    centroid = body.sum(axis=0) / len(body)
+    size = math.sqrt(float(((body - centroid) ** 2).sum(axis=1).max()))
     for f, (now, then) in enumerate(zip(*elevations, strict=True)):
-        side = _outside(body, faces[f])
+        side = _outside(body, faces[f], centroid, size)
         if side == 0.0:
             side = 1.0 if float((now + then).sum()) >= 0.0 else -1.0
         both = (side * now > 0.0) & (side * then > 0.0)
@@ -355,13 +357,11 @@ def _required_visibility(
     return sides, grazing
 
 
-def _outside(body: FloatArray, face: IntArray) -> float:
-    """Sign of a face's plane outside the body; 0 where all markers lie in it."""
+def _outside(body: FloatArray, face: IntArray, centroid: FloatArray, size: float) -> float:
+    """Sign of a face's plane outside a body of that ``centroid`` (3,) and ``size``; 0 where all markers lie in it."""
     a, b, c = (body[int(i)] for i in face)
     u, v = b - a, c - a
     normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
-    centroid = body.sum(axis=0) / len(body)
-    size = math.sqrt(float(((body - centroid) ** 2).sum(axis=1).max()))
     distance = float((normal * (centroid - a)).sum()) / math.sqrt(float((normal * normal).sum()))
     if abs(distance) < THICK * size:
         return 0.0

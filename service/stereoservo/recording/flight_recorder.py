@@ -22,8 +22,9 @@ CHUNK_BYTES = 256 * 1024
 class _OutputFile:
     """File that takes each block as a whole or not at all, so that it ends with a whole record on a full disk."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, durable: bool) -> None:
         self._file = FileIO(path, "wb")
+        self._durable = durable
         self.size = 0
 
     def write(self, data: bytes) -> int:
@@ -45,11 +46,12 @@ class _OutputFile:
         return self.size
 
     def close(self) -> None:
-        """Have the disk take what was written, and close. Idempotent. Raises OSError."""
+        """Close, with what is durable on the disk. Idempotent. Raises OSError."""
         if self._file.closed:
             return
         try:
-            os.fsync(self._file.fileno())
+            if self._durable:
+                os.fsync(self._file.fileno())
         finally:
             self._file.close()
 
@@ -57,14 +59,17 @@ class _OutputFile:
 class FlightRecorder:
     """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process.
 
-    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index. A file that
-    cannot be written any more ends with its last whole chunk: ``failure`` has the cause then, ``steps`` counts those in
-    the file, ``dropped`` those that came later and are not.
+    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index, and, where it
+    is ``durable``, waits until the disk has it all. A file that cannot be written any more ends with its last whole
+    chunk: ``failure`` has the cause then, ``steps`` counts those in the file, ``dropped`` those that came later and are
+    not.
 
     Raises OSError where the file cannot be begun.
     """
 
-    def __init__(self, path: Path, settings: CoreSettings, fingerprint: Fingerprint) -> None:
+    def __init__(
+        self, path: Path, settings: CoreSettings, fingerprint: Fingerprint, *, durable: bool = True
+    ) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.steps = 0
@@ -72,12 +77,8 @@ class FlightRecorder:
         self.failure = ""
         self._pending = 0
         self._closed = False
-        self._stream = _OutputFile(path)
-        self._writer = Writer(
-            self._stream,
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.LZ4,
-        )
+        self._stream = _OutputFile(path, durable)
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
         self._writer.start(profile=FORMAT, library="stereoservo")
         encoded = encode(settings)
         self._channels = {
@@ -89,6 +90,11 @@ class FlightRecorder:
             {"fingerprint": msgspec.to_builtins(fingerprint), "settings": encoded}
         )
         self._add("header", header, 0)
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far; the last chunk is not in it yet."""
+        return self._stream.tell()
 
     def write(self, message: RecordedStep | RecordedCheckpoint) -> None:
         """Append what the servo loop sent, with the gap before it."""
@@ -157,6 +163,11 @@ class FlightRecorder:
                 self._stream.close()
         except OSError as error:
             self._fail(error, size)
+
+    def abandon(self) -> None:
+        """Leave the file as it is: of a disk that takes no more."""
+        with suppress(OSError):
+            self._stream.close()
 
     def __enter__(self) -> FlightRecorder:
         return self

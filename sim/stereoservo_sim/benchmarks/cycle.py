@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-import uuid
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,30 +10,27 @@ import numpy as np
 
 from stereoservo.control.law import Law, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
-from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
-from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward, image_jacobian, project_points, transform_points
-from stereoservo.messages.goals import Enable, FeatureTarget, Goal, LawName, Request, RunGoal
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.goals import LawName
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import CameraObservation, JointState
+from stereoservo_sim.benchmarks.core_loop import FRAME_EVERY, RATE_HZ, CoreLoop, rx90_with_facets
 from stereoservo_sim.benchmarks.stereo_reference import stereo_law
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.exact_model import exact_model
-from stereoservo_sim.world.synthetic import SyntheticCell, rx90
+from stereoservo_sim.world.synthetic import rx90
 
 GAIN, DAMPING = 1.0, 1e-6
-RATE_HZ, FRAME_EVERY = 250.0, 10
-"""Of the loop, and steps between images."""
 WARM_UP = 100
 """Steps of the core that do not count."""
-PLANNING = 5000
-"""Steps in which a goal must be answered."""
+LARGE_BODIES = ((8, 2), (64, 2), (256, 2), (256, 8))
+"""Markers and cameras."""
 
 
 def stereo_problem() -> dict[str, Any]:
@@ -140,6 +135,7 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
             name: summary(timed(call, count, warm_up=20)[0], 1e6) for name, call in law_calls(problem).items()
         },
         "core_step_us": core,
+        "large_bodies": large_bodies(count, seed, progress),
         "core": {
             "joints": 6,
             "markers": 14,
@@ -152,97 +148,43 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
 
 def core_steps(law: LawName, count: int, seed: int) -> list[float]:
     """Durations [s] of ``count`` steps of a core that drives the simulated arm to a goal by ``law``."""
-    loop = _Loop(rx90(), seed)
-    loop.step(model_update=ModelUpdate(exact_model(loop.cell)))
-    loop.step(requests=(Request(1, "bench", Enable()),))
-    # Far enough that the arm is under way all the time.
-    goal = loop.cell.home + 0.3 * loop.cell.ranges
-    target = FeatureTarget(
-        {
-            name: {i: (float(u), float(v)) for i, (u, v) in zip(loop.cell.marker_ids, seen, strict=True)}
-            for name, seen in zip(("cam0", "cam1"), loop.cell.pixels(goal[None])[:, 0], strict=True)
-        }
-    )
-    run = RunGoal(Goal(str(uuid.UUID(int=seed + 1)), target, law=law, gain=0.2))
-    outputs = loop.step(requests=(Request(2, "bench", run),))
-    for _ in range(PLANNING):  # it is planned, a slice a step, before it is answered
-        replies = [event for event in outputs.events if event.kind == "reply"]
-        if replies:
-            break
-        outputs = loop.step()
-    if not (replies and replies[0].accepted):
-        raise RuntimeError(f"the core did not take the bench's goal: {[event.message for event in replies]}")
+    loop = CoreLoop(rx90(), seed)
+    loop.start_goal(law)
     for _ in range(WARM_UP):
         loop.step()
     loop.times.clear()
     for _ in range(count):
         loop.step()
-    return loop.times
+    return [seconds for _, seconds in loop.times]
 
 
-class _Loop:
-    """A core in virtual time with perfect joints, and noise-free images that are one frame late."""
+def _find_groups(model: CellModel, _: int) -> CellModel:
+    return with_groups(model)
 
-    def __init__(self, cell: SyntheticCell, seed: int) -> None:
-        self.cell, self.seed = cell, seed
-        self.core = ServoCore(_settings(cell))
-        self.q, self.now_ns, self.seq, self.active = cell.home.copy(), 1_000_000_000, 0, False
-        self.pending: tuple[CameraObservation, ...] = ()
-        self.times: list[float] = []
 
-    def step(self, **inputs: Any) -> StepOutputs:
-        """Run and time one step; then the arm moves as commanded."""
-        period_ns = round(1e9 / RATE_HZ)
-        self.now_ns += period_ns
-        self.seq += 1
-        joints = JointState(self.seq, self.now_ns, self.q.copy(), np.zeros(len(self.q)))
-        observations, self.pending = self.pending, ()
-        given = {"requests": (), **inputs}
-        cycle = StepInputs(self.now_ns, period_ns, joints, observations, driver_active=self.active, **given)
-        at = time.perf_counter()
-        outputs = self.core.step(cycle)
-        self.times.append(time.perf_counter() - at)
-        if outputs.driver_request:
-            self.active = outputs.driver_request == "activate"
-        if self.seq % FRAME_EVERY == 0:
-            self.pending = self._images()
-        if outputs.command is not None:
-            self.q = self.q + outputs.command / RATE_HZ
-        return outputs
-
-    def _images(self) -> tuple[CameraObservation, ...]:
-        ids = np.array(self.cell.marker_ids)
-        covariances = np.tile(1e-4 * np.eye(2), (len(ids), 1, 1))
-        received = self.now_ns + round(1e9 / RATE_HZ)
-        return tuple(
-            CameraObservation(f"cam{c}", self.seq, self.now_ns, received, ids, pixels, covariances)
-            for c, pixels in enumerate(self.cell.pixels(self.q[None])[:, 0])
+def large_bodies(count: int, seed: int, progress: ProgressCall) -> list[dict[str, Any]]:
+    """Microseconds of each kind of core step, by the number of markers and cameras; and of finding their planes."""
+    rows = []
+    for markers, cameras in LARGE_BODIES:
+        cell = rx90_with_facets(markers, cameras)
+        bare = exact_model(cell)
+        finding = timed(partial(_find_groups, bare), 2)[0]
+        model = with_groups(bare)
+        for _ in range(2):  # the first one compiles
+            loop = CoreLoop(cell, seed, model)
+            loop.start_goal("cartesian3")
+            for _ in range(count):
+                loop.step()
+        by_kind: dict[str, list[float]] = {}
+        for kind, seconds in loop.times:
+            by_kind.setdefault(kind, []).append(seconds)
+        rows.append(
+            {
+                "markers": markers,
+                "cameras": cameras,
+                "groups_of_model_ms": 1e3 * min(finding),
+                "step_us": {kind: summary(times, 1e6) for kind, times in by_kind.items()},
+            }
         )
-
-
-def _settings(cell: SyntheticCell) -> CoreSettings:
-    n = len(cell.kinds)
-    return CoreSettings(
-        cell="bench",
-        joint_names=cell.joint_names,
-        joint_kinds=cell.kinds,
-        cameras=tuple(
-            CameraSettings(f"cam{c}", cell.width, cell.height, RATE_HZ / FRAME_EVERY, cell.mount, cell.marker_ids)
-            for c in range(len(cell.poses))
-        ),
-        limits=LimitSettings(
-            np.full(n, -6.0), np.full(n, 6.0), np.full(n, 1.0), np.full(n, 4.0), 0.01, np.zeros((0, n, 2)), (), 0.5,
-            0.1, 1.0,
-        ),
-        trials=None,
-        home=cell.home,
-        rate_hz=RATE_HZ,
-        law="cartesian3",
-        points="predicted",
-        gain=1.0,
-        tolerance_px=1e-3,
-        hold_frames=5,
-        time_limit_s=1e6,
-        filter_s=0.2,
-        gate_sigma=6.0,
-    )  # fmt: skip
+        progress("large bodies", len(rows), len(LARGE_BODIES))
+    return rows

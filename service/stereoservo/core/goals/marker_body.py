@@ -15,8 +15,10 @@ from math import isfinite
 
 import numpy as np
 
-from stereoservo.control.faces import FLAT_PX, Faces, find_faces, sights_along
+from stereoservo.control.face_choice import MOST_TRIED, spread_in_images
+from stereoservo.control.faces import Faces, find_faces, select_faces, sights_along
 from stereoservo.control.laws.cartesian3 import FaceTask, cartesian3_step
+from stereoservo.control.marker_groups import FLAT_PX
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import markers_at
@@ -71,7 +73,12 @@ def place_now(context: StepContext) -> BodyState:
     seen = (
         np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
     )
-    faces = find_faces(points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators)
+    if arrays.groups is not None:
+        faces = select_faces(arrays.groups, points, arrays.camera_centres, seen)
+    else:  # recorded before models had them: found for each goal, from the pose that it sets out from
+        faces = find_faces(
+            points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators
+        )
     return BodyState(context.settings, arrays, points, prediction.operators, faces)
 
 
@@ -129,7 +136,13 @@ def goal_pose(
     (n, 4, 4): the arm's at present, a basis of displacements where the model knows no metric one.
     """
     basis = operators if arrays.metric_basis is None else arrays.metric_basis
-    displacement = _displacement_by_law(basis, points, targets, known, face)
+    few = np.flatnonzero(known)
+    if len(few) > MOST_TRIED:  # a start for least squares: it takes no more of a large body
+        few = np.union1d(face, spread_in_images(few, set_points, wanted))
+        face, some = np.searchsorted(few, face), np.ones(len(few), dtype=bool)
+        displacement = _displacement_by_law(basis, points[few], targets[few], some, face)
+    else:
+        displacement = _displacement_by_law(basis, points, targets, known, face)
     return refined_pose(arrays, basis, points, displacement, set_points, wanted)
 
 

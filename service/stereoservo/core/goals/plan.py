@@ -14,10 +14,10 @@ from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import BodyState, view_of
-from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
 from stereoservo.core.prediction import centre_of, chain_at, composition_of
 from stereoservo.core.state import PlanJob, Purpose, ServoGoal
-from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points
+from stereoservo.kinematics.kernels import project_points
 from stereoservo.messages import goals
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
@@ -29,11 +29,11 @@ from stereoservo.planning.planner import PlanRequestError, start_planning
 
 SLICE = 8
 """Samples of the arm's way that a step works on."""
+PIXELS_PER_STEP = 512
+"""Pixels of markers that these samples may have together; a step works on fewer samples of a large body."""
 VIEW_MARGIN_PX = 5.0
 PLANNED_SPEED, PLANNED_ACCELERATION = 0.9, 0.7
 """Shares of the limits that a way is planned with: the rest is feedback's."""
-REPORTED = 17
-"""Samples of a way that a report holds."""
 
 
 def begin_plan(
@@ -102,7 +102,9 @@ def _plan_request(
 def go_on_planning(job: PlanJob) -> bool:
     """A step's share of the work; whether it is done."""
     if not job.planning.finished:
-        plan_on(job.planning, SLICE)
+        request = job.planning.request
+        pixels = len(request.points) * len(request.matrices)
+        plan_on(job.planning, max(1, min(SLICE, PIXELS_PER_STEP // pixels)))
     return job.planning.finished
 
 
@@ -156,7 +158,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
     arrays = context.arrays
     assert arrays is not None
     source, settings = job.source, context.settings
-    count = min(REPORTED, len(plan.times))
+    count = min(reported_samples(arrays), len(plan.times))
     at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
     seconds = float(plan.times[-1])
     way = plan.way
@@ -174,39 +176,17 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
         joints={
             name: tuple(float(plan.joints[k, j]) for k in at) for j, name in enumerate(settings.joint_names)
         },
-        pixels=_pixels(job, plan, at, arrays, context),
+        pixels={
+            camera.name: pixels
+            for camera, used, pixels in zip(
+                settings.cameras,
+                source.used,
+                reported_pixels(arrays, plan.displacements[at], job.points),
+                strict=True,
+            )
+            if used != 0.0
+        },
     )
-
-
-def _pixels(
-    job: PlanJob, plan: Plan, at: list[int], arrays: ModelArrays, context: StepContext
-) -> dict[str, dict[int, tuple[tuple[float, float], ...]]]:
-    """Raw pixels along the way, by camera and marker; a marker that a lens does not image is left out."""
-    found: dict[str, dict[int, tuple[tuple[float, float], ...]]] = {}
-    ways = _raw_way(arrays.matrices, arrays.lenses, plan.displacements[at], job.points)
-    for c, camera in enumerate(context.settings.cameras):
-        if job.source.used[c] == 0.0:
-            continue
-        found[camera.name] = {}
-        for i, marker in enumerate(arrays.marker_ids):
-            if bool(np.isfinite(ways[:, c, i]).all()):
-                found[camera.name][marker] = tuple((float(u), float(v)) for u, v in ways[:, c, i])
-    return found
-
-
-@kernel
-def _raw_way(
-    matrices: FloatArray, lenses: FloatArray, displacements: FloatArray, points: FloatArray
-) -> FloatArray:
-    """Raw pixels (k, c, m, 2) of ``points`` (m, 4) after ``displacements`` (k, 4, 4); NaN beyond a lens's fold."""
-    found = np.empty((displacements.shape[0], matrices.shape[0], points.shape[0], 2))
-    for k in range(displacements.shape[0]):
-        pixels, _ = project_points(matrices, transform_points(displacements[k], points))
-        for c in range(matrices.shape[0]):
-            for i in range(points.shape[0]):
-                u, v = distort_pixel(lenses[c], pixels[c, i, 0], pixels[c, i, 1])
-                found[k, c, i, 0], found[k, c, i, 1] = u, v
-    return found
 
 
 def _exponential_s(job: PlanJob, context: StepContext) -> float:

@@ -4,15 +4,15 @@ creates the initial state of its control law. Refuses invalid targets.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
-from stereoservo.control.face_choice import NOT_CHOSEN
+from stereoservo.control.face_choice import NOT_CHOSEN, spread_in_images
 from stereoservo.control.law import JacobianChoice
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
@@ -141,13 +141,15 @@ def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray,
     )
     for name, markers in target.set_points.items():
         camera = camera_index(name, place.settings)
-        ideal = ideal_pixels(
-            arrays.lenses[camera], np.array(tuple(markers.values()), dtype=np.float64).reshape(-1, 2)
-        )
-        for (marker, raw), pixel in zip(markers.items(), ideal, strict=True):
-            i = marker_index(marker, arrays)
-            require_imaged(cameras[camera], f"marker {marker}", raw, pixel)
-            set_points[camera, i], wanted[camera, i] = pixel, 1.0
+        shape = cameras[camera]
+        given = np.array(tuple(markers.values()), dtype=np.float64).reshape(-1, 2)
+        ideal = ideal_pixels(arrays.lenses[camera], given)
+        rows = [marker_index(marker, arrays) for marker in markers]
+        set_points[camera, rows], wanted[camera, rows] = ideal, 1.0
+        inside = (given >= -0.5) & (given <= np.array((shape.width, shape.height)) - 0.5) & np.isfinite(ideal)
+        for k in np.flatnonzero(~inside.all(axis=1)):
+            marker = tuple(markers)[k]
+            require_imaged(shape, f"marker {marker}", markers[marker], ideal[k])
     return set_points, wanted
 
 
@@ -375,7 +377,7 @@ def _aim(place: BodyState, targets: FloatArray, known: BoolArray, *, only_known:
 
 
 def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: ModelArrays) -> IntArray:
-    """Three markers known at the goal that span the largest triangle in the images."""
+    """Three markers known at the goal that span the largest triangle in the images: of many, of those spread out."""
     candidates = np.flatnonzero(known)
     if candidates.size < MIN_MARKERS:
         raise RefusalError(
@@ -383,22 +385,44 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
             f"{MIN_MARKERS} markers that two cameras show at the goal are needed; {candidates.size} are",
             value=float(candidates.size), threshold=float(MIN_MARKERS), unit="markers",
         )  # fmt: skip
-    triples = np.array(list(combinations(candidates.tolist(), 3)), dtype=np.int64)
-    a, b, c = (set_points[:, triples[:, k]] for k in range(3))
-    areas = np.abs((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0])
-    whole = wanted[:, triples].min(axis=-1) > 0.0
-    areas = np.where(whole, areas, np.inf).min(axis=0)
-    areas = np.where(whole.any(axis=0), areas, 0.0)
-    best = int(areas.argmax())
-    if not float(areas[best]) >= MIN_FACE_AREA_PX2:
+    found: IntArray
+    found, area = _largest_triangle(candidates, set_points, wanted)
+    if not area >= MIN_FACE_AREA_PX2:
         ids = [arrays.marker_ids[int(i)] for i in candidates]
         raise RefusalError(
             "COLLINEAR_MARKERS",
             f"the markers {ids} of the goal lie on one line; three that span a face are needed",
-            value=float(areas[best]), threshold=MIN_FACE_AREA_PX2, unit="px²",
+            value=float(area), threshold=MIN_FACE_AREA_PX2, unit="px²",
         )  # fmt: skip
-    found: IntArray = triples[best]
     return found
+
+
+@kernel
+def _largest_triangle(
+    candidates: IntArray, set_points: FloatArray, wanted: FloatArray
+) -> tuple[IntArray, float]:
+    """Three of the ``candidates`` (k,) of the largest area, and twice that [px²]: the least of the cameras that see all
+    three.
+    """
+    tried = spread_in_images(candidates, set_points, wanted)
+    best = tried[:3].copy()
+    largest = -1.0
+    for a in range(tried.shape[0]):
+        for b in range(a + 1, tried.shape[0]):
+            for c in range(b + 1, tried.shape[0]):
+                i, j, k = tried[a], tried[b], tried[c]
+                least = math.inf
+                for camera in range(wanted.shape[0]):
+                    if min(wanted[camera, i], wanted[camera, j], wanted[camera, k]) > 0.0:
+                        p = set_points[camera]
+                        ux, uy = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
+                        vx, vy = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1]
+                        least = min(least, abs(ux * vy - uy * vx))
+                area = least if least < math.inf else 0.0
+                if area > largest:
+                    largest = area
+                    best[0], best[1], best[2] = i, j, k
+    return best, largest
 
 
 def _product(A: FloatArray, B: FloatArray) -> FloatArray:

@@ -405,10 +405,9 @@ def marker_pixels(samples: tuple[Sample, ...], core: CoreSettings) -> tuple[Floa
     sigmas = np.full((len(row), len(column)), np.nan)
     for sample in samples:
         c = row[sample.camera]
-        for marker, pixel, covariance in zip(sample.ids, sample.pixels, sample.covariances, strict=True):
-            i = column[int(marker)]
-            pixels[c, i] = pixel
-            sigmas[c, i] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
+        seen = [column[marker] for marker in sample.ids.tolist()]
+        pixels[c, seen] = sample.pixels
+        sigmas[c, seen] = np.sqrt(0.5 * (sample.covariances[:, 0, 0] + sample.covariances[:, 1, 1]))
     return pixels, sigmas
 
 

@@ -7,12 +7,11 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.core.context import RefusalError, SourceOutput, StepContext
+from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
 from stereoservo.core.goals.resolve import joint_index
-from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
 from stereoservo.core.settings import CoreSettings, LimitSettings
 from stereoservo.core.state import JointMove
-from stereoservo.kinematics.kernels import distort_pixel, project_points, transform_points
 from stereoservo.messages.goals import Approach, Goal, JointTarget, PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
@@ -21,8 +20,6 @@ APPROACH_GAIN = 15.0  # [1/s] end of a joint move
 BRAKE_SHARE = 0.6  # of the acceleration limit that a joint move plans with
 ARRIVED = 5e-4  # [rad or m]
 ARRIVED_STEPS = 5
-REPORTED = 17
-"""Samples of a way that a report holds."""
 
 
 def joint_goal(goal: Goal, target: JointTarget, context: StepContext) -> JointMove:
@@ -88,8 +85,15 @@ def joint_report(move: JointMove, context: StepContext) -> PlanReport:
                 "beside it",
                 subject=name, value=share, threshold=1.0, unit="of the way",
             )  # fmt: skip
-    shares = tuple(k / (REPORTED - 1.0) for k in range(REPORTED))
+    arrays = context.arrays
+    count = reported_samples(arrays)
+    shares = tuple(k / (count - 1.0) for k in range(count))
     joints = np.array([start + share * (move.target - start) for share in shares])
+    pixels = {}
+    if arrays is not None:
+        displacements = np.array([chain_at(arrays, q)[0] for q in joints])
+        found = reported_pixels(arrays, displacements, arrays.marker_points)
+        pixels = {camera.name: of_camera for camera, of_camera in zip(settings.cameras, found, strict=True)}
     return PlanReport(
         law="joints",
         way="straight in joint space",
@@ -97,29 +101,8 @@ def joint_report(move: JointMove, context: StepContext) -> PlanReport:
         approaches=(_nearest_limit(move, context),),
         shares=shares,
         joints={name: tuple(float(x) for x in joints[:, j]) for j, name in enumerate(settings.joint_names)},
-        pixels={} if context.arrays is None else way_pixels(joints, context.arrays, context),
+        pixels=pixels,
     )
-
-
-def way_pixels(
-    joints: FloatArray, arrays: ModelArrays, context: StepContext
-) -> dict[str, dict[int, tuple[tuple[float, float], ...]]]:
-    """Raw pixels of every marker at ``joints`` (k, n), by camera and marker; markers outside the image are left out."""
-    found: dict[str, dict[int, tuple[tuple[float, float], ...]]] = {}
-    pixels = np.array(
-        [
-            project_points(arrays.matrices, transform_points(chain_at(arrays, q)[0], arrays.marker_points))[0]
-            for q in joints
-        ]
-    )
-    for c, camera in enumerate(context.settings.cameras):
-        markers = {}
-        for i, marker in enumerate(arrays.marker_ids):
-            way = tuple(distort_pixel(arrays.lenses[c], float(u), float(v)) for u, v in pixels[:, c, i])
-            if bool(np.isfinite(np.array(way)).all()):
-                markers[marker] = way
-        found[camera.name] = markers
-    return found
 
 
 def first_inside(box: FloatArray, margin: float, start: FloatArray, target: FloatArray) -> float | None:

@@ -165,7 +165,8 @@ def too_slow(visit: PoseMeasurement, context: StepContext, trial: TrialSettings)
 
 def _of_body(ids: IntArray, static: tuple[int, ...]) -> int:
     """How many of ``ids`` are not ``static``, of the scene."""
-    return sum(int(marker) not in static for marker in ids)
+    of_scene = set(static)
+    return sum(marker not in of_scene for marker in ids.tolist())
 
 
 def markers_lost(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> bool:

@@ -24,6 +24,7 @@ from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.fit_assessment import Acceptance, assess_failure, assess_fit, depth_spread
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.kinematics.model import ModelFileError, save_model
@@ -77,7 +78,7 @@ def fit_trials(
     """
     created = datetime.now(UTC).isoformat(timespec="seconds")
     result = fit_model(trials, epoch=epoch, created=created, progress=progress, lens_priors=lens_priors)
-    save_model(result.model, model_path)
+    save_model(with_groups(result.model), model_path)
     figures = msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n"
     write_atomically(figures_file(model_path), figures)
     return result, assess_fit(result.model, result.report, depth_spread(result.model, trials))

@@ -1,0 +1,250 @@
+"""Flight ring: the servo loop's last minutes in segments on disk, each of which replays by itself; bounded in time, in
+bytes and by the free space of the disk; kept aside at a fault.
+
+A segment is an ordinary recording that begins with a checkpoint of the state. The oldest ones are dropped whole. What a
+gateway that was killed has left stays, and its successor goes on in a new segment.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from stereoservo.recording.flight_recorder import CHUNK_BYTES, FlightRecorder
+from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, StepMessage
+
+SEGMENT_S = 60.0
+SEGMENTS = 16
+"""A segment has at most this part of the ring's bytes."""
+AFTER_FAULT_S = 5.0
+"""What is kept of a fault goes on for so long after it."""
+WAITING_BYTES = 16 << 20
+CLOSING_S = 3.0
+
+Report = Callable[[str, str], None]
+"""Is told the kind of an event, ``ring_kept`` or ``warning``, and its message."""
+
+
+class RingLimits(NamedTuple):
+    """``seconds`` and ``bytes`` of the ring; ``reserve_bytes`` of the disk stay free; ``kept``: faults whose ring is
+    kept aside, each of at most ``bytes``.
+    """
+
+    seconds: float
+    bytes: int
+    reserve_bytes: int
+    kept: int
+
+
+class FlightRing:
+    """The ring in a ``directory``: segments in ``ring/``, those of faults in ``kept/``.
+
+    Never raises on what the disk does: it is reported once, and tried again with later checkpoints. ``wall``: seconds
+    of the wall clock; ``free``: bytes left on the disk of a path.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        limits: RingLimits,
+        report: Report,
+        wall: Callable[[], float] = time.time,
+        free: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
+    ) -> None:
+        self.segments, self.kept = directory / "ring", directory / "kept"
+        self._limits, self._report, self._wall, self._free = limits, report, wall, free
+        self._start: RecordingStart | None = None
+        self._segment: FlightRecorder | None = None
+        self._begun_ns = 0
+        self._keep_ns: int | None = None
+        self._trouble = ""
+
+    def take(self, message: StepMessage) -> None:
+        """Write a message of the servo process; nothing is written before the first checkpoint of a stream."""
+        try:
+            if isinstance(message, RecordingStart):
+                self._end()
+                self._start = message
+            elif isinstance(message, RecordedCheckpoint):
+                self._checkpoint(message)
+            elif self._segment is not None:
+                self._write(message)
+                self._trouble = ""
+                if self._segment.size > self._limits.bytes // SEGMENTS - CHUNK_BYTES:
+                    self._end()
+        except OSError as error:
+            self._abandon(f"{error.strerror or error}")
+
+    def keep(self, t_ns: int) -> None:
+        """Keep the ring aside, with what follows the fault at ``t_ns``."""
+        if self._keep_ns is None:
+            self._keep_ns = t_ns + int(AFTER_FAULT_S * 1e9)
+
+    def close(self) -> None:
+        """End the segment. Idempotent."""
+        try:
+            self._end()
+            if self._keep_ns is not None:
+                self._move_aside()
+        except OSError as error:
+            self._abandon(f"{error.strerror or error}")
+
+    def _checkpoint(self, message: RecordedCheckpoint) -> None:
+        """Begin a segment where one is due, and there is room for it; write the checkpoint."""
+        if self._keep_ns is not None and message.t_ns >= self._keep_ns:
+            self._end()
+            self._move_aside()
+        if self._segment is not None and not 0 <= message.t_ns - self._begun_ns < SEGMENT_S * 1e9:
+            self._end()
+        if not self._has_room():
+            return
+        if self._segment is None:
+            self._begin(message.t_ns)
+            message = msgspec.structs.replace(message, lost=0)  # a segment begins where a gap has ended
+        self._write(message)
+
+    def _write(self, message: RecordedStep | RecordedCheckpoint) -> None:
+        """Append to the segment, if there is one. Raises OSError."""
+        if self._segment is not None:
+            self._segment.write(message)
+            if self._segment.failure:
+                raise OSError(self._segment.failure)
+
+    def _begin(self, t_ns: int) -> None:
+        if self._start is None:
+            return
+        self.segments.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._prune()
+        stamp = datetime.fromtimestamp(self._wall(), UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+        path = self.segments / f"{stamp}.mcap"
+        self._segment = FlightRecorder(path, self._start.settings, self._start.fingerprint, durable=False)
+        self._begun_ns = t_ns
+
+    def _end(self) -> None:
+        segment, self._segment = self._segment, None
+        if segment is not None:
+            segment.close()
+            if segment.failure:
+                raise OSError(segment.failure)
+
+    def _abandon(self, trouble: str) -> None:
+        """Report why nothing is written, once, and leave the segment as it is."""
+        if self._segment is not None:
+            self._segment.abandon()
+        self._segment = None
+        if trouble != self._trouble:
+            self._report("warning", f"the flight ring in {self.segments} is not written: {trouble}")
+        self._trouble = trouble
+
+    def _has_room(self) -> bool:
+        place = self.segments
+        while not place.exists():
+            place = place.parent
+        if self._free(place) < self._limits.reserve_bytes:
+            self._end()
+            self._abandon(f"less than {self._limits.reserve_bytes >> 20} MiB are free, which stay free")
+            return False
+        return True
+
+    def _prune(self) -> None:
+        """Drop the oldest segments until the rest, and one to come, keep the limits."""
+        found = sorted((path, path.stat()) for path in self.segments.glob("*.mcap"))
+        total = sum(stat.st_size for _, stat in found) + self._limits.bytes // SEGMENTS
+        oldest = self._wall() - self._limits.seconds
+        for path, stat in found:
+            if total <= self._limits.bytes and stat.st_mtime >= oldest:
+                break
+            path.unlink(missing_ok=True)
+            total -= stat.st_size
+
+    def _move_aside(self) -> None:
+        """Keep all segments in a directory of their own; drop the oldest of these."""
+        self._keep_ns = None
+        found = sorted(self.segments.glob("*.mcap"))
+        if not found or self._limits.kept == 0:
+            return
+        stamp = datetime.fromtimestamp(self._wall(), UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+        place = self.kept / stamp
+        place.mkdir(mode=0o700, parents=True)
+        for path in found:
+            path.rename(place / path.name)
+        for path in sorted(self.kept.iterdir())[: -self._limits.kept]:
+            shutil.rmtree(path, ignore_errors=True)
+        self._report("ring_kept", f"the minutes before the fault are kept in {place}")
+
+
+class RingThread:
+    """A `FlightRing` written by a thread: a disk that hangs costs the ring steps, and the gateway nothing.
+
+    ``said``: what it has to report, kind and message, for the gateway to take.
+    """
+
+    def __init__(self, directory: Path, limits: RingLimits) -> None:
+        self.said: deque[tuple[str, str]] = deque(maxlen=64)
+        self._ring = FlightRing(directory, limits, lambda kind, message: self.said.append((kind, message)))
+        self._waiting: deque[StepMessage | int] = deque()
+        self._bytes = self._lost = 0
+        self._ending = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="flight-ring", daemon=True)
+        self._thread.start()
+
+    def take(self, message: StepMessage) -> None:
+        """Queue a message; after one that found the queue full, none before the next checkpoint."""
+        size = _size(message)
+        with self._changed:
+            full = self._bytes + size > WAITING_BYTES
+            if full or (self._lost and isinstance(message, RecordedStep)):
+                self._lost += 1
+                return
+            if self._lost and isinstance(message, RecordedCheckpoint):
+                message, self._lost = msgspec.structs.replace(message, lost=message.lost + self._lost), 0
+            self._bytes += size
+            self._waiting.append(message)
+            self._changed.notify()
+
+    def keep(self, t_ns: int) -> None:
+        """Keep the ring aside, with what follows the fault at ``t_ns``."""
+        with self._changed:
+            self._waiting.append(t_ns)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Write what waits and end the segment, within ``CLOSING_S``. Idempotent."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify()
+        self._thread.join(CLOSING_S)
+
+    def _run(self) -> None:
+        while (item := self._next()) is not None:
+            if isinstance(item, int):
+                self._ring.keep(item)
+            else:
+                self._ring.take(item)
+        self._ring.close()
+
+    def _next(self) -> StepMessage | int | None:
+        with self._changed:
+            while not self._waiting and not self._ending:
+                self._changed.wait()
+            if not self._waiting:
+                return None
+            item = self._waiting.popleft()
+            self._bytes -= 0 if isinstance(item, int) else _size(item)
+            return item
+
+
+def _size(message: StepMessage) -> int:
+    """Bytes of what a message carries."""
+    if isinstance(message, RecordedStep):
+        return len(message.data)
+    return len(message.state) if isinstance(message, RecordedCheckpoint) else 0

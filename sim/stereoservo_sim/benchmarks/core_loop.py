@@ -1,0 +1,170 @@
+"""A servo core in virtual time before a synthetic cell, and bodies of many markers, for benchmarks and for tests of how
+a step's work grows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+import uuid
+from typing import Any
+
+import numpy as np
+
+from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.goals import Enable, FeatureTarget, Goal, LawName, Request, RunGoal
+from stereoservo.ports.devices import CameraObservation, JointState
+from stereoservo_sim.world.exact_model import exact_model
+from stereoservo_sim.world.synthetic import SyntheticCell, rotation, rx90, translation
+
+RATE_HZ, FRAME_EVERY = 250.0, 10
+"""Of the loop, and steps between images."""
+PLANNING = 5000
+"""Steps in which a goal must be answered."""
+
+
+class CoreLoop:
+    """A core in virtual time with perfect joints, and noise-free images that are one frame late.
+
+    ``times``: kind and duration [s] of each step: ``model`` (taken), ``goal`` (looked at), ``planning``, ``planned``
+    (the answer), ``frames`` (of all cameras), ``between`` them.
+    """
+
+    def __init__(self, cell: SyntheticCell, seed: int, model: CellModel | None = None) -> None:
+        self.cell, self.seed = cell, seed
+        self.model = exact_model(cell) if model is None else model
+        self.core = ServoCore(_settings(cell))
+        self.q, self.now_ns, self.seq, self.active = cell.home.copy(), 1_000_000_000, 0, False
+        self.pending: tuple[CameraObservation, ...] = ()
+        self.times: list[tuple[str, float]] = []
+        self.shift_px = 0.0
+        """By which the first camera's pixels are off, as if it had been pushed."""
+
+    def step(self, **inputs: Any) -> StepOutputs:
+        """Run and time one step; then the arm moves as commanded."""
+        period_ns = round(1e9 / RATE_HZ)
+        self.now_ns += period_ns
+        self.seq += 1
+        joints = JointState(self.seq, self.now_ns, self.q.copy(), np.zeros(len(self.q)))
+        observations, self.pending = self.pending, ()
+        given = {"requests": (), **inputs}
+        cycle = StepInputs(self.now_ns, period_ns, joints, observations, driver_active=self.active, **given)
+        kind = _kind(cycle, self.core)
+        at = time.perf_counter()
+        outputs = self.core.step(cycle)
+        seconds = time.perf_counter() - at
+        if kind == "planning" and self.core.state.planning is None:
+            kind = "planned"
+        self.times.append((kind, seconds))
+        if outputs.driver_request:
+            self.active = outputs.driver_request == "activate"
+        if self.seq % FRAME_EVERY == 0:
+            self.pending = self._images()
+        if outputs.command is not None:
+            self.q = self.q + outputs.command / RATE_HZ
+        return outputs
+
+    def take_model(self) -> None:
+        """Put the model in use, and enable."""
+        self.step(model_update=ModelUpdate(self.model))
+        self.step(requests=(Request(1, "bench", Enable()),))
+
+    def target_at(self, share: float) -> FeatureTarget:
+        """Set-points of the markers as they are at home plus a ``share`` of the ranges."""
+        seen = self.cell.pixels((self.cell.home + share * self.cell.ranges)[None])[:, 0]
+        return FeatureTarget(
+            {
+                f"cam{c}": {
+                    i: (float(u), float(v)) for i, (u, v) in zip(self.cell.marker_ids, pixels, strict=True)
+                }
+                for c, pixels in enumerate(seen)
+            }
+        )
+
+    def start_goal(self, law: LawName) -> None:
+        """Take the model, and go for a goal that is far enough that the arm is under way for long."""
+        self.take_model()
+        run = RunGoal(Goal(str(uuid.UUID(int=self.seed + 1)), self.target_at(0.3), law=law, gain=0.2))
+        outputs = self.step(requests=(Request(2, "bench", run),))
+        for _ in range(PLANNING):  # it is planned, a slice a step, before it is answered
+            replies = [event for event in outputs.events if event.kind == "reply"]
+            if replies:
+                break
+            outputs = self.step()
+        if not (replies and replies[0].accepted):
+            raise RuntimeError(f"the core did not take the goal: {[event.message for event in replies]}")
+
+    def _images(self) -> tuple[CameraObservation, ...]:
+        ids = np.array(self.cell.marker_ids)
+        covariances = np.tile(1e-4 * np.eye(2), (len(ids), 1, 1))
+        received = self.now_ns + round(1e9 / RATE_HZ)
+        seen = self.cell.pixels(self.q[None])[:, 0]
+        seen[0] += self.shift_px
+        return tuple(
+            CameraObservation(f"cam{c}", self.seq, self.now_ns, received, ids, pixels, covariances)
+            for c, pixels in enumerate(seen)
+        )
+
+
+def _kind(inputs: StepInputs, core: ServoCore) -> str:
+    """What a step has to do."""
+    if inputs.model_update is not None:
+        return "model"
+    if any(isinstance(request.command, RunGoal) for request in inputs.requests):
+        return "goal"
+    if core.state.planning is not None:
+        return "planning"
+    return "frames" if inputs.observations else "between"
+
+
+def rx90_with_facets(markers: int, cameras: int) -> SyntheticCell:
+    """The 6R cell with a body of small facets of four markers on a dome, before so many cameras."""
+    side = math.ceil(math.sqrt(markers / 4))
+    offsets = (np.arange(side) - 0.5 * (side - 1)) * min(0.03, 0.24 / side)
+    dots = np.array([(-9, -8), (8, -9), (9, 8), (-8, 9)]) / 1000 * min(1.0, 8 / side)
+    facets = []
+    for x in offsets:
+        for y in offsets:
+            tilt = (rotation("y", 200.0 * float(x)) @ rotation("x", -200.0 * float(y)))[:3, :3]
+            here = np.hstack([dots, np.zeros((4, 1))]) @ tilt.T
+            facets.append(here + np.array((x, y, 0.08 - 1.7 * (x * x + y * y))))
+    cell = rx90(np.concatenate(facets)[:markers])
+    poses = np.array([translation(0.0, 0.03 * (c // 2), 0.0) @ cell.poses[c % 2] for c in range(cameras)])
+    return dataclasses.replace(
+        cell,
+        intrinsics=cell.intrinsics[np.arange(cameras) % 2],
+        poses=poses,
+        lenses=cell.lenses[np.arange(cameras) % 2],
+    )
+
+
+def _settings(cell: SyntheticCell) -> CoreSettings:
+    n = len(cell.kinds)
+    return CoreSettings(
+        cell="bench",
+        joint_names=cell.joint_names,
+        joint_kinds=cell.kinds,
+        cameras=tuple(
+            CameraSettings(f"cam{c}", cell.width, cell.height, RATE_HZ / FRAME_EVERY, cell.mount, cell.marker_ids)
+            for c in range(len(cell.poses))
+        ),
+        limits=LimitSettings(
+            np.full(n, -6.0), np.full(n, 6.0), np.full(n, 1.0), np.full(n, 4.0), 0.01, np.zeros((0, n, 2)), (), 0.5,
+            0.1, 1.0,
+        ),
+        trials=None,
+        home=cell.home,
+        rate_hz=RATE_HZ,
+        law="cartesian3",
+        points="predicted",
+        gain=1.0,
+        tolerance_px=1e-3,
+        hold_frames=5,
+        time_limit_s=1e6,
+        filter_s=0.2,
+        gate_sigma=6.0,
+    )  # fmt: skip
