@@ -274,7 +274,9 @@ def test_ctrl_c_while_it_starts_leaves_nothing(start: Start, directories: CellDi
 # -- modes --------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_replays_bit_for_bit(calibrated: Path, start: Start, tmp_path: Path) -> None:
+def test_a_recording_replays_bit_for_bit_and_so_does_the_ring(
+    calibrated: Path, start: Start, directories: CellDirectories, tmp_path: Path
+) -> None:
     path = tmp_path / "flight.mcap"
     daemon = start(calibrated, "--record", str(path))
     with Client(CELL) as client:
@@ -287,6 +289,8 @@ def test_a_recording_replays_bit_for_bit(calibrated: Path, start: Start, tmp_pat
     assert result.identical is True
     assert result.steps > 500
     assert result.checkpoints >= 1
+    newest = max((directories.recordings / "ring").glob("*.mcap"))
+    assert replay(newest).identical is True
 
 
 def test_a_live_cell_is_recorded_on_demand(own: Client) -> None:
