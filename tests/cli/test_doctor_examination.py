@@ -151,7 +151,7 @@ def test_a_cell_with_one_camera_fails(cell: Path, capfd: pytest.CaptureFixture[s
     capfd.readouterr()
     assert cli.invoke(["doctor", str(cell), "--seconds", "0", "--json"]) == 1
     checks = json.loads(capfd.readouterr().out)["error"]["checks"]
-    assert [check["name"] for check in checks if check["ok"] is False] == ["stereo"]
+    assert [check["name"] for check in checks if check["ok"] is False] == ["camera count"]
 
 
 def test_a_damaged_file_of_taught_goals_is_a_finding(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import msgspec
@@ -170,12 +171,29 @@ def test_a_frame_that_cannot_be_stops_what_works_by_images(
     assert bench.core.state.stopped
 
 
-def test_a_model_that_is_not_finite_is_refused(bench: Any) -> None:
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda m: {"marker_points": m.marker_points * np.nan},
+            "marker points with numbers that are not finite",
+        ),
+        (
+            lambda m: {"generators": m.generators[:5]},
+            r"generators of shape \(5, 4, 4\), \(6, 4, 4\) is needed",
+        ),
+        (lambda m: {"projective_to_euclidean": np.full((4, 4), np.inf)}, "Euclidean frame with numbers"),
+        (
+            lambda m: {"cameras": tuple(msgspec.structs.replace(c, lens=np.zeros(3)) for c in m.cameras)},
+            "a lens of",
+        ),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused(bench: Any, change: Any, told: str) -> None:
     bench.ready()
-    model = bench.truth.model
-    wrong = msgspec.structs.replace(model, marker_points=np.where(model.marker_points > 1e9, 0.0, np.nan))
-    outputs = bench.step(model_update=ModelUpdate(wrong))
-    assert "model has marker points that are not finite" in outputs.events[0].message
+    model = bench.core.state.model
+    outputs = bench.step(model_update=ModelUpdate(msgspec.structs.replace(model, **change(model))))
+    assert re.search(told, outputs.events[0].message)
     assert bench.core.state.model is model
 
 

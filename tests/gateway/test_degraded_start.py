@@ -24,6 +24,7 @@ from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.kinematics.model import save_model
 from stereoservo.messages import files
+from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.wire import EventMessage
 from stereoservo.recording import flight_recorder
@@ -247,10 +248,11 @@ class Recorder:
             directories=directories,
             cameras=[],
             record="",
-            cell=SimpleNamespace(cell=SimpleNamespace(name="cell")),
+            cell=SimpleNamespace(cell=SimpleNamespace(name="cell"), recording=RecordingSection(ring_mib=0)),
         )
         monkeypatch.setattr(recordings, "request_path", lambda _: directory / "images.json")
         self.recordings = Recordings(plan, bench.log, bench.notes.tell)
+        self.recordings.request()
         self.start = RecordingStart(SETTINGS, fingerprint())
 
 
@@ -285,6 +287,7 @@ def test_a_recording_that_cannot_begin_is_told_and_given_up(
     assert bench.events[0].kind == "recording_failed"
     assert len(bench.notes.texts) == 1
     (tmp_path / "recordings").unlink()
+    recorder.recordings.request()
     recorder.recordings.take(recorder.start)
     assert recorder.recordings.running
     assert not recorder.recordings.refused

@@ -124,7 +124,7 @@ def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_pat
     )  # fmt: skip
     (tmp_path / "run").mkdir()
     log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
-    both = Recordings(plan, log)
+    both = Recordings(plan, log, lambda topic, text: None)
     assert both.wants_steps
     begin: Any = RecordingStart({"rate": 1}, fingerprint())  # type: ignore[arg-type]
 
@@ -140,7 +140,7 @@ def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_pat
     stream(11)
     assert both.running
     assert [event.kind for event in events] == ["recording"]
-    assert both.stop() == 10
+    assert both.stop().endswith(": 10 steps")
     assert both.wants_steps
     both.keep_ring(0)
     stream(21)
@@ -153,7 +153,7 @@ def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_pat
         == 3
     )
     plan.cell.recording = RecordingSection(ring_mib=0)
-    without = Recordings(plan, log)
+    without = Recordings(plan, log, lambda topic, text: None)
     assert not without.wants_steps
     without.keep_ring(0)
     without.close()

@@ -43,6 +43,27 @@ class ModelArrays:
     """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
 
 
+def _require_numbers(model: CellModel) -> None:
+    """Raises ValueError naming an array of ``model`` that has not its shape, or numbers that are not finite."""
+    joints, markers, scene = len(model.joint_names), len(model.marker_ids), len(model.scene_ids)
+    arrays = [
+        ("generators", model.generators, (joints, 4, 4)),
+        ("joint zeros", model.zero, (joints,)),
+        ("marker points", model.marker_points, (markers, 4)),
+        ("scene points", model.scene_points, (scene, 4)),
+        ("plane at infinity", model.plane_at_infinity, (4,)),
+        *((f"a matrix of camera {camera.name}", camera.matrix, (3, 4)) for camera in model.cameras),
+        *((f"a lens of camera {camera.name}", camera.lens, (4,)) for camera in model.cameras),
+    ]
+    if model.projective_to_euclidean is not None:
+        arrays.append(("Euclidean frame", model.projective_to_euclidean, (4, 4)))
+    for what, values, shape in arrays:
+        if values.shape != shape and (values.size or 0 not in shape):
+            raise ValueError(f"model has {what} of shape {values.shape}, {shape} is needed: calibrate again")
+        if not np.isfinite(values).all():
+            raise ValueError(f"model has {what} with numbers that are not finite: calibrate again")
+
+
 def require_fitting(model: CellModel, settings: CoreSettings) -> None:
     """Raises ValueError naming what of ``model`` does not fit the cell."""
     if model.joint_names != settings.joint_names:
@@ -57,6 +78,7 @@ def require_fitting(model: CellModel, settings: CoreSettings) -> None:
             f"model was learnt with cameras mounted {model.mount}; the cell's are {mounts}: calibrate again, or "
             "correct camera.mount in the cell file"
         )
+    _require_numbers(model)
     by_name = {camera.name: camera for camera in model.cameras}
     for camera in settings.cameras:
         known = by_name.get(camera.name)
@@ -79,7 +101,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
     centres = np.array([camera_centre(P) for P in matrices])
     scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
     scene_pixels, _ = project_points(matrices, scene)
-    arrays = ModelArrays(
+    return ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
         zero=np.ascontiguousarray(model.zero, dtype=np.float64),
@@ -98,18 +120,6 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
         groups=groups_of(model),
     )
-    for name in (
-        "generators",
-        "zero",
-        "matrices",
-        "lenses",
-        "marker_points",
-        "plane_at_infinity",
-        "camera_centres",
-    ):
-        if not np.isfinite(getattr(arrays, name)).all():
-            raise ValueError(f"model has {name.replace('_', ' ')} that are not finite: calibrate again")
-    return arrays
 
 
 def _metric_basis(model: CellModel) -> FloatArray | None:

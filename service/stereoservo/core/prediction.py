@@ -18,6 +18,7 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 
+from stereoservo.control.law import Scene
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.monitor_state import CameraMonitor, CameraTiming, ModelMonitor
 from stereoservo.core.settings import CoreSettings
@@ -381,6 +382,14 @@ def points_now(
         found, ok = triangulate(arrays.matrices, pixels, weights, 3)
         points = np.where(ok[:, None], with_unit_height(found, arrays.plane_at_infinity), points)
     return points
+
+
+def scene_of(
+    prediction: Prediction, pixels: FloatArray, arrays: ModelArrays, points: FloatArray, weights: FloatArray
+) -> Scene:
+    """The present as laws take it: operators, cameras, points (m, 4), pixels (c, m, 2) and their weights (c, m)."""
+    matrices, centres = arrays.matrices, arrays.camera_centres
+    return Scene(prediction.operators, composition_of(arrays), matrices, centres, points, pixels, weights)
 
 
 def composition_of(arrays: ModelArrays) -> int:

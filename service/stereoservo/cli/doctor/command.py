@@ -121,13 +121,13 @@ def _rates(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     )
 
 
-def _stereo(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
+def _camera_count(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     """Finding on the number of cameras: one alone tells nothing of depth, so that no model can be learnt."""
     count = len(plan.cell.camera)
     if count > 1:
-        return ExaminationFinding("stereo", True, f"{count} cameras")
+        return ExaminationFinding("camera count", True, f"{count} cameras")
     return ExaminationFinding(
-        "stereo",
+        "camera count",
         False,
         "the cell has 1 camera, two are needed: it can never be calibrated, and without a model only joint goals run",
         "another [[camera]] that sees the markers, mounted as the first one",
@@ -199,7 +199,7 @@ def _disk(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
 CHECKS: tuple[Callable[[RunPlan, CellDirectories], ExaminationFinding], ...] = (
     _daemon,
     _rates,
-    _stereo,
+    _camera_count,
     _wire,
     _model,
     _taught,

@@ -37,8 +37,8 @@ from stereoservo.core.goals.resolve import (
     used_cameras,
 )
 from stereoservo.core.model_arrays import with_unit_height
-from stereoservo.core.prediction import points_now
-from stereoservo.core.sources.law import options, run_ended, scene_of
+from stereoservo.core.prediction import points_now, scene_of
+from stereoservo.core.sources.law import options, run_ended
 from stereoservo.core.state import IncidenceGoal
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.kernels import project_points, triangulate
@@ -199,7 +199,8 @@ def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> 
     """Raises RefusalError for incidences that no motion of the arm brings nearer."""
     assert context.weights is not None
     assert context.pixels is not None
-    scene = scene_of(context, place.arrays, place.points, context.weights)
+    assert context.prediction is not None
+    scene = scene_of(context.prediction, context.pixels, place.arrays, place.points, context.weights)
     step = incidence_step(scene, _task(source), options(source, context, None))
     if step.share < MAKEABLE:
         _has_freedoms(source, scene, place)
@@ -242,7 +243,7 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     points = points_now(
         arrays, context.q, prediction, pixels, usable, context.state.correction, source.points
     )
-    scene = scene_of(context, arrays, points, usable)
+    scene = scene_of(prediction, pixels, arrays, points, usable)
     task, how = _task(source), options(source, context, source.error_px)
     second = _second(source, context, scene, how.gain)
     step = incidence_step(scene, task, how, second)

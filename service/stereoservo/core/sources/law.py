@@ -17,7 +17,7 @@ from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import centre_of, composition_of, points_now
+from stereoservo.core.prediction import centre_of, points_now, scene_of
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
 from stereoservo.kinematics.kernels import project_points, transform_points
@@ -119,15 +119,6 @@ def run_ended(
     return None
 
 
-def scene_of(context: StepContext, arrays: ModelArrays, points: FloatArray, weights: FloatArray) -> Scene:
-    """The present as laws take it: operators, cameras, points (m, 4), pixels and their weights (c, m)."""
-    prediction, pixels = context.prediction, context.pixels
-    assert prediction is not None
-    assert pixels is not None
-    matrices, centres = arrays.matrices, arrays.camera_centres
-    return Scene(prediction.operators, composition_of(arrays), matrices, centres, points, pixels, weights)
-
-
 def scene_and_task(
     source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray
 ) -> tuple[Scene, Task]:
@@ -138,7 +129,7 @@ def scene_and_task(
     points = points_now(
         arrays, context.q, prediction, pixels, weights, context.state.correction, source.points
     )
-    scene = scene_of(context, arrays, points, weights)
+    scene = scene_of(prediction, pixels, arrays, points, weights)
     task = Task(
         source.set_points,
         source.wanted,
