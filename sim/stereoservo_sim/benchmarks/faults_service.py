@@ -111,12 +111,13 @@ class ServiceFault:
     """What is done to the service, and what must come of it.
 
     ``process``, ``signal``: of the daemon's, or ``client``, or an act of the bench's own by ``act``. ``bound_ms``: to
-    rest; None where the arm goes on. ``after``: lifecycle a second later, or ``gone`` for a daemon that has ended.
+    rest; None where the arm goes on. ``after``: what `status` may tell a second later, the
+    lifecycle or the code of its error.
     """
 
     name: str
     bound_ms: float | None
-    after: str
+    after: tuple[str, ...]
     process: str = ""
     signal: signal.Signals = signal.SIGKILL
     act: Callable[[ServiceBench], int] | None = None
@@ -270,20 +271,23 @@ def _second_daemon(bench: ServiceBench) -> int:
     return t0_ns
 
 
+ACTIVE = ("active",)
+ENDED = ("not_running", "servo_silent")
+NO_GATEWAY = ("no_reply", "session")
 FAULTS = (
-    ServiceFault("stop slot raised", STOP_MS, "active", act=_raise_stop_slot),
-    ServiceFault("`stereoservo stop`", COMMAND_MS, "active", act=_stop_command),
-    ServiceFault("servo killed", DRIVES_MS, "gone", "servo"),
-    ServiceFault("servo hung", DRIVES_MS, "gone", "servo", signal.SIGSTOP),
-    ServiceFault("gateway killed", SILENCE_MS, "active", "gateway"),
-    ServiceFault("gateway hung", SILENCE_MS, "active", "gateway", signal.SIGSTOP),
-    ServiceFault("vision killed", None, "active", "vision-left"),
-    ServiceFault("vision hung", None, "active", "vision-left", signal.SIGSTOP),
-    ServiceFault("supervisor killed", DRIVES_MS, "gone", "supervisor"),
-    ServiceFault("supervisor hung", None, "active", "supervisor", signal.SIGSTOP),
-    ServiceFault("client killed while it jogs", LEASE_MS, "active", "client", jogs=True),
-    ServiceFault("client hung while it jogs", LEASE_MS, "active", "client", signal.SIGSTOP, jogs=True),
-    ServiceFault("second daemon started", None, "active", act=_second_daemon),
+    ServiceFault("stop slot raised", STOP_MS, ACTIVE, act=_raise_stop_slot),
+    ServiceFault("`stereoservo stop`", COMMAND_MS, ACTIVE, act=_stop_command),
+    ServiceFault("servo killed", DRIVES_MS, ENDED, "servo"),
+    ServiceFault("servo hung", DRIVES_MS, ("servo_silent",), "servo", signal.SIGSTOP),
+    ServiceFault("gateway killed", SILENCE_MS, NO_GATEWAY, "gateway"),
+    ServiceFault("gateway hung", SILENCE_MS, NO_GATEWAY, "gateway", signal.SIGSTOP),
+    ServiceFault("vision killed", None, ACTIVE, "vision-left"),
+    ServiceFault("vision hung", None, ACTIVE, "vision-left", signal.SIGSTOP),
+    ServiceFault("supervisor killed", DRIVES_MS, ENDED, "supervisor"),
+    ServiceFault("supervisor hung", None, ACTIVE, "supervisor", signal.SIGSTOP),
+    ServiceFault("client killed while it jogs", LEASE_MS, ACTIVE, "client", jogs=True),
+    ServiceFault("client hung while it jogs", LEASE_MS, ACTIVE, "client", signal.SIGSTOP, jogs=True),
+    ServiceFault("second daemon started", None, ACTIVE, act=_second_daemon),
 )
 
 
@@ -353,8 +357,8 @@ def _is_within(rest_ms: float | None, bound_ms: float | None) -> bool:
 
 
 def _status_is_right(trial: dict[str, Any], fault: ServiceFault) -> bool:
-    """Whether `status` a second later told the state, with an error where the servo process was silent."""
-    return bool(trial["after"] == fault.after and (trial["code"] == 0) == (fault.after != "gone"))
+    """Whether `status` a second later told what is so, with exit code 1 where that is an error."""
+    return trial["after"] in fault.after and trial["code"] == (0 if trial["after"] == "active" else 1)
 
 
 def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
@@ -393,10 +397,9 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
             jogger.wait()
         with suppress(ClientError):
             client.close()
-    gone = "error" in told or not told.get("servo_alive", True)
     return {
         "rest_ms": rest_ms,
-        "after": "gone" if gone else str(told["lifecycle"]),
+        "after": str(told["error"]["code"] if "error" in told else told["lifecycle"]),
         "code": code,
         "says": str(told["error"]["message"]) if "error" in told else _reasons(told),
         "terminal": -1 if goal is None else _terminal_events(bench, goal, fault),

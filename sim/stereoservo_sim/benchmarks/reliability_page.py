@@ -1,0 +1,95 @@
+"""Makes ``docs/reliability.md`` of what ``bench faults`` has measured:
+
+``stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.reliability_page > docs/reliability.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+PAGE = """# Reliability: what happens when something fails
+
+Made by `stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.reliability_page`; nothing on this page
+is written by hand. What the service does against each of these, and why: [safety.md](safety.md).
+
+Times are from the fault to the last motion of any axis, by the emulated arm's true joints, in milliseconds: median /
+max. They hold the ramp to rest. Machine: {machine}. Trials of the service in real time: {service} each; of the drives:
+{drives} each.
+
+## The service
+
+A daemon with emulated drives moves to a joint goal, or is jogged, when the fault comes. *A second later*: what
+`stereoservo status` told then, the cell's state or the code of its error. *Ends*: terminal events of the goal, by this
+daemon or the next; one is right. *Void*: trials in which the machine stalled; they count for nothing.
+
+{service_table}
+
+## The drives
+
+The driver and emulated drives on a CAN bus, in the emulator's bit time: what they do of themselves.
+
+{drive_table}
+"""
+SERVICE_COLUMNS = (
+    "fault", "at rest", "bound", "within", "a second later", "status right", "ends", "what `status` says", "void",
+)  # fmt: skip
+DRIVE_COLUMNS = ("protocol", "fault", "noticed", "at rest", "bound", "by", "latched", "within")
+
+
+def reliability_page(figures: dict[str, Any]) -> str:
+    """The page of the figures that ``bench faults --json`` has printed."""
+    machine = figures["machine"]
+    return PAGE.format(
+        machine=f"{machine['processor']}, {machine['cores']} cores",
+        service=max(row["trials"] for row in figures["service"]),
+        drives=max(row["trials"] for row in figures["rows"]),
+        service_table=_table(SERVICE_COLUMNS, [_service_cells(row) for row in figures["service"]]),
+        drive_table=_table(DRIVE_COLUMNS, [_drive_cells(row) for row in figures["rows"]]),
+    )
+
+
+def _service_cells(row: dict[str, Any]) -> list[str]:
+    rest = row["rest_ms"]
+    ends = ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"])
+    return [
+        row["fault"],
+        "goes on" if rest is None else _pair(rest["median"], rest["max"]),
+        "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
+        f"{row['within']} of {row['trials']}",
+        ", ".join(row["after"]),
+        f"{row['status_right']} of {row['trials']}",
+        ends,
+        "<br>".join(row["status_says"]),
+        str(len(row["void"])),
+    ]
+
+
+def _drive_cells(row: dict[str, Any]) -> list[str]:
+    return [
+        row["protocol"],
+        row["fault"],
+        _pair(row["detected_ms_median"], row["detected_ms_max"]),
+        _pair(row["rest_ms_median"], row["rest_ms_max"]),
+        "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
+        row["by"],
+        ", ".join(row["codes"]) or "-",
+        "yes" if row["ok"] else "NO",
+    ]
+
+
+def _pair(median: float | None, largest: float | None) -> str:
+    return "-" if median is None or largest is None else f"{median:.0f} / {largest:.0f}"
+
+
+def _table(columns: tuple[str, ...], rows: list[list[str]]) -> str:
+    return "\n".join(_line(cells) for cells in (list(columns), ["---"] * len(columns), *rows))
+
+
+def _line(cells: list[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+
+
+if __name__ == "__main__":
+    print(reliability_page(json.load(sys.stdin)), end="")
