@@ -88,13 +88,14 @@ def test_a_gateway_that_dies_and_finds_its_files_damaged_goes_on(
         client.enable()
         client.teach("here", frames=2)
         boot = client.status().boot
-    handled = directories.runtime / "handled"
+    handled = directories.runtime / "handled.slot"
     assert handled.exists()
     plan = directories.runtime / "plan.msgpack"
     slot = directories.observation_slot("left")
     gateway = processes(directories)["gateway"]
     os.kill(gateway, signal.SIGSTOP)
-    handled.write_bytes(b"")
+    with handled.open("r+b") as file:
+        file.write(b"\xff" * handled.stat().st_size)
     plan.write_bytes(b"\xff" * 10)
     with slot.open("r+b") as file:
         file.write(b"\xff" * 24)
@@ -110,7 +111,7 @@ def test_a_gateway_that_dies_and_finds_its_files_damaged_goes_on(
 
     eventually("the gateway is back", back, 60.0)
     with Client(CELL) as client:
-        assert any("handled.damaged-1" in note for note in client.status().notes)
+        assert any("handled.slot: was damaged and begins anew" in note for note in client.status().notes)
         told = [event.message for event in client.events().events if event.kind == "warning"]
         assert any("run plan was damaged" in text for text in told)
         assert any("observation-left.slot" in text for text in told)

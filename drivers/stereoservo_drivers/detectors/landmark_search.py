@@ -195,9 +195,9 @@ class Keypoints:
 
 def find_keypoints(picture: ImageArray, most: int, tilts: int = 0) -> Keypoints:
     """SIFT keypoints of an image (h, w), of up to ``most`` a view; ``tilts``: also of simulated oblique views."""
-    finder: Any = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST)
+    finder: Any = cv2.SIFT.create(nfeatures=most, contrastThreshold=CONTRAST)
     if tilts:
-        finder = cv2.AffineFeature_create(finder, tilts)
+        finder = cv2.AffineFeature.create(finder, tilts)
     points, descriptors = finder.detectAndCompute(picture, None)
     if descriptors is None or not len(points):
         return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))

@@ -47,7 +47,7 @@ def run_calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict
         progress("fits", min(k + 1, count), count)
 
     wall, cpu = timed(fit, count)
-    result = {
+    result: dict[str, Any] = {
         "problem": {
             "joints": len(cell.kinds),
             "stops_per_joint": STOPS,

@@ -29,6 +29,7 @@ from stereoservo.client import Client, ClientError, GoalHandle, SessionError
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import DaemonError, DaemonProcess
+from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
@@ -367,6 +368,11 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
     goal: GoalHandle | None = None
     jogger: subprocess.Popen[bytes] | None = None
     client = Client(CELL)
+    told_live: list[EventMessage] = []
+    client.session.declare_subscriber(
+        client.keys.event,
+        lambda sample: told_live.append(decode(sample.payload.to_bytes(), EventMessage)),
+    )
     try:
         if fault.jogs:
             jogger = subprocess.Popen([sys.executable, "-c", JOGS, CELL])
@@ -402,7 +408,7 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
         "after": str(told["error"]["code"] if "error" in told else told["lifecycle"]),
         "code": code,
         "says": str(told["error"]["message"]) if "error" in told else _reasons(told),
-        "terminal": -1 if goal is None else _terminal_events(bench, goal, fault),
+        "terminal": -1 if goal is None else _terminal_events(bench, goal, fault, told_live),
     }
 
 
@@ -410,15 +416,18 @@ def _reasons(status: dict[str, Any]) -> str:
     return "; ".join(reason["hint"] for reason in status["reasons"]) or "nothing is wrong"
 
 
-def _terminal_events(bench: ServiceBench, goal: GoalHandle, fault: ServiceFault) -> int:
-    """How many terminal events of a goal are told in the end, by this daemon or the next."""
+def _terminal_events(
+    bench: ServiceBench, goal: GoalHandle, fault: ServiceFault, told_live: list[EventMessage]
+) -> int:
+    """How many terminal events of a goal are told in the end: to who listened, by this daemon or the next."""
     bench.ready()
     with Client(CELL) as client:
         if fault.bound_ms is None:
             with suppress(ClientError):
                 client.cancel(goal.id)
         time.sleep(0.3)
-        return sum(event.kind in TERMINAL and event.id == goal.id for event in client.events(0).events)
+        told = [*told_live, *client.events(0).events]
+    return len({(event.boot, event.seq) for event in told if event.kind in TERMINAL and event.id == goal.id})
 
 
 def _await_motion(history: TrueJointHistory) -> None:

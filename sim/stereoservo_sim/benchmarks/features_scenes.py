@@ -93,7 +93,8 @@ def random_picture(conditions: Conditions, rng: np.random.Generator) -> tuple[Im
     for f, face in enumerate(DEFAULT_BODY):
         at = np.array([180.0 + 280.0 * f, 240.0]) + rng.uniform(-1.0, 1.0, 2) * (20.0, 60.0)
         tilt = np.radians(rng.uniform(0.0, conditions.tilt))
-        H = look(tilt, *rng.uniform(0.0, 2.0 * np.pi, 2), z, at)
+        azimuth, roll = rng.uniform(0.0, 2.0 * np.pi, 2)
+        H = look(tilt, azimuth, roll, z, at)
         half = face.half_side
         corners = project(H, np.array([[-half, -half], [half, -half], [half, half], [-half, half]]))
         blend_polygon(image, corners, BLACK - 10.0)

@@ -62,7 +62,7 @@ def _signature() -> inspect.Signature:
     for name, option in options.items():
         owner = takers[name][0] if len(takers[name]) == 1 else "Simulated experiments"
         told = typer.Option(option.flag, min=option.least, help=f"{owner}: {option.help}.")
-        parameters.append(_parameter(name, Annotated[option.kind | None, told], None))  # type: ignore[valid-type]
+        parameters.append(_parameter(name, Annotated[option.kind | None, told], None))
     parameters += [_parameter(name, kind, default) for name, (default, kind) in COMMON.items()]
     return inspect.Signature(parameters, return_annotation=None)
 

@@ -141,7 +141,7 @@ class Experiment:
         for module in filter(None, (self.module, self.figures)):
             found = getattr(import_module(f"stereoservo_sim.experiments.{module}"), function, None)
             if found is not None:
-                return found  # type: ignore[no-any-return]
+                return found
         return None
 
     def _function(self, function: str) -> Callable[..., Any]:

@@ -261,6 +261,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         scene_points=np.zeros((0, 4)),
         scene_pixels=np.zeros((len(knowledge.matrices), 0, 2)),
         rows={i: i for i in range(m)},
+        groups=None,
     )
 
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.incidence import SecondTask, image_task, incidence_step, incidence_task
+from stereoservo.control.incidence import image_task, incidence_step, incidence_task
+from stereoservo.control.incidence_kernel import SecondTask
 from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.model_arrays import with_unit_height

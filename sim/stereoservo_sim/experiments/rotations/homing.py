@@ -95,10 +95,11 @@ def homings(
         changes = [
             sensitivity(
                 problem,
-                *(homing_problem(other, home, at_home, image, SIGMA) for other in pair),
+                homing_problem(above, home, at_home, image, SIGMA),
+                homing_problem(below, home, at_home, image, SIGMA),
                 found.current.q,
             )
-            for pair in others
+            for above, below in others
         ]
         levers.append(np.array(changes).reshape(-1, 2).T)
     lever = np.concatenate(levers)
