@@ -67,6 +67,7 @@ def joint_corruptions(draw: st.DrawFn) -> Any:
                 return replaced(sample, positions=np.array([["?"]]))
         return None
 
+    corrupt.__name__ = f"{kind} {j} {odd} {late} {size} {jump}"
     return corrupt
 
 
@@ -112,6 +113,7 @@ def frame_corruptions(draw: st.DrawFn) -> Any:
                 return [replaced(frame, ids=frame.ids[::-1] - 2**40)]
         return []
 
+    corrupt.__name__ = f"{kind} {number} {odd} {late}"
     return corrupt
 
 
@@ -124,6 +126,7 @@ class CorruptedCell(RuleBasedStateMachine):
     @initialize(seed=st.integers(0, 2**16))
     def start(self, seed: int) -> None:
         self.bench = make_bench(seed)
+        self.bench.now_ns = 3_600_000_000_000  # a computer that has run for an hour: its clock is never negative
         self.core = self.bench.core
         self.bench.core = self  # type: ignore[assignment]
         self.corrupt_joints = self.corrupt_frames = None
