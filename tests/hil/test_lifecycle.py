@@ -242,6 +242,20 @@ def test_a_process_that_hangs_is_replaced(name: str, own: Client, directories: C
     eventually("it is told", told, 60.0)
 
 
+def test_a_supervisor_that_hangs_is_told_until_it_goes_on(own: Client, live: DaemonProcess) -> None:
+    def told() -> bool:
+        return any("the supervisor has given no sign of life" in note for note in own.status().notes)
+
+    assert not told()
+    os.kill(live.process.pid, signal.SIGSTOP)
+    try:
+        eventually("it is told", told, 30.0)
+        assert own.stop().accepted
+    finally:
+        os.kill(live.process.pid, signal.SIGCONT)
+    eventually("it is over", lambda: not told(), 30.0)
+
+
 def test_a_killed_supervisor_leaves_no_orphan(live: DaemonProcess, directories: CellDirectories) -> None:
     live.process.kill()
     live.process.wait()

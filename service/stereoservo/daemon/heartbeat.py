@@ -28,6 +28,8 @@ DRIVER_CALL_S = 15.0
 """Drives that are connected, configured and enabled anew: the gateway waits 10 s for it."""
 GATEWAY_HANG_S = 5.0
 """The arm is held after 0.5 s of its silence, so nothing hurries; its files are on disks that may be slow."""
+SUPERVISOR_HANG_S = 0.8
+"""Nobody ends a supervisor that hangs, for the arm would stop without need: the gateway tells it."""
 REQUEST_S = 60.0
 """A client's request may have kernels compiled, where no warm-up did."""
 VISION_HANG_S = 3.0

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,13 @@ from typing import NoReturn
 import msgspec
 
 from stereoservo.daemon.cell_preparation import PlanOptions
-from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT, HangWatch
+from stereoservo.daemon.heartbeat import (
+    HEARTBEAT_BYTES,
+    HEARTBEAT_LAYOUT,
+    SUPERVISOR_HANG_S,
+    HangWatch,
+    HeartbeatWriter,
+)
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -121,9 +128,11 @@ class Supervisor:
             if not termination.asked:
                 record_run(partial(run_is_up, self.plan.directories))
                 on_ready()
-            while not termination.asked:
-                self.look(time.monotonic())
-                time.sleep(WATCH_EVERY_S)
+            with closing(HeartbeatWriter(self.plan.directories.heartbeat_slot("supervisor"))) as heartbeat:
+                while not termination.asked:
+                    heartbeat.beat(SUPERVISOR_HANG_S)
+                    self.look(time.monotonic())
+                    time.sleep(WATCH_EVERY_S)
         except ServoDiedError as error:
             # Before the gateway ends, which tells it.
             record_run(partial(end_run, self.plan.directories, error.cause, AFTER_SERVO))
@@ -264,7 +273,7 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
     """Path, capacity and layout of all slots of a cell."""
     directories = plan.directories
     found = [(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)]
-    for name in ("servo", "gateway", *(f"vision-{camera.name}" for camera in plan.cameras)):
+    for name in ("servo", "gateway", "supervisor", *(f"vision-{camera.name}" for camera in plan.cameras)):
         found.append((directories.heartbeat_slot(name), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT))
     for camera in plan.cameras:
         found.append((directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT))

@@ -23,7 +23,13 @@ from zenoh.handlers import RingChannel
 from stereoservo.client.session import SessionError, close_session, open_session
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
-from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, REQUEST_S, HeartbeatWriter
+from stereoservo.daemon.heartbeat import (
+    GATEWAY_HANG_S,
+    REQUEST_S,
+    SUPERVISOR_HANG_S,
+    HeartbeatReader,
+    HeartbeatWriter,
+)
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PlanError,
@@ -89,6 +95,11 @@ ANNOUNCE_AGAIN_S = 1.0
 EXIT_SETUP = 3
 ONCE = frozenset({"taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted", "fault"})
 """Events of the core whose effects must not come twice."""
+SUPERVISOR_SILENT = (
+    f"the supervisor has given no sign of life for {SUPERVISOR_HANG_S:g} s: it hangs or was stopped (Ctrl-Z, SIGSTOP). "
+    "The arm and every stop work as before, but a process that hangs is not killed and one that ends is not started "
+    "again: let it go on (`kill -CONT` its process), or stop the arm, end the daemon and run the cell again"
+)
 GATEWAY_VERBS = ("record", "synthesise")
 """Commands that the gateway carries out itself."""
 
@@ -155,6 +166,7 @@ class Gateway:
         self._greeted = False
         self._announce_due_s: float | None = 0.0
         self._heartbeat = HeartbeatWriter(directories.heartbeat_slot("gateway"))
+        self._supervisor = HeartbeatReader(directories.heartbeat_slot("supervisor"))
         self.goals.end_earlier(self.log)
         run = read_run(directories)
         if run is not None and run.boot == plan.boot and run.previous:
@@ -387,6 +399,8 @@ class Gateway:
         self._notes.tell("journal", self._journal.note)
         self._notes.tell("servo process", self._servo.note)
         self._notes.tell("reports", self._report_boundary.note)
+        beat = self._supervisor.newest()
+        self._notes.tell("supervisor", SUPERVISOR_SILENT if beat is not None and beat.silent_s(0.0) else "")
         for k, (_, boundary) in enumerate(self._observations):
             self._notes.tell(f"observations {k}", boundary.note)
 
@@ -471,6 +485,7 @@ class Gateway:
         self._journal.close()
         self._handled.close()
         self._heartbeat.close()
+        self._supervisor.close()
 
     @property
     def owed(self) -> bool:
