@@ -126,7 +126,9 @@ class CorruptedCell(RuleBasedStateMachine):
     @initialize(seed=st.integers(0, 2**16))
     def start(self, seed: int) -> None:
         self.bench = make_bench(seed)
-        self.bench.now_ns = 3_600_000_000_000  # a computer that has run for an hour: its clock is never negative
+        self.bench.now_ns = (
+            3_600_000_000_000  # a computer that has run for an hour: its clock is never negative
+        )
         self.core = self.bench.core
         self.bench.core = self  # type: ignore[assignment]
         self.corrupt_joints = self.corrupt_frames = None
