@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from stereoservo.client import Client, ClientError, SessionError
+from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.discovery import DaemonError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_sim.benchmarks import service_bench
@@ -182,13 +182,16 @@ FAULTS = (
                  may_go_on=True),
     ServiceFault("200 silent TCP sockets", None, ACTIVE, act=service_bench.idle_sockets),
     ServiceFault(
-        "`stereoservo stop` meanwhile", COMMAND_MS, ACTIVE,
+        "`stereoservo stop`, 200 silent TCP sockets", COMMAND_MS, ACTIVE,
         act=during(service_bench.idle_sockets, service_bench.stop_command),
     ),
-    ServiceFault("stop by an open TCP session meanwhile", SESSION_MS, ACTIVE, act=service_bench.stop_by_open_session),
+    ServiceFault(
+        "stop by an open TCP session, 200 silent sockets", SESSION_MS, ACTIVE,
+        act=service_bench.stop_by_open_session,
+    ),
     ServiceFault("20 000 refused messages", None, ACTIVE, act=service_bench.refused_puts),
     ServiceFault(
-        "`stereoservo stop` during 20 000 refused messages", COMMAND_MS, ACTIVE,
+        "`stereoservo stop`, 20 000 refused messages", COMMAND_MS, ACTIVE,
         act=during(service_bench.refused_puts, service_bench.stop_command),
     ),
 )  # fmt: skip
@@ -349,16 +352,20 @@ def _afterwards(
     notes of the daemon that is ready again.
     """
     bench.ready()
-    with Client(CELL) as client:
+
+    def cancel(client: Client) -> None:
         for goal in bench.goals:
-            if fault.bound_ms is None or fault.may_go_on:
-                with suppress(ClientError):
-                    client.cancel(goal)
-        time.sleep(0.3)
-        told = [event for event in (*told_live, *client.events(0).events) if event.kind in TERMINAL]
-        ends = [{(event.boot, event.seq) for event in told if event.id == goal} for goal in bench.goals]
-        notes = tuple(note.replace(f"{bench.folder}/", "") for note in client.status().notes)
-        return tuple(map(len, ends)), notes
+            with suppress(RefusedError):
+                client.cancel(goal)
+
+    if fault.bound_ms is None or fault.may_go_on:
+        bench.asked(cancel)
+    time.sleep(0.3)
+    events = bench.asked(lambda client: client.events(0).events)
+    told = [event for event in (*told_live, *events) if event.kind in TERMINAL]
+    ends = [{(event.boot, event.seq) for event in told if event.id == goal} for goal in bench.goals]
+    notes = bench.asked(lambda client: client.status().notes)
+    return tuple(map(len, ends)), tuple(note.replace(f"{bench.folder}/", "") for note in notes)
 
 
 def _await_motion(history: TrueJointHistory) -> None:

@@ -20,7 +20,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import msgspec
 
@@ -28,7 +28,7 @@ from stereoservo.client import Client, ClientError, SessionError
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.kinematics.model import encode_model
 from stereoservo.messages.directories import CellDirectories, cell_directories
-from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.messages.discovery import DaemonError, DaemonProcess
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
@@ -37,11 +37,14 @@ from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
 from stereoservo_sim.world.simulated_cell import demo_cell
 
+T = TypeVar("T")
 CELL = "hil-can"
 SPEED_SCALE = 0.1
 END = 0.85
 """[rad] Of the first joint to either side, at a tenth of its speed: the arm moves for longer than any trial lasts."""
 READY_S = 60.0
+START_TRIES = 3
+"""Of a daemon that a loaded machine does not bring up in time."""
 WATCH = {"heartbeat_timeout_ms": "100", "rpdo_deadline_ms": "0"}
 """The drives' own watch of their master as by default, 100 ms; the shipped cell is more patient."""
 CAMERAS = '[[camera]]\nname = "{}"\ndriver = "fake"\nmount = "eye_to_hand"\n\n'
@@ -158,10 +161,16 @@ class ServiceBench:
         self.emulator.stop()
 
     def start(self) -> None:
-        """Start a daemon; the one before must have ended."""
-        self.starts += 1
-        self.daemon = DaemonProcess(self.cell, log=self.folder / f"daemon-{self.starts}.log")
-        self.daemon.wait_ready()
+        """Start a daemon; the one before must have ended. Raises DaemonError."""
+        for tries_left in reversed(range(START_TRIES)):
+            self.starts += 1
+            self.daemon = DaemonProcess(self.cell, log=self.folder / f"daemon-{self.starts}.log")
+            try:
+                self.daemon.wait_ready()
+                return
+            except DaemonError as error:
+                if not tries_left or "not ready within" not in error.output:
+                    raise
 
     def end_daemon(self) -> None:
         """End the daemon, whatever became of its processes."""
@@ -182,24 +191,19 @@ class ServiceBench:
         if self.daemon.process.poll() is not None:
             self.end_daemon()
             self.start()
+        self.asked(_operated)
+
+    def asked(self, ask: Callable[[Client], T]) -> T:
+        """The answer of a daemon whose gateway may be being started again. Raises ClientError, SessionError."""
         until = time.monotonic() + READY_S
         while True:
             try:
-                return self._operated()
-            except (ClientError, SessionError):  # a gateway that is being started again
+                with Client(CELL) as client:
+                    return ask(client)
+            except (ClientError, SessionError):
                 if time.monotonic() > until:
                     raise
                 time.sleep(0.1)
-
-    def _operated(self) -> None:
-        """What an operator does to go on: reset, enable, resume, where it is needed."""
-        with Client(CELL) as client:
-            if client.status().lifecycle == "fault":
-                client.reset()
-            if client.status().lifecycle != "active":
-                client.enable()
-            if {reason.code for reason in client.status().reasons} & {"STOPPED", "HELD"}:
-                client.resume()
 
     def forget_state(self) -> None:
         """End the daemon, and remove the models and taught goals that a trial left."""
@@ -239,6 +243,16 @@ def send(pid: int, how: signal.Signals) -> None:
     """Send a signal to a process, if it lives."""
     with suppress(ProcessLookupError):
         os.kill(pid, how)
+
+
+def _operated(client: Client) -> None:
+    """What an operator does to go on: reset, enable, resume, where it is needed."""
+    if client.status().lifecycle == "fault":
+        client.reset()
+    if client.status().lifecycle != "active":
+        client.enable()
+    if {reason.code for reason in client.status().reasons} & {"STOPPED", "HELD"}:
+        client.resume()
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
