@@ -386,7 +386,7 @@ def _rest_ms(history: TrueJointHistory, start: int, t0_ns: int) -> float | None:
     last_ns = newest_ns = t0_ns
     for index in range(start, history.count):
         sample = history.sample(index)
-        if sample is None or sample[0] > end_ns:
+        if sample is None or not t0_ns <= sample[0] <= end_ns:
             continue
         newest_ns = sample[0]
         if np.abs(sample[2]).max() > MOVING:
