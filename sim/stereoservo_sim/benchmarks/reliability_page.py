@@ -22,7 +22,8 @@ max. They hold the ramp to rest. Machine: {machine}. Trials of the service in re
 
 A daemon with emulated drives moves to a joint goal, or is jogged, when the fault comes. *A second later*: what
 `stereoservo status` told then, the cell's state or the code of its error. *Ends*: terminal events of the goal, by this
-daemon or the next; one is right. *Void*: trials in which the machine stalled; they count for nothing.
+daemon or the next; one is right. *Later*: notes once the daemon is ready again. *Void*: trials in which the machine
+stalled; they count for nothing.
 
 {service_table}
 
@@ -68,10 +69,11 @@ def reliability_page(figures: dict[str, Any]) -> str:
 
 def _service_cells(row: dict[str, Any]) -> list[str]:
     rest = row["rest_ms"]
+    on = "goes on" if row["trials"] else "no trial"
     ends = ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"])
     return [
         row["fault"],
-        "goes on" if rest is None else _pair(rest["median"], rest["max"]),
+        on if rest is None else _pair(rest["median"], rest["max"]),
         "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
         f"{row['within']} of {row['trials']}",
         ", ".join(row["after"]),

@@ -111,6 +111,13 @@ def test_the_page_has_a_row_for_each_fault_of_the_service():
     ]
 
 
+def test_the_page_has_a_row_for_each_fault_of_the_inputs():
+    text = Path(__file__).parents[3].joinpath("docs/reliability.md").read_text(encoding="utf-8")
+    rows = [tuple(line.removeprefix("| ").split(" | ")[:3]) for line in text.splitlines()]
+    faults_of_inputs = [(fault.input, fault.name, fault.goal) for fault in faults_inputs.FAULTS]
+    assert [row for row in rows if row in faults_of_inputs] == faults_of_inputs
+
+
 def test_a_problem_is_printed_and_the_table_not_ok(one_case, monkeypatch):
     impossible = FaultCase(name="too strict", orders=("fault 3 0x20",), codes=("drive_fault",), bound_ms=1.0)
     monkeypatch.setattr(faults, "CASES", {"odrive": (impossible,)})
