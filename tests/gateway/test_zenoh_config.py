@@ -1,7 +1,11 @@
 """zenoh configurations: what listens where, and what is refused."""
 
+import contextlib
 import json
 import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ from stereoservo.client.session import (
 )
 from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, split_listeners, stop_config
 from stereoservo.messages.cell_file import CellFile, CellFileError, check_cell
+from stereoservo_sim.benchmarks.service_bench import CONNECTS
 
 
 def cell(**section: Any) -> CellFile:
@@ -184,6 +189,38 @@ def test_a_peer_that_takes_all_sessions_of_the_network_locks_out_nobody_on_this_
         answers.undeclare()
         for session in reversed(sessions):
             close_session(session, [])
+
+
+ROUTERS = """
+import json, sys
+from stereoservo.client.session import open_session
+from stereoservo.gateway.zenoh_config import prepare_runtime
+prepare_runtime()
+sessions = [open_session(config) for config in json.loads(sys.argv[1])]
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.process
+def test_connects_of_strangers_lock_out_nobody_on_this_host(tmp_path: Path) -> None:
+    """200 TCP sockets that say nothing, and are opened again as soon as the router gives them up."""
+    port = unused_port()
+    both = split_listeners(
+        gateway_config(cell(endpoints=[f"tcp/127.0.0.1:{port}"]), Path("/"), tmp_path / "z")
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with contextlib.ExitStack() as ended:
+        for program, *arguments in ((ROUTERS, json.dumps(both)), (CONNECTS, str(port), "200")):
+            child = ended.enter_context(
+                subprocess.Popen([sys.executable, "-c", program, *arguments], **pipes)
+            )
+            ended.callback(child.kill)
+            assert child.stdout.readline()
+        time.sleep(0.4)
+        for _ in range(5):
+            close_session(open_session(client_config(f"unixsock-stream/{tmp_path}/z")), [])
+            time.sleep(0.2)
 
 
 def test_tls_paths_are_relative_to_the_cell_file_on_either_side() -> None:

@@ -15,7 +15,7 @@ from stereoservo.cli import main as cli
 from stereoservo.client import Client
 from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import DaemonProcess
-from stereoservo_sim.benchmarks.faults_service import processes_of
+from stereoservo_sim.benchmarks.service_bench import processes_of
 
 CELL = "hil"
 QUICK_CALIBRATION = """

@@ -63,7 +63,13 @@ from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.stop_thread import StopThread
 from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.gateway.validation import GoalContext
-from stereoservo.gateway.zenoh_config import endpoint_of, gateway_config, split_listeners, stop_config
+from stereoservo.gateway.zenoh_config import (
+    endpoint_of,
+    gateway_config,
+    prepare_runtime,
+    split_listeners,
+    stop_config,
+)
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import DirectoryError
@@ -518,6 +524,7 @@ def main() -> int:
     runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
     die_with_parent(parent, signal.SIGTERM)
     termination = Termination(grace_s=8.0)
+    prepare_runtime()
     try:
         run(load_plan(runtime), parent, termination)
     except (DirectoryError, OSError, PlanError, SessionError, SlotError) as error:

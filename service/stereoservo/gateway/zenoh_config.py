@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,16 @@ _NETWORK_ENDPOINT = re.compile(
 )
 
 RECONNECT = {"period_init_ms": 100, "period_max_ms": 500}
+
+RUNTIME = "(net: (worker_threads: 4))"
+"""zenoh's threads for what is being connected, one unless given: strangers who connect by TCP again and again hold it,
+and no client of this host gets in meanwhile.
+"""
+
+
+def prepare_runtime() -> None:
+    """Give this process's zenoh its threads, before the first session; what the environment says stays."""
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
 
 
 def endpoint_of(cell: CellFile, socket: Path) -> str:

@@ -1,5 +1,5 @@
-"""``bench faults``: injects every fault of the CAN arm and of the service, and measures the time to detection and to
-rest.
+"""``bench faults``: injects every fault of the CAN arm, of the service and of its inputs, and measures the time to
+detection and to rest.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
+from stereoservo_sim.benchmarks.faults_inputs import run_inputs
 from stereoservo_sim.benchmarks.faults_service import run_service
 from stereoservo_sim.benchmarks.faults_wall import run_wall
 from stereoservo_sim.emulators.bus.fault_cases import CASES
@@ -31,7 +32,8 @@ WALL_SHARE = 3
 
 def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``rows``: of the drives in the emulator's bit time, ``repetitions`` trials a fault, alike for one seed. ``wall``:
-    of the drives in real time. ``service``: of the whole daemon in real time.
+    of the drives in real time. ``service``: of the whole daemon in real time. ``inputs``: of joint samples, camera
+    frames and the clock in virtual time, ``repetitions`` trials a fault, alike for one seed.
 
     Raises ExperimentError where a trial cannot begin, or the emulated drives or a daemon end.
     """
@@ -46,6 +48,7 @@ def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
     wall = run_wall(
         max(repetitions // WALL_SHARE, 1), lambda done, total: progress("faults in real time", done, total)
     )
+    inputs = run_inputs(repetitions, seed, _tell_input)
     service = run_service(max(repetitions // WALL_SHARE, 1), _tell_row)
     return {
         "axes": AXES,
@@ -55,6 +58,7 @@ def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
         "rows": [msgspec.to_builtins(row) for row in rows],
         "wall": wall,
         "service": service,
+        "inputs": inputs,
     }
 
 
@@ -67,14 +71,24 @@ def _tell_row(row: dict[str, Any]) -> None:
     )
 
 
+def _tell_input(row: dict[str, Any]) -> None:
+    """One row of the inputs as it comes, on stderr."""
+    print(
+        f"{row['input']}, {row['fault']}, goal by {row['goal']}: rest {_summary(row['rest_ms'])} ms of "
+        f"{row['bound_ms']}, within {row['within']} of {row['trials']}, works again {row['works_again']}",
+        file=sys.stderr,
+    )
+
+
 def show_faults(figures: dict[str, Any], console: Console) -> None:
-    """The two tables."""
+    """The tables."""
     console.print(_bit_time_table(figures))
     for row in figures["rows"]:
         for problem in row["problems"]:
             console.print(f"{row['protocol']}, {row['fault']}: {problem}")
     console.print(_wall_table(figures["wall"]))
     console.print(_service_table(figures["service"]))
+    console.print(_input_table(figures["inputs"]))
     loop = figures["wall"]["emulator_loop"]
     if loop is not None:
         console.print(
@@ -170,6 +184,40 @@ def _service_table(rows: list[dict[str, Any]]) -> Table:
             " | ".join(row["status_says"]),
             ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"]),
             str(len(row["void"])),
+        )
+    return table
+
+
+def _input_table(rows: list[dict[str, Any]]) -> Table:
+    title = "inputs of the core in virtual time, fake arm and cameras in lockstep; [ms], median / max"
+    table = Table(title=title, title_justify="left")
+    for name in (
+        "input",
+        "fault",
+        "goal by",
+        "at rest",
+        "bound",
+        "within",
+        "after",
+        "told",
+        "goal",
+        "ends",
+        "works again",
+    ):
+        table.add_column(name)
+    for row in rows:
+        table.add_row(
+            row["input"],
+            row["fault"],
+            row["goal"],
+            _summary(row["rest_ms"]) if row["rest_ms"] else "goes on",
+            "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
+            f"{row['within']} of {row['trials']}",
+            ", ".join(row["after"]),
+            ", ".join(row["reasons"]) or "-",
+            ", ".join(row["outcomes"]),
+            ", ".join(str(count) for count in row["terminal_events"]),
+            f"{row['works_again']} of {row['trials']}",
         )
     return table
 

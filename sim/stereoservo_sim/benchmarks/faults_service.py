@@ -1,5 +1,6 @@
-"""Fault trials of the whole service in real time: a daemon with emulated drives, of which any process is killed or hung
-while the arm moves to a goal, and what a person at the cell sees of it.
+"""Fault trials of the whole service in real time: a daemon with emulated drives, of which any process is killed or
+hung, whose files are damaged, whose clients die or are hostile while the arm moves to a goal, and what a person at the
+cell sees of it.
 
 The time to rest is by the emulator's true joints. Machines are shared and stall: a trial in which the arm did not move
 when the fault came, or the machine stalled, is void, counted, and tried again.
@@ -7,9 +8,7 @@ when the fault came, or the machine stalled, is void, counted, and tried again.
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -18,37 +17,44 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from stereoservo.client import Client, ClientError, GoalHandle, SessionError
-from stereoservo.daemon.seqlock import StopSlot
-from stereoservo.messages.directories import CellDirectories, cell_directories
-from stereoservo.messages.discovery import DaemonError, DaemonProcess
+from stereoservo.client import Client, ClientError, RefusedError, SessionError
+from stereoservo.messages.discovery import DaemonError
 from stereoservo.messages.wire import EventMessage, decode
+from stereoservo_sim.benchmarks import service_bench
+from stereoservo_sim.benchmarks.service_bench import (
+    CELL,
+    END,
+    SPEED_SCALE,
+    ServiceBench,
+    VoidTrialError,
+    during,
+    send,
+)
 from stereoservo_sim.benchmarks.timing import summary
-from stereoservo_sim.cells import shipped_cell_path
-from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
-from stereoservo_sim.emulators.emulator_process import EmulatorProcess
 from stereoservo_sim.experiments.experiment import ExperimentError
-from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
+from stereoservo_sim.world.history import TrueJointHistory
 
-CELL = "hil-can"
-SPEED_SCALE = 0.1
-END = 0.85
-"""[rad] Of the first joint to either side, at a tenth of its speed: the arm moves for longer than any trial lasts."""
+SLOW = 0.04
+"""Share of its speed at which the arm moves for longer than a daemon takes to start."""
 RAMP_MS = 60.0
 """From that speed to rest, by the loop's ramp or the drives' own."""
 DRIVES_MS = 120.0
 """After which drives notice a master that has gone."""
 SILENCE_MS = 800.0
 """After which the servo process takes the gateway for gone."""
-LEASE_MS = 250.0
+JOG_LEASE_MS = 250.0
 """Of a jog that nobody renews."""
+GOAL_LEASE_MS = 1000.0
+"""Of a goal that nobody renews."""
+SESSION_MS = 100.0
+"""Of a stop by a session that is open."""
 STOP_MS = 50.0
 COMMAND_MS = 700.0
 """From the start of `stereoservo stop`."""
@@ -58,15 +64,11 @@ ASKED_S = 1.0
 """After the fault `status` is asked."""
 MOVING = 2e-3
 """[rad/s] Of any joint, by the truth."""
-READY_S = 60.0
 STILL_NS = 50_000_000
 TRIES = 5
-WATCH = {"heartbeat_timeout_ms": "100", "rpdo_deadline_ms": "0"}
-"""The drives' own watch of their master as by default, 100 ms; the shipped cell is more patient."""
 STALL_S = 0.09
 """By which a thread that only sleeps comes late on a machine that stalls, short of what the drives bear."""
 TERMINAL = ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted")
-CAMERAS = '[[camera]]\nname = "{}"\ndriver = "fake"\nmount = "eye_to_hand"\n\n'
 JOGS = """
 import sys, time
 from stereoservo.client import Client
@@ -75,10 +77,14 @@ with Client(sys.argv[1]) as client:
         client.jog({"j1": 0.1}, lease_s=0.25)
         time.sleep(0.08)
 """
-
-
-class VoidTrialError(Exception):
-    """The machine stalled, and the arm did not move when the fault came."""
+GOES = """
+import sys, time
+from stereoservo.client import Client
+with Client(sys.argv[1]) as client:
+    end = -0.85 if client.status().joints["j1"] > 0.0 else 0.85
+    print(client.goal({"j1": end}, speed_scale=0.1, lease_s=1.0).id, flush=True)
+    time.sleep(60.0)
+"""
 
 
 class StallWatch:
@@ -112,8 +118,10 @@ class ServiceFault:
     """What is done to the service, and what must come of it.
 
     ``process``, ``signal``: of the daemon's, or ``client``, or an act of the bench's own by ``act``. ``bound_ms``: to
-    rest; None where the arm goes on. ``after``: what `status` may tell a second later, the
-    lifecycle or the code of its error.
+    rest; None where the arm goes on; with ``may_go_on`` it rests by then or goes on. ``after``: what `status` may tell
+    a second later, the lifecycle or the code of its error. ``client``: the program of a client in a process of its own,
+    which moves the arm; else one of the bench does, at ``speed_scale``. ``note``: what a note in the status says once
+    the daemon is ready again, which then is ended, and its state forgotten.
     """
 
     name: str
@@ -122,162 +130,23 @@ class ServiceFault:
     process: str = ""
     signal: signal.Signals = signal.SIGKILL
     act: Callable[[ServiceBench], int] | None = None
-    jogs: bool = False
+    client: str = ""
+    note: str = ""
+    may_go_on: bool = False
+    speed_scale: float = SPEED_SCALE
 
-
-def processes_of(runtime: Path) -> dict[str, int]:
-    """Live processes of a cell by what they are: ``servo``, ``gateway``, ``vision-CAMERA``, …; found by the runtime
-    directory on their command lines.
-    """
-    found = {}
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            words = (entry / "cmdline").read_bytes().decode(errors="replace").split("\0")
-            state = re.search(r"^State:\s+(\w)", (entry / "status").read_text(), re.MULTILINE)
-        except OSError:
-            continue
-        if str(runtime) not in words or state is None or state[1] in "ZX":
-            continue
-        module = next((word for word in words if word.startswith("stereoservo.")), "?").rpartition(".")[2]
-        name = "gateway" if module == "process" else module
-        if name == "vision":
-            name = f"vision-{words[words.index(str(runtime)) + 2]}"
-        found[name] = int(entry.name)
-    return found
-
-
-@dataclass
-class ServiceBench:
-    """A daemon with emulated drives in a directory of its own; a context manager that ends both."""
-
-    folder: Path
-    emulator: EmulatorProcess = field(init=False)
-    daemon: DaemonProcess = field(init=False)
-    cell: Path = field(init=False)
-    directories: CellDirectories = field(init=False)
-    starts: int = 0
-
-    def __enter__(self) -> Self:
-        text = shipped_cell_path(CELL).read_text(encoding="utf-8")
-        front, rest = text[: text.index("[[camera]]")], text[text.index("[servo]") :]
-        text = front.replace('plant = "pybullet"', 'plant = "ideal"')
-        for option, value in WATCH.items():
-            text = re.sub(rf"(?m)^{option} = \d+", f"{option} = {value}", text)
-        path = self.folder / f"{CELL}.toml"
-        path.write_text(text + CAMERAS.format("left") + CAMERAS.format("right") + rest, encoding="utf-8")
-        self.directories = cell_directories(CELL)
-        (self.folder / "bus").mkdir()
-        self.emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=self.folder / "drives.log")
-        self.cell = move_to_channel(path, self.folder / "bus", self.emulator.wait_ready())
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.end_daemon()
-        self.emulator.stop()
-
-    def start(self) -> None:
-        """Start a daemon; the one before must have ended."""
-        self.starts += 1
-        self.daemon = DaemonProcess(self.cell, log=self.folder / f"daemon-{self.starts}.log")
-        self.daemon.wait_ready()
-
-    def end_daemon(self) -> None:
-        """End the daemon, whatever became of its processes."""
-        for pid in processes_of(self.directories.runtime).values():
-            _send(pid, signal.SIGCONT)
-        self.daemon.stop()
-        until = time.monotonic() + 10.0
-        while left := processes_of(self.directories.runtime):
-            if time.monotonic() > until:
-                for pid in left.values():
-                    _send(pid, signal.SIGKILL)
-            time.sleep(0.05)
-
-    def ready(self) -> None:
-        """A daemon that lives, without fault or stop, its drives on."""
-        for pid in processes_of(self.directories.runtime).values():
-            _send(pid, signal.SIGCONT)
-        if self.daemon.process.poll() is not None:
-            self.end_daemon()
-            self.start()
-        until = time.monotonic() + READY_S
-        while True:
-            try:
-                return self._operated()
-            except (ClientError, SessionError):  # a gateway that is being started again
-                if time.monotonic() > until:
-                    raise
-                time.sleep(0.1)
-
-    def _operated(self) -> None:
-        """What an operator does to go on: reset, enable, resume, where it is needed."""
-        with Client(CELL) as client:
-            if client.status().lifecycle == "fault":
-                client.reset()
-            if client.status().lifecycle != "active":
-                client.enable()
-            if {reason.code for reason in client.status().reasons} & {"STOPPED", "HELD"}:
-                client.resume()
-
-    def processes(self) -> dict[str, int]:
-        """The daemon's processes, with its supervisor."""
-        found = processes_of(self.directories.runtime)
-        if self.daemon.process.poll() is None:
-            found["supervisor"] = self.daemon.process.pid
-        return found
-
-    def truth(self) -> TrueJointHistory:
-        """Where the emulated arm was; to be closed."""
-        return TrueJointHistory.open(self.directories.runtime / FILE_NAME)
-
-    def status(self) -> tuple[int, dict[str, Any]]:
-        """What ``stereoservo status --json`` says, and its exit code."""
-        done = subprocess.run(
-            [sys.executable, "-m", "stereoservo.cli.main", "status", CELL, "--json"],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        return done.returncode, json.loads(done.stdout)
-
-
-def _send(pid: int, how: signal.Signals) -> None:
-    with suppress(ProcessLookupError):
-        os.kill(pid, how)
-
-
-def _raise_stop_slot(bench: ServiceBench) -> int:
-    slot = StopSlot(bench.directories.stop_slot)
-    t0_ns = time.monotonic_ns()
-    slot.raise_stop()
-    slot.close()
-    return t0_ns
-
-
-def _stop_command(bench: ServiceBench) -> int:
-    t0_ns = time.monotonic_ns()
-    command = [sys.executable, "-m", "stereoservo.cli.main", "stop", CELL]
-    subprocess.run(command, capture_output=True, check=True)
-    return t0_ns
-
-
-def _second_daemon(bench: ServiceBench) -> int:
-    t0_ns = time.monotonic_ns()
-    second = DaemonProcess(bench.cell, log=bench.folder / "second.log")
-    if second.process.wait(60.0) == 0:
-        raise ExperimentError("two_daemons", "a second daemon of the cell ran and ended without an error")
-    return t0_ns
+    @property
+    def jogs(self) -> bool:
+        """Whether the arm moves without a goal."""
+        return self.client == JOGS
 
 
 ACTIVE = ("active",)
 ENDED = ("not_running", "servo_silent")
 NO_GATEWAY = ("no_reply", "session")
 FAULTS = (
-    ServiceFault("stop slot raised", STOP_MS, ACTIVE, act=_raise_stop_slot),
-    ServiceFault("`stereoservo stop`", COMMAND_MS, ACTIVE, act=_stop_command),
+    ServiceFault("stop slot raised", STOP_MS, ACTIVE, act=service_bench.raise_stop_slot),
+    ServiceFault("`stereoservo stop`", COMMAND_MS, ACTIVE, act=service_bench.stop_command),
     ServiceFault("servo killed", DRIVES_MS, ENDED, "servo"),
     ServiceFault("servo hung", DRIVES_MS, ("servo_silent",), "servo", signal.SIGSTOP),
     ServiceFault("gateway killed", SILENCE_MS, NO_GATEWAY, "gateway"),
@@ -286,10 +155,46 @@ FAULTS = (
     ServiceFault("vision hung", None, ACTIVE, "vision-left", signal.SIGSTOP),
     ServiceFault("supervisor killed", DRIVES_MS, ENDED, "supervisor"),
     ServiceFault("supervisor hung", None, ACTIVE, "supervisor", signal.SIGSTOP),
-    ServiceFault("client killed while it jogs", LEASE_MS, ACTIVE, "client", jogs=True),
-    ServiceFault("client hung while it jogs", LEASE_MS, ACTIVE, "client", signal.SIGSTOP, jogs=True),
-    ServiceFault("second daemon started", None, ACTIVE, act=_second_daemon),
-)
+    ServiceFault("client killed while it jogs", JOG_LEASE_MS, ACTIVE, "client", client=JOGS),
+    ServiceFault("client hung while it jogs", JOG_LEASE_MS, ACTIVE, "client", signal.SIGSTOP, client=JOGS),
+    ServiceFault("client of a goal killed", GOAL_LEASE_MS, ACTIVE, "client", client=GOES),
+    ServiceFault("client of a goal hung", GOAL_LEASE_MS, ACTIVE, "client", signal.SIGSTOP, client=GOES),
+    ServiceFault("client replaced by another's goal", None, ACTIVE, act=service_bench.second_client),
+    ServiceFault("second daemon started", None, ACTIVE, act=service_bench.second_daemon, speed_scale=SLOW),
+    ServiceFault(
+        "second daemon with other directories", None, ACTIVE, act=service_bench.second_daemon_elsewhere,
+        speed_scale=SLOW,
+    ),
+    ServiceFault(
+        "gateway killed, `taught.json` cut", SILENCE_MS, NO_GATEWAY,
+        act=service_bench.damaged(service_bench.spoil_taught), note="taught.json",
+    ),
+    ServiceFault(
+        "gateway killed, newest model damaged", SILENCE_MS, NO_GATEWAY,
+        act=service_bench.damaged(service_bench.spoil_model), note="is used instead",
+    ),
+    ServiceFault(
+        "gateway killed, `handled.slot` damaged", SILENCE_MS, NO_GATEWAY,
+        act=service_bench.damaged(service_bench.spoil_handled), note="handled.slot",
+    ),
+    ServiceFault("disk full", None, ACTIVE, act=service_bench.full_disk, note="no recording"),
+    ServiceFault("gateway without memory", SILENCE_MS, (*ACTIVE, *NO_GATEWAY), act=service_bench.memory_exhausted,
+                 may_go_on=True),
+    ServiceFault("200 silent TCP sockets", None, ACTIVE, act=service_bench.idle_sockets),
+    ServiceFault(
+        "`stereoservo stop`, 200 silent TCP sockets", COMMAND_MS, ACTIVE,
+        act=during(service_bench.idle_sockets, service_bench.stop_command),
+    ),
+    ServiceFault(
+        "stop by an open TCP session, 200 silent sockets", SESSION_MS, ACTIVE,
+        act=service_bench.stop_by_open_session,
+    ),
+    ServiceFault("20 000 refused messages", None, ACTIVE, act=service_bench.refused_puts),
+    ServiceFault(
+        "`stereoservo stop`, 20 000 refused messages", COMMAND_MS, ACTIVE,
+        act=during(service_bench.refused_puts, service_bench.stop_command),
+    ),
+)  # fmt: skip
 
 
 def run_service(
@@ -332,6 +237,11 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
         except VoidTrialError as error:
             void.append(str(error))
             continue
+        finally:
+            bench.lasting.close()
+            bench.goals.clear()
+            if fault.note:
+                bench.forget_state()
         if watch.longest_s > STALL_S:
             void.append(f"the machine stalled for {watch.longest_s * 1e3:.0f} ms")
         else:
@@ -342,31 +252,33 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
         "fault": fault.name,
         "bound_ms": bound,
         "rest_ms": summary(rests) if rests else None,
-        "within": sum(_is_within(trial["rest_ms"], bound) for trial in trials),
+        "within": sum(_is_within(trial["rest_ms"], bound, fault.may_go_on) for trial in trials),
         "after": sorted({trial["after"] for trial in trials}),
         "status_right": sum(_status_is_right(trial, fault) for trial in trials),
         "status_says": sorted({trial["says"] for trial in trials}),
-        "terminal_events": sorted({trial["terminal"] for trial in trials}),
+        "terminal_events": sorted({count for trial in trials for count in trial["terminal"]}),
         "trials": len(trials),
         "void": void,
     }
 
 
-def _is_within(rest_ms: float | None, bound_ms: float | None) -> bool:
+def _is_within(rest_ms: float | None, bound_ms: float | None, may_go_on: bool) -> bool:
     """Whether the arm rested in time, or, without a bound, went on."""
-    return rest_ms is None if bound_ms is None else rest_ms is not None and rest_ms <= bound_ms
+    if rest_ms is None:
+        return bound_ms is None or may_go_on
+    return bound_ms is not None and rest_ms <= bound_ms
 
 
 def _status_is_right(trial: dict[str, Any], fault: ServiceFault) -> bool:
-    """Whether `status` a second later told what is so, with exit code 1 where that is an error."""
-    return trial["after"] in fault.after and trial["code"] == (0 if trial["after"] == "active" else 1)
+    """Whether `status` a second later told what is so, with exit code 1 where that is an error, and later the note."""
+    right = trial["after"] in fault.after and trial["code"] == (0 if trial["after"] == "active" else 1)
+    return right and (not fault.note or any(fault.note in note for note in trial["notes"]))
 
 
 def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
     """One trial. Raises VoidTrialError."""
     history = bench.truth()
-    goal: GoalHandle | None = None
-    jogger: subprocess.Popen[bytes] | None = None
+    child: subprocess.Popen[str] | None = None
     client = Client(CELL)
     told_live: list[EventMessage] = []
     client.session.declare_subscriber(
@@ -374,60 +286,86 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
         lambda sample: told_live.append(decode(sample.payload.to_bytes(), EventMessage)),
     )
     try:
-        if fault.jogs:
-            jogger = subprocess.Popen([sys.executable, "-c", JOGS, CELL])
-        else:
-            try:
-                end = -END if client.status().joints["j1"] > 0.0 else END
-                goal = client.goal({"j1": end}, speed_scale=SPEED_SCALE)
-            except ClientError as error:
-                raise VoidTrialError(str(error)) from error
+        if fault.client:
+            child = subprocess.Popen(
+                [sys.executable, "-c", fault.client, CELL], stdout=subprocess.PIPE, text=True
+            )
+        if not fault.jogs:
+            bench.goals.append(_sent_goal(client, child, fault.speed_scale))
         _await_motion(history)
         start = history.count
         if fault.act is not None:
             t0 = fault.act(bench)
         else:
-            processes = bench.processes()
-            pid = jogger.pid if jogger is not None else processes[fault.process]
+            pid = child.pid if child is not None else bench.processes()[fault.process]
             t0 = time.monotonic_ns()
-            _send(pid, fault.signal)
+            send(pid, fault.signal)
+        if any(event.kind == "goal_reached" for event in told_live):
+            raise VoidTrialError("the goal was reached before the fault came")
         time.sleep(max(0.0, ASKED_S - (time.monotonic_ns() - t0) * 1e-9))
         code, told = bench.status()
         time.sleep(max(0.0, WATCHED_S - (time.monotonic_ns() - t0) * 1e-9))
         rest_ms = _rest_ms(history, start, t0)
+        bench.lasting.close()
     finally:
         history.close()
-        if jogger is not None:
-            _send(jogger.pid, signal.SIGCONT)
-            jogger.kill()
-            jogger.wait()
+        if child is not None:
+            send(child.pid, signal.SIGCONT)
+            child.kill()
+            child.communicate()
         with suppress(ClientError):
             client.close()
+    counts, notes = _afterwards(bench, fault, told_live)
+    says = str(told["error"]["message"]) if "error" in told else _reasons(told)
     return {
         "rest_ms": rest_ms,
         "after": str(told["error"]["code"] if "error" in told else told["lifecycle"]),
         "code": code,
-        "says": str(told["error"]["message"]) if "error" in told else _reasons(told),
-        "terminal": -1 if goal is None else _terminal_events(bench, goal, fault, told_live),
+        "says": f"{says}. Later: {'; '.join(notes)}" if fault.note else says,
+        "notes": notes,
+        "terminal": counts or (-1,),
     }
+
+
+def _sent_goal(client: Client, child: subprocess.Popen[str] | None, speed_scale: float) -> str:
+    """The id of a goal that this process's client sends, or that of the child's. Raises VoidTrialError."""
+    if child is not None:
+        assert child.stdout is not None
+        if not (line := child.stdout.readline()):
+            raise VoidTrialError("the client of the goal ended")
+        return line.strip()
+    try:
+        end = -END if client.status().joints["j1"] > 0.0 else END
+        return client.goal({"j1": end}, speed_scale=speed_scale).id
+    except ClientError as error:
+        raise VoidTrialError(str(error)) from error
 
 
 def _reasons(status: dict[str, Any]) -> str:
     return "; ".join(reason["hint"] for reason in status["reasons"]) or "nothing is wrong"
 
 
-def _terminal_events(
-    bench: ServiceBench, goal: GoalHandle, fault: ServiceFault, told_live: list[EventMessage]
-) -> int:
-    """How many terminal events of a goal are told in the end: to who listened, by this daemon or the next."""
+def _afterwards(
+    bench: ServiceBench, fault: ServiceFault, told_live: list[EventMessage]
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """How many terminal events of each goal are told in the end, to who listened, by this daemon or the next; and the
+    notes of the daemon that is ready again.
+    """
     bench.ready()
-    with Client(CELL) as client:
-        if fault.bound_ms is None:
-            with suppress(ClientError):
-                client.cancel(goal.id)
-        time.sleep(0.3)
-        told = [*told_live, *client.events(0).events]
-    return len({(event.boot, event.seq) for event in told if event.kind in TERMINAL and event.id == goal.id})
+
+    def cancel(client: Client) -> None:
+        for goal in bench.goals:
+            with suppress(RefusedError):
+                client.cancel(goal)
+
+    if fault.bound_ms is None or fault.may_go_on:
+        bench.asked(cancel)
+    time.sleep(0.3)
+    events = bench.asked(lambda client: client.events(0).events)
+    told = [event for event in (*told_live, *events) if event.kind in TERMINAL]
+    ends = [{(event.boot, event.seq) for event in told if event.id == goal} for goal in bench.goals]
+    notes = bench.asked(lambda client: client.status().notes)
+    return tuple(map(len, ends)), tuple(note.replace(f"{bench.folder}/", "") for note in notes)
 
 
 def _await_motion(history: TrueJointHistory) -> None:
@@ -448,7 +386,7 @@ def _rest_ms(history: TrueJointHistory, start: int, t0_ns: int) -> float | None:
     last_ns = newest_ns = t0_ns
     for index in range(start, history.count):
         sample = history.sample(index)
-        if sample is None or sample[0] > end_ns:
+        if sample is None or not t0_ns <= sample[0] <= end_ns:
             continue
         newest_ns = sample[0]
         if np.abs(sample[2]).max() > MOVING:

@@ -22,9 +22,20 @@ max. They hold the ramp to rest. Machine: {machine}. Trials of the service in re
 
 A daemon with emulated drives moves to a joint goal, or is jogged, when the fault comes. *A second later*: what
 `stereoservo status` told then, the cell's state or the code of its error. *Ends*: terminal events of the goal, by this
-daemon or the next; one is right. *Void*: trials in which the machine stalled; they count for nothing.
+daemon or the next; one is right. *Later*: notes once the daemon is ready again. *Void*: trials in which the machine
+stalled; they count for nothing.
 
 {service_table}
+
+## The inputs
+
+What the core is told is wrong in one way from one moment on: joint samples, camera frames, the clock. The servo and
+vision loops run in virtual time before a fake arm and fake cameras, with a goal by joints, by images, or by either as
+the trial draws; trials: {inputs} each. *After*: the cell's state 2 s later; *told*: the reasons in `status`. *Ends*:
+terminal events of the goal in the end; one is right. *Works again*: the cause gone, an operator resumes, or resets and
+enables, and the arm reaches a goal. The fastest joint ever had {fastest} of its velocity limit.
+
+{input_table}
 
 ## The drives
 
@@ -34,6 +45,9 @@ The driver and emulated drives on a CAN bus, in the emulator's bit time: what th
 """
 SERVICE_COLUMNS = (
     "fault", "at rest", "bound", "within", "a second later", "status right", "ends", "what `status` says", "void",
+)  # fmt: skip
+INPUT_COLUMNS = (
+    "input", "fault", "goal by", "at rest", "bound", "within", "after", "told", "the goal", "ends", "works again",
 )  # fmt: skip
 DRIVE_COLUMNS = ("protocol", "fault", "noticed", "at rest", "bound", "by", "latched", "within")
 
@@ -45,17 +59,21 @@ def reliability_page(figures: dict[str, Any]) -> str:
         machine=f"{machine['processor']}, {machine['cores']} cores",
         service=max(row["trials"] for row in figures["service"]),
         drives=max(row["trials"] for row in figures["rows"]),
+        inputs=max(row["trials"] for row in figures["inputs"]),
+        fastest=f"{max(row['fastest_of_limit'] for row in figures['inputs']):.2f}",
         service_table=_table(SERVICE_COLUMNS, [_service_cells(row) for row in figures["service"]]),
+        input_table=_table(INPUT_COLUMNS, [_input_cells(row) for row in figures["inputs"]]),
         drive_table=_table(DRIVE_COLUMNS, [_drive_cells(row) for row in figures["rows"]]),
     )
 
 
 def _service_cells(row: dict[str, Any]) -> list[str]:
     rest = row["rest_ms"]
+    on = "goes on" if row["trials"] else "no trial"
     ends = ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"])
     return [
         row["fault"],
-        "goes on" if rest is None else _pair(rest["median"], rest["max"]),
+        on if rest is None else _pair(rest["median"], rest["max"]),
         "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
         f"{row['within']} of {row['trials']}",
         ", ".join(row["after"]),
@@ -63,6 +81,23 @@ def _service_cells(row: dict[str, Any]) -> list[str]:
         ends,
         "<br>".join(row["status_says"]),
         str(len(row["void"])),
+    ]
+
+
+def _input_cells(row: dict[str, Any]) -> list[str]:
+    rest = row["rest_ms"]
+    return [
+        row["input"],
+        row["fault"],
+        row["goal"],
+        "goes on" if rest is None else _pair(rest["median"], rest["max"]),
+        "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
+        f"{row['within']} of {row['trials']}",
+        ", ".join(row["after"]),
+        ", ".join(row["reasons"]) or "-",
+        ", ".join(row["outcomes"]),
+        ", ".join(str(count) for count in row["terminal_events"]),
+        f"{row['works_again']} of {row['trials']}",
     ]
 
 

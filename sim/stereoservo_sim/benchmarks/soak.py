@@ -97,11 +97,13 @@ def run_soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
         folder = Path(name)
         truth = TrueJointHistory.in_memory(len(demo_cell().robot.joints), TRUTH_SAMPLES)
         services = {"world": truth}
-        with LockstepCell(_cell(), cell_dir=folder, runtime_dir=folder, seed=seed, services=services) as cell:
+        with LockstepCell(
+            fake_cell(), cell_dir=folder, runtime_dir=folder, seed=seed, services=services
+        ) as cell:
             return _Soak(cell, truth, rng).run(repetitions * VIRTUAL_MINUTES * 60.0, progress)
 
 
-def _cell() -> CellFile:
+def fake_cell() -> CellFile:
     """A cell of the fake arm and fake cameras, which has no images to render."""
     world = demo_cell()
     names = [joint.name for joint in world.robot.joints]

@@ -114,7 +114,9 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         from stereoservo_sim.benchmarks.faults import show_faults
 
         show_faults(answer, console)
-        answer = {key: value for key, value in answer.items() if key not in ("rows", "wall", "service")}
+        answer = {
+            key: value for key, value in answer.items() if key not in ("rows", "wall", "service", "inputs")
+        }
     for name, value in _flat(answer, ""):
         console.print(f"{name:<44} {f'{value:.4g}' if isinstance(value, float) else value}", soft_wrap=True)
 

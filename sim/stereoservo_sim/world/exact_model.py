@@ -1,4 +1,4 @@
-"""Exact model of a synthetic cell: the result of a calibration without noise."""
+"""Exact models of synthetic cells and of the simulated cell: the result of a calibration without noise."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.strata import euclidean_to_projective
-from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, Stratum
+from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics, Stratum
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.robots import joint_frames
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 
@@ -66,3 +68,32 @@ def exact_model(
         statistics=None,
         mount=cell.mount,
     )
+
+
+def exact_simulated_model(cell: SimulatedCell, seed: int) -> CellModel:
+    """Model of the simulated cell with its base as zero, in a projective frame that ``seed`` draws."""
+    frames, flange = joint_frames(cell.robot, cell.base)
+    generators = np.zeros((len(cell.base), 4, 4))
+    for twist, frame in zip(generators, frames, strict=True):
+        x, y, z = frame[:3, 2]
+        twist[:3, :3] = [(0, -z, y), (z, 0, -x), (-y, x, 0)]
+        twist[:3, 3] = -twist[:3, :3] @ frame[:3, 3]
+    points = np.column_stack([cell.marker_positions(cell.base), np.ones(len(cell.body.ids))])
+    if cell.stand is not None:  # everything as the flange sees it
+        back = np.linalg.inv(flange)
+        generators = -back @ generators @ flange
+        points = points @ back.T
+    H = np.eye(4) + 0.3 * np.random.default_rng(seed).standard_normal((4, 4))
+    inverse = np.linalg.inv(H)
+    plane = np.array([0, 0, 0, 1.0]) @ H
+    points = points @ inverse.T
+    return CellModel(
+        schema=MODEL_SCHEMA, epoch=3, joint_names=cell.robot.joint_names,
+        joint_kinds=("revolute",) * len(cell.base),
+        zero=cell.base, generators=inverse @ generators @ H,
+        cameras=tuple(CameraModel(c.name, c.P @ H, c.width, c.height, c.lens) for c in cell.rig.cameras),
+        marker_ids=tuple(int(i) for i in cell.body.ids), marker_points=points / (points @ plane)[:, None],
+        plane_at_infinity=plane, stratum="metric", projective_to_euclidean=H,
+        statistics=FitStatistics(0.01, 1.0, 1, True, 1, 0, 0, (), 1),
+        mount="eye_to_hand" if cell.stand is None else "eye_in_hand",
+    )  # fmt: skip

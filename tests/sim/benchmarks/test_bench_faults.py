@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.benchmarks import faults, faults_service, faults_wall
+from stereoservo_sim.benchmarks import faults, faults_inputs, faults_service, faults_wall
 from stereoservo_sim.benchmarks.reliability_page import reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
@@ -52,11 +52,28 @@ SERVICE = {
     "void": [],
 }
 
+INPUT = {
+    "input": "joints",
+    "fault": "not a number",
+    "goal": "either",
+    "bound_ms": 270.0,
+    "rest_ms": {"repetitions": 2, "median": 120.0, "max": 140.0},
+    "within": 2,
+    "after": ["active"],
+    "reasons": ["JOINT_VALUE", "STOPPED"],
+    "outcomes": ["goal_aborted"],
+    "terminal_events": [1],
+    "works_again": 2,
+    "fastest_of_limit": 0.512,
+    "trials": 2,
+}
+
 
 def test_rows_and_tables(one_case, monkeypatch):
     asked = []
     monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: asked.append(repetitions) or WALL)
     monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [SERVICE])
+    monkeypatch.setattr(faults, "run_inputs", lambda repetitions, seed, tell: [INPUT])
     figures = faults.run_faults(2, 5, lambda stage, done, total: None)
     (row,) = figures["rows"]
     assert asked == [1]
@@ -67,6 +84,9 @@ def test_rows_and_tables(one_case, monkeypatch):
     page = reliability_page({**figures, "machine": {"processor": "one", "cores": 2}})
     assert "| servo killed | 23 / 23 | 180 | 1 of 1 | not_running | 1 of 1 | 1 | no daemon runs | 0 |" in page
     assert "| odrive | drive error | " in page
+    told = "JOINT_VALUE, STOPPED | goal_aborted | 1 | 2 of 2 |"
+    assert f"| joints | not a number | either | 120 / 140 | 270 | 2 of 2 | active | {told}" in page
+    assert "had 0.51 of its velocity limit" in page
     console = Console(width=200, file=io.StringIO(), markup=False)
     faults.show_faults(figures, console)
     text = console.file.getvalue()
@@ -78,6 +98,7 @@ def test_rows_and_tables(one_case, monkeypatch):
         "12.5 ms",
         "servo killed",
         "no daemon runs",
+        "JOINT_VALUE",
     ):
         assert word in text
 
@@ -90,18 +111,33 @@ def test_the_page_has_a_row_for_each_fault_of_the_service():
     ]
 
 
+def test_the_page_has_a_row_for_each_fault_of_the_inputs():
+    text = Path(__file__).parents[3].joinpath("docs/reliability.md").read_text(encoding="utf-8")
+    rows = [tuple(line.removeprefix("| ").split(" | ")[:3]) for line in text.splitlines()]
+    faults_of_inputs = [(fault.input, fault.name, fault.goal) for fault in faults_inputs.FAULTS]
+    assert [row for row in rows if row in faults_of_inputs] == faults_of_inputs
+
+
 def test_a_problem_is_printed_and_the_table_not_ok(one_case, monkeypatch):
     impossible = FaultCase(name="too strict", orders=("fault 3 0x20",), codes=("drive_fault",), bound_ms=1.0)
     monkeypatch.setattr(faults, "CASES", {"odrive": (impossible,)})
     monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: WALL)
     monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [])
+    monkeypatch.setattr(faults, "run_inputs", lambda repetitions, seed, tell: [])
     figures = faults.run_faults(1, 0, lambda stage, done, total: None)
     assert not figures["ok"]
     (problem,) = figures["rows"][0]["problems"]
     assert problem.startswith("at rest after")
 
 
-FEW = ("stop slot raised", "servo killed", "vision killed", "client killed while it jogs")
+FEW = (
+    "stop slot raised",
+    "servo killed",
+    "vision killed",
+    "client killed while it jogs",
+    "client of a goal killed",
+    "200 silent TCP sockets",
+)
 
 
 @pytest.mark.process
@@ -116,9 +152,33 @@ def test_faults_of_the_service(names):
         assert row["trials"] == 1, row
         assert set(row["after"]) <= set(fault.after), row
         assert row["status_right"] == 1, row
-        assert (row["rest_ms"] is None) == (fault.bound_ms is None), row
+        assert fault.may_go_on or (row["rest_ms"] is None) == (fault.bound_ms is None), row
         if not fault.jogs:
             assert row["terminal_events"] == [1], row
+
+
+FEW_INPUTS = (
+    ("frozen: no new sample", "either"),
+    ("not a number", "either"),
+    ("not a number", "joints"),
+    ("from the past", "images"),
+    ("everyone's goes back", "either"),
+)
+
+
+@pytest.mark.parametrize("names", [FEW_INPUTS, pytest.param((), marks=pytest.mark.slow)])
+def test_faults_of_the_inputs(names):
+    chosen = tuple(f for f in faults_inputs.FAULTS if not names or (f.name, f.goal) in names)
+    assert len(chosen) >= len(FEW_INPUTS)
+    told = []
+    rows = faults_inputs.run_inputs(1, 3, told.append, chosen)
+    assert told == rows
+    for fault, row in zip(chosen, rows, strict=True):
+        assert row["trials"] == row["within"] == row["works_again"] == 1, row
+        assert row["terminal_events"] == [1], row
+        assert row["fastest_of_limit"] <= 1.0, row
+        assert (row["rest_ms"] is None) == (fault.notice_ms is None), row
+    assert faults_inputs.run_inputs(1, 3, told.append, chosen[:1]) == rows[:1]
 
 
 @pytest.mark.slow
@@ -127,6 +187,7 @@ def test_a_fault_in_real_time_is_measured(one_case, monkeypatch, capsys):
     monkeypatch.setattr(faults_wall, "ORDERED", tuple(ordered))
     monkeypatch.setattr(faults_wall, "DONE_TO_THE_MASTER", ("master killed",))
     monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [])
+    monkeypatch.setattr(faults, "run_inputs", lambda repetitions, seed, tell: [])
     assert cli.invoke(["bench", "faults", "--repetitions", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     silent, killed = answer["wall"]["rows"]

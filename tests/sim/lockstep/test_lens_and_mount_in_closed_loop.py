@@ -11,45 +11,16 @@ import pytest
 
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.daemon.lockstep import LockstepCell
-from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, FitStatistics
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.demonstration.truth import true_cell
+from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.robots import joint_frames
-from stereoservo_sim.world.simulated_cell import SimulatedCell, goals_of
+from stereoservo_sim.world.simulated_cell import goals_of
 
 TERMINAL = ("goal_reached", "goal_aborted", "goal_cancelled")
-
-
-def exact_model(cell: SimulatedCell, seed: int) -> CellModel:
-    """The simulated truth, at the base, in a random projective frame."""
-    frames, flange = joint_frames(cell.robot, cell.base)
-    twists = np.zeros((6, 4, 4))
-    for twist, frame in zip(twists, frames, strict=True):
-        x, y, z = frame[:3, 2]
-        twist[:3, :3] = [(0, -z, y), (z, 0, -x), (-y, x, 0)]
-        twist[:3, 3] = -twist[:3, :3] @ frame[:3, 3]
-    points = np.column_stack([cell.marker_positions(cell.base), np.ones(14)])
-    if cell.stand is not None:  # everything as the flange sees it
-        back = np.linalg.inv(flange)
-        twists = -back @ twists @ flange
-        points = points @ back.T
-    H = np.eye(4) + 0.3 * np.random.default_rng(seed).standard_normal((4, 4))
-    inverse = np.linalg.inv(H)
-    plane = np.array([0, 0, 0, 1.0]) @ H
-    points = points @ inverse.T
-    return CellModel(
-        schema=MODEL_SCHEMA, epoch=3, joint_names=cell.robot.joint_names, joint_kinds=("revolute",) * 6,
-        zero=cell.base, generators=inverse @ twists @ H,
-        cameras=tuple(CameraModel(c.name, c.P @ H, c.width, c.height, c.lens) for c in cell.rig.cameras),
-        marker_ids=tuple(int(i) for i in cell.body.ids), marker_points=points / (points @ plane)[:, None],
-        plane_at_infinity=plane, stratum="metric", projective_to_euclidean=H,
-        statistics=FitStatistics(0.01, 1.0, 1, True, 1, 0, 0, (), 1),
-        mount="eye_to_hand" if cell.stand is None else "eye_in_hand",
-    )  # fmt: skip
 
 
 def faked(name: str) -> dict[str, Any]:
@@ -89,7 +60,7 @@ def test_goal_is_reached_with_an_exact_model(tmp_path: Path, name: str, law: Any
     with LockstepCell(file, cell_dir=tmp_path, runtime_dir=tmp_path, services={"world": history}) as cell:
         cell.run_for(0.5)
         LockstepOperator(cell).enable()
-        cell.update_model(ModelUpdate(exact_model(truth, seed=5)))
+        cell.update_model(ModelUpdate(exact_simulated_model(truth, seed=5)))
         cell.run_for(0.3)
         assert cell.submit(RunGoal(Goal("0000abcd", target, law=law))).accepted
         end = cell.wait_for(lambda event: event.kind in TERMINAL, 30.0)
