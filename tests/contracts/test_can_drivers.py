@@ -83,6 +83,13 @@ class CanContract(JointDriverContract):
     def make_driver(self, context: DriverContext) -> JointDriver:
         return CanJointDriver(self.given, context)
 
+    @pytest.fixture
+    def configured(self, driver: JointDriver) -> JointDriver:
+        """A configured driver, without the faults that a stall of the machine in an earlier test has left latched."""
+        driver.configure()
+        driver.configure()
+        return driver
+
 
 class TestCia402OnVirtual(CanContract):
     interface = "virtual"
