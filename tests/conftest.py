@@ -73,13 +73,15 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the fast ones before ``-m`` chooses. A test that failed runs again, three times at most, where the machine
-    stalled while it ran, and only there.
+    stalled while it ran, or where it is of several processes in real time, which wait for one another's processor.
     """
     for item in items:
         if is_fast(item.path) and item.get_closest_marker("slow") is None:
             item.add_marker("fast")
         if item.config.getoption("--hil") is None:
-            item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=partial(machine_stalled, item)))
+            processes = item.get_closest_marker("process") is not None
+            condition = True if processes else partial(machine_stalled, item)
+            item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=condition))
 
 
 STALLS = "STEREOSERVO_TESTS_STALLS"

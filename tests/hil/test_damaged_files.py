@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -112,9 +113,13 @@ def test_a_gateway_that_dies_and_finds_its_files_damaged_goes_on(
     eventually("the gateway is back", back, 60.0)
     with Client(CELL) as client:
         assert any("handled.slot: was damaged and begins anew" in note for note in client.status().notes)
-        told = [event.message for event in client.events().events if event.kind == "warning"]
-        assert any("run plan was damaged" in text for text in told)
-        assert any("observation-left.slot" in text for text in told)
+
+        def told(words: str) -> bool:
+            return any(words in event.message for event in client.events().events if event.kind == "warning")
+
+        # The supervisor tells these as soon as the new gateway listens to it.
+        for words in ("run plan was damaged", "observation-left.slot"):
+            eventually(words, partial(told, words))
         assert [goal.name for goal in client.info().taught] == ["here", "park"]
         eventually("features", lambda: sum(client.status().visible.values()) > 0)
         assert at_rest(client)
