@@ -19,8 +19,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
-from stereoservo.calibration.normal_equations import triangle_of
-from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, full_charts
+from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.cameras import isotropic_normaliser
 from stereoservo.geometry.distortion import LensEstimate, straight_lens, undistort
@@ -114,20 +113,17 @@ def lens_test(solution: Solution) -> LensTest:
     relative to the noise left, where that is above the stated one.
     """
     c = len(solution.rig.lenses)
-    charts = replace(
-        solution.charts, lenses=full_charts(solution.rig, solution.stratum, lenses="radial").lenses
-    )
-    whole = triangle_of(solution.rig, charts, solution.data)
-    own = charts.start(2) + np.arange(c)
-    others = np.setdiff1d(np.arange(charts.size), own)
-    last = np.asarray(np.linalg.qr(whole[:, [*others, *own, charts.size]], mode="r"))[
-        len(others) :, len(others) :
-    ]
+    at = solution.charts.start(2)
+    free = 1 if solution.lenses == "none" else len(solution.charts.lenses[0])
+    own = at + free * np.arange(c)
+    core = solution.lens_factor.core[:, [*range(at), *own, -1]]
+    last = np.asarray(np.linalg.qr(core, mode="r"))[at:, at:]
     block = last[:c, :c]
     scores = last[:c, -1] if solution.lenses == "none" else block @ solution.rig.lenses[:, 0]
     gain = float(scores @ scores)
     left = solution.cost - (gain if solution.lenses == "none" else 0.0)
-    factor = max(1.0, left / max(1, solution.rows - charts.size))
+    parameters = at + c + solution.charts.size - solution.charts.start(3)
+    factor = max(1.0, left / max(1, solution.rows - parameters))
     return LensTest(gain / factor, c, float(chi2_distribution.isf(LENS_TAIL, c)))
 
 
@@ -149,6 +145,8 @@ CENTRE_BOUND = 2.0
 """Largest offset of a centre in the search, in those standard deviations."""
 START_GAIN = 100.0
 """Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
+MOST_MATCHES = 20_000
+"""Matches of two cameras at most, evenly spread, that the search for a lens looks at."""
 
 
 def straight_lenses(trials: TrialData) -> FloatArray:
@@ -202,7 +200,9 @@ def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
     seen = np.asarray(finite_rows(pixels).all(axis=0))
     if int(seen.sum()) < MIN_MATCHES:
         return None
-    return pixels[:, seen], trials.sigmas[[0, k]].reshape(2, -1)[:, seen]
+    every = np.flatnonzero(seen)
+    some = every[np.linspace(0, len(every) - 1, min(len(every), MOST_MATCHES)).astype(np.int64)]
+    return pixels[:, some], trials.sigmas[[0, k]].reshape(2, -1)[:, some]
 
 
 def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float:

@@ -16,9 +16,10 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.bundle_adjustment import Solution, jacobian, solve
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.normal_equations import arrow_factor
 from stereoservo.calibration.rig_model import Measurements, RigModel, residuals
 from stereoservo.calibration.single_joint_fit import (
     VirtualObservations,
@@ -163,7 +164,6 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
     if not joints:
         return ()
-    slope = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), solution.data)
     step = 1e-5
     columns = []
     for joint in joints:
@@ -173,11 +173,10 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
             offsets[:, joint] *= np.exp(-sign * step)
             ends.append(residuals(solution.rig, replace(solution.data, offsets=offsets)))
         columns.append((ends[1] - ends[0]) / (2.0 * step))
-    moments = np.stack(columns, axis=1)
     # What the other parameters can imitate of a factor is theirs.
-    q, _ = np.linalg.qr(slope / solution.sizes)
-    moments = moments - q @ (q.T @ moments)
-    rest = solution.residuals - q @ (q.T @ solution.residuals)
+    factor = arrow_factor(solution.rig, solution.charts, solution.data, np.stack(columns, axis=1))
+    at = solution.charts.start(3)
+    moments, rest = factor.core[at:, at:-1], factor.core[at:, -1]
     information = moments.T @ moments
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-10) / np.outer(size, size)
