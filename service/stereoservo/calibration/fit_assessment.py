@@ -64,6 +64,7 @@ REMEDIES = {
     "camera, a wrong joint scale, a detector that understates its noise",
     "noise_understated": "raise the detector's sigma to what the text says; look whether images are dark or blurred",
     "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",
+    "lens_implausible": "show markers all over the images, or straight edges (--lines); larger motions, more stops",
     "wrong_scale": "correct the drive's scale: revolute joints report rad, with the gear taken into account",
     "joints_exchanged": "two joints answer under each other's names: correct the order in the joint driver's options",
     "joint_order": "list the joints base first: correct the order in the joint driver's options",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import msgspec
@@ -28,8 +28,15 @@ from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import LensModel
 from stereoservo.numerics.arrays import FloatArray
 
+if TYPE_CHECKING:
+    from stereoservo.calibration.calibration_result import CalibrationFit
+
 FREE_LENS: LensModel = "radial_centre"
 """The lens model of cameras that distort."""
+STARTING_BENDS = (-0.1, -0.04, -0.2, 0.04)
+"""Radial parameters at half the image width of all cameras, from which fits start where the search has failed."""
+MOST_ASPECT = 1.5
+"""Ratio of a pixel's sides beyond which no camera is."""
 LENS_TAIL = 1e-4
 """Probability with which a pinhole is taken for a distorting lens."""
 
@@ -51,12 +58,16 @@ class LensTest:
 
 
 def starting_lenses(
-    trials: TrialData, asked: Literal["auto"] | LensModel, priors: Mapping[str, LensEstimate]
+    trials: TrialData,
+    asked: Literal["auto"] | LensModel,
+    priors: Mapping[str, LensEstimate],
+    bend: float | None = None,
 ) -> tuple[FloatArray, LensModel]:
     """Lenses (c, 4) to start from, and which of their parameters are free in the first bundle.
 
     Where ``asked`` leaves it to the data, lenses are free at once if priors are given or the epipolar geometry
-    needs them. Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
+    needs them; with ``bend`` they are free and all start from that radial parameter.
+    Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
     """
     names = [camera.name for camera in trials.cameras]
     unknown = sorted(set(priors) - set(names))
@@ -68,6 +79,9 @@ def starting_lenses(
             unknown=unknown,
         )
     lenses = straight_lenses(trials)
+    if bend is not None:
+        lenses[:, 0] = bend
+        return lenses, FREE_LENS if asked == "auto" else asked
     if asked == "none":
         return lenses, "none"
     if priors:
@@ -94,6 +108,34 @@ def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> Le
         else:
             information[c, [1, 2], [1, 2]] = 1.0 / (CENTRE_SHARE * camera.width) ** 2
     return LensPriors(mean, information)
+
+
+def implausible_lens(result: CalibrationFit) -> CalibrationError | None:
+    """Error (``lens_implausible``) of a fit whose lens has its centre outside the image, or whose camera has pixels
+    far from square; None where all is plausible.
+    """
+    for camera, fitted in zip(result.model.cameras, result.report.cameras, strict=True):
+        if fitted.lens is not None:
+            _, cu, cv = fitted.lens
+            if not (0.0 <= cu <= camera.width and 0.0 <= cv <= camera.height):
+                return CalibrationError(
+                    "lens_implausible",
+                    f"the lens of camera {fitted.name!r} would have its centre at ({cu:.0f}, {cv:.0f}) px, outside of "
+                    f"the image of {camera.width} x {camera.height}: the fit has ended in a wrong place",
+                    camera=fitted.name,
+                    centre=[cu, cv],
+                )
+        if fitted.lens is not None and fitted.intrinsics is not None:
+            aspect = fitted.intrinsics[0] / fitted.intrinsics[2]
+            if not 1.0 / MOST_ASPECT < abs(aspect) < MOST_ASPECT:
+                return CalibrationError(
+                    "lens_implausible",
+                    f"the pixels of camera {fitted.name!r} would be {aspect:.3g} times as wide as high: the fit has "
+                    "ended in a wrong place",
+                    camera=fitted.name,
+                    aspect=aspect,
+                )
+    return None
 
 
 def straightened(rig: RigModel, data: Measurements) -> RigModel:
@@ -131,6 +173,8 @@ GRID = (-0.30, -0.24, -0.19, -0.15, -0.12, -0.09, -0.06, -0.03, 0.0, 0.03, 0.06,
 """Radial parameters at half the image width that the search begins with."""
 PINHOLE_AGREEMENT = 0.95
 """Share of matches within 3.29 sigmas of one epipolar geometry at which no lens is searched for."""
+NOISE_AGREEMENT = 0.99
+"""The share that Gaussian noise leaves to pinholes, 0.999, less what some matches' scatter takes."""
 COARSE_PX = 1.5
 """Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
 MOST_BEND = 0.6
@@ -192,6 +236,16 @@ def epipolar_lenses(trials: TrialData) -> FloatArray:
         if found is not None:
             lenses[[0, k]] = found
     return lenses
+
+
+def lenses_may_bend(trials: TrialData) -> bool:
+    """Whether the matches of some pair of cameras leave more to a lens than pinholes do by noise."""
+    straight = straight_lenses(trials)
+    for k in range(1, len(trials.cameras)):
+        match = _matches(trials, k)
+        if match is not None and _agreement(*match, straight[[0, k]]) < NOISE_AGREEMENT:
+            return True
+    return False
 
 
 def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
