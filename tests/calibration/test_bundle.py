@@ -12,6 +12,7 @@ from stereoservo.calibration.bundle_adjustment import jacobian, solve
 from stereoservo.calibration.bundle_statistics import rank_of
 from stereoservo.calibration.normal_equations import (
     CHUNK,
+    arrow_factor,
     by_stop,
     leverages,
     normal_equations,
@@ -156,7 +157,24 @@ def test_blocks_and_chunks_add_up_to_the_whole_jacobian(arms, stratum):
     assert expected == pytest.approx(float(r @ r - ((J @ direct + r) ** 2).sum()), rel=1e-7)
     root = np.linalg.inv(triangle[:-1, :-1])
     hat = (dense[: 2 * len(data.pixels), :-1] @ root).reshape(len(data.pixels), 2, -1)
-    assert np.allclose(leverages(rig, charts, data, root), (hat**2).sum(axis=(1, 2)), rtol=1e-6)
+    factor = arrow_factor(rig, charts, data)
+    assert np.allclose(leverages(rig, charts, data, factor), (hat**2).sum(axis=(1, 2)), rtol=1e-6)
+    # Columns beside, and columns left out: what is then left of the rest is its part across the others.
+    more = np.vstack(
+        [rng.normal(size=(2 * len(data.pixels), 2)), np.zeros((len(dense) - 2 * len(data.pixels), 2))]
+    )
+    other = np.column_stack([more, dense[:, -1]])
+    q, _ = np.linalg.qr(dense[:, :-1] / sizes[:-1])
+    across = other - q @ (q.T @ other)
+    last = arrow_factor(rig, charts, data, more[: 2 * len(data.pixels)]).core[-3:, -3:]
+    assert np.allclose(
+        last.T @ last, across.T @ across, rtol=1e-9, atol=1e-9 * np.abs(across.T @ across).max()
+    )
+    lenses = charts.start(2) + np.arange(9)
+    kept = np.delete(dense, lenses, axis=1)
+    fixed = factor.without(lenses).dense()
+    scale = np.outer(np.linalg.norm(kept, axis=0), np.linalg.norm(kept, axis=0))
+    assert np.abs((fixed.T @ fixed - kept.T @ kept) / scale).max() < 1e-12
 
 
 def test_memory_does_not_grow_with_the_images(arms):

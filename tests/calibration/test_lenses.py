@@ -6,19 +6,29 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.calibration import stratum_selection
+from stereoservo.calibration import self_calibration, stratum_selection
 from stereoservo.calibration.bundle_adjustment import solve
 from stereoservo.calibration.bundle_statistics import chi2_within
 from stereoservo.calibration.calibration_result import intrinsics
-from stereoservo.calibration.lens_estimation import epipolar_lenses, lens_test, straight_lenses, undistorted
+from stereoservo.calibration.diagnosis.joint_scales import lenses_explain_more, model_scales
+from stereoservo.calibration.lens_estimation import (
+    STARTING_BENDS,
+    epipolar_lenses,
+    implausible_lens,
+    lens_test,
+    straight_lenses,
+    undistorted,
+)
 from stereoservo.calibration.rig_model import LensPriors, RigModel
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.single_joint_fit import measurements
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.distortion import distort, lens_from_lines
+from stereoservo.kinematics.axes import framed
 from stereoservo.kinematics.covariance import propagated
 from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.exact_model import exact_model
 
 MIDDLE = np.array([319.5, 239.5])
 
@@ -271,3 +281,79 @@ def test_a_prior_of_an_unknown_camera_is_refused():
         )
     assert caught.value.code == "bad_data"
     assert caught.value.data["unknown"] == ["cam7"]
+
+
+def brown(cell, positions, k1, k2):
+    """Raw pixels (c, s, m, 2) through lenses of two radial terms (OpenCV's) about the principal points."""
+    exact = cell.pixels(positions)
+    for K, pixels in zip(cell.intrinsics, exact, strict=True):
+        x = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+        square = (x**2).sum(axis=-1, keepdims=True)
+        pixels += (k1 * square + k2 * square**2) * x * K[[0, 1], [0, 1]]
+    return exact
+
+
+@pytest.mark.parametrize("cause", ["second radial term", "scale of a joint"])
+def test_terms_that_the_lens_lacks_and_scales_of_joints_are_told_apart_by_likelihood(cause):
+    cell = wide_angle(0.0)
+    rng = np.random.default_rng(3)
+    trials = cell.trials(0.02, rng, 9)
+    positions = trials.positions.copy()
+    if cause == "scale of a joint":
+        positions[:, 2] = cell.home[2] + 1.01 * (positions[:, 2] - cell.home[2])
+        pixels = cell.with_k1(-0.2).pixels(trials.positions)
+    else:
+        pixels = brown(cell, trials.positions, -0.2, 0.03)
+    pixels = pixels + rng.normal(0, 0.02, pixels.shape)
+    changed = msgspec.structs.replace(trials, positions=positions, pixels=pixels)
+    start = cell.with_k1(-0.2)
+    parts = framed(exact_model(start))
+    rig = RigModel(start.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
+    data = measurements(changed, changed.visible, positions - parts.zero)
+    solution = solve(rig, data, "metric", lenses="radial_centre")
+    blamed = [scale.joint for scale in model_scales(solution) if scale.wrong]
+    assert 2 in blamed or cause != "scale of a joint", model_scales(solution)
+    assert lenses_explain_more(solution) == (cause == "second radial term")
+
+
+def test_a_lens_with_its_centre_outside_of_the_image_is_no_result():
+    cell = synthetic.rx90().with_k1(-0.3)
+    fit = fit_model(cell.trials(0.05, np.random.default_rng(2), 9), epoch=1)
+    assert implausible_lens(fit) is None
+    left, right = fit.report.cameras
+    for wrong, key in (
+        (msgspec.structs.replace(left, lens=(-0.05, -40.0, 200.0)), "centre"),
+        (msgspec.structs.replace(left, intrinsics=(800.0, 0.0, 450.0, 320.0, 240.0)), "aspect"),
+    ):
+        report = msgspec.structs.replace(fit.report, cameras=(wrong, right))
+        refused = implausible_lens(msgspec.structs.replace(fit, report=report))
+        assert refused.code == "lens_implausible"
+        assert key in refused.data
+
+
+def test_other_lenses_are_tried_before_a_joint_is_blamed(monkeypatch):
+    """A first fit that blames a joint's scale, of cameras that distort: a fit from another lens explains the data."""
+    cell = wide_angle(-0.25)
+    trials = cell.trials(0.05, np.random.default_rng(4), 9)
+    whole = self_calibration._fit
+    starts = []
+
+    def misled(*arguments):
+        bend = arguments[6] if len(arguments) > 6 else None
+        starts.append(bend)
+        if bend is None:
+            raise CalibrationError("residual_above_floor", "a wrong basin")
+        return whole(*arguments)
+
+    blamed = CalibrationError("wrong_scale", "joint 'j1' reports 1.003 times its motion")
+    monkeypatch.setattr(self_calibration, "_fit", misled)
+    monkeypatch.setattr(self_calibration, "diagnose_failure", lambda *_: blamed)
+    fit = fit_model(trials, epoch=1)
+    assert fit.report.chi2_ok
+    assert starts[:2] == [None, STARTING_BENDS[0]]
+    # Of pinholes nothing is left to a lens: the joint is blamed at once.
+    starts.clear()
+    with pytest.raises(CalibrationError) as error:
+        fit_model(wide_angle(0.0).trials(0.05, np.random.default_rng(4), 9), epoch=1)
+    assert error.value is blamed
+    assert starts == [None]

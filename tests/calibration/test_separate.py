@@ -1,5 +1,7 @@
 """Trials of single joints, driven once or over several distal configurations (5.5, fig. 5.16)."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from stereoservo.calibration.bundle_adjustment import solve
 from stereoservo.calibration.bundle_statistics import generator_noise
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
+from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.rig_model import Measurements, projective_rig
 from stereoservo.calibration.self_calibration import fit_model
@@ -156,3 +159,40 @@ def test_too_few_stops_say_why():
         )
     assert caught.value.code == "too_few_stops"
     assert caught.value.data["strayed"] >= 5
+
+
+@pytest.mark.parametrize(
+    ("name", "half", "stratum"), [("gantry", 0.003, "affine"), ("mixed", 0.009, "metric")]
+)
+def test_strokes_of_millimetres_calibrate_where_the_images_show_them(name, half, stratum):
+    cell = getattr(synthetic, name)()
+    ranges = np.where([kind == "prismatic" for kind in cell.kinds], half, cell.ranges)
+    fit = fit_model(replace(cell, ranges=ranges).trials(0.02, np.random.default_rng(0), 9), epoch=1)
+    assert fit.model.stratum == stratum
+    assert fit.report.chi2_ok
+
+
+def test_small_turns_in_noise_calibrate_and_the_text_says_what_helps():
+    cell = replace(synthetic.rx90(), ranges=np.full(6, np.radians(2.5)))
+    fit = fit_model(cell.trials(0.5, np.random.default_rng(0), 9), epoch=1)
+    said = assess_fit(fit.model, fit.report)
+    assert said.grade == "usable"
+    assert "times as many stops or frames" in said.text
+    assert "more stops (calibration.stops) or frames at each (calibration.frames) do the same" in said.text
+
+
+@pytest.mark.parametrize("understated", [1.0, 3.0])
+def test_a_joint_that_stands_shows_no_motion_whatever_the_detector_states_of_its_noise(understated):
+    cell = synthetic.rx90()
+    positions, moved = cell.stops(9)
+    still = positions.copy()
+    still[moved == 2, 2] = cell.home[2]
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        trials = cell.trials(SIGMA, rng, 9)
+        pixels = cell.pixels(still) + rng.normal(0, understated * SIGMA, trials.pixels.shape)
+        points = np.ones((*trials.pixels.shape[1:3], 4))
+        with pytest.raises(CalibrationError, match="more frames at each stop") as error:
+            trial_stops(msgspec.structs.replace(trials, pixels=pixels), points, 2)
+        assert error.value.code == "joint_without_effect"
+        assert error.value.data["motion_sigmas"] < 0.85 * error.value.data["minimum"]

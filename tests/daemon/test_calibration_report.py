@@ -146,6 +146,9 @@ def test_verdict_names_the_joint_that_moved_too_little(fitted: tuple) -> None:
     assert said.grade == "usable"
     assert "depths are known to 9% only; joint j3 moved 4.0° only" in said.text
     assert "Raise calibration.range.j3." in said.text
+    # Deviations fall with the root of what is measured: (0.09 / 0.05)² rounded up.
+    assert "more stops (calibration.stops) or frames" in said.text
+    assert "4 times as many" in said.text
 
 
 def test_verdict_says_what_a_stratum_means(tmp_path: Path) -> None:

@@ -1,13 +1,16 @@
+import contextlib
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from oracles.frame_change import homography_from_basis, homography_refine
-from stereoservo.geometry.cameras import project_many
+from stereoservo.geometry.cameras import project_many, triangulate
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.homography import homography_from_points
+from stereoservo.geometry.homography import COPLANAR_TAIL, homography_from_points
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -99,6 +102,42 @@ def test_degenerate_point_sets_are_refused():
     nearly_flat[0] = A[0]  # all but one on a plane: a homology remains free
     with pytest.raises(GeometryError, match="determine"):
         homography_from_points(nearly_flat, nearly_flat)
+
+
+def turned_views(rig, rng, n, thickness, sigma):
+    """Points (n, 4) triangulated before and after a motion, noise ``sigma`` [px]; a plate of relative ``thickness``."""
+    X = rig.points(rng, n)
+    middle = X[:, :3].mean(axis=0)
+    turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    X[:, :3] = (X[:, :3] - middle) @ turn * [1.0, 1.0, thickness] @ turn.T + middle
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)).as_matrix()
+    T[:3, 3] = middle - T[:3, :3] @ middle
+    seen = [rig.pixels(M) + rng.normal(0, sigma, (2, n, 2)) for M in (X, X @ T.T)]
+    return [triangulate(rig.Ps, pixels) for pixels in seen]
+
+
+@pytest.mark.parametrize(("n", "most"), [(6, 6), (8, 2), (14, 1), (40, 1)])
+def test_coplanar_points_are_refused_within_their_noise(rig, n, most):
+    """Of 400 noisy plates at most what the stated tail allows is taken for spatial; of bodies none is refused."""
+    rng = np.random.default_rng(n)
+    accepted = refused = 0
+    for _ in range(400):
+        with contextlib.suppress(GeometryError):
+            homography_from_points(*turned_views(rig, rng, n, 0.0, 0.1))
+            accepted += 1
+    for _ in range(100):
+        try:
+            homography_from_points(*turned_views(rig, rng, n, 1.0, 0.1))
+        except GeometryError:
+            refused += 1
+    assert accepted <= most
+    with pytest.raises(GeometryError, match="coplanar within their noise") as error:
+        homography_from_points(*turned_views(rig, rng, n, 0.0, 0.1))
+    assert error.value.code == "degenerate"
+    assert error.value.data["probability"] > error.value.data["limit"] == COPLANAR_TAIL
+    # Six points show their noise by three freedoms: some that are near a plane cannot be told from one.
+    assert refused <= (8 if n == 6 else 0)
 
 
 def test_degenerate_bases_are_refused():

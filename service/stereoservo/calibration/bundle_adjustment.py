@@ -13,12 +13,13 @@ from typing import Literal
 import numpy as np
 
 from stereoservo.calibration.normal_equations import (
+    ArrowFactor,
     Weights,
+    arrow_factor,
     by_stop,
     chunks,
     normal_equations,
     prior_rows,
-    triangle_of,
 )
 from stereoservo.calibration.rig_model import (
     Charts,
@@ -62,9 +63,24 @@ class Solution:
     evaluations: int
 
     @cached_property
+    def lens_factor(self) -> ArrowFactor:
+        """Orthogonal factor of the Jacobian in which at least the radial parameters of the lenses are free."""
+        lenses: LensModel = "radial" if self.lenses == "none" else self.lenses
+        free = full_charts(self.rig, self.stratum, cameras=False, points=False, lenses=lenses).lenses
+        return arrow_factor(self.rig, replace(self.charts, lenses=free), self.data)
+
+    @cached_property
+    def factor(self) -> ArrowFactor:
+        """Orthogonal factor of the Jacobian by the parameters."""
+        fixed = len(self.rig.lenses) if self.lenses == "none" else 0
+        return self.lens_factor.without(self.charts.start(2) + np.arange(fixed))
+
+    @cached_property
     def triangle(self) -> FloatArray:
-        """Triangle (p, p) of the Jacobian: ``triangleᵀ triangle = Jᵀ J``, to the accuracy of QR."""
-        return triangle_of(self.rig, self.charts, self.data)[:-1, :-1]
+        """Root (p, p) of the normal matrix, ``triangleᵀ triangle = Jᵀ J``, to the accuracy of QR; triangular where
+        markers come first.
+        """
+        return self.factor.dense()[:-1, :-1]
 
     @cached_property
     def sizes(self) -> FloatArray:

@@ -72,7 +72,7 @@ def prediction_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
     camera, stop, marker = (index.ravel() for index in np.indices((c, s, m)))
     k = len(camera)
     grid = Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
-    variances = leverages(solution.rig, solution.charts, grid, covariance_root(solution))
+    variances = leverages(solution.rig, solution.charts, grid, solution.factor)
     seen = np.isfinite(predicted(solution.rig, grid)).all(axis=1)
     return np.where(seen, variances, np.nan).reshape(c, s, m)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
@@ -49,17 +50,21 @@ REMEDIES = {
     "another calibration.base",
     "too_few_stops": "raise calibration.stops, or give the joint more room: calibration.base, calibration.range",
     "joint_did_not_move": "the encoder reported no motion: is the joint's brake released, is its name the right one?",
-    "joint_without_effect": "the markers did not move with this joint: do they sit behind it, does its drive turn?",
+    "joint_without_effect": "the markers did not move with this joint: do they sit behind it, does its drive turn? If "
+    "it does, the motion is too small for the noise: raise calibration.range, or calibration.frames",
     "joint_kind": "correct the joint's kind in its driver's description: revolute or prismatic",
     "views_degenerate": "set the cameras apart (a baseline of a tenth of the distance at least) and show markers that "
     "do not stay in one plane: two faces, or calibration.spread for a flat plate",
-    "not_identifiable": "larger motions (calibration.range), markers off one plane (a second face, calibration.spread)",
+    "not_identifiable": "larger motions (calibration.range), markers off one plane (a second face, "
+    "calibration.spread); where there is no room, more stops (calibration.stops) or frames at each "
+    "(calibration.frames)",
     "no_convergence": "look at the tracks: did a camera move, are markers mixed up, are joint positions right?",
     "too_many_outliers": "look at the tracks of the joint named: reflections, mixed-up markers, another joint moving",
     "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
     "camera, a wrong joint scale, a detector that understates its noise",
     "noise_understated": "raise the detector's sigma to what the text says; look whether images are dark or blurred",
     "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",
+    "lens_implausible": "show markers all over the images, or straight edges (--lines); larger motions, more stops",
     "wrong_scale": "correct the drive's scale: revolute joints report rad, with the gear taken into account",
     "joints_exchanged": "two joints answer under each other's names: correct the order in the joint driver's options",
     "joint_order": "list the joints base first: correct the order in the joint driver's options",
@@ -176,15 +181,26 @@ def _identified(
         reasons.append(f"the data identify the {model.stratum} stratum only")
         why = [note for note in report.notes if "refused" in note]
         if why:
-            reasons.append(why[0])
+            # The last attempt at the stratum wanted is the nearest to the truth.
+            wanted = why[0].split()[0]
+            reasons.append([note for note in why if note.startswith(wanted)][-1])
     if not loose and model.stratum == "metric":
         return
+    short = False
     for joint, kind in zip(statistics.joints, model.joint_kinds, strict=True):
         small = np.degrees(joint.range) < SHORT_DEG if kind == "revolute" else joint.range < SHORT_M
         if small:
             moved = f"{np.degrees(joint.range):.1f}°" if kind == "revolute" else f"{joint.range:.3f} m"
             reasons.append(f"joint {joint.name} moved {moved} only")
             advice.append(f"raise calibration.range.{joint.name}")
+            short = True
+    if short:
+        ratio = 1.0 if depth is None else depth / NOTABLE_DEPTH_DEVIATION
+        times = f", {ceil(ratio**2)} times as many in all," if ratio > 1.0 else ""
+        advice.append(
+            f"where there is no room, more stops (calibration.stops) or frames at each (calibration.frames){times} do "
+            "the same"
+        )
     if not advice and loose:
         advice.append("larger trial motions, markers larger in the image or more stops make it better")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import msgspec
@@ -19,8 +19,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
-from stereoservo.calibration.normal_equations import triangle_of
-from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, full_charts
+from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.cameras import isotropic_normaliser
 from stereoservo.geometry.distortion import LensEstimate, straight_lens, undistort
@@ -29,8 +28,15 @@ from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import LensModel
 from stereoservo.numerics.arrays import FloatArray
 
+if TYPE_CHECKING:
+    from stereoservo.calibration.calibration_result import CalibrationFit
+
 FREE_LENS: LensModel = "radial_centre"
 """The lens model of cameras that distort."""
+STARTING_BENDS = (-0.1, -0.04, -0.2, 0.04)
+"""Radial parameters at half the image width of all cameras, from which fits start where the search has failed."""
+MOST_ASPECT = 1.5
+"""Ratio of a pixel's sides beyond which no camera is."""
 LENS_TAIL = 1e-4
 """Probability with which a pinhole is taken for a distorting lens."""
 
@@ -52,12 +58,16 @@ class LensTest:
 
 
 def starting_lenses(
-    trials: TrialData, asked: Literal["auto"] | LensModel, priors: Mapping[str, LensEstimate]
+    trials: TrialData,
+    asked: Literal["auto"] | LensModel,
+    priors: Mapping[str, LensEstimate],
+    bend: float | None = None,
 ) -> tuple[FloatArray, LensModel]:
     """Lenses (c, 4) to start from, and which of their parameters are free in the first bundle.
 
     Where ``asked`` leaves it to the data, lenses are free at once if priors are given or the epipolar geometry
-    needs them. Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
+    needs them; with ``bend`` they are free and all start from that radial parameter.
+    Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
     """
     names = [camera.name for camera in trials.cameras]
     unknown = sorted(set(priors) - set(names))
@@ -69,6 +79,9 @@ def starting_lenses(
             unknown=unknown,
         )
     lenses = straight_lenses(trials)
+    if bend is not None:
+        lenses[:, 0] = bend
+        return lenses, FREE_LENS if asked == "auto" else asked
     if asked == "none":
         return lenses, "none"
     if priors:
@@ -97,6 +110,34 @@ def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> Le
     return LensPriors(mean, information)
 
 
+def implausible_lens(result: CalibrationFit) -> CalibrationError | None:
+    """Error (``lens_implausible``) of a fit whose lens has its centre outside the image, or whose camera has pixels
+    far from square; None where all is plausible.
+    """
+    for camera, fitted in zip(result.model.cameras, result.report.cameras, strict=True):
+        if fitted.lens is not None:
+            _, cu, cv = fitted.lens
+            if not (0.0 <= cu <= camera.width and 0.0 <= cv <= camera.height):
+                return CalibrationError(
+                    "lens_implausible",
+                    f"the lens of camera {fitted.name!r} would have its centre at ({cu:.0f}, {cv:.0f}) px, outside of "
+                    f"the image of {camera.width} x {camera.height}: the fit has ended in a wrong place",
+                    camera=fitted.name,
+                    centre=[cu, cv],
+                )
+        if fitted.lens is not None and fitted.intrinsics is not None:
+            aspect = fitted.intrinsics[0] / fitted.intrinsics[2]
+            if not 1.0 / MOST_ASPECT < abs(aspect) < MOST_ASPECT:
+                return CalibrationError(
+                    "lens_implausible",
+                    f"the pixels of camera {fitted.name!r} would be {aspect:.3g} times as wide as high: the fit has "
+                    "ended in a wrong place",
+                    camera=fitted.name,
+                    aspect=aspect,
+                )
+    return None
+
+
 def straightened(rig: RigModel, data: Measurements) -> RigModel:
     """The rig with pinhole cameras, distortion centres from the priors of ``data``."""
     lenses = rig.lenses.copy()
@@ -114,20 +155,17 @@ def lens_test(solution: Solution) -> LensTest:
     relative to the noise left, where that is above the stated one.
     """
     c = len(solution.rig.lenses)
-    charts = replace(
-        solution.charts, lenses=full_charts(solution.rig, solution.stratum, lenses="radial").lenses
-    )
-    whole = triangle_of(solution.rig, charts, solution.data)
-    own = charts.start(2) + np.arange(c)
-    others = np.setdiff1d(np.arange(charts.size), own)
-    last = np.asarray(np.linalg.qr(whole[:, [*others, *own, charts.size]], mode="r"))[
-        len(others) :, len(others) :
-    ]
+    at = solution.charts.start(2)
+    free = 1 if solution.lenses == "none" else len(solution.charts.lenses[0])
+    own = at + free * np.arange(c)
+    core = solution.lens_factor.core[:, [*range(at), *own, -1]]
+    last = np.asarray(np.linalg.qr(core, mode="r"))[at:, at:]
     block = last[:c, :c]
     scores = last[:c, -1] if solution.lenses == "none" else block @ solution.rig.lenses[:, 0]
     gain = float(scores @ scores)
     left = solution.cost - (gain if solution.lenses == "none" else 0.0)
-    factor = max(1.0, left / max(1, solution.rows - charts.size))
+    parameters = at + c + solution.charts.size - solution.charts.start(3)
+    factor = max(1.0, left / max(1, solution.rows - parameters))
     return LensTest(gain / factor, c, float(chi2_distribution.isf(LENS_TAIL, c)))
 
 
@@ -135,6 +173,8 @@ GRID = (-0.30, -0.24, -0.19, -0.15, -0.12, -0.09, -0.06, -0.03, 0.0, 0.03, 0.06,
 """Radial parameters at half the image width that the search begins with."""
 PINHOLE_AGREEMENT = 0.95
 """Share of matches within 3.29 sigmas of one epipolar geometry at which no lens is searched for."""
+NOISE_AGREEMENT = 0.99
+"""The share that Gaussian noise leaves to pinholes, 0.999, less what some matches' scatter takes."""
 COARSE_PX = 1.5
 """Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
 MOST_BEND = 0.6
@@ -149,6 +189,8 @@ CENTRE_BOUND = 2.0
 """Largest offset of a centre in the search, in those standard deviations."""
 START_GAIN = 100.0
 """Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
+MOST_MATCHES = 20_000
+"""Matches of two cameras at most, evenly spread, that the search for a lens looks at."""
 
 
 def straight_lenses(trials: TrialData) -> FloatArray:
@@ -196,13 +238,25 @@ def epipolar_lenses(trials: TrialData) -> FloatArray:
     return lenses
 
 
+def lenses_may_bend(trials: TrialData) -> bool:
+    """Whether the matches of some pair of cameras leave more to a lens than pinholes do by noise."""
+    straight = straight_lenses(trials)
+    for k in range(1, len(trials.cameras)):
+        match = _matches(trials, k)
+        if match is not None and _agreement(*match, straight[[0, k]]) < NOISE_AGREEMENT:
+            return True
+    return False
+
+
 def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
     """Raw matches (2, n, 2) of cameras 0 and k over all stops, and their sigmas (2, n); None where too few."""
     pixels = trials.pixels[[0, k]].reshape(2, -1, 2)
     seen = np.asarray(finite_rows(pixels).all(axis=0))
     if int(seen.sum()) < MIN_MATCHES:
         return None
-    return pixels[:, seen], trials.sigmas[[0, k]].reshape(2, -1)[:, seen]
+    every = np.flatnonzero(seen)
+    some = every[np.linspace(0, len(every) - 1, min(len(every), MOST_MATCHES)).astype(np.int64)]
+    return pixels[:, some], trials.sigmas[[0, k]].reshape(2, -1)[:, some]
 
 
 def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float:

@@ -1,9 +1,10 @@
 """Analytic Jacobian of the calibration's pixels, and from it the normal equations by blocks for the bundle adjustment's
-steps; a triangular factor by QR and the leverages of measurements for its statistics.
+steps; an orthogonal factor and the leverages of measurements for its statistics.
 
 A pixel depends on the generators, one camera, one lens and one marker. Rows of the Jacobian are made chunk by chunk, so
-that memory stays bounded and cost grows linearly with the images; markers, which no pixel shares, are eliminated from
-the normal equations by blocks (Schur complement).
+that memory stays bounded and cost grows linearly with the images; markers, which no pixel shares, are eliminated one by
+one, from the normal equations by blocks (Schur complement), from the factor by reflections: cost grows linearly with
+them, too.
 """
 
 from __future__ import annotations
@@ -373,31 +374,143 @@ def normal_equations(
     )
 
 
-def triangle_of(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
-    """Triangle ``R`` (p + 1, p + 1) with ``Rᵀ R = [J r]ᵀ [J r]`` by QR in chunks, priors of lenses included.
+@kernel
+def _eliminate_markers(
+    core: FloatArray, own: FloatArray, order: IntArray, marker: IntArray, blocks: FloatArray
+) -> None:
+    """Householder reflections that take the columns of each row's own marker out of ``core`` (2 k, p + 1), ``own``
+    (2 k, q), both overwritten, and into ``blocks`` (m, q, q + p + 1), each marker's triangle and its coupling.
 
-    To the accuracy of QR on the whole Jacobian: no product squares its condition.
+    ``order`` (k,) sorts the measurements by ``marker`` (k,).
     """
-    sorted_data, _ = by_stop(data)
-    p = charts.size
-    R = _triangle(np.vstack([np.zeros((p + 1, p + 1)), prior_rows(rig, charts, data)]))
-    for _, rows in chunks(rig, charts, sorted_data):
-        R = _triangle(np.vstack([R, rows.dense(len(rig.points))]))
-    return R
+    q, width = own.shape[1], core.shape[1]
+    along = np.zeros(q + width)
+    first = 0
+    while first < len(order):
+        i, end = marker[order[first]], first
+        while end < len(order) and marker[order[end]] == i:
+            end += 1
+        block = blocks[i]
+        for a in range(q):
+            below = 0.0
+            for k in range(first, end):
+                for row in range(2 * order[k], 2 * order[k] + 2):
+                    below += own[row, a] * own[row, a]
+            if below == 0.0:
+                continue
+            # The reflection that takes (x, y) to (-sign(x) |(x, y)|, 0), by its vector (head, y).
+            size = np.sqrt(block[a, a] * block[a, a] + below)
+            head = block[a, a] + (size if block[a, a] >= 0.0 else -size)
+            scale = 2.0 / (head * head + below)
+            for b in range(a, q + width):
+                along[b] = head * block[a, b]
+            for k in range(first, end):
+                for row in range(2 * order[k], 2 * order[k] + 2):
+                    y = own[row, a]
+                    for b in range(a, q):
+                        along[b] += y * own[row, b]
+                    for b in range(width):
+                        along[q + b] += y * core[row, b]
+            for b in range(a, q + width):
+                along[b] *= scale
+                block[a, b] -= head * along[b]
+            for k in range(first, end):
+                for row in range(2 * order[k], 2 * order[k] + 2):
+                    y = own[row, a]
+                    for b in range(a + 1, q):
+                        own[row, b] -= y * along[b]
+                    for b in range(width):
+                        core[row, b] -= y * along[q + b]
+                    own[row, a] = 0.0
+        first = end
+
+
+@dataclass(frozen=True)
+class ArrowFactor:
+    """Orthogonal factor ``R`` of ``[J r]``, triangular where markers come first: ``Rᵀ R = [J r]ᵀ [J r]``.
+
+    ``own`` (m, q, q): each marker's triangle; ``cross`` (m, q, p_core + 1): its rows by the other parameters and the
+    residuals; ``core`` (p_core + 1, p_core + 1): the triangle of these once the markers are eliminated.
+    """
+
+    own: FloatArray
+    cross: FloatArray
+    core: FloatArray
+
+    def without(self, columns: IntArray) -> ArrowFactor:
+        """The factor without these ``columns`` of generators, cameras and lenses: with them kept fixed."""
+        if not len(columns):
+            return self
+        return ArrowFactor(
+            self.own, np.delete(self.cross, columns, axis=2), _triangle(np.delete(self.core, columns, axis=1))
+        )
+
+    def dense(self) -> FloatArray:
+        """``R`` (p + 1, p + 1), columns in the order of the charts and the residuals last; rows of markers first."""
+        m, q, width = self.cross.shape
+        out = np.zeros((m * q + width, m * q + width))
+        core = np.append(np.arange(width - 1), m * q + width - 1)
+        out[: m * q, core] = self.cross.reshape(m * q, width)
+        out[m * q :, core] = self.core
+        rows = np.arange(m * q)
+        out[rows[:, None], width - 1 + (rows // max(q, 1))[:, None] * q + np.arange(q)] = self.own.reshape(
+            m * q, q
+        )
+        return out
+
+
+def arrow_factor(
+    rig: RigModel, charts: Charts, data: Measurements, more: FloatArray | None = None
+) -> ArrowFactor:
+    """Orthogonal factor of the Jacobian and the residuals, priors of lenses included, in chunks.
+
+    To the accuracy of QR on the whole Jacobian, for no product squares its condition; time and memory linear in the
+    markers, for each is eliminated from its own rows. ``more`` (2 k, e): columns behind those of the lenses.
+    """
+    sorted_data, order = by_stop(data)
+    beside = np.zeros((2 * len(order), 0)) if more is None else more
+    width, q, e = charts.start(3), len(charts.points[0]), beside.shape[1]
+    blocks = np.zeros((len(rig.points), q, q + width + e + 1))
+    core = np.zeros((width + e + 1, width + e + 1))
+    prior = np.insert(prior_rows(rig, charts, data)[:, [*range(width), -1]], [width] * e, 0.0, axis=1)
+    core = _triangle(np.vstack([core, prior]))
+    for here, rows in chunks(rig, charts, sorted_data):
+        whole = rows.core
+        if e:
+            extra = beside.reshape(-1, 2, e)[order[here]].reshape(-1, e)
+            whole = np.hstack([whole[:, :-1], extra, whole[:, -1:]])
+        if q:
+            _eliminate_markers(whole, rows.own, np.argsort(rows.marker, kind="stable"), rows.marker, blocks)
+        core = _triangle(np.vstack([core, whole]))
+    return ArrowFactor(blocks[:, :, :q], blocks[:, :, q:], core)
+
+
+def triangle_of(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
+    """``R`` (p + 1, p + 1) with ``Rᵀ R = [J r]ᵀ [J r]``, dense, priors of lenses included: see `arrow_factor`."""
+    return arrow_factor(rig, charts, data).dense()
 
 
 def _triangle(rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def leverages(rig: RigModel, charts: Charts, data: Measurements, root: FloatArray) -> FloatArray:
-    """Leverage (k,) of each measurement, ``trace(J_i C J_iᵀ)`` in its sigmas: its share of the hat matrix's trace.
-
-    ``root`` (p, p): ``C = root rootᵀ`` is the parameters' covariance.
+def leverages(rig: RigModel, charts: Charts, data: Measurements, factor: ArrowFactor) -> FloatArray:
+    """Leverage (k,) of each measurement, ``trace(J_i (Jᵀ J)⁻¹ J_iᵀ)`` in its sigmas: its share of the hat matrix's
+    trace. ``factor``: of the measurements that determine the parameters. Raises LinAlgError where they do not.
     """
     sorted_data, order = by_stop(data)
+    triangle = factor.core[:-1, :-1]
+    sizes = np.linalg.norm(triangle, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    core_root = np.linalg.inv(triangle / sizes) / sizes[:, None]
+    lengths = np.linalg.norm(factor.own, axis=1)
+    lengths[lengths == 0.0] = 1.0
+    own_roots = np.linalg.inv(factor.own / lengths[:, None, :]) / lengths[:, :, None]
     out = np.empty(len(order))
     for here, rows in chunks(rig, charts, sorted_data):
-        slopes = rows.dense(len(rig.points))[:, :-1] @ root
-        out[order[here]] = (slopes**2).sum(axis=1).reshape(-1, 2).sum(axis=1)
+        marker = np.repeat(rows.marker, 2)
+        own = np.einsum("ka,kab->kb", rows.own, own_roots[marker])
+        left = rows.core[:, :-1] - np.einsum("ka,kab->kb", own, factor.cross[marker, :, :-1])
+        squares = (own**2).sum(axis=1) + ((left @ core_root) ** 2).sum(axis=1)
+        out[order[here]] = squares.reshape(-1, 2).sum(axis=1)
     return out

@@ -20,7 +20,10 @@ from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.lens_estimation import (
     FREE_LENS,
+    STARTING_BENDS,
+    implausible_lens,
     lens_test,
+    lenses_may_bend,
     prior_of_lenses,
     starting_lenses,
     straightened,
@@ -51,6 +54,8 @@ Progress = Callable[[str, float], None]
 
 VALLEY_VARIANCE = 1.5
 """Variance factor up to which an unconverged bundle lies in a flat valley of its cost: a direction is undetermined."""
+OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
+"""Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
 FEW_OUTLIERS = 0.05
 """Share of outliers that may still change in a bundle that has not converged."""
 MIN_SIGHTINGS = 2
@@ -87,21 +92,39 @@ def fit_model(
         return _fit(data, epoch, created, _silent, chosen, priors)
 
     check_motions(chain)
+
+    def otherwise(cause: CalibrationError) -> CalibrationFit:
+        """The fit from other lenses where one explains the data; else ``cause`` is raised."""
+        free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
+        bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
+        found = _from_other_lenses(chain, epoch, created, options) if bent else None
+        if found is None:
+            raise cause
+        return found
+
     try:
         result = _fit(chain, epoch, created, progress or _silent, options, priors)
     except CalibrationError as error:
-        raise diagnose_failure(chain, error, refit, options) from error
+        result = otherwise(diagnose_failure(chain, error, refit, options))
     except (GeometryError, np.linalg.LinAlgError) as error:
         broken = CalibrationError(
             "no_convergence",
             f"the fit broke down: {error}. Are positions and markers what they are said to be?",
         )
-        raise diagnose_failure(chain, broken, refit, options) from error
+        result = otherwise(diagnose_failure(chain, broken, refit, options))
+    implausible = implausible_lens(result)
+    if implausible is not None:
+        result = otherwise(implausible)
+    try:
+        notes = review_notes(chain, result, refit, options)
+    except CalibrationError as cause:
+        result = otherwise(cause)
+        notes = review_notes(chain, result, refit, options)
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
     model, of_scene = with_static_points(model, trials.static)
     report = msgspec.structs.replace(
         result.report,
-        notes=(*result.report.notes, *review_notes(chain, result, refit, options), *of_scene),
+        notes=(*result.report.notes, *notes, *of_scene),
         untested=untested(chain),
     )
     return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
@@ -114,9 +137,11 @@ def _fit(
     report_progress: Progress,
     options: FitOptions,
     priors: Mapping[str, LensEstimate],
+    bend: float | None = None,
 ) -> CalibrationFit:
+    """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from."""
     report_progress("cameras", 0.0)
-    lenses, lens_model = starting_lenses(trials, options.lens, priors)
+    lenses, lens_model = starting_lenses(trials, options.lens, priors, bend)
     cameras, points, usable = initial_reconstruction(undistorted(trials, lenses))
     trials, points, usable, left_out = _without_rare_markers(trials, points, usable)
     ideal = undistorted(trials, lenses)
@@ -134,7 +159,7 @@ def _fit(
     clean = every.select(usable[every.camera, every.stop, every.marker])
     linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     report_progress("rigid bundle", 0.6)
-    decided = options.lens != "auto" or bool(priors)
+    decided = options.lens != "auto" or bool(priors) or bend is not None
     solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
     _refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
@@ -168,6 +193,23 @@ def _fit(
     )
     report_progress("done", 1.0)
     return result
+
+
+def _from_other_lenses(
+    trials: TrialData, epoch: int, created: str, options: FitOptions
+) -> CalibrationFit | None:
+    """The first fit, of those that start from lenses over the whole range, that its noise explains and whose lenses
+    are plausible; None where there is none.
+    """
+    for bend in STARTING_BENDS:
+        try:
+            result = _fit(trials, epoch, created, _silent, options, {}, bend)
+        except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+            continue  # not from there
+        statistics = result.model.statistics
+        if statistics is not None and statistics.chi2_ok and implausible_lens(result) is None:
+            return result
+    return None
 
 
 def _projective(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from math import ceil
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -55,6 +56,8 @@ NOMINAL_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
 """Infinity of the canonical frame's nominal cameras."""
 FINISHED, FINISH_EVALUATIONS = 4, 400
 """How many of the bundles that have not converged are solved to their end, and how long."""
+MOST_TIMES = 5.0
+"""How many times the deviation wanted one may be for its first-order value to tell how much more must be measured."""
 LOOSE_SPREAD = 0.75
 """Relative deviation of depths and focal lengths beyond which linear statistics are meaningless."""
 PLAUSIBLE_TAIL, NESTED_TAIL = 1e-3, 1e-6
@@ -207,7 +210,8 @@ class StratumSelector:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
         limit = self.options.max_spread
         return "; ".join(
-            f"{what} known to {deviation:.0%} only, {limit:.0%} needed"
+            f"{what} known to {deviation:.0%} only, {limit:.0%} needed: larger motions, or "
+            f"{_as_many(deviation / limit)} stops or frames"
             for what, deviation in _relative_deviations(solution).items()
             if deviation > limit
         )
@@ -216,6 +220,11 @@ class StratumSelector:
         note = f"{solution.stratum} stratum refused: {text}"
         if note not in self.notes:
             self.notes.append(note)
+
+
+def _as_many(ratio: float) -> str:
+    """How many more measurements make a deviation smaller by ``ratio``, in words."""
+    return f"{ceil(ratio**2)} times as many" if ratio <= MOST_TIMES else "many more"
 
 
 def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:

@@ -24,7 +24,7 @@ from stereoservo.geometry.cameras import (
     triangulation_covariance,
 )
 from stereoservo.geometry.homogeneous import GeometryError, move_points, to_homogeneous, whitener
-from stereoservo.geometry.homography import homography_from_points, pixel_whitening, unit_determinant
+from stereoservo.geometry.homography import linear_homography, pixel_whitening, unit_determinant
 from stereoservo.geometry.moved_cameras import (
     OFF_PLANE,
     FrameChange,
@@ -243,7 +243,7 @@ def _start(
 ) -> FloatArray:
     """A first map from both reconstructions, ``|det| = 1``, with the sign that keeps points in front."""
     if family == "projective":
-        return homography_from_points(M_old, M_new)
+        return linear_homography(M_old, M_new)[0]
     X, Y = move_points(up_old, M_old), move_points(up_new, M_new)
     x, y = X[:, :3] / X[:, 3:], Y[:, :3] / Y[:, 3:]
     if not (np.isfinite(x).all() and np.isfinite(y).all()):

@@ -324,7 +324,7 @@ def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatAr
     system = np.concatenate(
         [np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:2] * X])], axis=0
     )
-    _, singular, v = np.linalg.svd(system)
+    _, singular, v = np.linalg.svd(system, full_matrices=False)
     if not singular[10] > 1e-9 * singular[0]:
         raise GeometryError(
             "degenerate", "the points do not determine a camera (coplanar?)", singular=singular

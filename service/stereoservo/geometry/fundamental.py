@@ -36,7 +36,7 @@ def fundamental_linear(left: FloatArray, right: FloatArray) -> FloatArray:
     T_left, T_right = isotropic_normaliser(left), isotropic_normaliser(right)
     x, y = to_homogeneous(from_pixels(T_left, left)), to_homogeneous(from_pixels(T_right, right))
     system = (y[:, :, None] * x[:, None, :]).reshape(-1, 9)
-    _, singular, v = np.linalg.svd(system)
+    _, singular, v = np.linalg.svd(system, full_matrices=len(system) < 9)
     if not singular[7] > 1e-7 * singular[0]:
         raise GeometryError(
             "degenerate",
@@ -162,10 +162,9 @@ def fundamental_refine(
         value, on_right, on_left, length = _sampson_parts(p @ B @ q, u, v, lines)
         # d(value/length): value is linear in the matrix, length² a sum of squares of line normals in
         # pixels.
-        d_value = np.einsum("ni,kij,nj->nk", v, D, u)
-        d_right = np.einsum("ai,kij,nj->nka", lines[1], D, u)
-        d_left = np.einsum("aj,kij,ni->nka", lines[0], D, v)
-        d_square = np.einsum("na,nka->nk", on_right, d_right) + np.einsum("na,nka->nk", on_left, d_left)
+        d_value = _products(v, u) @ D.reshape(7, 9).T
+        d_square = _products(on_right, u) @ (lines[1] @ D).reshape(7, 6).T
+        d_square += _products(v, on_left) @ (D @ lines[0].T).reshape(7, 6).T
         result: FloatArray = (d_value / length[:, None] - (value / length**3)[:, None] * d_square) * weights[
             :, None
         ]
@@ -175,6 +174,11 @@ def fundamental_refine(
     fit = least_squares(residuals, np.zeros(7), jac=jacobian, method="trf", loss=loss, **options)
     p, B, q = parts(fit.x)
     return _unit(T_right.T @ U @ p @ B @ q @ Vt @ T_left)
+
+
+def _products(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Products (n, i j) of the entries of each row of ``a`` (n, i) with those of ``b`` (n, j)."""
+    return (a[:, :, None] * b[:, None, :]).reshape(len(a), -1)
 
 
 def _sampson_parts(

@@ -10,13 +10,49 @@ from stereoservo.geometry.cameras import projection_jacobian_many
 from stereoservo.geometry.homogeneous import GeometryError, whitener
 from stereoservo.numerics.arrays import FloatArray
 
+COPLANAR_TAIL = 1e-3
+"""Probability with which coplanar points are taken for spatial ones."""
+
 
 def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
     """``H`` (4, 4) with ``B_i ~ H A_i`` for points ``(n, 4)``, n >= 5, linear with whitening; ``|det H| =
     1``.
 
     The sign keeps heights: ``H A_i`` points where ``B_i`` does. Rows with NaN are left out. Raises
-    GeometryError for fewer than five points or points that leave H undetermined (coplanar).
+    GeometryError for fewer than five points or points that leave H undetermined (coplanar): exactly so, or, from six
+    points on, within the noise that the fit shows. Five points fit exactly and show none: where they are noisy ask
+    `moved_cameras.refuse_coplanar`.
+    """
+    H, count, values = linear_homography(A, B)
+    chance = _chance_of_coplanar(values, count)
+    if chance > COPLANAR_TAIL:
+        raise GeometryError(
+            "degenerate",
+            f"the {count} points are coplanar within their noise: as such they would look like this with probability "
+            f"{chance:.2g}, {COPLANAR_TAIL:g} at most may; points farther off one plane, or less noise, are needed",
+            probability=chance,
+            limit=COPLANAR_TAIL,
+        )
+    return H
+
+
+def _chance_of_coplanar(values: FloatArray, count: int) -> float:
+    """Probability of a least singular value as far below the one before it, if the points were coplanar.
+
+    Whitening takes the noise across the plane of coplanar points for their fourth coordinate. Then both values are of
+    that noise alone, over 3 n - 14 freedoms, the least of them the smaller by √3: H is the identity of the plane's
+    three coordinates there, of unit norm. For two directions of equal noise over ν freedoms,
+    ``(2 s t / (s² + t²))^(ν - 1)`` is uniform in [0, 1] (the test of sphericity, exact for two).
+    """
+    if count < 6:
+        return 0.0
+    second, least = float(values[14]), min(float(np.sqrt(3.0) * values[15]), float(values[14]))
+    return float((2.0 * second * least / (second**2 + least**2)) ** (3 * count - 15))
+
+
+def linear_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int, FloatArray]:
+    """``H`` (4, 4) as of `homography_from_points`, without its test against noise: for points that have passed
+    another. Also the number of points used, and the 16 singular values of the equations.
     """
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
     if A.ndim != 2 or A.shape[1] != 4 or A.shape != B.shape:
@@ -36,13 +72,14 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
     mirror = mirror / np.linalg.norm(mirror, axis=1, keepdims=True)
     planes = (np.eye(4) - 2.0 * mirror[:, :, None] * mirror[:, None, :])[:, 1:]
     system = (planes[:, :, :, None] * a[:, None, None, :]).reshape(-1, 16)
-    _, singular, v = np.linalg.svd(system)
+    _, values, v = np.linalg.svd(system, full_matrices=len(system) < 16)
+    singular = np.append(values, np.zeros(16 - len(values)))
     if not singular[14] > 1e-9 * singular[0]:
         raise GeometryError("degenerate", "the points do not determine a homography (four of five coplanar?)")
     H: FloatArray = np.linalg.solve(W_B, v[15].reshape(4, 4)) @ W_A
     H = unit_determinant(H, "the homography")
     agreement = (np.sign(((A @ H.T) * B).sum(axis=1))).sum()
-    return -H if agreement < 0 else H
+    return (-H if agreement < 0 else H), len(A), singular
 
 
 def unit_determinant(H: FloatArray, what: str) -> FloatArray:

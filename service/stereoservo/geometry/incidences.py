@@ -108,7 +108,8 @@ def homography_from_incidences(incidences: Sequence[Incidence], tolerance: float
     for incidence in incidences:
         planes = dual(incidence.second @ W_B.T, RANK)
         rows.append(np.einsum("li,kj->lkij", planes, basis(incidence.first @ W_A.T, RANK)).reshape(-1, 16))
-    _, singular, v = np.linalg.svd(np.concatenate(rows))
+    system = np.concatenate(rows)
+    _, singular, v = np.linalg.svd(system, full_matrices=len(system) < 16)
     family = int((singular[:15] <= tolerance * singular[0]).sum())
     if family:
         raise GeometryError(

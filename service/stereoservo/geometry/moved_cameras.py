@@ -45,7 +45,8 @@ def plane_deviations(points: FloatArray, covariance: FloatArray | None = None) -
         # Least Σw²(aᵀM)² at Σw²aᵀΣa = 1, by the generalised singular values of the two stacks.
         stack = np.concatenate([points * weights[:, None], (roots * weights[:, None, None]).reshape(-1, 4)])
         Q, R = np.linalg.qr(stack)
-        plane: FloatArray = np.asarray(np.linalg.solve(R, np.linalg.svd(Q[:n])[2][3]), dtype=np.float64)
+        across = np.linalg.svd(Q[:n], full_matrices=n < 4)[2][3]
+        plane: FloatArray = np.asarray(np.linalg.solve(R, across), dtype=np.float64)
         plane = plane / np.linalg.norm(plane)
         deviation = np.sqrt(np.einsum("i,nij,j->n", plane, covariance, plane))
         weights = 1.0 / np.where(deviation > 0, deviation, 1.0)

@@ -56,7 +56,7 @@ def dual(vectors: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
     unit = _vectors(vectors)
     if not len(unit):
         return np.eye(unit.shape[1])
-    _, singular, rows = np.linalg.svd(unit, full_matrices=True)
+    _, singular, rows = np.linalg.svd(unit, full_matrices=len(unit) < unit.shape[1])
     return np.ascontiguousarray(rows[int((singular > tolerance * singular[0]).sum()) :])
 
 

@@ -195,7 +195,7 @@ def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
     weights = 1.0 / np.linalg.norm(M, axis=1)
     plane = np.zeros(4)
     for _ in range(10):  # the variances follow the plane
-        plane = np.linalg.svd(M * weights[:, None])[2][3]
+        plane = np.linalg.svd(M * weights[:, None], full_matrices=len(M) < 4)[2][3]
         weights = 1.0 / np.sqrt(np.maximum(np.einsum("i,nij,j->n", plane, C, plane), 1e-300))
     return float(((M @ plane * weights) ** 2).sum())
 

@@ -250,7 +250,7 @@ ACROSS = 1e-6
 def plane_basis(M: FloatArray) -> FloatArray:
     """Orthonormal ``(4, 4)``: columns 1 to 3 span the points M (m, 4) best, column 4 is their common plane."""
     unit = M / np.linalg.norm(M, axis=1, keepdims=True)
-    basis: FloatArray = np.linalg.svd(unit)[2].T
+    basis: FloatArray = np.linalg.svd(unit, full_matrices=len(unit) < 4)[2].T
     return basis
 
 
@@ -299,7 +299,7 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
         pairs = [(abs(values[i] - values[j]), values[i] + values[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
         gamma = 0.5 * float(min(pairs, key=lambda pair: float(pair[0]))[1].real)
         weighted.append(left @ (D / gamma - B) @ factor.T)
-    v = np.linalg.svd(np.concatenate(weighted))[2][0]
+    v = np.linalg.svd(np.concatenate(weighted), full_matrices=False)[2][0]
     g = np.linalg.solve(factor, v)
     k = np.stack([np.linalg.solve(left, G @ v) for G in weighted])
     return _last_freedom(B @ g, normal, k, left)

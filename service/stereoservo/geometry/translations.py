@@ -197,7 +197,7 @@ def plane_at_infinity_from_stack(
     Raises GeometryError for an empty stack and for a homography without trace.
     """
     stack = np.concatenate([weighting.weighted(H) for H in _some(Hs)])
-    return weighting.plane(np.linalg.svd(stack)[2][0])
+    return weighting.plane(np.linalg.svd(stack, full_matrices=False)[2][0])
 
 
 def direction_given_plane(H: FloatArray, plane: FloatArray, weighting: Weighting = UNWEIGHTED) -> FloatArray:

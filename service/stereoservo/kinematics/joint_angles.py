@@ -356,7 +356,7 @@ def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
 def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
     """Raise JointAnglesError where the pixels do not determine a joint's position at ``q`` (n,)."""
     slope = problem.linearise(q[None])[1][0]
-    _, singular, rows = np.linalg.svd(slope, full_matrices=True)
+    _, singular, rows = np.linalg.svd(slope, full_matrices=len(slope) < len(q))
     padded = np.zeros(len(q))
     padded[: len(singular)] = singular
     padded = np.maximum(padded, max(1e-12 * float(padded[0]), 1e-300))

@@ -221,7 +221,7 @@ def base_link(poses: FloatArray, displacements: FloatArray) -> BaseLink:
     D = displacements[1:] @ np.linalg.inv(displacements[0])
     eye = np.eye(4)
     rows = np.concatenate([np.kron(eye, d.T) - np.kron(b, eye) for b, d in zip(B, D, strict=True)])
-    _, values, vectors = np.linalg.svd(rows)
+    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
     if not values[-2] > 10.0 * max(float(values[-1]), 1e-12 * float(values[0])):
         raise GeometryError(
             "degenerate",

@@ -1,9 +1,11 @@
-"""``bench calibration``: duration of a fit of the thesis's size, CPU time per image, and scipy's dense least
-squares as a baseline.
+"""``bench calibration``: duration of a fit of the thesis's size, CPU time per image, CPU time and memory over the
+markers, and scipy's dense least squares as a baseline.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import resource
 import time
 from typing import Any
 
@@ -19,13 +21,20 @@ from stereoservo.kinematics.axes import framed
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.exact_model import exact_model
-from stereoservo_sim.world.synthetic import SyntheticCell, rx90, two_faces
+from stereoservo_sim.world.synthetic import SyntheticCell, rotation, rx90, two_faces
 
 SIGMA = 0.05
 """[px]"""
 STOPS = 20
 IMAGES = (100, 300, 1000, 3000, 10_000)
 """About how many, for the cost an image."""
+MARKERS = (8, 16, 32, 64)
+"""For the cost a marker, in two cameras."""
+MARKER_IMAGES = 1000
+"""About how many, for the cost a marker."""
+LARGEST = (64, 4, 10_000)
+"""Markers, cameras and images of a large plant, fitted from ``LARGE_FROM`` repetitions on: it takes a minute."""
+LARGE_FROM = 20
 START = 30.0
 """How far the common start of the two least squares lies from the truth [standard deviations]."""
 
@@ -59,10 +68,16 @@ def run_calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict
         "fit_wall_s": summary(wall),
         "fit_cpu_s": summary(cpu),
         "per_image": _per_image(cell, seed, progress),
+        "per_marker": _per_marker(count, seed, progress),
         "least_squares": _beside_scipy(cell, data[0], count, seed, progress),
     }
     times = [row["fit_ms_an_image"] for row in result["per_image"]]
     result["fit_ms_an_image_last_over_first"] = times[-1] / times[0]
+    plants = [row for row in result["per_marker"] if row["cameras"] == 2]
+    slope = np.polyfit(
+        np.log([row["markers"] for row in plants]), np.log([row["fit_cpu_s"] for row in plants]), 1
+    )
+    result["fit_cpu_exponent_over_markers"] = float(slope[0])
     return result
 
 
@@ -84,6 +99,43 @@ def _per_image(cell: SyntheticCell, seed: int, progress: ProgressCall) -> list[d
         )
         progress("cost an image", k + 1, len(IMAGES))
     return rows
+
+
+def _per_marker(count: int, seed: int, progress: ProgressCall) -> list[dict[str, float]]:
+    """CPU time and peak memory of one fit each, in a process of its own; of the largest plant from many repetitions on.
+
+    The processes are forked from a small server: the peak of a child of this one would begin at its size.
+    """
+    plants = [(markers, 2, MARKER_IMAGES) for markers in MARKERS]
+    if count >= LARGE_FROM:
+        plants.append(LARGEST)
+    rows = []
+    with multiprocessing.get_context("forkserver").Pool(1, maxtasksperchild=1) as pool:
+        for k, plant in enumerate(plants):
+            rows.append(pool.apply(measured_fit, (*plant, seed)))
+            progress("cost a marker", k + 1, len(plants))
+    return rows
+
+
+def measured_fit(markers: int, cameras: int, images: int, seed: int) -> dict[str, float]:
+    """CPU time [s] of one fit and the peak memory [MB] of this process, after a small fit that loads all kernels."""
+    across = np.random.default_rng([seed, 3000]).uniform([-0.05, -0.035], [0.05, 0.035], (markers, 2))
+    front, side = np.array_split(np.column_stack([across, np.full(markers, 0.05)]), 2)
+    side = side @ rotation("y", 50)[:3, :3].T + [0.07, 0.0, -0.02]
+    cell = rx90(np.vstack([front, side]), cameras)
+    fit_model(cell.trials(SIGMA, np.random.default_rng([seed, 3001]), 4), epoch=1)
+    stops = max(4, round(images / (len(cell.kinds) * cameras)))
+    trials = cell.trials(SIGMA, np.random.default_rng([seed, 3002]), stops)
+    at = time.process_time()
+    fit_model(trials, epoch=1)
+    spent = time.process_time() - at
+    return {
+        "markers": markers,
+        "cameras": cameras,
+        "images": trials.images,
+        "fit_cpu_s": round(spent, 3),
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+    }
 
 
 def _beside_scipy(

@@ -196,7 +196,7 @@ def flat_plate() -> FloatArray:
 def stereo_pair(count: int = 2) -> tuple[FloatArray, FloatArray]:
     """Intrinsics (c, 3, 3) and poses (c, 4, 4): f = 800 px, 640x480, baseline 20 cm, vergence 20°, looking along z.
 
-    Cell with a third camera above.
+    A third camera is above, a fourth below.
     """
     K = np.array([[800, 0, 322.0], [0, 795, 238.5], [0, 0, 1]])
     K2 = np.array([[812, 0, 315.0], [0, 806, 243.0], [0, 0, 1]])
@@ -204,8 +204,9 @@ def stereo_pair(count: int = 2) -> tuple[FloatArray, FloatArray]:
         rotation("y", -10) @ translation(0.1, 0, 0),
         rotation("y", 10) @ translation(-0.1, 0, 0),
         rotation("x", -12) @ translation(0, -0.25, 0.05),
+        rotation("x", 12) @ translation(0, 0.25, 0.05),
     ]
-    return np.array([K, K2, K][:count]), np.array(poses[:count])
+    return np.array([K, K2, K, K2][:count]), np.array(poses[:count])
 
 
 def placed(

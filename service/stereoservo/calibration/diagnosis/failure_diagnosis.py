@@ -35,7 +35,7 @@ from stereoservo.calibration.diagnosis.input_corrections import (
     pinhole_reconstruction,
     solution_of,
 )
-from stereoservo.calibration.diagnosis.joint_scales import prismatic_ratios
+from stereoservo.calibration.diagnosis.joint_scales import lenses_explain_more, prismatic_ratios
 from stereoservo.calibration.diagnosis.marker_tracks import find_step, path_noise, paths_are_smooth
 from stereoservo.calibration.diagnosis.outlier_causes import (
     camera_moved,
@@ -221,8 +221,13 @@ def review_notes(
     bent = result.report.lens.model == "none" and result.report.lens.chi2 > result.report.lens.limit
     if nearly and not bent:
         wrong = scale_error(trials, trials, result, np.ones(len(trials.joint_names)))
-        if wrong is not None:
+        if wrong is not None and not lenses_explain_more(solution_of(trials, result)):
             raise wrong
+        if wrong is not None:
+            notes.append(
+                "the lenses distort in a way that a radial parameter with its centre does not follow; scales of joints "
+                "would explain less of what is left. Undistort the images before the detector, or use other lenses"
+            )
     if trials.joint_kinds.count("prismatic") > 1:
         for ratio in prismatic_ratios(result, solution_of(trials, result)):
             if ratio.wrong:

@@ -11,12 +11,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from stereoservo.calibration.single_joint_fit import LOCKED_RANGE, MIN_IMAGE_MOTION, MIN_RANGE
+from stereoservo.calibration.single_joint_fit import LOCKED_RANGE
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 ON_A_LINE = 3.0
 """Rms distance [sigmas] from their common line at which markers count as collinear: detectors misjudge their noise."""
+MIN_IMAGE_MOTION = 10.0
+"""Motion of the markers between two stops [sigmas] at which a joint has moved, whatever its encoder says."""
 FROZEN_STOPS = 3
 """Successive stops with one reported position and moving images that make an encoder a frozen one."""
 SAME_POSITION = 1e-5
@@ -123,7 +125,7 @@ def _refuse_exchanged(trials: TrialData, joint: int, name: str) -> None:
         return
     ranges = np.ptp(trials.positions[own], axis=0)
     other = int(ranges.argmax())
-    if other == joint or ranges[joint] >= MIN_RANGE or ranges[other] < MIN_RANGE:
+    if other == joint or ranges[joint] > LOCKED_RANGE or ranges[other] <= LOCKED_RANGE:
         return
     moving = trials.joint_names[other]
     raise CalibrationError(
@@ -220,7 +222,7 @@ def path_basis(trials: TrialData) -> FloatArray:
             name = tuple(np.round(base / (10 * LOCKED_RANGE)).astype(np.int64).tolist())
             bases.setdefault(name, np.zeros(len(positions)))[group] = 1.0
             displacement = np.zeros(len(positions))
-            span = max(float(np.ptp(positions[group, joint])), MIN_RANGE)
+            span = max(float(np.ptp(positions[group, joint])), LOCKED_RANGE)
             displacement[group] = 2.0 * (positions[group, joint] - middle) / span
             degree = min(PATH_DEGREE, (len(group) - 1) // 2)
             columns += [displacement**power for power in range(1, degree + 1)]

@@ -124,7 +124,8 @@ class _Known:
 
 
 def _twins(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
-    weakest = np.linalg.svd(linearised(chain, points, q)[1])[2][-1]
+    J = linearised(chain, points, q)[1]
+    weakest = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])[2][-1]
     steps = np.concatenate([TWINS, -TWINS])
     return np.asarray(q + steps[:, None] * weakest, dtype=np.float64)
 

@@ -30,7 +30,8 @@ def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -
     most = np.linalg.norm(operators, axis=(1, 2)) * float(np.linalg.norm(moved))
     idle = sizes <= NO_MOTION * most
     weights = np.where(idle, 1.0, sizes)
-    _, singular, rows = np.linalg.svd(np.where(idle, 0.0, J) / weights)
+    scaled = np.where(idle, 0.0, J) / weights
+    _, singular, rows = np.linalg.svd(scaled, full_matrices=len(scaled) < scaled.shape[1])
     rank = int((singular > NO_MOTION * max(float(singular[0]), 1e-300)).sum())
     kernel = rows[rank:] / weights
     if not len(kernel):

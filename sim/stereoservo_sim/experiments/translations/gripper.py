@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from stereoservo.geometry.cameras import triangulate
 from stereoservo.geometry.fundamental import fundamental_linear, fundamental_refine
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.homography import homography_from_points
+from stereoservo.geometry.homography import linear_homography
 from stereoservo.geometry.translation_fit import bundle_translations, refine_translations
 from stereoservo.geometry.translations import (
     direction_given_plane,
@@ -219,7 +219,7 @@ def _planes(
     Hs = np.stack([translation_homography(cameras, rest, p) for p in pixels[1:]])
     linear = plane_at_infinity_from_stack(Hs, weighting)
     directions = np.stack([direction_given_plane(H, linear, weighting) for H in Hs])
-    by_points = [homography_from_points(rest, triangulate(cameras, p)) for p in pixels[1:]]
+    by_points = [linear_homography(rest, triangulate(cameras, p))[0] for p in pixels[1:]]
     found: dict[str, tuple[FloatArray | None, FloatArray]] = {
         "linear": (linear, rest),
         "linear, reconstructed points": (plane_at_infinity_from_stack(by_points), rest),
