@@ -10,7 +10,7 @@ import pytest
 
 from stereoservo.core.state import encode_state
 from stereoservo.recording import ring as ring_module
-from stereoservo.recording.replay import replay
+from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.ring import FlightRing, RingLimits, RingThread
 from stereoservo.recording.step_records import (
     RecordedCheckpoint,
@@ -84,6 +84,18 @@ def test_each_segment_replays_by_itself(flight: Flight, monkeypatch: pytest.Monk
     assert [result.identical for result in results] == [True] * 4
     assert [result.steps for result in results] == [50, 50, 50, 40]
     assert flight.said == []
+
+
+def test_a_kill_loses_less_than_half_a_second(flight: Flight) -> None:
+    flight.fly(3.0)
+    (segment,) = flight.segments()  # which nobody has closed
+    with pytest.raises(RecordingError) as caught:
+        replay(segment)
+    assert caught.value.cut
+    result = caught.value.result
+    assert result is not None
+    assert result.identical is True
+    assert flight.steps - result.steps < 0.5 * flight.bench.settings.rate_hz
 
 
 def test_the_oldest_segments_are_dropped_by_age(flight: Flight, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -229,13 +229,19 @@ def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_p
     assert error.value.version == STATE_VERSION + 1
 
 
+class OtherSettings(msgspec.Struct):
+    """Settings of another version."""
+
+    rate_hz: float
+
+
 def test_settings_of_another_version_are_told_from_damage(bench: Any, tmp_path: Path) -> None:
     for version, said in (("0.0.1", "written by stereoservo 0.0.1"), (None, "damaged")):
         print_of = fingerprint()
         if version is not None:
             print_of = msgspec.structs.replace(print_of, stereoservo=version)
         path = tmp_path / f"{version}.mcap"
-        with FlightRecorder(path, {"rate": 1}, print_of):  # type: ignore[arg-type]
+        with FlightRecorder(path, OtherSettings(1.0), print_of):  # type: ignore[arg-type]
             pass
         with pytest.raises(RecordingError, match=said):
             replay(path)

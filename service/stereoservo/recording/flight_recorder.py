@@ -17,6 +17,12 @@ from stereoservo.recording.step_records import Fingerprint, RecordedCheckpoint, 
 
 FORMAT = "stereoservo-flight-1"
 CHUNK_BYTES = 256 * 1024
+"""At most in a chunk; what is not in a whole chunk yet is lost where the process is killed."""
+CHUNK_S = 0.25
+"""Of the loop's time in a chunk, at most."""
+LEAST_STEP_BYTES = 400
+"""Less than the record of any step."""
+LEAST_CHUNK_BYTES = 4 * 1024
 
 
 class _OutputFile:
@@ -59,10 +65,10 @@ class _OutputFile:
 class FlightRecorder:
     """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process.
 
-    The file grows chunk by chunk, so that a crash loses the last chunk at most; ``close`` adds the index, and, where it
-    is ``durable``, waits until the disk has it all. A file that cannot be written any more ends with its last whole
-    chunk: ``failure`` has the cause then, ``steps`` counts those in the file, ``dropped`` those that came later and are
-    not.
+    The file grows chunk by chunk, so that a crash loses the last ``CHUNK_S`` at most; ``close`` adds the index, and,
+    where it is ``durable``, waits until the disk has it all. A file that cannot be written any more ends with its last
+    whole chunk: ``failure`` has the cause then, ``steps`` counts those in the file, ``dropped`` those that came later
+    and are not.
 
     Raises OSError where the file cannot be begun.
     """
@@ -78,7 +84,9 @@ class FlightRecorder:
         self._pending = 0
         self._closed = False
         self._stream = _OutputFile(path, durable)
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        due = int(settings.rate_hz * CHUNK_S) * LEAST_STEP_BYTES
+        chunk = min(CHUNK_BYTES, max(LEAST_CHUNK_BYTES, due))
+        self._writer = Writer(self._stream, chunk_size=chunk, compression=CompressionType.LZ4)
         self._writer.start(profile=FORMAT, library="stereoservo")
         encoded = encode(settings)
         self._channels = {

@@ -8,24 +8,20 @@ when the fault came, or the machine stalled, is void, counted, and tried again.
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from stereoservo.client import Client, ClientError, RefusedError, SessionError
-from stereoservo.messages.discovery import DaemonError
+from stereoservo.client import Client, ClientError, RefusedError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_sim.benchmarks import service_bench
 from stereoservo_sim.benchmarks.service_bench import (
@@ -38,7 +34,6 @@ from stereoservo_sim.benchmarks.service_bench import (
     send,
 )
 from stereoservo_sim.benchmarks.timing import summary
-from stereoservo_sim.experiments.experiment import ExperimentError
 from stereoservo_sim.world.history import TrueJointHistory
 
 SLOW = 0.04
@@ -204,25 +199,11 @@ def run_service(
 
     Raises ExperimentError where the drives or a daemon do not come up.
     """
-    kept = {name: os.environ.get(name) for name in ("STEREOSERVO_RUNTIME_DIR", "STEREOSERVO_STATE_DIR")}
     rows = []
-    with tempfile.TemporaryDirectory(prefix="ssfault") as name:
-        folder = Path(name)
-        os.environ["STEREOSERVO_RUNTIME_DIR"] = str(folder / "r")
-        os.environ["STEREOSERVO_STATE_DIR"] = str(folder / "s")
-        try:
-            with ServiceBench(folder) as bench:
-                for fault in faults:
-                    rows.append(_row(bench, fault, repetitions))
-                    tell(rows[-1])
-        except (DaemonError, ClientError, SessionError) as error:
-            raise ExperimentError("daemon", str(error)) from error
-        finally:
-            for key, value in kept.items():
-                if value is None:
-                    os.environ.pop(key, None)
-                else:
-                    os.environ[key] = value
+    with service_bench.running_bench() as bench:
+        for fault in faults:
+            rows.append(_row(bench, fault, repetitions))
+            tell(rows[-1])
     return rows
 
 

@@ -14,9 +14,10 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -39,6 +40,8 @@ from stereoservo_sim.world.simulated_cell import demo_cell
 
 T = TypeVar("T")
 CELL = "hil-can"
+RATE_HZ = 250.0
+"""Of its servo loop."""
 SPEED_SCALE = 0.1
 END = 0.85
 """[rad] Of the first joint to either side, at a tenth of its speed: the arm moves for longer than any trial lasts."""
@@ -239,6 +242,30 @@ class ServiceBench:
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         return done.returncode, json.loads(done.stdout)
+
+
+@contextmanager
+def running_bench() -> Iterator[ServiceBench]:
+    """A running daemon whose directories, and those of clients that are started inside, are its own.
+
+    Raises ExperimentError for what a daemon or a client says.
+    """
+    names = ("STEREOSERVO_RUNTIME_DIR", "STEREOSERVO_STATE_DIR")
+    before = {name: os.environ.get(name) for name in names}
+    with tempfile.TemporaryDirectory(prefix="ssbench") as name:
+        folder = Path(name)
+        os.environ.update(dict(zip(names, (str(folder / "r"), str(folder / "s")), strict=True)))
+        try:
+            with ServiceBench(folder) as bench:
+                yield bench
+        except (DaemonError, ClientError, SessionError) as error:
+            raise ExperimentError("daemon", str(error)) from error
+        finally:
+            for key, value in before.items():
+                if value is None:
+                    os.environ.pop(key, None)
+                else:
+                    os.environ[key] = value
 
 
 def send(pid: int, how: signal.Signals) -> None:

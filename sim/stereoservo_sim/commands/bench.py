@@ -53,13 +53,27 @@ def _soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]
     return run_soak(repetitions, seed, progress)
 
 
+def _kills(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.service_soak import run_kills
+
+    return run_kills(repetitions, seed, progress)
+
+
+def _soak_live(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.service_soak import run_soak_live
+
+    return run_soak_live(repetitions, seed, progress)
+
+
 BENCHES: dict[str, Bench] = {
     "calibration": _calibration,
     "can": _can,
     "cycle": _cycle,
     "faults": _faults,
     "features": _features,
+    "kills": _kills,
     "soak": _soak,
+    "soak-live": _soak_live,
 }
 """By the name given on the command line."""
 
@@ -70,8 +84,8 @@ def bench(
         int,
         typer.Option(
             min=1,
-            help="Timed fits of `calibration`, trials of each of `faults`, two virtual minutes of `soak`; the others "
-            "take a multiple.",
+            help="Timed fits of `calibration`, trials of each of `faults`, ten of `kills`, two virtual minutes of "
+            "`soak`, two real ones of `soak-live`; the others take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,

@@ -104,5 +104,14 @@ def test_unknown_names_are_refused_with_the_list(capfd):
     assert cli.invoke(["bench", "wheels", "--json"]) == 1
     error = json.loads(capfd.readouterr().out)["error"]
     assert error["code"] == "bench"
-    assert error["known"] == ["calibration", "can", "cycle", "faults", "features", "soak"]
+    assert error["known"] == [
+        "calibration",
+        "can",
+        "cycle",
+        "faults",
+        "features",
+        "kills",
+        "soak",
+        "soak-live",
+    ]
     assert "wheels" in error["message"]
