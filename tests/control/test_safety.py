@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from oracles.safety import expected
 from stereoservo.core import limit
 from stereoservo.core.limit import SafetyConfigurationError, SafetyInputs, SafetyLimits, safety_stage
 
@@ -312,3 +313,69 @@ def test_limits_that_cannot_work_are_refused_by_name(changes, text):
 def test_a_period_that_is_none_is_refused(dt):
     with pytest.raises(SafetyConfigurationError, match="dt_s"):
         safety_stage(SafetyInputs(np.zeros(3), np.zeros(3), np.zeros(3), dt), make_limits())
+
+
+def drawn(rng):
+    """A step at which everything may act: near limits and boxes, fast and slow, stale, not finite."""
+    n = 3
+    boxes = np.sort(rng.uniform(-1.2, 1.6, (2, n, 2)), axis=2)
+    boxes[rng.random(boxes.shape) < 0.3] *= np.inf
+    boxes[:, :, 0], boxes[:, :, 1] = (
+        np.where(boxes[:, :, 0] > 1e9, -np.inf, boxes[:, :, 0]),
+        np.where(boxes[:, :, 1] < -1e9, np.inf, boxes[:, :, 1]),
+    )
+    boxes[:, 0] = np.sort(rng.uniform(-1.2, 1.6, (2, 2)))
+    limits = make_limits(
+        keep_outs=boxes,
+        position_min=rng.uniform(-1.2, -0.5, n),
+        position_max=rng.uniform(0.5, 1.6, n),
+        velocity_max=rng.uniform(0.3, 2.0, n),
+        acceleration_max=rng.uniform(0.5, 8.0, n),
+        position_margin=float(rng.choice([0.0, 0.01, 0.05])),
+    )
+    edges = np.concatenate([limits.position_min, limits.position_max, boxes[np.isfinite(boxes)]])
+    positions = np.where(
+        rng.random(n) < 0.5, rng.choice(edges, n) + rng.normal(0.0, 0.05, n), rng.uniform(-1.0, 1.2, n)
+    )
+    previous = rng.uniform(-1.0, 1.0, n) * limits.velocity_max * rng.choice([0.1, 1.0, 1.2])
+    raw = np.where(rng.random(n) < 0.6, previous + rng.normal(0.0, 0.01, n), rng.normal(0.0, 2.0, n))
+    for array in (positions, previous, raw):
+        if rng.random() < 0.05:
+            array[rng.integers(n)] = rng.choice([np.nan, np.inf, -np.inf])
+    raw[rng.random(n) < 0.1] = 0.0
+    return limits, SafetyInputs(
+        raw,
+        positions,
+        previous,
+        float(rng.choice([0.001, 0.004, 0.02])),
+        joint_age_s=float(
+            rng.choice([0.0, 0.004, 0.05, 0.1, 0.3, -0.1, np.nan], p=[0.3, 0.3, 0.2, 0.05, 0.05, 0.05, 0.05])
+        ),
+        feature_age_s=float(rng.choice([0.0, 0.15, 0.3, 0.5, 0.7, -0.1, np.nan])),
+        needs_features=bool(rng.random() < 0.3),
+        speed_scale=float(
+            rng.choice([1.0, 0.3, 0.0, 1.5, -1.0, np.nan], p=[0.6, 0.2, 0.05, 0.05, 0.05, 0.05])
+        ),
+        brake=bool(rng.random() < 0.1),
+    )
+
+
+def test_the_stage_answers_as_its_plain_description_does():
+    rng = np.random.default_rng(1)
+    seen = set()
+    for trial in range(1500):
+        limits, inputs = drawn(rng)
+        result, wanted = safety_stage(inputs, limits), expected(inputs, limits)
+        where = f"trial {trial}: {inputs}, {limits}"
+        np.testing.assert_allclose(result.limited, wanted.limited, rtol=1e-9, atol=1e-10, err_msg=where)
+        assert result.braking == wanted.braking, where
+        told = [(r.code, r.level, r.subject, r.value, r.threshold) for r in result.reasons]
+        assert [t[:3] for t in told] == [r[:3] for r in wanted.reasons], where
+        for reason, (*_, value, threshold, words) in zip(result.reasons, wanted.reasons, strict=True):
+            assert reason.value == (None if value is None else pytest.approx(value, rel=1e-9, abs=1e-10)), (
+                where
+            )
+            assert reason.threshold == (None if threshold is None else pytest.approx(threshold)), where
+            assert words in reason.hint, where
+        seen |= codes(result)
+    assert len(seen) == 9
