@@ -1,6 +1,8 @@
 """The safety stage: what it promises, for any input."""
 
+import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from oracles.safety import expected
 from stereoservo.core import limit
 from stereoservo.core.limit import SafetyConfigurationError, SafetyInputs, SafetyLimits, safety_stage
+from stereoservo.messages.status import Lifecycle
 
 DT = 0.004
 
@@ -379,3 +382,49 @@ def test_the_stage_answers_as_its_plain_description_does():
             assert words in reason.hint, where
         seen |= codes(result)
     assert len(seen) == 9
+
+
+def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
+    rng = np.random.default_rng(2)
+    for lifecycle in (*Lifecycle, *[Lifecycle.ACTIVE] * 60):
+        limits, step = drawn(rng)
+        now_ns, source, cell = 10**12 + int(rng.integers(10**9)), *rng.uniform(0.2, 1.0, 2)
+        ages_ns = [int(age * 1e9) for age in rng.uniform(0.0, 0.8, 3)]
+        accepted = [SimpleNamespace(accepted_ns=now_ns - age) for age in ages_ns[: rng.integers(3)]]
+        context = SimpleNamespace(
+            state=SimpleNamespace(
+                cameras=accepted,
+                command=step.previous,
+                last_joints_ns=now_ns - ages_ns[2] // 4,
+                lifecycle=lifecycle,
+            ),
+            q=step.positions,
+            dt_s=step.dt_s,
+            now_ns=now_ns,
+            paused=step.brake,
+            settings=SimpleNamespace(limits=SimpleNamespace(speed_scale=cell)),
+        )
+        motion = SimpleNamespace(velocity=step.raw, needs_features=step.needs_features, speed_scale=source)
+        result = limit.limit(context, motion, limits)
+        same = dataclasses.replace(
+            step,
+            joint_age_s=ages_ns[2] // 4 * 1e-9,
+            feature_age_s=min(ages_ns[: len(accepted)], default=now_ns) * 1e-9,
+            speed_scale=source * cell,
+        )
+        wanted = expected(same, limits)
+        np.testing.assert_allclose(result.limited, wanted.limited, rtol=1e-9, atol=1e-10)
+        assert [reason.code for reason in result.reasons] == [reason[0] for reason in wanted.reasons]
+        command = result.limited if lifecycle == Lifecycle.ACTIVE else np.zeros(3)
+        np.testing.assert_array_equal(context.state.command, command)
+        assert not np.shares_memory(context.state.command, result.limited)
+
+
+def test_the_limits_are_those_of_the_cell():
+    names = {field.name for field in dataclasses.fields(SafetyLimits)} - {"joint_names", "features_fresh_s"}
+    limits = make_limits(keep_outs=[[[0.2, 0.4], [-0.3, 0.3], [-np.inf, np.inf]]])
+    cell = SimpleNamespace(**{name: getattr(limits, name) for name in names})
+    made = limit.safety_limits(SimpleNamespace(joint_names=limits.joint_names, limits=cell), 0.07)
+    for field in dataclasses.fields(SafetyLimits):
+        wanted = 0.07 if field.name == "features_fresh_s" else getattr(limits, field.name)
+        np.testing.assert_array_equal(getattr(made, field.name), wanted)
