@@ -50,6 +50,7 @@ EDGE_PERIODS = 5
 TERMINAL = ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted")
 QUIET = 0.5
 """Share of goals without a fault."""
+HELD_S = 0.3
 LIMIT_S = 20.0
 """For a goal."""
 
@@ -208,7 +209,7 @@ class _LiveSoak:
             "vision killed": lambda: self._vision(signal.SIGKILL),
             "vision hung": lambda: self._vision(signal.SIGSTOP),
             "preempted": lambda: self._goal(lease_s=None),
-            "hold": client.hold,
+            "held": self._held,
         }
 
     def _goal(self, lease_s: float | None) -> str:
@@ -220,6 +221,11 @@ class _LiveSoak:
     def _vision(self, how: signal.Signals) -> None:
         if (pid := self.bench.processes().get("vision-left")) is not None:
             send(pid, how)
+
+    def _held(self) -> None:
+        self.client.hold()
+        time.sleep(HELD_S)
+        self.client.resume()
 
     def one_goal(self) -> None:
         """Send a goal, do something to the daemon in half of them, and wait for its end. Raises ExperimentError."""
@@ -234,12 +240,22 @@ class _LiveSoak:
         until = time.monotonic() + 2 * LIMIT_S
         while not (ends := self._ends(goal)):
             if time.monotonic() > until:
-                raise ExperimentError("no_end", f"goal {goal} has no end; faults so far: {dict(self.faults)}")
+                raise ExperimentError("no_end", self._without_end(goal))
             time.sleep(0.02)
         time.sleep(0.2)
         if len(ends := self._ends(goal)) != 1:
             raise ExperimentError("ends", f"goal {goal} ended {len(ends)} times: {', '.join(ends)}")
         self.outcomes[ends[0]] += 1
+
+    def _without_end(self, goal: str) -> str:
+        """What is known of a goal of which no end was heard."""
+        asked = [event.kind for event in self.client.events(0).events if event.id == goal]
+        status = self.client.status()
+        return (
+            f"no end of goal {goal} was heard, of it {[e.kind for e in self.told if e.id == goal]}; the daemon tells "
+            f"{asked} when asked; the cell is {status.lifecycle}, goal {status.goal!r}; faults so far: "
+            f"{dict(self.faults)}; daemon starts: {self.bench.starts}"
+        )
 
     def _ends(self, goal: str) -> list[str]:
         return [event.kind for event in tuple(self.told) if event.id == goal and event.kind in TERMINAL]
