@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from stereoservo.gateway import recordings
@@ -16,6 +17,12 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.recording_request import RecordedImages, read_request, request_path
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, fingerprint
+
+
+class Settings(msgspec.Struct):
+    """What a recorder asks of the core's settings."""
+
+    rate_hz: float
 
 
 class Bench:
@@ -126,7 +133,7 @@ def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_pat
     log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
     both = Recordings(plan, log, lambda topic, text: None)
     assert both.wants_steps
-    begin: Any = RecordingStart({"rate": 1}, fingerprint())  # type: ignore[arg-type]
+    begin = RecordingStart(Settings(250.0), fingerprint())  # type: ignore[arg-type]
 
     def stream(first: int) -> None:
         both.take(begin)

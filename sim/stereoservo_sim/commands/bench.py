@@ -36,7 +36,7 @@ def _cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any
 
 
 def _faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.faults import run_faults
+    from stereoservo_sim.benchmarks.faults.bench import run_faults
 
     return run_faults(repetitions, seed, progress)
 
@@ -125,7 +125,7 @@ def _find(what: str) -> Bench:
 def _show(answer: dict[str, Any], console: Console) -> None:
     """Print one line a figure, nested names joined by points; tables of faults."""
     if answer["bench"] == "faults":
-        from stereoservo_sim.benchmarks.faults import show_faults
+        from stereoservo_sim.benchmarks.faults.bench import show_faults
 
         show_faults(answer, console)
         answer = {

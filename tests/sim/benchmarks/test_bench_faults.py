@@ -10,15 +10,15 @@ import pytest
 from rich.console import Console
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.benchmarks import faults, faults_inputs, faults_service, faults_wall
-from stereoservo_sim.benchmarks.reliability_page import reliability_page
+from stereoservo_sim.benchmarks.faults import bench, inputs, service, wall
+from stereoservo_sim.benchmarks.faults.page import reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 
 @pytest.fixture
 def one_case(monkeypatch):
     drive_error = next(case for case in ODRIVE_CASES if case.name == "drive error")
-    monkeypatch.setattr(faults, "CASES", {"odrive": (drive_error,)})
+    monkeypatch.setattr(bench, "CASES", {"odrive": (drive_error,)})
 
 
 WALL = {
@@ -71,10 +71,10 @@ INPUT = {
 
 def test_rows_and_tables(one_case, monkeypatch):
     asked = []
-    monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: asked.append(repetitions) or WALL)
-    monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [SERVICE])
-    monkeypatch.setattr(faults, "run_inputs", lambda repetitions, seed, tell: [INPUT])
-    figures = faults.run_faults(2, 5, lambda stage, done, total: None)
+    monkeypatch.setattr(bench, "run_wall", lambda repetitions, progress: asked.append(repetitions) or WALL)
+    monkeypatch.setattr(bench, "run_service", lambda repetitions, tell: [SERVICE])
+    monkeypatch.setattr(bench, "run_inputs", lambda repetitions, seed, tell: [INPUT])
+    figures = bench.run_faults(2, 5, lambda stage, done, total: None)
     (row,) = figures["rows"]
     assert asked == [1]
     assert figures["ok"]
@@ -88,7 +88,7 @@ def test_rows_and_tables(one_case, monkeypatch):
     assert f"| joints | not a number | either | 120 / 140 | 270 | 2 of 2 | active | {told}" in page
     assert "had 0.51 of its velocity limit" in page
     console = Console(width=200, file=io.StringIO(), markup=False)
-    faults.show_faults(figures, console)
+    bench.show_faults(figures, console)
     text = console.file.getvalue()
     for word in (
         "drive error",
@@ -106,25 +106,25 @@ def test_rows_and_tables(one_case, monkeypatch):
 def test_the_page_has_a_row_for_each_fault_of_the_service():
     text = Path(__file__).parents[3].joinpath("docs/reliability.md").read_text(encoding="utf-8")
     rows = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines() if line.startswith("| ")]
-    assert [name for name in rows if name in {f.name for f in faults_service.FAULTS}] == [
-        fault.name for fault in faults_service.FAULTS
+    assert [name for name in rows if name in {f.name for f in service.FAULTS}] == [
+        fault.name for fault in service.FAULTS
     ]
 
 
 def test_the_page_has_a_row_for_each_fault_of_the_inputs():
     text = Path(__file__).parents[3].joinpath("docs/reliability.md").read_text(encoding="utf-8")
     rows = [tuple(line.removeprefix("| ").split(" | ")[:3]) for line in text.splitlines()]
-    faults_of_inputs = [(fault.input, fault.name, fault.goal) for fault in faults_inputs.FAULTS]
+    faults_of_inputs = [(fault.input, fault.name, fault.goal) for fault in inputs.FAULTS]
     assert [row for row in rows if row in faults_of_inputs] == faults_of_inputs
 
 
 def test_a_problem_is_printed_and_the_table_not_ok(one_case, monkeypatch):
     impossible = FaultCase(name="too strict", orders=("fault 3 0x20",), codes=("drive_fault",), bound_ms=1.0)
-    monkeypatch.setattr(faults, "CASES", {"odrive": (impossible,)})
-    monkeypatch.setattr(faults, "run_wall", lambda repetitions, progress: WALL)
-    monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [])
-    monkeypatch.setattr(faults, "run_inputs", lambda repetitions, seed, tell: [])
-    figures = faults.run_faults(1, 0, lambda stage, done, total: None)
+    monkeypatch.setattr(bench, "CASES", {"odrive": (impossible,)})
+    monkeypatch.setattr(bench, "run_wall", lambda repetitions, progress: WALL)
+    monkeypatch.setattr(bench, "run_service", lambda repetitions, tell: [])
+    monkeypatch.setattr(bench, "run_inputs", lambda repetitions, seed, tell: [])
+    figures = bench.run_faults(1, 0, lambda stage, done, total: None)
     assert not figures["ok"]
     (problem,) = figures["rows"][0]["problems"]
     assert problem.startswith("at rest after")
@@ -136,10 +136,10 @@ FEW = ("servo killed", "client of a goal killed")
 @pytest.mark.process
 @pytest.mark.parametrize("names", [FEW, pytest.param((), marks=pytest.mark.slow)])
 def test_faults_of_the_service(names):
-    chosen = tuple(fault for fault in faults_service.FAULTS if not names or fault.name in names)
+    chosen = tuple(fault for fault in service.FAULTS if not names or fault.name in names)
     assert len(chosen) >= len(FEW)
     told = []
-    rows = faults_service.run_service(1, told.append, chosen)
+    rows = service.run_service(1, told.append, chosen)
     assert told == rows
     for fault, row in zip(chosen, rows, strict=True):
         if not row["trials"]:
@@ -162,26 +162,26 @@ FEW_INPUTS = (
 
 @pytest.mark.parametrize("names", [FEW_INPUTS, pytest.param((), marks=pytest.mark.slow)])
 def test_faults_of_the_inputs(names):
-    chosen = tuple(f for f in faults_inputs.FAULTS if not names or (f.name, f.goal) in names)
+    chosen = tuple(f for f in inputs.FAULTS if not names or (f.name, f.goal) in names)
     assert len(chosen) >= len(FEW_INPUTS)
     told = []
-    rows = faults_inputs.run_inputs(1, 3, told.append, chosen)
+    rows = inputs.run_inputs(1, 3, told.append, chosen)
     assert told == rows
     for fault, row in zip(chosen, rows, strict=True):
         assert row["trials"] == row["within"] == row["works_again"] == 1, row
         assert row["terminal_events"] == [1], row
         assert row["fastest_of_limit"] <= 1.0, row
         assert (row["rest_ms"] is None) == (fault.notice_ms is None), row
-    assert faults_inputs.run_inputs(1, 3, told.append, chosen[:1]) == rows[:1]
+    assert inputs.run_inputs(1, 3, told.append, chosen[:1]) == rows[:1]
 
 
 @pytest.mark.slow
 def test_a_fault_in_real_time_is_measured(one_case, monkeypatch, capsys):
-    ordered = [case for case in faults_wall.ORDERED if case[0] == "node silent"]
-    monkeypatch.setattr(faults_wall, "ORDERED", tuple(ordered))
-    monkeypatch.setattr(faults_wall, "DONE_TO_THE_MASTER", ("master killed",))
-    monkeypatch.setattr(faults, "run_service", lambda repetitions, tell: [])
-    monkeypatch.setattr(faults, "run_inputs", lambda repetitions, seed, tell: [])
+    ordered = [case for case in wall.ORDERED if case[0] == "node silent"]
+    monkeypatch.setattr(wall, "ORDERED", tuple(ordered))
+    monkeypatch.setattr(wall, "DONE_TO_THE_MASTER", ("master killed",))
+    monkeypatch.setattr(bench, "run_service", lambda repetitions, tell: [])
+    monkeypatch.setattr(bench, "run_inputs", lambda repetitions, seed, tell: [])
     assert cli.invoke(["bench", "faults", "--repetitions", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     silent, killed = answer["wall"]["rows"]

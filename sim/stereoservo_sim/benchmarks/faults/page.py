@@ -1,6 +1,6 @@
 """Makes ``docs/reliability.md`` of what ``bench faults`` has measured:
 
-``stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.reliability_page > docs/reliability.md``.
+``stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.faults.page > docs/reliability.md``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 PAGE = """# Reliability: what happens when something fails
 
-Made by `stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.reliability_page`; nothing on this page
+Made by `stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.faults.page`; nothing on this page
 is written by hand. What the service does against each of these, and why: [safety.md](safety.md).
 
 Times are from the fault to the last motion of any axis, by the emulated arm's true joints, in milliseconds: median /

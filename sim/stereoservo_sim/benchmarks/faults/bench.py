@@ -11,9 +11,9 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from stereoservo_sim.benchmarks.faults_inputs import run_inputs
-from stereoservo_sim.benchmarks.faults_service import run_service
-from stereoservo_sim.benchmarks.faults_wall import run_wall
+from stereoservo_sim.benchmarks.faults.inputs import run_inputs
+from stereoservo_sim.benchmarks.faults.service import run_service
+from stereoservo_sim.benchmarks.faults.wall import run_wall
 from stereoservo_sim.emulators.bus.fault_cases import CASES
 from stereoservo_sim.emulators.bus.fault_table import run_row
 from stereoservo_sim.emulators.bus.fault_trials import (

@@ -74,7 +74,7 @@ class _Master:
     """The driver's process."""
 
     def __init__(self, options: CanOptions, speed: float) -> None:
-        command = [sys.executable, "-m", "stereoservo_sim.benchmarks.faults_master"]
+        command = [sys.executable, "-m", "stereoservo_sim.benchmarks.faults.master"]
         settings = json.dumps(msgspec.to_builtins(options))
         self.process = subprocess.Popen(
             [*command, settings, repr(speed)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
