@@ -23,7 +23,7 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
     points on, within the noise that the fit shows. Five points fit exactly and show none: where they are noisy ask
     `moved_cameras.refuse_coplanar`.
     """
-    H, count, values = linear_homography(A, B)
+    H, count, values = _least_squares_homography(A, B)
     chance = _chance_of_coplanar(values, count)
     if chance > COPLANAR_TAIL:
         raise GeometryError(
@@ -33,7 +33,7 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
             probability=chance,
             limit=COPLANAR_TAIL,
         )
-    return H
+    return unit_determinant(H, "the homography")
 
 
 def _chance_of_coplanar(values: FloatArray, count: int) -> float:
@@ -54,6 +54,12 @@ def linear_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int, Fl
     """``H`` (4, 4) as of `homography_from_points`, without its test against noise: for points that have passed
     another. Also the number of points used, and the 16 singular values of the equations.
     """
+    H, count, values = _least_squares_homography(A, B)
+    return unit_determinant(H, "the homography"), count, values
+
+
+def _least_squares_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int, FloatArray]:
+    """As `linear_homography`, but ``H`` of any scale and perhaps singular."""
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
     if A.ndim != 2 or A.shape[1] != 4 or A.shape != B.shape:
         raise GeometryError("shape", f"point sets have shapes {A.shape} and {B.shape}; both must be (n, 4)")
@@ -77,7 +83,6 @@ def linear_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int, Fl
     if not singular[14] > 1e-9 * singular[0]:
         raise GeometryError("degenerate", "the points do not determine a homography (four of five coplanar?)")
     H: FloatArray = np.linalg.solve(W_B, v[15].reshape(4, 4)) @ W_A
-    H = unit_determinant(H, "the homography")
     agreement = (np.sign(((A @ H.T) * B).sum(axis=1))).sum()
     return (-H if agreement < 0 else H), len(A), singular
 
