@@ -110,7 +110,9 @@ def _per_marker(count: int, seed: int, progress: ProgressCall) -> list[dict[str,
     if count >= LARGE_FROM:
         plants.append(LARGEST)
     rows = []
-    with multiprocessing.get_context("forkserver").Pool(1, maxtasksperchild=1) as pool:
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload([__name__])
+    with server.Pool(1, maxtasksperchild=1) as pool:
         for k, plant in enumerate(plants):
             rows.append(pool.apply(measured_fit, (*plant, seed)))
             progress("cost a marker", k + 1, len(plants))

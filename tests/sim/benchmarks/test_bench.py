@@ -43,8 +43,8 @@ def test_machine_facts_and_stolen_time():
 
 def test_calibration_is_thesis_sized_and_reaches_one_minimum(monkeypatch):
     monkeypatch.setattr(calibration, "IMAGES", (100, 200))
-    monkeypatch.setattr(calibration, "MARKERS", (16, 64))
-    monkeypatch.setattr(calibration, "MARKER_IMAGES", 120)
+    monkeypatch.setattr(calibration, "MARKERS", (8, 16))
+    monkeypatch.setattr(calibration, "MARKER_IMAGES", 48)
     result = run_calibration(3, 0, quiet)
     assert result["problem"] == {
         "joints": 6,
@@ -65,10 +65,10 @@ def test_calibration_is_thesis_sized_and_reaches_one_minimum(monkeypatch):
         last["fit_ms_an_image"] / first["fit_ms_an_image"]
     )
     few, many = result["per_marker"]
-    assert (few["markers"], many["markers"], many["cameras"], many["images"]) == (16, 64, 2, 120)
+    assert (few["markers"], many["markers"], many["cameras"], many["images"]) == (8, 16, 2, 48)
     assert 50 < few["peak_memory_mb"] < many["peak_memory_mb"] + 50 < 1000
     assert result["fit_cpu_exponent_over_markers"] == pytest.approx(
-        np.log(many["fit_cpu_s"] / few["fit_cpu_s"]) / np.log(4.0)
+        np.log(many["fit_cpu_s"] / few["fit_cpu_s"]) / np.log(2.0)
     )
     assert thesis_sized().in_view(thesis_sized().stops(20)[0]).mean() > 0.95
 
