@@ -10,15 +10,15 @@ from stereoservo.calibration import self_calibration, stratum_selection
 from stereoservo.calibration.bundle_adjustment import solve
 from stereoservo.calibration.bundle_statistics import chi2_within
 from stereoservo.calibration.calibration_result import intrinsics
-from stereoservo.calibration.diagnosis.joint_scales import lenses_explain_more, model_scales
+from stereoservo.calibration.diagnosis.joint_scales import model_scales
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     epipolar_lenses,
     implausible_lens,
-    lens_test,
     straight_lenses,
     undistorted,
 )
+from stereoservo.calibration.lens_significance import lens_test, lens_wanted, lenses_explain_more
 from stereoservo.calibration.rig_model import LensPriors, RigModel
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.single_joint_fit import measurements
@@ -27,6 +27,7 @@ from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.distortion import distort, lens_from_lines
 from stereoservo.kinematics.axes import framed
 from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 
@@ -314,6 +315,47 @@ def test_terms_that_the_lens_lacks_and_scales_of_joints_are_told_apart_by_likeli
     blamed = [scale.joint for scale in model_scales(solution) if scale.wrong]
     assert 2 in blamed or cause != "scale of a joint", model_scales(solution)
     assert lenses_explain_more(solution) == (cause == "second radial term")
+    assert lens_wanted(solution) == ("brown" if cause == "second radial term" else "radial_centre")
+
+
+@pytest.mark.parametrize(
+    ("k1", "k2", "sigma"),
+    [(-0.3, 0.12, 0.05), pytest.param(-0.35, 0.15, 0.02, marks=pytest.mark.slow), (0.0, 0.0, 0.02)],
+)
+def test_second_radial_and_tangential_terms_are_estimated_to_their_covariance(k1, k2, sigma):
+    """With a radial parameter alone such cells were refused, or their cameras were off by many deviations."""
+    cell = wide_angle(0.0)
+    lenses = [cell.lens_of(0, k1, k2, 1e-3, -8e-4), cell.lens_of(1, 0.95 * k1, k2, -6e-4, 1e-3)]
+    cell = replace(cell, lenses=np.array(lenses))
+    result = fit_model(cell.trials(sigma, np.random.default_rng(7), 9), epoch=1)
+    assert result.report.lens.model == "brown"
+    assert result.report.stratum == "metric"
+    assert result.report.lens.chi2 > result.report.lens.limit
+    assert_at_the_floor(result)
+    values, covariance = propagated(result.model, camera_angles)
+    assert (np.abs(values - true_angles(cell)) < 4.5 * np.sqrt(np.diag(covariance))).all()
+    for lens, camera, fitted in zip(cell.lenses, result.model.cameras, result.report.cameras, strict=True):
+        assert camera.lens.shape == (7,)
+        assert tuple(camera.lens[4:]) == fitted.lens_terms
+        assert np.abs(camera.lens[[0, 4]] - lens[[0, 4]])[0] < 4.5 * fitted.lens_std[0]
+        assert np.abs(camera.lens[4] - lens[4]) < 4.5 * fitted.lens_terms_std[0]
+    again = decode_model(encode_model(result.model))
+    assert np.array_equal(again.cameras[1].lens, result.model.cameras[1].lens)
+    assert again.covariance.lenses[0].shape == (6, 7)
+    left, right = result.model.cameras
+    strong = msgspec.structs.replace(left, lens=np.append(left.lens[:6], 50.0))
+    short = msgspec.structs.replace(right, lens=right.lens[:4])
+    for cameras, match in (((strong, right), "at most"), ((left, short), "shape")):
+        wrong = msgspec.structs.replace(result.model, cameras=cameras)
+        with pytest.raises(ModelFileError, match=match):
+            check_model(wrong)
+
+
+def test_a_radial_parameter_with_its_centre_suffices_where_it_does():
+    result = fit_model(wide_angle(-0.25).trials(0.05, np.random.default_rng(8), 9), epoch=1)
+    assert result.report.lens.model == "radial_centre"
+    assert result.model.cameras[0].lens.shape == (4,)
+    assert result.report.cameras[0].lens_terms is None
 
 
 def test_a_lens_with_its_centre_outside_of_the_image_is_no_result():

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.self_calibration import fit_model
+from stereoservo_sim.experiments.arms.random_lenses import run_random_lenses
 from stereoservo_sim.experiments.arms.random_rigs import held_out_ratio, judged, run_random_rigs
 from stereoservo_sim.summaries import wilson
 from stereoservo_sim.world import random_cells
-from stereoservo_sim.world.random_cells import random_case
+from stereoservo_sim.world.random_cells import random_case, random_lens_case
 
 
 def test_the_same_seed_gives_the_same_case():
@@ -78,6 +79,22 @@ def test_random_rigs_are_calibrated_from_nothing(cases):
     are fixed cases.
     """
     assert promised(cases, 0)["success"] >= cases - 1
+
+
+def test_lenses_of_random_cases_are_as_stated_and_their_command_counts():
+    case, again = random_lens_case(7), random_lens_case(7)
+    assert np.array_equal(case.cell.lenses, again.cell.lenses)
+    for seed in range(40):
+        cell = random_lens_case(seed).cell
+        assert cell.lenses.shape == (2, 7)
+        for K, lens in zip(cell.intrinsics, cell.lenses, strict=True):
+            assert np.array_equal(lens[1:3], K[:2, 2])
+            assert -0.44 <= lens[0] * K[0, 0] * K[1, 1] / lens[3] ** 2 <= 0.11
+            assert random_cells.unfolded(lens, cell.width, cell.height)
+    answer = run_random_lenses(2, 10)
+    assert (answer["usable"], answer["wrong"], answer["refused"]) == (2, 0, 0)
+    assert sum(row["cases"] for row in answer["rows"]) == 2
+    assert answer["not_usable"] == []
 
 
 @pytest.mark.slow

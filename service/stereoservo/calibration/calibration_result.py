@@ -20,7 +20,7 @@ from stereoservo.calibration.bundle_statistics import (
     prediction_variances,
     variance_factor,
 )
-from stereoservo.calibration.lens_estimation import lens_test
+from stereoservo.calibration.lens_significance import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.trial_data import TrialData
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
@@ -45,6 +45,7 @@ class CameraReport(msgspec.Struct, frozen=True):
 
     ``expected_px``, ``standard_error_px``: of the rms, as in the model's joint statistics. ``intrinsics``: fx, skew,
     fy, u0, v0. ``lens``: k, cu, cv (`geometry.distortion`) and ``lens_std`` their deviations, None for a pinhole.
+    ``lens_terms``: k2, p1, p2 and ``lens_terms_std`` their deviations, None for a lens without them.
     """
 
     name: str
@@ -56,13 +57,15 @@ class CameraReport(msgspec.Struct, frozen=True):
     standard_error_px: float
     lens: tuple[float, float, float] | None
     lens_std: tuple[float, ...] | None
+    lens_terms: tuple[float, float, float] | None = None
+    lens_terms_std: tuple[float, ...] | None = None
 
 
 class LensReport(msgspec.Struct, frozen=True):
-    """The lens model that was selected, ``none`` or ``radial_centre``, and the test of it.
+    """The lens model that was selected, ``none``, ``radial_centre`` or ``brown``, and the test of it.
 
-    ``chi2``: what the radial parameters of all cameras (``freedom`` of them) are worth against zero: the gain that
-    freeing them would bring (score test) where they are not free, their own significance (Wald) where they are.
+    ``chi2``: what the parameters of all lenses but their centres (``freedom`` of them) are worth against zero: the gain
+    that freeing them would bring (score test) where they are not free, their own significance (Wald) where they are.
     Above ``limit`` a lens distorts; pinholes get there once in ten thousand fits.
     """
 
@@ -185,14 +188,17 @@ def build_fit(
 def _camera_report(
     trials: TrialData, c: int, solution: Solution, fit: GroupRms, every: Measurements, inliers: BoolArray
 ) -> CameraReport:
-    lens, lens_std = None, None
+    lens, lens_std, terms, terms_std = None, None, None, None
     if solution.lenses != "none":
-        k, cu, cv, _ = (float(value) for value in solution.rig.lenses[c])
+        k, cu, cv, _, k2, p1, p2 = (float(value) for value in solution.rig.lenses[c])
         basis = solution.charts.lenses[c]
         at = solution.charts.start(2) + sum(len(other) for other in solution.charts.lenses[:c])
         covariance = parameter_covariance(solution)[at : at + len(basis), at : at + len(basis)]
         lens = k, cu, cv
-        lens_std = tuple(float(value) for value in np.sqrt(np.diag(basis.T @ covariance @ basis))[:3])
+        deviations = tuple(float(value) for value in np.sqrt(np.diag(basis.T @ covariance @ basis)))
+        lens_std = deviations[:3]
+        if solution.lenses == "brown":
+            terms, terms_std = (k2, p1, p2), deviations[4:]
     mine = every.camera == c
     return CameraReport(
         trials.cameras[c].name,
@@ -204,6 +210,8 @@ def _camera_report(
         fit.standard_error_px,
         lens,
         lens_std,
+        terms,
+        terms_std,
     )
 
 
@@ -240,7 +248,7 @@ def build_model(
         zero=zero,
         generators=frame @ rig.generators @ back,
         cameras=tuple(
-            CameraModel(camera.name, matrix, camera.width, camera.height, lens)
+            CameraModel(camera.name, matrix, camera.width, camera.height, lens[: _lens_size(solution)])
             for camera, matrix, lens in zip(trials.cameras, cameras, rig.lenses, strict=True)
         ),
         marker_ids=trials.marker_ids,
@@ -255,6 +263,11 @@ def build_model(
     )
     check_model(model)
     return model
+
+
+def _lens_size(solution: Solution) -> int:
+    """How many numbers the model's lenses have: 7 with second radial and tangential terms, else 4."""
+    return 7 if solution.lenses == "brown" else 4
 
 
 def _covariance(
@@ -272,7 +285,7 @@ def _covariance(
     return ModelCovariance(
         tuple(frame @ basis @ back for basis in charts.generators),
         tuple(scale * (basis @ back) for scale, basis in zip(camera_scales, charts.cameras, strict=True)),
-        charts.lenses,
+        tuple(basis[:, : _lens_size(solution)] for basis in charts.lenses),
         tuple(scale * (basis @ frame.T) for scale, basis in zip(point_scales, charts.points, strict=True)),
         parameter_covariance(solution),
     )

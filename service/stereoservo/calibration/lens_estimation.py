@@ -1,24 +1,24 @@
 """Lens models of the cameras in a calibration: start values from straight lines or epipolar geometry, undistortion,
-and a significance test of radial distortion.
+priors, and plausibility of a lens that was found.
 
-The models are nested: none, or a radial parameter with its centre for each camera. The centre is held by a weak prior:
-a small distortion does not determine it, but fixing it would underestimate the uncertainty.
+The models are nested: none; a radial parameter with its centre for each camera; second radial and tangential terms
+beside them. Centre and terms are held by weak priors: a small distortion does not determine them, but fixing them would
+underestimate the uncertainty.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import cv2
 import msgspec
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
+from stereoservo.calibration.lens_significance import FREE_LENS
 from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.cameras import isotropic_normaliser
@@ -31,30 +31,10 @@ from stereoservo.numerics.arrays import FloatArray
 if TYPE_CHECKING:
     from stereoservo.calibration.calibration_result import CalibrationFit
 
-FREE_LENS: LensModel = "radial_centre"
-"""The lens model of cameras that distort."""
 STARTING_BENDS = (-0.1, -0.04, -0.2, 0.04)
 """Radial parameters at half the image width of all cameras, from which fits start where the search has failed."""
 MOST_ASPECT = 1.5
 """Ratio of a pixel's sides beyond which no camera is."""
-LENS_TAIL = 1e-4
-"""Probability with which a pinhole is taken for a distorting lens."""
-
-
-@dataclass(frozen=True)
-class LensTest:
-    """Test of the radial parameters: ``chi2`` of ``freedom`` parameters against zero, and the ``limit`` that
-    pinhole cameras exceed with probability ``LENS_TAIL``.
-    """
-
-    chi2: float
-    freedom: int
-    limit: float
-
-    @property
-    def distorted(self) -> bool:
-        """Whether pinholes are rejected."""
-        return self.chi2 > self.limit
 
 
 def starting_lenses(
@@ -95,16 +75,19 @@ def starting_lenses(
 
 
 def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> LensPriors:
-    """Priors of (k, cu, cv): the given estimates, elsewhere the centre near the image's middle.
+    """Priors of the lenses: the given estimates of (k, cu, cv), elsewhere the centre near the image's middle; terms
+    near zero.
 
-    ``CENTRE_SHARE`` of the width is its standard deviation there.
+    ``CENTRE_SHARE`` of the width is the centre's standard deviation, ``TERM_SPREADS`` those of the terms.
     """
     straight = straight_lenses(trials)
-    mean, information = straight[:, :3].copy(), np.zeros((len(straight), 3, 3))
+    mean, information = np.zeros((len(straight), 6)), np.zeros((len(straight), 6, 6))
+    mean[:, :3] = straight[:, :3]
+    information[:, [3, 4, 5], [3, 4, 5]] = 1.0 / np.array(TERM_SPREADS) ** 2
     for c, camera in enumerate(trials.cameras):
         if camera.name in priors:
-            mean[c] = priors[camera.name].lens[:3]
-            information[c] = np.linalg.inv(priors[camera.name].covariance)
+            mean[c, :3] = priors[camera.name].lens[:3]
+            information[c, :3, :3] = np.linalg.inv(priors[camera.name].covariance)
         else:
             information[c, [1, 2], [1, 2]] = 1.0 / (CENTRE_SHARE * camera.width) ** 2
     return LensPriors(mean, information)
@@ -141,32 +124,10 @@ def implausible_lens(result: CalibrationFit) -> CalibrationError | None:
 def straightened(rig: RigModel, data: Measurements) -> RigModel:
     """The rig with pinhole cameras, distortion centres from the priors of ``data``."""
     lenses = rig.lenses.copy()
-    lenses[:, 0] = 0.0
+    lenses[:, [0, 4, 5, 6]] = 0.0
     if data.lens_priors is not None:
-        lenses[:, 1:3] = data.lens_priors.mean[:, 1:]
+        lenses[:, 1:3] = data.lens_priors.mean[:, 1:3]
     return replace(rig, lenses=lenses)
-
-
-def lens_test(solution: Solution) -> LensTest:
-    """Chi-square of the radial parameters of all cameras against zero.
-
-    With pinholes the score test: what freeing them would gain, to first order. With free lenses Wald's: the
-    estimates against their covariance, centres fixed, for without a radial parameter a centre explains nothing. Both
-    relative to the noise left, where that is above the stated one.
-    """
-    c = len(solution.rig.lenses)
-    at = solution.charts.start(2)
-    free = 1 if solution.lenses == "none" else len(solution.charts.lenses[0])
-    own = at + free * np.arange(c)
-    core = solution.lens_factor.core[:, [*range(at), *own, -1]]
-    last = np.asarray(np.linalg.qr(core, mode="r"))[at:, at:]
-    block = last[:c, :c]
-    scores = last[:c, -1] if solution.lenses == "none" else block @ solution.rig.lenses[:, 0]
-    gain = float(scores @ scores)
-    left = solution.cost - (gain if solution.lenses == "none" else 0.0)
-    parameters = at + c + solution.charts.size - solution.charts.start(3)
-    factor = max(1.0, left / max(1, solution.rows - parameters))
-    return LensTest(gain / factor, c, float(chi2_distribution.isf(LENS_TAIL, c)))
 
 
 GRID = (-0.30, -0.24, -0.19, -0.15, -0.12, -0.09, -0.06, -0.03, 0.0, 0.03, 0.06, 0.10, 0.15)
@@ -183,6 +144,8 @@ WORTH_SHARE = 0.03
 """By how much a lens must raise the share of matches that fit: misfit that it does not cure is not the lens's."""
 CENTRE_SHARE = 0.1
 """Standard deviation of a lens's centre about the middle of the image, beforehand [image widths]."""
+TERM_SPREADS = (0.2, 0.01, 0.01)
+"""Standard deviations of k2, p1, p2 about zero, beforehand: several times those of lenses that people buy."""
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""
 CENTRE_BOUND = 2.0

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, partial_products
+from stereoservo.kinematics.parameterization import LENS_PARAMETERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 
@@ -112,7 +113,7 @@ class Motions(NamedTuple):
 
 
 class Projections(NamedTuple):
-    """``cameras`` (c, 3, 4) and ``lenses`` (c, 4), with the bases of their parameters and where each camera's begin."""
+    """``cameras`` (c, 3, 4) and ``lenses`` (c, 7), with the bases of their parameters and where each camera's begin."""
 
     cameras: FloatArray
     camera_basis: FloatArray
@@ -171,14 +172,19 @@ def _rows_into(
         bend, cu, cv, r0 = lenses[c, 0], lenses[c, 1], lenses[c, 2], lenses[c, 3]
         du, dv = (u - cu) / r0, (v - cv) / r0
         square = du * du + dv * dv
-        stretch = 1.0 + bend * square
+        k2, p1, p2 = lenses[c, 4], lenses[c, 5], lenses[c, 6]
+        across_term, down_term = square + 2.0 * du * du, square + 2.0 * dv * dv
+        growth = square * (bend + k2 * square)
+        slope = 2.0 * bend + 4.0 * k2 * square
         weight = 1.0 / sigmas[k]
         # ∂raw/∂ideal, in sigmas.
-        Duu = (stretch + 2.0 * bend * du * du) * weight
-        Duv = 2.0 * bend * du * dv * weight
-        Dvv = (stretch + 2.0 * bend * dv * dv) * weight
-        core[2 * k, residual_at] = (u + (u - cu) * bend * square - pixels[k, 0]) * weight
-        core[2 * k + 1, residual_at] = (v + (v - cv) * bend * square - pixels[k, 1]) * weight
+        Duu = (1.0 + growth + slope * du * du + 2.0 * p1 * dv + 6.0 * p2 * du) * weight
+        Duv = (slope * du * dv + 2.0 * p1 * du + 2.0 * p2 * dv) * weight
+        Dvv = (1.0 + growth + slope * dv * dv + 6.0 * p1 * dv + 2.0 * p2 * du) * weight
+        bent_u = (u - cu) * growth + r0 * (2.0 * p1 * du * dv + p2 * across_term)
+        bent_v = (v - cv) * growth + r0 * (p1 * down_term + 2.0 * p2 * du * dv)
+        core[2 * k, residual_at] = (u + bent_u - pixels[k, 0]) * weight
+        core[2 * k + 1, residual_at] = (v + bent_v - pixels[k, 1]) * weight
         scale = 1.0 / ray[2]
         for r in range(4):
             across, down = (P[0, r] - u * P[2, r]) * scale, (P[1, r] - v * P[2, r]) * scale
@@ -200,9 +206,12 @@ def _rows_into(
             core[2 * k, width + a] = Duu * across + Duv * down
             core[2 * k + 1, width + a] = Duv * across + Dvv * down
         for a in range(lens_start[c], lens_start[c + 1]):
-            dk, dcu, dcv = lens_basis[a, 0], lens_basis[a, 1], lens_basis[a, 2]
-            core[2 * k, lens_at + a] = ((u - cu) * square * dk + dcu) * weight - Duu * dcu - Duv * dcv
-            core[2 * k + 1, lens_at + a] = ((v - cv) * square * dk + dcv) * weight - Duv * dcu - Dvv * dcv
+            dk = square * (lens_basis[a, 0] + square * lens_basis[a, 4])
+            dcu, dcv, dp1, dp2 = lens_basis[a, 1], lens_basis[a, 2], lens_basis[a, 5], lens_basis[a, 6]
+            turned = r0 * (2.0 * du * dv * dp1 + across_term * dp2)
+            core[2 * k, lens_at + a] = ((u - cu) * dk + dcu + turned) * weight - Duu * dcu - Duv * dcv
+            turned = r0 * (down_term * dp1 + 2.0 * du * dv * dp2)
+            core[2 * k + 1, lens_at + a] = ((v - cv) * dk + dcv + turned) * weight - Duv * dcu - Dvv * dcv
         _marker_columns(H, point_basis[i], outer, own[2 * k : 2 * k + 2])
 
 
@@ -253,7 +262,7 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
     """Rows of ``data`` (sorted by :func:`by_stop`) in chunks, each with its slice of ``data``."""
     generator_basis = np.concatenate([np.zeros((0, 4, 4)), *charts.generators])
     camera_basis = np.concatenate([np.zeros((0, 3, 4)), *charts.cameras])
-    lens_basis = np.concatenate([np.zeros((0, 4)), *charts.lenses])
+    lens_basis = np.concatenate([np.zeros((0, 7)), *charts.lenses])
     point_basis = np.array(charts.points)
     width = len(generator_basis) + len(camera_basis) + len(lens_basis)
     projections = Projections(
@@ -292,13 +301,16 @@ def prior_rows(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
     for lens, basis, mean, information in zip(
         rig.lenses, charts.lenses, data.lens_priors.mean, data.lens_priors.information, strict=True
     ):
-        values, vectors = np.linalg.eigh(information)
+        # Terms that are not free have no prior: it would only count.
+        part = len(mean) if len(basis) and basis[:, 4:].any() else 3
+        entries = list(LENS_PARAMETERS[:part])
+        values, vectors = np.linalg.eigh(information[:part, :part])
         known = values > 0.0
         root = np.sqrt(values[known])[:, None] * vectors[:, known].T
         if len(basis) and len(root):
             rows = np.zeros((len(root), charts.size + 1))
-            rows[:, at : at + len(basis)] = root @ basis[:, :3].T
-            rows[:, -1] = root @ (lens[:3] - mean)
+            rows[:, at : at + len(basis)] = root @ basis[:, entries].T
+            rows[:, -1] = root @ (lens[entries] - mean[:part])
             out = np.vstack([out, rows])
         at += len(basis)
     return out

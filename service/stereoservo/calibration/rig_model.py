@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.geometry.distortion import distort
+from stereoservo.geometry.distortion import bends, distort
 from stereoservo.kinematics.axes import stratum_frame
 from stereoservo.kinematics.model import CellModel, ModelCovariance, Stratum, check_model, pinhole
 from stereoservo.kinematics.parameterization import (
@@ -35,7 +35,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 @dataclass(frozen=True)
 class RigModel:
     """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4) to ideal pixels, ``points`` (m, 4)
-    at joint offset 0, ``lenses`` (c, 4) from ideal to raw pixels; empty for pinholes.
+    at joint offset 0, ``lenses`` (c, 7) from ideal to raw pixels; given as (c, 4) without terms, empty for pinholes.
     """
 
     kinds: tuple[Kind, ...]
@@ -47,12 +47,14 @@ class RigModel:
     def __post_init__(self) -> None:
         if not len(self.lenses):
             object.__setattr__(self, "lenses", np.tile(pinhole(), (len(self.cameras), 1)))
+        if self.lenses.shape[1] == 4:
+            object.__setattr__(self, "lenses", np.hstack([self.lenses, np.zeros((len(self.lenses), 3))]))
 
 
 @dataclass(frozen=True)
 class LensPriors:
-    """Prior estimates of the lenses: ``mean`` (c, 3) of (k, cu, cv) and ``information`` (c, 3, 3), the
-    inverse of its covariance, zero where nothing is known.
+    """Prior estimates of the lenses: ``mean`` (c, 6) of (k, cu, cv, k2, p1, p2) and ``information`` (c, 6, 6), the
+    inverse of its covariance, zero where nothing is known; or (c, 3) and (c, 3, 3) of (k, cu, cv) alone.
     """
 
     mean: FloatArray
@@ -90,13 +92,17 @@ class Measurements:
 @dataclass(frozen=True)
 class Charts:
     """Minimal parameterization: directions of each part in the order of their parameters; an empty basis (0, ...) keeps
-    the part fixed.
+    the part fixed. Those of lenses are (p, 7), given as (p, 4) without terms.
     """
 
     generators: tuple[FloatArray, ...]
     cameras: tuple[FloatArray, ...]
     lenses: tuple[FloatArray, ...]
     points: tuple[FloatArray, ...]
+
+    def __post_init__(self) -> None:
+        whole = tuple(np.pad(basis, ((0, 0), (0, 7 - basis.shape[1]))) for basis in self.lenses)
+        object.__setattr__(self, "lenses", whole)
 
     @property
     def parts(self) -> tuple[tuple[FloatArray, ...], ...]:
@@ -194,8 +200,15 @@ def predicted(rig: RigModel, data: Measurements) -> FloatArray:
         mine = np.flatnonzero(data.camera == c)
         images = world[data.stop[mine], data.marker[mine]] @ matrix.T
         ideal = images[:, :2] / images[:, 2:]
-        pixels[mine] = ideal if lens[0] == 0.0 else distort(lens, ideal)
+        pixels[mine] = _through(lens, ideal)
     return pixels
+
+
+def _through(lens: FloatArray, ideal: FloatArray) -> FloatArray:
+    """Raw pixels (k, 2) of ideal ones through a lens (7,), which has terms or is only radial."""
+    if not bends(lens):
+        return ideal
+    return distort(lens if lens[4:].any() else lens[:4], ideal)
 
 
 def residuals(rig: RigModel, data: Measurements) -> FloatArray:

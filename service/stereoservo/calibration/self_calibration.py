@@ -19,16 +19,15 @@ from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.lens_estimation import (
-    FREE_LENS,
     STARTING_BENDS,
     implausible_lens,
-    lens_test,
     lenses_may_bend,
     prior_of_lenses,
     starting_lenses,
     straightened,
     undistorted,
 )
+from stereoservo.calibration.lens_significance import FREE_LENS, FULL_LENS, lens_test, lens_wanted
 from stereoservo.calibration.rig_model import (
     Measurements,
     RigModel,
@@ -167,12 +166,17 @@ def _fit(
     final, inliers = refine_to_convergence(
         raised.solution.rig, every, raised.solution.stratum, options, solution.lenses
     )
-    if options.lens == "auto" and final.lenses == "none" and (raised.bent or lens_test(final).distorted):
+    for _ in range(2 if options.lens == "auto" else 0):
+        wanted = lens_wanted(final)
+        if wanted == final.lenses and raised.bent and final.lenses != FULL_LENS:
+            wanted = FREE_LENS if final.lenses == "none" else FULL_LENS
+        if wanted == final.lenses:
+            break
         # Only the constraints of the higher stratum have separated distortion from kinematics.
-        solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
+        solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, wanted, 1e-6)
         raised = select_stratum(solution, every.select(inliers), options)
         final, inliers = refine_to_convergence(
-            raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS
+            raised.solution.rig, every, raised.solution.stratum, options, wanted
         )
     _refuse_poor_fit(trials, final, every, inliers, options)
     _refuse_undetermined(final, raised.notes)
@@ -222,18 +226,20 @@ def _projective(
 ) -> tuple[Solution, BoolArray]:
     """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
     robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
-    if not decided and lenses == "none":
+    for _ in range(2 if options.lens == "auto" else 0):
         # Before anything is called an outlier: distortion makes many of them.
         inside = every.select(inlier_mask(robust.rig, every, options))
-        if lens_test(solve(robust.rig, inside, "projective", max_evaluations=1)).distorted:
-            lenses = FREE_LENS
-            robust = solve(
-                robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
-            )
+        wanted = lens_wanted(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
+        if wanted == lenses:
+            break
+        lenses = wanted
+        robust = solve(
+            robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
+        )
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.
     solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
-    if decided or lens_test(solution).distorted == (lenses == FREE_LENS):
+    if decided or lens_test(solution).distorted == (lenses != "none"):
         return solution, inliers
     if lenses == "none":
         return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)

@@ -19,7 +19,7 @@ from stereoservo.calibration.bundle_statistics import (
     rank_of,
     variance_factor,
 )
-from stereoservo.calibration.lens_estimation import lens_test
+from stereoservo.calibration.lens_significance import lens_wanted
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.homogeneous import GeometryError
@@ -38,7 +38,7 @@ class FitOptions:
     ``metric_loss``: how much worse, in variance, the metric bundle may fit than the projective one where it
     is not certain that the metric is identifiable. ``max_spread``: largest relative standard deviation of
     focal lengths (metric) and depths (metric, affine) with which a stratum is believed. ``lens``: what of the
-    lenses is free; ``auto`` lets the data decide between nothing and the radial parameter with its centre.
+    lenses is free; ``auto`` lets the data decide between nothing, the radial parameter with its centre, and more terms.
     """
 
     outlier_chi2: float = 25.0
@@ -72,7 +72,7 @@ class StratumSelector:
 
     A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
     is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
-    nearly. ``bent``: free lenses would have satisfied them. ``tolerable``: costly
+    nearly. ``bent``: a richer lens model would have satisfied them. ``tolerable``: costly
     ones, taken if no start finds a better; ``unfinished``: bundles that may still converge; ``loose``: good fits
     that hardly determine the stratum.
     """
@@ -109,7 +109,7 @@ class StratumSelector:
         if not self._worse(solution, NESTED_TAIL):
             self.tolerable.append((solution, plane))
             return False
-        self.bent = self.bent or (solution.lenses == "none" and lens_test(solution).distorted)
+        self.bent = self.bent or lens_wanted(solution) != solution.lenses
         # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
         self.hopeless = any(
             abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve

@@ -12,7 +12,7 @@ from stereoservo.control.marker_groups import MarkerGroups, groups_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
-from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.model import CellModel, lens_size
 from stereoservo.numerics.arrays import FloatArray
 
 
@@ -53,7 +53,10 @@ def _require_numbers(model: CellModel) -> None:
         ("scene points", model.scene_points, (scene, 4)),
         ("plane at infinity", model.plane_at_infinity, (4,)),
         *((f"a matrix of camera {camera.name}", camera.matrix, (3, 4)) for camera in model.cameras),
-        *((f"a lens of camera {camera.name}", camera.lens, (4,)) for camera in model.cameras),
+        *(
+            (f"a lens of camera {camera.name}", camera.lens, (lens_size(model.cameras),))
+            for camera in model.cameras
+        ),
     ]
     if model.projective_to_euclidean is not None:
         arrays.append(("Euclidean frame", model.projective_to_euclidean, (4, 4)))

@@ -164,7 +164,7 @@ def motion_at(history: JointHistory, t_ns: int) -> FloatArray | None:
 def ideal_observation(arrays: ModelArrays, camera: int, observation: CameraObservation) -> CameraObservation:
     """An observation in ideal pixels; sights that the camera's lens cannot have made are left out."""
     lens = arrays.lenses[camera]
-    if lens[0] == 0.0:
+    if len(lens) == 4 and lens[0] == 0.0:
         return observation
     pixels, covariances, seen = undistort_sights(
         lens,
@@ -432,7 +432,7 @@ def priors(
 
 def _raw_prior(prior: Prior, lens: FloatArray) -> Prior:
     """A prior as the camera's lens shows it; markers beyond its fold are left out."""
-    if lens[0] == 0.0:
+    if len(lens) == 4 and lens[0] == 0.0:
         return prior
     pixels, velocities, covariances, seen = distort_expected(
         lens, prior.pixels, prior.velocities, prior.covariances

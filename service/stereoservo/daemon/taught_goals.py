@@ -33,7 +33,7 @@ class TaughtFileError(DamagedError):
 
 
 class TaughtCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A camera at the time of teaching: ``matrix`` 3x4 row by row, ``lens`` (k, cu, cv, r0), image size [px]."""
+    """A camera at the time of teaching: ``matrix`` 3x4 row by row, ``lens`` as in a model, image size [px]."""
 
     name: str
     matrix: tuple[float, ...]
@@ -192,8 +192,9 @@ def _check_shapes(path: Path, name: str, model: TaughtModel | None) -> None:
     upgrade = model.projective_to_euclidean
     sizes = [("plane_at_infinity", model.plane_at_infinity, 4)]
     sizes += [] if upgrade is None else [("projective_to_euclidean", upgrade, 16)]
+    lens = 7 if model.cameras and len(model.cameras[0].lens) == 7 else 4
     for camera in model.cameras:
-        sizes += [(f"{camera.name}.matrix", camera.matrix, 12), (f"{camera.name}.lens", camera.lens, 4)]
+        sizes += [(f"{camera.name}.matrix", camera.matrix, 12), (f"{camera.name}.lens", camera.lens, lens)]
     for what, values, size in sizes:
         if len(values) != size:
             raise TaughtFileError(

@@ -1,14 +1,17 @@
-"""Radial lens distortion with one parameter and its own centre: ideal (pinhole) pixels to raw pixels and back, with
-derivatives; and its estimation from images of straight lines.
+"""Lens distortion about its own centre, radial and tangential: ideal (pinhole) pixels to raw pixels and back, with
+derivatives; and the radial parameter from images of straight lines.
 
-A ``lens`` is ``(k, cu, cv, r0)``: the raw pixel of an ideal one ``p`` is ``c + (p - c)(1 + k |p - c|² / r0²)``
-with the centre ``c = (cu, cv)`` [px] and the reference radius ``r0`` [px], half the image width. With square
-pixels and the centre at the principal point, ``k / r0²`` is Brown's (and OpenCV's) ``k1 / f²``. Everything
-projective works on ideal pixels; raw ones are what cameras and people see.
+A ``lens`` is ``(k, cu, cv, r0)`` or ``(k, cu, cv, r0, k2, p1, p2)``: the raw pixel of an ideal one ``p`` is
+``c + (p - c)(1 + k s + k2 s²) + r0 (2 p1 x y + p2 (s + 2 x²), p1 (s + 2 y²) + 2 p2 x y)`` with the centre ``c = (cu,
+cv)`` [px], the reference radius ``r0`` [px], half the image width, ``(x, y) = (p - c) / r0`` and ``s = x² + y²``. With
+square pixels and the centre at the principal point, ``k / r0²``, ``k2 / r0⁴``, ``p1 / r0``, ``p2 / r0`` are Brown's
+(and OpenCV's) ``k1 / f²``, ``k2 / f⁴``, ``p1 / f``, ``p2 / f``. Everything projective works on ideal pixels; raw ones
+are what cameras and people see.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -23,6 +26,10 @@ ITERATIONS = 30
 """Newton steps of the inverse at most; from the start below five suffice inside the image."""
 CONVERGED = 1e-14
 """Step, relative to the radius, at which the inverse ends."""
+FARTHEST = 20.0
+"""Ideal radius [r0] beyond which no inverse of a lens of several terms is sought."""
+MET = 1e-10
+"""Error [r0] of an inverse through tangential terms above which there is none: beyond the fold."""
 
 
 def straight_lens(width: int, height: int) -> FloatArray:
@@ -30,8 +37,28 @@ def straight_lens(width: int, height: int) -> FloatArray:
     return np.array([0.0, 0.5 * (width - 1), 0.5 * (height - 1), 0.5 * width])
 
 
+def bends(lens: FloatArray) -> bool:
+    """Whether a lens distorts."""
+    return bool(lens[0] != 0.0 or (len(lens) > 4 and lens[4:].any()))
+
+
+def fold_radius(lens: FloatArray) -> float:
+    """Ideal radius [px] at which the radial function ceases to grow and the image folds back; infinite where it grows
+    everywhere.
+    """
+    k, k2 = float(lens[0]), float(lens[4]) if len(lens) > 4 else 0.0
+    # The least positive root s of 1 + 3 k s + 5 k2 s².
+    under = 9.0 * k * k - 20.0 * k2
+    below = math.sqrt(under) - 3.0 * k if under > 0.0 else 0.0
+    return float(lens[3]) * math.sqrt(2.0 / below) if below > 0.0 else math.inf
+
+
 def distort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Raw pixels (..., 2) of ideal ones; NaN beyond the radius where the image folds back."""
+    if len(lens) > 4:
+        offset = (np.asarray(pixels, dtype=np.float64) - lens[1:3]) / lens[3]
+        unfolded = (offset**2).sum(axis=-1, keepdims=True) < min(fold_radius(lens) / lens[3], FARTHEST) ** 2
+        return np.where(unfolded, lens[1:3] + lens[3] * _distorted(lens, offset), np.nan)
     k, centre, r0 = lens[0], lens[1:3], lens[3]
     offset = np.asarray(pixels, dtype=np.float64) - centre
     squared = (offset**2).sum(axis=-1, keepdims=True) / r0**2
@@ -44,6 +71,8 @@ def undistort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
 
     Newton's method on the radius. With ``k < 0`` the image ends at a radius: nothing lies beyond.
     """
+    if len(lens) > 4:
+        return _undistorted(lens, np.asarray(pixels, dtype=np.float64))
     k, centre, r0 = lens[0], lens[1:3], lens[3]
     offset = np.asarray(pixels, dtype=np.float64) - centre
     if k == 0.0:
@@ -66,10 +95,84 @@ def undistort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     return np.where(inside[..., None], centre + offset * scale[..., None], np.nan)
 
 
+def _distorted(lens: FloatArray, offset: FloatArray) -> FloatArray:
+    """Raw offsets (..., 2) [r0] from the centre of a lens (7,), of ideal ones."""
+    k, k2, p1, p2 = lens[[0, 4, 5, 6]]
+    x, y = offset[..., 0], offset[..., 1]
+    s = x * x + y * y
+    stretch = 1.0 + s * (k + s * k2)
+    return np.stack(
+        [
+            x * stretch + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+            y * stretch + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _undistorted(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Ideal pixels (..., 2) of raw ones through a lens (7,): Newton's method within brackets on the radius, then on
+    both coordinates; NaN also where tangential terms carry a pixel beyond the radial image.
+    """
+    centre, r0 = lens[1:3], lens[3]
+    k, k2 = lens[0], lens[4]
+    target = (pixels - centre) / r0
+    raw = np.sqrt((target**2).sum(axis=-1))
+    fold = min(fold_radius(lens) / r0, FARTHEST)
+    inside = raw < fold * (1.0 + fold**2 * (k + fold**2 * k2))
+    goal = np.where(inside, raw, 0.0)
+    low, high = np.zeros_like(goal), np.full_like(goal, fold)
+    radius = np.minimum(goal, 0.9 * fold)
+    for _ in range(2 * ITERATIONS):
+        s = radius**2
+        excess = radius * (1.0 + s * (k + s * k2)) - goal
+        low, high = np.where(excess <= 0.0, radius, low), np.where(excess >= 0.0, radius, high)
+        step = radius - excess / (1.0 + s * (3.0 * k + 5.0 * k2 * s))
+        step = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
+        moved = np.abs(step - radius)
+        radius = step
+        if float(np.max(moved, initial=0.0)) <= CONVERGED * float(np.max(radius, initial=1.0)):
+            break
+    goals = np.where(inside[..., None], target, 0.0)
+    offset = goals * (radius / np.where(goal > 0.0, goal, 1.0))[..., None]
+    for _ in range(ITERATIONS):
+        slope = distortion_jacobian(lens, centre + r0 * offset)
+        determinant = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] * slope[..., 1, 0]
+        error = _distorted(lens, offset) - goals
+        step = (
+            np.stack(
+                [
+                    slope[..., 1, 1] * error[..., 0] - slope[..., 0, 1] * error[..., 1],
+                    slope[..., 0, 0] * error[..., 1] - slope[..., 1, 0] * error[..., 0],
+                ],
+                axis=-1,
+            )
+            / np.where(determinant > 0.0, determinant, np.inf)[..., None]
+        )
+        offset = offset - step
+        if float(np.max(np.abs(step), initial=0.0)) <= CONVERGED * float(np.max(np.abs(offset), initial=1.0)):
+            break
+    met = np.abs(_distorted(lens, offset) - goals).max(axis=-1, initial=0.0) < MET
+    return np.where((inside & met)[..., None], centre + r0 * offset, np.nan)
+
+
 def distortion_jacobian(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """``∂raw/∂ideal`` (..., 2, 2) at ideal pixels (..., 2)."""
     k, centre, r0 = lens[0], lens[1:3], lens[3]
     offset = (np.asarray(pixels, dtype=np.float64) - centre) / r0
+    if len(lens) > 4:
+        k2, p1, p2 = lens[4:7]
+        x, y = offset[..., 0], offset[..., 1]
+        s = x * x + y * y
+        even, slope = 1.0 + s * (k + s * k2), 2.0 * k + 4.0 * k2 * s
+        across = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        return np.stack(
+            [
+                np.stack([even + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x, across], axis=-1),
+                np.stack([across, even + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x], axis=-1),
+            ],
+            axis=-2,
+        )
     squared = (offset**2).sum(axis=-1)[..., None, None]
     result: FloatArray = (1.0 + k * squared) * np.eye(2) + 2.0 * k * offset[..., :, None] * offset[
         ..., None, :
@@ -84,6 +187,19 @@ def lens_jacobian(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     squared = (offset**2).sum(axis=-1, keepdims=True) / r0**2
     by_centre = np.eye(2) - distortion_jacobian(lens, pixels)
     return np.concatenate([(offset * squared)[..., None], by_centre], axis=-1)
+
+
+def terms_jacobian(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """``∂raw/∂(k2, p1, p2)`` (..., 2, 3) at ideal pixels (..., 2), of a lens with or without these terms."""
+    offset = (np.asarray(pixels, dtype=np.float64) - lens[1:3]) / lens[3]
+    x, y = offset[..., 0], offset[..., 1]
+    s = x * x + y * y
+    columns = (
+        np.stack([x * s * s, y * s * s], axis=-1),
+        np.stack([2.0 * x * y, s + 2.0 * y * y], axis=-1),
+        np.stack([s + 2.0 * x * x, 2.0 * x * y], axis=-1),
+    )
+    return np.asarray(lens[3] * np.stack(columns, axis=-1))
 
 
 CENTRE_SHARE = 0.1

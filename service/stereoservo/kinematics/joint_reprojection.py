@@ -37,7 +37,7 @@ class JointAnglesError(ValueError):
 @dataclass(frozen=True, eq=False)
 class SeenChain:
     """A chain and the cameras that observe its points, or are mounted on it: ``cameras`` (c, 3, 4) to ideal pixels,
-    ``lenses`` (c, 4) from them to raw ones. Third rows of the cameras are positive on points in front, as a
+    ``lenses`` (c, 4) or (c, 7) from them to raw ones. Third rows of the cameras are positive on points in front, as a
     calibration gives them.
     """
 
@@ -50,7 +50,7 @@ class SeenChain:
         c, n = len(self.cameras), self.chain.joints
         if (
             self.cameras.shape != (c, 3, 4)
-            or self.lenses.shape != (c, 4)
+            or self.lenses.shape not in ((c, 4), (c, 7))
             or len(self.joint_names) != n
             or not c
         ):

@@ -417,12 +417,110 @@ ITERATIONS = 30
 """Newton steps of the inverse at most."""
 CONVERGED = 1e-14
 """Step, relative to the radius, at which the inverse ends."""
+FARTHEST = 20.0
+"""Ideal radius [r0] beyond which a lens of several terms images nothing."""
+MET = 1e-10
+"""Error [r0] of an inverse through tangential terms above which there is none."""
+
+
+@kernel
+def _fold_square(lens: FloatArray) -> float:
+    """Square of the ideal radius [r0] at which a lens (7,) folds back, `FARTHEST` at most."""
+    k, k2 = lens[0], lens[4]
+    under = 9.0 * k * k - 20.0 * k2
+    below = math.sqrt(under) - 3.0 * k if under > 0.0 else 0.0
+    return min(2.0 / below, FARTHEST * FARTHEST) if below > 0.0 else FARTHEST * FARTHEST
+
+
+@kernel
+def _distorted_offset(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Raw offset [r0] from the centre of a lens (7,), of an ideal one."""
+    k, k2, p1, p2 = lens[0], lens[4], lens[5], lens[6]
+    s = x * x + y * y
+    stretch = 1.0 + s * (k + s * k2)
+    return (
+        x * stretch + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+        y * stretch + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+@kernel
+def distortion_jacobian(lens: FloatArray, u: float, v: float) -> tuple[float, float, float]:
+    """``∂raw/∂ideal`` at the ideal pixel ``(u, v)``, a symmetric matrix: its entries uu, uv, vv."""
+    k, r0 = lens[0], lens[3]
+    x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
+    if len(lens) > 4:
+        k2, p1, p2 = lens[4], lens[5], lens[6]
+        s = x * x + y * y
+        stretch, slope = 1.0 + s * (k + s * k2), 2.0 * k + 4.0 * k2 * s
+        return (
+            stretch + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+            slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
+            stretch + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
+        )
+    even = 1.0 + k * (x * x + y * y)
+    return even + 2.0 * k * x * x, 2.0 * k * x * y, even + 2.0 * k * y * y
+
+
+@kernel
+def _undistorted_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Ideal pixel of the raw one through a lens (7,): Newton's method within brackets on the radius, then on both
+    coordinates; NaN where there is none.
+    """
+    k, r0, k2 = lens[0], lens[3], lens[4]
+    goal_x, goal_y = (u - lens[1]) / r0, (v - lens[2]) / r0
+    raw = math.sqrt(goal_x * goal_x + goal_y * goal_y)
+    square = _fold_square(lens)
+    fold = math.sqrt(square)
+    if not raw < fold * (1.0 + square * (k + square * k2)):
+        return math.nan, math.nan
+    low, high, radius = 0.0, fold, min(raw, 0.9 * fold)
+    for _ in range(2 * ITERATIONS):
+        s = radius * radius
+        excess = radius * (1.0 + s * (k + s * k2)) - raw
+        if excess <= 0.0:
+            low = radius
+        if excess >= 0.0:
+            high = radius
+        ahead = radius - excess / (1.0 + s * (3.0 * k + 5.0 * k2 * s))
+        if not low <= ahead <= high:
+            ahead = 0.5 * (low + high)
+        moved = abs(ahead - radius)
+        radius = ahead
+        if moved <= CONVERGED * max(radius, 1.0):
+            break
+    scale = radius / raw if raw > 0.0 else 1.0
+    x, y = goal_x * scale, goal_y * scale
+    left_x, left_y = 0.0, 0.0
+    for _ in range(ITERATIONS):
+        seen_x, seen_y = _distorted_offset(lens, x, y)
+        left_x, left_y = seen_x - goal_x, seen_y - goal_y
+        uu, uv, vv = distortion_jacobian(lens, lens[1] + r0 * x, lens[2] + r0 * y)
+        determinant = uu * vv - uv * uv
+        if not determinant > 0.0:
+            return math.nan, math.nan
+        step_x = (vv * left_x - uv * left_y) / determinant
+        step_y = (uu * left_y - uv * left_x) / determinant
+        x, y = x - step_x, y - step_y
+        if max(abs(step_x), abs(step_y)) <= CONVERGED * max(abs(x), abs(y), 1.0):
+            break
+    if not max(abs(left_x), abs(left_y)) < MET:
+        return math.nan, math.nan
+    return lens[1] + r0 * x, lens[2] + r0 * y
 
 
 @kernel
 def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. ``k = 0`` leaves it as it is, to the bit."""
+    """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. ``lens`` (4,) or (7,) as in `geometry.distortion`; a
+    lens (4,) of ``k = 0`` leaves it as it is, to the bit.
+    """
     k, r0 = lens[0], lens[3]
+    if len(lens) > 4:
+        x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
+        if not x * x + y * y < _fold_square(lens):
+            return math.nan, math.nan
+        x, y = _distorted_offset(lens, x, y)
+        return lens[1] + r0 * x, lens[2] + r0 * y
     if k == 0.0:
         return u, v
     x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
@@ -436,9 +534,11 @@ def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
 def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Ideal pixel of the raw one ``(u, v)`` by Newton's method on the radius; NaN where there is none.
 
-    A lens of ``k = 0`` leaves it as it is, to the bit.
+    A lens (4,) of ``k = 0`` leaves it as it is, to the bit.
     """
     k, r0 = lens[0], lens[3]
+    if len(lens) > 4:
+        return _undistorted_pixel(lens, u, v)
     if k == 0.0:
         return u, v
     x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
@@ -454,12 +554,3 @@ def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]
             break
     scale = 1.0 / (1.0 + k * radius * radius)
     return lens[1] + (u - lens[1]) * scale, lens[2] + (v - lens[2]) * scale
-
-
-@kernel
-def distortion_jacobian(lens: FloatArray, u: float, v: float) -> tuple[float, float, float]:
-    """``∂raw/∂ideal`` at the ideal pixel ``(u, v)``, a symmetric matrix: its entries uu, uv, vv."""
-    k, r0 = lens[0], lens[3]
-    x, y = (u - lens[1]) / r0, (v - lens[2]) / r0
-    even = 1.0 + k * (x * x + y * y)
-    return even + 2.0 * k * x * x, 2.0 * k * x * y, even + 2.0 * k * y * y

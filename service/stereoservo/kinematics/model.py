@@ -32,7 +32,8 @@ def pinhole() -> FloatArray:
 class CameraModel(msgspec.Struct, frozen=True, eq=False):
     """A camera in the model's projective frame: ``matrix`` (3, 4) maps points to ideal pixels; image size [px].
 
-    ``lens`` (4,): radial distortion ``(k, cu, cv, r0)`` from ideal to raw pixels, see `geometry.distortion`.
+    ``lens`` (4,) or (7,): distortion ``(k, cu, cv, r0)``, or with the terms ``(k2, p1, p2)`` behind, from ideal to raw
+    pixels, see `geometry.distortion`; of one length in all cameras of a model.
     """
 
     name: str
@@ -99,7 +100,7 @@ class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
     - ``generators``: for each joint directions D (p_j, 4, 4); a parameter changes the generator by ``[D, G]``, at
       finite values by ``T G T⁻¹``, ``T = (I - Δ/2)⁻¹ (I + Δ/2)``, ``Δ = Σ x_k D_k``: the algebra stays exact.
     - ``cameras``: for each camera directions (p_c, 3, 4) of its matrix.
-    - ``lenses``: for each camera directions (p_l, 4) of its lens ``(k, cu, cv, r0)``; none where it is a pinhole.
+    - ``lenses``: for each camera directions (p_l, 4 or 7) of its lens; none where it is a pinhole.
     - ``markers``: for each marker directions (p_m, 4) of its point.
 
     A gauge is fixed: only functions of the model that no change of frame alters, within the group of its stratum,
@@ -249,7 +250,10 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         ("marker_points", model.marker_points, (m, 4)),
         ("plane_at_infinity", model.plane_at_infinity, (4,)),
         *((f"cameras[{i}].matrix", camera.matrix, (3, 4)) for i, camera in enumerate(model.cameras)),
-        *((f"cameras[{i}].lens", camera.lens, (4,)) for i, camera in enumerate(model.cameras)),
+        *(
+            (f"cameras[{i}].lens", camera.lens, (lens_size(model.cameras),))
+            for i, camera in enumerate(model.cameras)
+        ),
     ]
     if model.projective_to_euclidean is not None:
         arrays.append(("projective_to_euclidean", model.projective_to_euclidean, (4, 4)))
@@ -276,6 +280,11 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
                 f"is of markers {group.members}, by {group.triple}: indices from 0 to {m - 1}, three of them "
                 "different, are needed",
             )
+
+
+def lens_size(cameras: tuple[CameraModel, ...]) -> int:
+    """How many numbers the lens of each of ``cameras`` has, by the first one: 7 with terms of distortion, else 4."""
+    return 7 if cameras and cameras[0].lens.shape == (7,) else 4
 
 
 def check_loads(loads: JointLoads, n: int, path: Path | str = "<loads>") -> None:
@@ -313,11 +322,12 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
                 f"cameras[{i}].lens",
                 f"{camera.name!r}: reference radius {camera.lens[3]:g} px is not positive",
             )
-        if abs(camera.lens[0]) > MAX_BEND:
+        strongest = max(camera.lens[[0, *range(4, len(camera.lens))]], key=abs)
+        if abs(strongest) > MAX_BEND:
             raise ModelFileError(
                 path,
                 f"cameras[{i}].lens",
-                f"{camera.name!r}: radial parameter {camera.lens[0]:g}; at most {MAX_BEND:g} either way is taken",
+                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_BEND:g} either way is taken",
             )
         # Each row to one length: what is left is rank, not units.
         rows = np.linalg.norm(camera.matrix, axis=1)
@@ -397,7 +407,7 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
     expected: list[tuple[str, tuple[FloatArray, ...], int, tuple[int, ...]]] = [
         ("generators", given.generators, len(model.joint_names), (4, 4)),
         ("cameras", given.cameras, cameras, (3, 4)),
-        ("lenses", given.lenses, cameras, (4,)),
+        ("lenses", given.lenses, cameras, (lens_size(model.cameras),)),
         ("markers", given.markers, len(model.marker_ids), (4,)),
     ]
     p = 0
@@ -518,7 +528,8 @@ def _converted(tree: Any, path: Path | str) -> CellModel:
         text, _, where = str(error).partition(" - at `")
         raise ModelFileError(path, where.rstrip("`").removeprefix("$").lstrip("."), text) from error
     if model.covariance is not None:
-        model = msgspec.structs.replace(model, covariance=_shaped(model.covariance))
+        shaped = _shaped(model.covariance, lens_size(model.cameras))
+        model = msgspec.structs.replace(model, covariance=shaped)
     if not model.scene_ids:
         model = msgspec.structs.replace(
             model, scene_points=np.zeros((0, 4)), scene_covariances=np.zeros((0, 4, 4))
@@ -526,8 +537,8 @@ def _converted(tree: Any, path: Path | str) -> CellModel:
     return model
 
 
-def _shaped(given: ModelCovariance) -> ModelCovariance:
-    """Restore the shape of empty lists of directions, which JSON does not keep."""
+def _shaped(given: ModelCovariance, lens: int) -> ModelCovariance:
+    """Restore the shape of empty lists of directions, which JSON does not keep; ``lens``: numbers of a lens."""
 
     def shaped(bases: tuple[FloatArray, ...], *shape: int) -> tuple[FloatArray, ...]:
         return tuple(basis if basis.size else np.zeros((0, *shape)) for basis in bases)
@@ -535,7 +546,7 @@ def _shaped(given: ModelCovariance) -> ModelCovariance:
     return ModelCovariance(
         shaped(given.generators, 4, 4),
         shaped(given.cameras, 3, 4),
-        shaped(given.lenses, 4),
+        shaped(given.lenses, lens),
         shaped(given.markers, 4),
         given.covariance,
     )

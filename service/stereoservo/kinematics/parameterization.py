@@ -22,8 +22,12 @@ from stereoservo.kinematics.model import Stratum
 from stereoservo.numerics.arrays import FloatArray
 
 Kind = Literal["revolute", "prismatic"]
-LensModel = Literal["none", "radial", "radial_centre"]
-"""What of the lenses is free: nothing, one radial parameter a camera, or that and its centre."""
+LensModel = Literal["none", "radial", "radial_centre", "brown"]
+"""What of the lenses is free: nothing, one radial parameter a camera, that and its centre, or in addition the second
+radial and both tangential terms.
+"""
+LENS_PARAMETERS = (0, 1, 2, 4, 5, 6)
+"""Entries of a lens (7,) that can be free, k, cu, cv, k2, p1, p2: all but the reference radius."""
 
 CHART_SIZE: dict[tuple[Stratum, Kind], int] = {
     ("projective", "revolute"): 10,
@@ -116,8 +120,16 @@ def camera_basis(
 
 
 def lens_basis(model: LensModel) -> FloatArray:
-    """Directions (p, 4) of a lens (k, cu, cv, r0): none, ``k``, or ``k`` and the centre."""
-    return np.eye(4)[: {"none": 0, "radial": 1, "radial_centre": 3}[model]]
+    """Directions (p, 7) of a lens (k, cu, cv, r0, k2, p1, p2) that are free: see `LensModel`."""
+    free = {"none": 0, "radial": 1, "radial_centre": 3, "brown": 6}[model]
+    return np.asarray(np.eye(7)[list(LENS_PARAMETERS[:free])])
+
+
+def lens_model_of(lenses: FloatArray) -> LensModel:
+    """What of ``lenses`` (c, 4 or 7) was free in the fit that they come from."""
+    if lenses[:, 4:].any():
+        return "brown"
+    return "radial_centre" if lenses[:, 0].any() else "none"
 
 
 def point_bases(points: FloatArray, stratum: Stratum) -> FloatArray:

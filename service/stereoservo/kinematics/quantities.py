@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from stereoservo.geometry.cameras import project, projection_jacobian
-from stereoservo.geometry.distortion import distort, distortion_jacobian
+from stereoservo.geometry.distortion import bends, distort, distortion_jacobian
 from stereoservo.kinematics.axes import (
     FramedModel,
     axis_angle,
@@ -122,14 +122,17 @@ def lenses(model: CellModel) -> list[Group]:
     """Quantities of lens distortion, where the model has any."""
     groups = []
     for c, camera in enumerate(model.cameras):
-        if camera.lens[0] == 0.0:
+        if not bends(camera.lens):
             continue
 
-        def values(parts: FramedModel, c: int = c) -> FloatArray:
-            return parts.lenses[c, :3]
+        label, terms = f"{camera.name}: lens", ("k2", "p1", "p2") if len(camera.lens) > 4 else ()
+        free = [0, 1, 2, 4, 5, 6][: 3 + len(terms)]
 
-        label = f"{camera.name}: lens"
-        groups.append(Group(((f"{label} k", ""), (f"{label} cu", "px"), (f"{label} cv", "px")), values))
+        def values(parts: FramedModel, c: int = c, free: list[int] = free) -> FloatArray:
+            return parts.lenses[c, free]
+
+        names = [(f"{label} k", ""), (f"{label} cu", "px"), (f"{label} cv", "px")]
+        groups.append(Group((*names, *((f"{label} {term}", "") for term in terms)), values))
     return groups
 
 

@@ -78,6 +78,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(12),),
         ),
         Experiment(
+            "random-lenses",
+            "the random rigs behind lenses with k1, k2 and tangential terms: usable, wrong, refused by cause",
+            "arms.random_lenses",
+            (repetitions(12),),
+        ),
+        Experiment(
             "inverse-kinematics",
             "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
             "arms.inverse_kinematics",

@@ -8,6 +8,10 @@ of arms in random configurations; four bodies, two of them flat, 0.6 to 2 m away
 What is drawn again: rigs that do not both see the whole body at home, and configurations in which some joint cannot
 move by ``MIN_RANGE`` with ``MIN_SHOWN`` markers in both images. An operator would choose another home, too. Nothing
 else is: no case is drawn again because its fit is hard.
+
+Cases behind lenses are the same rigs, whose cameras share a make of lens: radial terms of OpenCV's model up to what
+wide lenses have, tangential ones, a centre at the principal point. Lenses that would fold an image back are drawn
+again: such are not made.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.trial_data import TrialData
+from stereoservo.geometry.distortion import fold_radius, undistort
 from stereoservo.kinematics.model import pinhole
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.world.synthetic import (
@@ -60,6 +65,14 @@ MIN_RANGE = 0.05
 """A home at which some joint may move less than this to either side [rad] is drawn again."""
 MIN_SHOWN = 4
 """Markers that both images hold at every stop."""
+K1, K2 = (-0.4, 0.1), (-0.05, 0.2)
+"""Radial terms of the lenses, OpenCV's."""
+TANGENTIAL = 1e-3
+"""Largest tangential term of each lens, OpenCV's."""
+LENS_RATIO = 0.1
+"""How far the radial terms of the second camera's lens may differ from the first one's."""
+UNFOLDED = 1.1
+"""Ideal radius at which lenses fold back at least, over that of the image's corner."""
 MARGIN = 4.0
 """Distance of markers from the edge of the image [px]."""
 
@@ -117,6 +130,34 @@ def random_case(seed: int) -> RandomCase:
         if cell is not None:
             return RandomCase(seed, cell, sigma, stops, arm, body_name, redraws)
         redraws += 1
+
+
+def random_lens_case(seed: int) -> RandomCase:
+    """Random cell of ``seed`` with lenses that distort, reproducible bit for bit."""
+    case = random_case(seed)
+    rng = np.random.default_rng([seed, 3])
+    return replace(case, cell=replace(case.cell, lenses=random_lenses(rng, case.cell)))
+
+
+def random_lenses(rng: np.random.Generator, cell: SyntheticCell) -> FloatArray:
+    """Lenses (c, 7) of the cell's cameras, about their principal points."""
+    while True:
+        radial = np.array([rng.uniform(*K1), rng.uniform(*K2)])
+        lenses = np.array(
+            [
+                cell.lens_of(c, *(radial * (1.0 + c * rng.uniform(-1.0, 1.0) * LENS_RATIO)), *tangential)
+                for c, tangential in enumerate(rng.uniform(-TANGENTIAL, TANGENTIAL, (2, 2)))
+            ]
+        )
+        if all(unfolded(lens, cell.width, cell.height) for lens in lenses):
+            return lenses
+
+
+def unfolded(lens: FloatArray, width: int, height: int) -> bool:
+    """Whether a lens folds back well outside of its image."""
+    corners = np.array([[u, v] for u in (0.0, width - 1.0) for v in (0.0, height - 1.0)])
+    reach = np.linalg.norm(undistort(lens, corners) - lens[1:3], axis=1).max()
+    return bool(UNFOLDED * reach < fold_radius(lens))
 
 
 def random_pair(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -51,7 +51,7 @@ class SyntheticCell:
 
     ``base`` (4, 4): the arm's base in the rig's frame, or with ``mount`` eye-in-hand the base in the frame of the
     markers. ``links`` (4, 4) each, fixed, after the joint about or along its z. ``body`` (m, 3): markers in the
-    flange's frame, or where they stand. ``intrinsics`` (c, 3, 3), ``lenses`` (c, 4), ``poses`` (c, 4, 4) from the
+    flange's frame, or where they stand. ``intrinsics`` (c, 3, 3), ``lenses`` (c, 4 or 7), ``poses`` (c, 4, 4) from the
     rig (eye-in-hand: the flange) to each camera. ``home`` (n,), ``ranges`` (n,): trials go from -range to +range.
     """
 
@@ -172,6 +172,14 @@ class SyntheticCell:
     def with_body(self, body: npt.ArrayLike) -> SyntheticCell:
         """The same cell with other markers (m, 3)."""
         return replace(self, body=np.asarray(body, dtype=np.float64))
+
+    def lens_of(
+        self, camera: int, k1: float, k2: float = 0.0, p1: float = 0.0, p2: float = 0.0
+    ) -> FloatArray:
+        """Lens (7,) of OpenCV's first coefficients about a camera's principal point, as with square pixels."""
+        K, r0 = self.intrinsics[camera], 0.5 * self.width
+        share = r0 / float(np.sqrt(K[0, 0] * K[1, 1]))
+        return np.array([k1 * share**2, K[0, 2], K[1, 2], r0, k2 * share**4, p1 * share, p2 * share])
 
     def with_k1(self, k1: float) -> SyntheticCell:
         """The same cell through lenses of Brown's ``k1`` about each principal point (OpenCV's first coefficient)."""

@@ -27,6 +27,7 @@ from stereoservo.calibration.rig_model import (
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.kinematics.model import CellModel, ModelCovariance
+from stereoservo.kinematics.parameterization import lens_model_of
 from stereoservo.messages.check_report import CauseKind
 from stereoservo.numerics.arrays import FloatArray
 
@@ -192,8 +193,7 @@ def _curvature_uncertainty(
     model: CellModel, rig: RigModel, past: Measurements, data: Measurements
 ) -> FloatArray:
     """Like `_stated_uncertainty`, from the curvature of the calibration's own least squares at the model."""
-    bent = bool((rig.lenses[:, 0] != 0.0).any())
-    charts = full_charts(rig, model.stratum, lenses="radial_centre" if bent else "none")
+    charts = full_charts(rig, model.stratum, lenses=lens_model_of(rig.lenses))
     triangle = triangle_of(rig, charts, past)[:-1, :-1]
     sizes = np.linalg.norm(triangle, axis=0)
     sizes[sizes == 0.0] = 1.0

@@ -35,7 +35,7 @@ from stereoservo.calibration.diagnosis.input_corrections import (
     pinhole_reconstruction,
     solution_of,
 )
-from stereoservo.calibration.diagnosis.joint_scales import lenses_explain_more, prismatic_ratios
+from stereoservo.calibration.diagnosis.joint_scales import prismatic_ratios
 from stereoservo.calibration.diagnosis.marker_tracks import find_step, path_noise, paths_are_smooth
 from stereoservo.calibration.diagnosis.outlier_causes import (
     camera_moved,
@@ -44,6 +44,7 @@ from stereoservo.calibration.diagnosis.outlier_causes import (
     moved_together,
     predictions,
 )
+from stereoservo.calibration.lens_significance import lenses_explain_more
 from stereoservo.calibration.single_joint_fit import MIN_SHOWN
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData

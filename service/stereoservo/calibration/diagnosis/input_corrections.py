@@ -23,13 +23,13 @@ from stereoservo.calibration.diagnosis.epipolar_faults import (
 )
 from stereoservo.calibration.diagnosis.outlier_causes import expected_pixels
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
-from stereoservo.calibration.lens_estimation import FREE_LENS, prior_of_lenses, straight_lenses, undistorted
+from stereoservo.calibration.lens_estimation import prior_of_lenses, straight_lenses, undistorted
 from stereoservo.calibration.rig_model import Measurements, projective_rig, stratum_rig
 from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.parameterization import Kind
+from stereoservo.kinematics.parameterization import Kind, lens_model_of
 from stereoservo.numerics.arrays import FloatArray
 
 KIND_BETTER = 1.25
@@ -213,7 +213,5 @@ def solution_of(trials: TrialData, result: CalibrationFit) -> Solution:
         trials.sigmas[:, :, kept][used],
         prior_of_lenses(trials, {}),
     )
-    bent = any(camera.lens[0] != 0.0 for camera in model.cameras)
-    return solve(
-        stratum_rig(model), data, model.stratum, lenses=FREE_LENS if bent else "none", max_evaluations=1
-    )
+    rig = stratum_rig(model)
+    return solve(rig, data, model.stratum, lenses=lens_model_of(rig.lenses), max_evaluations=1)

@@ -8,7 +8,7 @@ joint's own trial, then with the whole model. Signs and the scale of all prismat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -19,8 +19,9 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.lens_significance import scale_columns
 from stereoservo.calibration.normal_equations import arrow_factor
-from stereoservo.calibration.rig_model import Measurements, RigModel, predicted, residuals
+from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.single_joint_fit import (
     VirtualObservations,
     best_single_joint,
@@ -164,7 +165,7 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
     if not joints:
         return ()
-    factor = arrow_factor(solution.rig, solution.charts, solution.data, _scale_columns(solution, joints))
+    factor = arrow_factor(solution.rig, solution.charts, solution.data, scale_columns(solution, joints))
     # What the other parameters can imitate of a factor is theirs.
     at = solution.charts.start(3)
     moments, rest = factor.core[at:, at:-1], factor.core[at:, -1]
@@ -177,56 +178,6 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
         JointScaleEstimate(joint, float(np.exp(log)), float(np.exp(log) * deviation))
         for joint, log, deviation in zip(joints, logs, deviations, strict=True)
     )
-
-
-def _scale_columns(solution: Solution, joints: list[int]) -> FloatArray:
-    """Derivatives (2 k, j) of the residuals by the logarithms of the joints' scale factors."""
-    step = 1e-5
-    columns = []
-    for joint in joints:
-        ends = []
-        for sign in (-1.0, 1.0):
-            offsets = solution.data.offsets.copy()
-            offsets[:, joint] *= np.exp(-sign * step)
-            ends.append(residuals(solution.rig, replace(solution.data, offsets=offsets)))
-        columns.append((ends[1] - ends[0]) / (2.0 * step))
-    return np.stack(columns, axis=1)
-
-
-def lenses_explain_more(solution: Solution) -> bool:
-    """Whether terms of distortion that the model lacks (second radial, tangential) explain more of its residuals than
-    scale factors of its joints do: of two hypotheses that of the larger likelihood, by Bayes's information criterion.
-    """
-    joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
-    evidence = []
-    for columns in (_distortion_columns(solution), _scale_columns(solution, joints)):
-        core = arrow_factor(solution.rig, solution.charts, solution.data, columns).core
-        at = solution.charts.start(3)
-        gain = float((core[at:-1, -1] ** 2).sum()) / max(1.0, variance_factor(solution))
-        evidence.append(gain - columns.shape[1] * float(np.log(solution.rows)))
-    lenses, scales = evidence
-    return bool(lenses > max(scales, 0.0))
-
-
-def _distortion_columns(solution: Solution) -> FloatArray:
-    """Derivatives (2 k, 3 c) of the residuals by the second radial and both tangential terms of each camera's lens."""
-    rig, data = solution.rig, solution.data
-    ideal = predicted(replace(rig, lenses=rig.lenses * [0.0, 1.0, 1.0, 1.0]), data)
-    lenses = rig.lenses[data.camera]
-    x, y = ((ideal - lenses[:, 1:3]) / lenses[:, 3:4]).T
-    square = x**2 + y**2
-    terms = np.array(
-        [
-            [x * square**2, y * square**2],
-            [2.0 * x * y, square + 2.0 * y**2],
-            [square + 2.0 * x**2, 2.0 * x * y],
-        ]
-    )
-    terms *= lenses[:, 3] / data.sigmas
-    out = np.zeros((len(data.camera), 2, 3 * len(rig.lenses)))
-    for term in range(3):
-        out[np.arange(len(out)), :, 3 * data.camera + term] = terms[term].T
-    return out.reshape(2 * len(out), -1)
 
 
 def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointScaleEstimate, ...]:

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from stereoservo.geometry.distortion import distort, distortion_jacobian
+from stereoservo.geometry.distortion import bends, distort, distortion_jacobian
 from stereoservo.kinematics.kernels import exp_twist
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -114,7 +114,7 @@ def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) 
     pixels: FloatArray = np.empty_like(ideal)
     for c, lens in enumerate(lenses):
         mine = views.camera == c
-        pixels[mine] = ideal[mine] if lens[0] == 0.0 else distort(lens, ideal[mine])
+        pixels[mine] = distort(lens, ideal[mine]) if bends(lens) else ideal[mine]
     return pixels
 
 
@@ -125,7 +125,7 @@ def entry_jacobian(matrices: FloatArray, lenses: FloatArray, views: Corresponden
     bend = np.tile(np.eye(2), (len(ideal), 1, 1))
     for c, lens in enumerate(lenses):
         mine = views.camera == c
-        if lens[0] != 0.0:
+        if bends(lens):
             bend[mine] = distortion_jacobian(lens, ideal[mine])
     by_image = np.zeros((len(ideal), 2, 3))
     by_image[:, 0, 0] = by_image[:, 1, 1] = 1.0

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from stereoservo.calibration.bundle_adjustment import jacobian
 from stereoservo.calibration.relocalization.camera_resection import Correspondences, entry_jacobian
 from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, acting_order
-from stereoservo.geometry.distortion import lens_jacobian
+from stereoservo.geometry.distortion import lens_jacobian, terms_jacobian
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
@@ -90,6 +90,8 @@ def model_jacobian(
         if len(basis):
             ideal = images[mine, :2] / images[mine, 2:]
             slope = lens_jacobian(lenses[i], ideal) @ basis[:, :3].T
+            if basis.shape[1] > 4:
+                slope += terms_jacobian(lenses[i], ideal) @ basis[:, 4:].T
             found[mine, :, starts[2][c] : starts[2][c] + len(basis)] += slope
     static = {marker: i for i, marker in enumerate(model.scene_ids)}
     for r in np.flatnonzero(views.pose < 0):

@@ -272,6 +272,9 @@ def _cameras(report: CalibrationReport) -> str:
             lens = "k {:.5f} ± {:.1g}, centre ({:.1f} ± {:.1g}, {:.1f} ± {:.1g})".format(
                 *(value for pair in zip(camera.lens, stds, strict=True) for value in pair)
             )
+        if camera.lens_terms is not None and camera.lens_terms_std is not None:
+            pairs = zip(("k2", "p1", "p2"), camera.lens_terms, camera.lens_terms_std, strict=True)
+            lens += "".join(f", {name} {value:.5f} ± {std:.1g}" for name, value, std in pairs)
         rms = f"{camera.rms_px:.4f}", f"{camera.expected_px:.4f} ± {camera.standard_error_px:.1g}"
         rows.append((camera.name, *rms, camera.pixels, camera.outliers, inner, lens))
     head = ("camera", "rms [px]", "floor [px]", "pixels", "left out", "fx, skew, fy, u0, v0 [px]", "lens")
@@ -281,7 +284,7 @@ def _cameras(report: CalibrationReport) -> str:
         page += f"<p>Deviations of the first camera's fx, skew, fy, u0, v0: {deviations} px.</p>"
     test = report.lens
     page += (
-        f"<p>Lens: {'pinholes were taken' if test.model == 'none' else 'radial distortion was estimated'}; a lens that "
+        f"<p>Lens: {'pinholes were taken' if test.model == 'none' else 'distortion was estimated'}; a lens that "
         f"bends is worth a chi-square of {test.chi2:.1f} for {test.freedom} parameters, pinholes stay below "
         f"{test.limit:.1f}.</p>"
     )

@@ -69,14 +69,18 @@ class Verdict(msgspec.Struct, frozen=True):
 
 def judged(seed: int) -> Verdict:
     """Outcome of the case of ``seed``, calibrated without prior knowledge."""
-    case = random_case(seed)
+    return judged_case(random_case(seed))
+
+
+def judged_case(case: RandomCase) -> Verdict:
+    """Outcome of a case, calibrated without prior knowledge."""
     trials = case.trials()
     begin = time.process_time()
     try:
         result = fit_model(trials, epoch=1)
     except CalibrationError as error:
         return Verdict(
-            seed,
+            case.seed,
             "failure",
             case.arm,
             case.body,
@@ -91,7 +95,7 @@ def judged(seed: int) -> Verdict:
     intrinsics = intrinsics_sigmas(case, result)
     true = ratio <= limit and intrinsics <= float(norm.isf(0.5 * TAIL))
     return Verdict(
-        seed,
+        case.seed,
         "success" if true else "wrong",
         case.arm,
         case.body,
