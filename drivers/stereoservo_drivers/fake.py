@@ -81,7 +81,7 @@ class FakeJointDriver(SimulatedArm):
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         decoded = decode_options(FakeJointOptions, options, self.driver)
         cell = demo_cell()
-        joints, base = cell.robot.joints, cell.base
+        joints, base, robot = cell.robot.joints, cell.base, cell.robot if not decoded.joints else None
         if decoded.joints:
             joints = tuple(
                 JointSpec(j.name, j.kind, j.min, j.max, j.velocity, j.acceleration) for j in decoded.joints
@@ -89,7 +89,7 @@ class FakeJointDriver(SimulatedArm):
             base = np.clip(
                 np.zeros(len(joints)), [j.min for j in decoded.joints], [j.max for j in decoded.joints]
             )
-        super().__init__(decoded, context, joints, base)
+        super().__init__(decoded, context, joints, base, robot)
         self.faults = decoded.faults
         self._reads = 0
         self._writes = 0

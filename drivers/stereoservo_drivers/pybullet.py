@@ -39,15 +39,15 @@ class PybulletJointDriver(SimulatedArm):
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         decoded = decode_options(PybulletJointOptions, options, self.driver)
         cell = demo_cell()
-        super().__init__(decoded, context, cell.robot.joints, cell.base)
-        self._robot = cell.robot
+        super().__init__(decoded, context, cell.robot.joints, cell.base, cell.robot)
+        self._arm = cell.robot
 
     def make_plant(self, positions: FloatArray) -> Plant:
         """The arm in a physics engine of its own. Raises DriverError."""
         from stereoservo_sim.world.physics import PhysicsError, PybulletPlant
 
         try:
-            return PybulletPlant(self._robot, positions, self.step_ns * 1e-9)
+            return PybulletPlant(self._arm, positions, self.step_ns * 1e-9)
         except PhysicsError as error:
             raise DriverError("physics", str(error)) from error
 

@@ -20,6 +20,9 @@ from stereoservo.ports.devices import (
 )
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
+from stereoservo_sim.world.mechanical_plant import MechanicalPlant
+from stereoservo_sim.world.mechanics import MechanicsOption, chosen_mechanics, column, quantised
+from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.velocity_drives import DriveBank, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -31,7 +34,8 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the
     simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
-    resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept.
+    resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept. ``mechanics``: a preset, or
+    what is not perfect by joint, see `stereoservo_sim.world.mechanics`; its ``encoder_step`` replaces ``encoder``.
     """
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
@@ -40,6 +44,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     command_timeout_s: Positive = 0.1
     encoder: NonNegative = 1e-6
     history: Annotated[int, Meta(ge=64, le=10_000_000)] = CAPACITY
+    mechanics: MechanicsOption = "none"
 
 
 class SimulatedArm:
@@ -47,7 +52,8 @@ class SimulatedArm:
 
     ``read_state`` and ``write_velocity`` bring the simulation up to now, so the truth that cameras see is
     as fine as these calls are frequent. ``context.services["world"]`` may hold a JointHistory to write
-    to; otherwise it is a file in the runtime directory.
+    to; otherwise it is a file in the runtime directory. ``robot``: whose weight bears on imperfect mechanics; None:
+    it is not known.
     """
 
     driver = "simulated"
@@ -60,10 +66,23 @@ class SimulatedArm:
         context: DriverContext,
         joints: tuple[JointSpec, ...],
         base: FloatArray,
+        robot: Robot | None,
     ) -> None:
         self._options = options
         self._context = context
-        self._joints = joints
+        self._robot = robot
+        try:
+            self._mechanics = chosen_mechanics(options.mechanics, [joint.name for joint in joints])
+        except ValueError as error:
+            raise DriverError("option", f"driver {self.driver!r}: {error}") from error
+        self._steps = np.full(len(joints), options.encoder)
+        if self._mechanics is not None:
+            coarse = column(self._mechanics, "encoder_step")
+            self._steps = np.where(coarse > 0.0, coarse, self._steps)
+        self._joints = tuple(
+            msgspec.structs.replace(joint, resolution=step)
+            for joint, step in zip(joints, self._steps.tolist(), strict=True)
+        )
         self._start = _start(self.driver, joints, base, options.start)
         self._life = DriverLifecycle(f"joint driver {self.driver!r}")
         self._bank: DriveBank | None = None
@@ -73,7 +92,7 @@ class SimulatedArm:
         self._last_ns = 0
 
     def make_plant(self, positions: FloatArray) -> Plant:
-        """Plant of the joints, at rest at ``positions`` (n,). Raises DriverError."""
+        """Plant of the links, at rest at ``positions`` (n,). Raises DriverError."""
         raise NotImplementedError
 
     def describe(self) -> JointDriverDescription:
@@ -97,9 +116,12 @@ class SimulatedArm:
         self._history = self._open_history(now_ns)
         newest = self._history.newest() if self._options.resume else None
         positions = newest[1] if newest is not None else self._start
+        plant = self.make_plant(positions)
+        if self._mechanics is not None:
+            plant = MechanicalPlant(plant, self._mechanics, self._robot)
         self._bank = DriveBank(
             self._joints,
-            self.make_plant(positions),
+            plant,
             now_ns=now_ns,
             step_ns=self.step_ns,
             timeout_ns=round(self._options.command_timeout_s * 1e9),
@@ -117,9 +139,9 @@ class SimulatedArm:
         self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         bank = self._advance()
         self._seq += 1
-        positions = self.encode(bank.plant.positions)
+        positions = self.encode(bank.plant.readings)
         return JointState(
-            seq=self._seq, t_ns=self._stamp(bank), positions=positions, velocities=bank.plant.velocities.copy(),
+            seq=self._seq, t_ns=self._stamp(bank), positions=positions, velocities=bank.plant.reading_rates.copy(),
             efforts=bank.plant.efforts.copy(), following_errors=bank.set_positions - positions,
         )  # fmt: skip
 
@@ -165,9 +187,8 @@ class SimulatedArm:
         self._life.state = LifecycleState.CLOSED
 
     def encode(self, positions: FloatArray) -> FloatArray:
-        """Readings (n,) of encoders of the given resolution."""
-        step = self._options.encoder
-        return np.round(positions / step) * step if step > 0 else positions.copy()
+        """Readings (n,) of the joints' encoders."""
+        return quantised(positions, self._steps)
 
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         """Send a command to the drives: returns what was sent (n,), and why it differs from what was commanded."""

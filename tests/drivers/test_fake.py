@@ -53,6 +53,30 @@ def test_encoder_has_its_resolution(tmp_path):
     assert position != truth
 
 
+def test_mechanics_bring_their_encoder_and_the_driver_describes_it(tmp_path):
+    clock = VirtualClock()
+    driver = active({"mechanics": "serial_servo"}, context(tmp_path, clock))
+    step = 2.0 * np.pi / 4096
+    assert [joint.resolution for joint in driver.describe().joints] == [step] * 6
+    state = run(driver, clock, [0.1] * 6, 37)
+    counts = state.positions / step
+    assert np.allclose(counts, np.round(counts), atol=1e-9)
+    truth = TrueJointHistory.open(tmp_path / FILE_NAME).newest()[1]
+    assert np.abs(state.positions - truth).max() <= 0.5 * step * (1 + 1e-9)
+
+
+def test_mechanics_by_joint_leave_the_others_perfect(tmp_path):
+    clock = VirtualClock()
+    driver = active({"mechanics": {"j3": {"sag": 0.05}}, "encoder": 0.0}, context(tmp_path, clock))
+    state = driver.read_state()
+    truth = TrueJointHistory.open(tmp_path / FILE_NAME).newest()[1]
+    off = truth - state.positions
+    assert abs(off[2]) > 1e-3
+    assert np.array_equal(np.delete(off, 2), np.zeros(5))
+    assert np.allclose(truth, demo_cell().base, atol=1e-12)
+    assert driver.describe().joints[2].resolution == 0.0
+
+
 def test_the_truth_is_recorded_with_its_stamps(tmp_path):
     clock = VirtualClock()
     driver = active({"joints": [{"name": "a", "acceleration": 2.0}]}, context(tmp_path, clock))
@@ -99,6 +123,10 @@ def test_a_restarted_arm_stands_where_it_was_left(tmp_path):
         ({"start": {"j1": 9.0}}, "its range is -2.79"),
         ({"faults": {"explode": True}}, "explode"),
         ({"joints": [{"name": "a", "kind": "spherical"}]}, "spherical"),
+        ({"mechanics": "belt"}, 'mechanics = "belt"; valid: .*serial_servo'),
+        ({"mechanics": {"j9": {}}}, "mechanics: no joint 'j9'; joints: j1, j2"),
+        ({"mechanics": {"j2": {"play": -1.0}}}, "play = -1"),
+        ({"mechanics": {"j2": {"slack": 1.0}}}, "no option 'slack'.* valid: .*play"),
     ],
 )
 def test_bad_options_are_refused_with_what_would_be_valid(tmp_path, options, message):

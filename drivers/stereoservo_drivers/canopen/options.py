@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
@@ -50,6 +51,7 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def spec(self) -> JointSpec:
         """The joint in the form of the joint driver port."""
+        turn = 2.0 * math.pi if self.kind == "revolute" else 1.0
         return JointSpec(
             name=self.name,
             kind=self.kind,
@@ -57,6 +59,7 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             position_max=self.position_max,
             velocity_max=self.max_velocity,
             acceleration_max=self.max_acceleration,
+            resolution=turn / (self.counts_per_rev * self.gear_ratio),
         )
 
 

@@ -90,6 +90,7 @@ class JointDriverContract(PacedSuite):
             assert joint.position_min < joint.position_max, joint
             assert joint.velocity_max > 0, joint
             assert joint.acceleration_max > 0, joint
+            assert 0 <= joint.resolution < joint.position_max - joint.position_min, joint
         assert description.rate_hz > 0
         assert description.command_timeout_s > 0
         assert len(description.effort_units) in (0, len(names))

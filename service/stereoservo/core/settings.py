@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import msgspec
 import numpy as np
 
@@ -13,6 +15,10 @@ from stereoservo.messages.goals import LawName, PointSource
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointKindName
 
+FINEST_ARRIVAL = 5e-4
+"""Nearer than this to its target [rad or m] a joint has arrived, however fine its encoder."""
+ARRIVAL_STEPS = 0.75
+"""The same of coarse encoders, in their steps: some reading is always within half a step of a target."""
 SLACK = 1e-3  # of a cell's limits beyond the drive's, for rounding [rad or m]
 LARGEST_RANGE: dict[JointKindName, float] = {"revolute": 0.6, "prismatic": 0.2}
 """To either side of the base, where the cell file states no range of its own [rad or m]."""
@@ -111,11 +117,34 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     """Ids that stand still for good: ``[scene] static``."""
     reanchor: bool = True
     """Whether a camera that was moved is found anew by itself."""
+    resolution: tuple[float, ...] = ()
+    """Steps of the joints' encoders [rad or m], 0: fine; empty: all are."""
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
         """Every marker id that some camera can report, sorted."""
         return tuple(sorted({i for camera in self.cameras for i in camera.marker_ids}))
+
+    @property
+    def arrival(self) -> FloatArray:
+        """How near (n,) [rad or m] its target a joint has arrived, from its encoder's step; not to be written to."""
+        return _arrival(self.resolution, len(self.joint_names))
+
+    def arrival_origin(self, joint: int) -> str:
+        """A joint's arrival tolerance and where it comes from, for people."""
+        tolerance = float(self.arrival[joint])
+        if tolerance <= FINEST_ARRIVAL:
+            return f"tolerance {tolerance:.4g}"
+        step = self.resolution[joint]
+        return f"tolerance {tolerance:.4g}, {ARRIVAL_STEPS:g} of its encoder's step of {step:.4g}"
+
+
+@lru_cache(maxsize=32)
+def _arrival(resolution: tuple[float, ...], joints: int) -> FloatArray:
+    steps = np.array(resolution if resolution else (0.0,) * joints)
+    tolerance: FloatArray = np.maximum(FINEST_ARRIVAL, ARRIVAL_STEPS * steps)
+    tolerance.setflags(write=False)
+    return tolerance
 
 
 def core_settings(
@@ -193,6 +222,7 @@ def core_settings(
         contact=_contact_settings(cell, joints),
         scene_ids=_scene_ids(cell, camera_settings),
         reanchor=cell.servo.reanchor == "auto",
+        resolution=tuple(joint.resolution for joint in joints.joints),
     )
 
 
@@ -271,7 +301,8 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
         spread = section.spread
         spread_joint = names.index(spread.joint)
         limit = next(limit for limit in cell.safety.limit if limit.joint == spread.joint)
-        base, margin = section.base[spread.joint], cell.safety.position_margin + SLACK
+        coarse = 2.0 * ARRIVAL_STEPS * joints.joints[spread_joint].resolution
+        base, margin = section.base[spread.joint], cell.safety.position_margin + max(SLACK, coarse)
         room = min(limit.max - margin - base, base - limit.min - margin)
         wanted = spread.range or section.range.get(
             spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind]

@@ -12,6 +12,7 @@ connected. Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,7 +44,11 @@ class DriverError(Exception):
 
 
 class JointSpec(msgspec.Struct, frozen=True):
-    """A joint's name, kind and the machine's limits; the cell's own can only be tighter."""
+    """A joint's name, kind and the machine's limits; the cell's own can only be tighter.
+
+    ``resolution``: step of its encoder at the joint [rad or m], 0 where it is finer than anything that matters here.
+    Raises ValueError where that is negative or not finite.
+    """
 
     name: str
     kind: JointKindName
@@ -51,6 +56,13 @@ class JointSpec(msgspec.Struct, frozen=True):
     position_max: float
     velocity_max: float
     acceleration_max: float
+    resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.resolution < math.inf:
+            raise ValueError(
+                f"joint {self.name!r}: encoder resolution {self.resolution:g}; at least 0 is needed"
+            )
 
 
 class JointDriverDescription(msgspec.Struct, frozen=True):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +20,11 @@ from rich.table import Table
 from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo_sim.cells import CELLS, shipped_cell_path
-from stereoservo_sim.demonstration.emulated import has_emulated_cameras, has_emulated_drives
+from stereoservo_sim.demonstration.emulated import (
+    has_emulated_cameras,
+    has_emulated_drives,
+    with_mechanics,
+)
 from stereoservo_sim.demonstration.results import summary
 from stereoservo_sim.demonstration.runner import (
     DemoFailedError,
@@ -29,6 +34,9 @@ from stereoservo_sim.demonstration.runner import (
 )
 from stereoservo_sim.demonstration.scenario import GOALS
 from stereoservo_sim.demonstration.truth import true_cell
+from stereoservo_sim.world.mechanics import PRESETS
+
+MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in PRESETS})  # type: ignore[misc]
 
 
 def demo(
@@ -52,6 +60,15 @@ def demo(
         str | None,
         typer.Option("--law", help="Of the first goal, in place of its own: a law that is installed."),
     ] = None,
+    mechanics: Annotated[
+        MechanicsChoice | None,
+        typer.Option(
+            "--mechanics",
+            help="The arm's gears, bearings and encoders, by how such joints really are: strain_wave (ripple, encoder "
+            "on the motor), planetary_qdd (play, compliance), serial_servo (play, sag, 12-bit encoder on the joint). "
+            "Default: the cell's, which is perfect where it states none.",
+        ),
+    ] = None,
 ) -> None:
     """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
     try:
@@ -61,8 +78,13 @@ def demo(
         raise typer.BadParameter(str(error), param_hint="--cell") from error
     if law is not None and law not in LAWS:
         raise typer.BadParameter(str(UnknownLawError(law, tuple(LAWS))), param_hint="--law")
-    goals = GOALS if law is None else (replace(GOALS[0], law=law), *GOALS[1:])
     out.mkdir(parents=True, exist_ok=True)
+    if mechanics is not None:
+        try:
+            path = with_mechanics(path, out, mechanics.value)
+        except ValueError as error:
+            raise typer.BadParameter(str(error), param_hint="--mechanics") from error
+    goals = GOALS if law is None else (replace(GOALS[0], law=law), *GOALS[1:])
     conduct = conduct_lockstep if lockstep else conduct_live
     started = time.monotonic()
     with _telling() as stage:

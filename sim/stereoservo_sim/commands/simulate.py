@@ -21,9 +21,11 @@ from stereoservo_sim.tasks.campaign import SettingsError, default_jobs, run_camp
 from stereoservo_sim.tasks.closed_loop import LoopSettings
 from stereoservo_sim.tasks.setting import DEFAULT_GAIN, DEFAULT_RATE_HZ
 from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks
+from stereoservo_sim.world.mechanics import PRESETS, MechanicsPreset
 
 LawOption = StrEnum("LawOption", {name: name for name in LAWS})  # type: ignore[misc]
 LAW = LawOption(DEFAULT_LAW)
+MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in PRESETS})  # type: ignore[misc]
 
 
 class ArmOption(StrEnum):
@@ -89,6 +91,12 @@ def simulate(
         str | None,
         typer.Option(metavar="START:SECONDS", help="The second camera is dropped for a time [s]."),
     ] = None,
+    mechanics: Annotated[
+        MechanicsChoice | None,
+        typer.Option(
+            help="Of the arm rx90: gears and encoders as such joints have them; docs/simulation.md."
+        ),
+    ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
     ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
@@ -108,6 +116,7 @@ def simulate(
         noise_px=_within("--noise-px", noise_px, 0.0, 100.0),
         seed=seed,
         drop_camera=_drop(drop_camera),
+        mechanics=_mechanics(mechanics, arm),
     )
     chosen = _chosen(read_tasks(tasks), limit, ids)
     with progress_bar() as progress:
@@ -119,6 +128,14 @@ def simulate(
         sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
     else:
         _show(answer, Console(markup=False, highlight=False))
+
+
+def _mechanics(chosen: MechanicsChoice | None, arm: ArmOption) -> MechanicsPreset | None:
+    if chosen is None:
+        return None
+    if arm is not ArmOption.RX90:
+        raise SettingsError(f"--mechanics {chosen.value}: --arm {arm.value} has no joints; take --arm rx90")
+    return chosen.value
 
 
 def _centre(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Cell files of the demonstration whose drives or cameras are emulated in processes of their own."""
+"""Copies of cell files for the demonstration: with emulated drives and cameras at other addresses, with mechanics."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 from stereoservo.messages.cell_file import CellFile
+from stereoservo_sim.world.mechanics import MechanicsPreset
 
 SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)
@@ -50,6 +51,41 @@ def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
     options = tomllib.loads(text).get("joints", {}).get("options", {})
     text = _replaced(text, "channel", channel, cell_path)
     eds = options.get("eds", "")
+    if eds:
+        text = _replaced(text, "eds", str(cell_path.parent.absolute() / eds), cell_path)
+    return _written(text, cell_path, folder)
+
+
+def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Path:
+    """Copy of the cell file in ``folder`` whose simulated arm, or emulated drives, have the mechanics ``preset``.
+
+    Raises ValueError where the cell has neither, or its file states them in a form that is not replaced.
+    """
+    text = cell_path.read_text(encoding="utf-8")
+    tree = tomllib.loads(text)
+    emulated = "drives" in tree.get("emulate", {})
+    driver = tree["joints"]["driver"]
+    if not emulated and driver not in ("fake", "pybullet"):
+        raise ValueError(
+            f"{cell_path}: joints.driver is {driver!r}; only simulated arms have a choice of mechanics"
+        )
+    section = "emulate.drives" if emulated else "joints.options"
+    line = f'mechanics = "{preset}"'
+    heading = re.search(rf"^\[{re.escape(section)}\][^\n]*\n", text, re.MULTILINE)
+    if heading is None:
+        text = f"{text.rstrip()}\n\n[{section}]\n{line}\n"
+    else:
+        end = HEADING.search(text, heading.end())
+        body = text[heading.end() : end.start() if end else len(text)]
+        body = re.sub(r"^\s*mechanics\s*=\s*[\"'][^\n]*\n", "", body, flags=re.MULTILINE)
+        text = f"{text[: heading.end()]}{line}\n{body}{text[end.start() :] if end else ''}"
+    try:
+        tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(
+            f"{cell_path}: mechanics cannot be put into [{section}] ({error}): state them as one line there"
+        ) from error
+    eds = tree["joints"].get("options", {}).get("eds", "")
     if eds:
         text = _replaced(text, "eds", str(cell_path.parent.absolute() / eds), cell_path)
     return _written(text, cell_path, folder)

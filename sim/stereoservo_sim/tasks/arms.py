@@ -6,7 +6,9 @@ with limits. The controller has the readings of their joints only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, Protocol
 
 import numpy as np
@@ -24,6 +26,8 @@ from stereoservo_sim.tasks.setting import (
     intrinsics,
 )
 from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
+from stereoservo_sim.world.mechanical_trials import synthetic_load
+from stereoservo_sim.world.mechanics import Mechanics, MechanicsPreset, Transmission, preset, quantised
 from stereoservo_sim.world.synthetic import (
     RX90_ROWS,
     SyntheticCell,
@@ -44,6 +48,8 @@ RX90_LIMITS = np.radians(
     [(-160.0, 160.0), (-227.5, 47.5), (-52.5, 232.5), (-270.0, 270.0), (-105.0, 120.0), (-270.0, 270.0)]
 )
 """(6, 2) [rad]"""
+GEAR_STEPS = 4
+"""Of imperfect mechanics in a step of the loop."""
 
 
 class TaskArm(Protocol):
@@ -84,20 +90,39 @@ class FreeArm:
 
 
 class SerialArm:
-    """The RX 90 from a configuration ``joints`` (6,)."""
+    """The RX 90 from a configuration ``joints`` (6,) of its links; with ``mechanics`` its readings are others."""
 
     composition = Composition.BASE_FIRST
     limits = RX90_LIMITS
 
-    def __init__(self, cell: SyntheticCell, joints: FloatArray) -> None:
+    def __init__(
+        self, cell: SyntheticCell, joints: FloatArray, mechanics: Sequence[Mechanics] | None = None
+    ) -> None:
         self._cell = cell
         self.joints = joints.copy()
         self.pose = cell.flange(joints) @ PLATE_ON_FLANGE
+        self._gears: Transmission | None = None
+        if mechanics is not None:
+            self._gears = Transmission(mechanics, joints, partial(synthetic_load, cell))
+            self._set_positions = self._gears.motor.copy()
+            self.joints = quantised(self._gears.readings, self._gears.encoder_step)
 
     def move(self, velocity: FloatArray, dt_s: float) -> None:
         """Integrate the joints, without limits."""
-        self.joints = self.joints + velocity * dt_s
-        self.pose = self._cell.flange(self.joints) @ PLATE_ON_FLANGE
+        if self._gears is None:
+            self.joints = self.joints + velocity * dt_s
+            self.pose = self._cell.flange(self.joints) @ PLATE_ON_FLANGE
+            return
+        for _ in range(GEAR_STEPS):
+            self._set_positions = self._set_positions + velocity * (dt_s / GEAR_STEPS)
+            self._gears.follow(self._set_positions, dt_s / GEAR_STEPS)
+        self.joints = quantised(self._gears.readings, self._gears.encoder_step)
+        self.pose = self._cell.flange(self._gears.link) @ PLATE_ON_FLANGE
+
+
+def mechanics_of(name: MechanicsPreset | None) -> tuple[Mechanics, ...] | None:
+    """Mechanics of the RX 90's joints after a preset, or None."""
+    return None if name is None else preset(name, len(RX90_HOME))
 
 
 def _cameras() -> tuple[FloatArray, FloatArray]:

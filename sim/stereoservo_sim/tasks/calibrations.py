@@ -25,7 +25,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, Reach, free_cell, rx90_cell
+from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, Reach, free_cell, mechanics_of, rx90_cell
 from stereoservo_sim.tasks.setting import (
     FOCAL_ERROR,
     HAND_EYE_ERROR_DEG,
@@ -35,6 +35,8 @@ from stereoservo_sim.tasks.setting import (
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
 from stereoservo_sim.world.exact_model import exact_model, twists
+from stereoservo_sim.world.mechanical_trials import mechanical_trials
+from stereoservo_sim.world.mechanics import MechanicsPreset
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 CalibrationName = Literal["self", "exact", "coarse"]
@@ -89,14 +91,20 @@ class Knowledge:
         return found
 
 
-def calibrate(arm: ArmName, calibration: CalibrationName, noise_px: float, seed: int) -> TaskCalibration:
+def calibrate(
+    arm: ArmName,
+    calibration: CalibrationName,
+    noise_px: float,
+    seed: int,
+    mechanics: MechanicsPreset | None = None,
+) -> TaskCalibration:
     """Calibrate once per file and seed. Raises CalibrationError where the trial motions give no model."""
     cell = free_cell() if arm == "free" else rx90_cell()
     if calibration == "coarse":
         return metric_model(arm, cell, FOCAL_ERROR, HAND_EYE_ERROR_DEG)
     if calibration == "exact":
         return TaskCalibration(arm, cell, exact_model(cell), {})
-    return self_calibrated(arm, cell, noise_px, seed)
+    return self_calibrated(arm, cell, noise_px, seed, mechanics)
 
 
 def metric_model(
@@ -107,13 +115,23 @@ def metric_model(
     return TaskCalibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
 
 
-def self_calibrated(arm: ArmName, cell: SyntheticCell, noise_px: float, seed: int) -> TaskCalibration:
-    """Model from trial motions about the cell's home. Raises CalibrationError."""
+def self_calibrated(
+    arm: ArmName,
+    cell: SyntheticCell,
+    noise_px: float,
+    seed: int,
+    mechanics: MechanicsPreset | None = None,
+) -> TaskCalibration:
+    """Model from trial motions about the cell's home, of a serial arm with ``mechanics``. Raises CalibrationError."""
     started = time.perf_counter()
     cell = with_trial_ranges(cell)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     sigma = max(noise_px / np.sqrt(FRAMES), LEAST_SIGMA_PX)
-    result = fit_model(cell.trials(sigma, rng, STOPS), epoch=1)
+    gears = mechanics_of(mechanics)
+    trials = (
+        cell.trials(sigma, rng, STOPS) if gears is None else mechanical_trials(cell, gears, sigma, rng, STOPS)
+    )
+    result = fit_model(trials, epoch=1)
     facts = {
         "stops_per_joint": STOPS,
         "frames_per_stop": FRAMES,

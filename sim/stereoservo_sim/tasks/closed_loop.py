@@ -7,7 +7,7 @@ points are computed from them with the controller's model.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import msgspec
@@ -20,7 +20,7 @@ from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, rx90_reach
+from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, mechanics_of, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, Knowledge, TaskCalibration, known_at_start
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
 from stereoservo_sim.tasks.ground_truth import (
@@ -42,6 +42,7 @@ from stereoservo_sim.tasks.setting import (
     SUCCESS_PX,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
+from stereoservo_sim.world.mechanics import MechanicsPreset
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
@@ -59,7 +60,7 @@ class LoopSettings:
     ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws that could correct
     their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
     ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
-    of the markers or the number of one.
+    of the markers or the number of one. ``mechanics``: of the serial arm; None: it is perfect.
     """
 
     law: str = DEFAULT_LAW
@@ -75,6 +76,7 @@ class LoopSettings:
     drop_camera: tuple[float, float] | None = None
     first_order: bool = False
     joint_speed: float | None = None
+    mechanics: MechanicsPreset | None = None
 
 
 class TaskResult(msgspec.Struct, frozen=True):
@@ -128,7 +130,12 @@ def run_task(
         reach = rx90_reach(calibration.cell, task.start, task.goal)
         if reach is None:
             return _unreachable(task, settings)
-    arm: TaskArm = FreeArm(task.start) if reach is None else SerialArm(calibration.cell, reach.start)
+    arm: TaskArm
+    if reach is None:
+        arm = FreeArm(task.start)
+    else:
+        arm = SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
+        reach = replace(reach, start=arm.joints)
     controller = Controller(known_at_start(calibration, task, reach), task, settings, arm.limits)
     rng = np.random.default_rng([settings.seed, task.id])
     return _run(task, arm, controller, settings, rng)

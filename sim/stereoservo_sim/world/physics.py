@@ -13,6 +13,7 @@ import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.world.robots import Robot, urdf
+from stereoservo_sim.world.velocity_drives import RigidPlant
 
 MAX_TORQUE = 1000.0
 POSITION_GAIN = 0.2
@@ -53,7 +54,7 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> int:
         return int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
 
 
-class PybulletPlant:
+class PybulletPlant(RigidPlant):
     """The arm as rigid bodies under gravity. Drives follow their set-points by position and velocity, so nothing
     sags. ``efforts`` (n,) [N m]: motor torques of the last step; at rest, those that balance gravity.
     """

@@ -16,16 +16,35 @@ REST_VELOCITY = 1e-9
 
 
 class Plant(Protocol):
-    """Protocol of what the drives move. ``positions``, ``velocities``, ``efforts`` of the motors [N m or N], (n,):
-    the truth.
+    """Protocol of what the drives move. ``positions``, ``velocities`` of the links, ``efforts`` of the motors [N m or
+    N], (n,): the truth.
     """
 
     positions: FloatArray
     velocities: FloatArray
     efforts: FloatArray
 
+    @property
+    def motors(self) -> FloatArray:
+        """Angles of the motors (n,), in units of the joints: what the drives' set-points are of."""
+        ...
+
+    @property
+    def readings(self) -> FloatArray:
+        """Angles at the encoders (n,), before they are rounded to steps."""
+        ...
+
+    @property
+    def reading_rates(self) -> FloatArray:
+        """Velocities at the encoders (n,)."""
+        ...
+
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Advance by ``h`` [s] towards the drives' set-points at its end, (n,), (n,)."""
+        ...
+
+    def rest(self, h: float) -> bool:
+        """Let ``h`` [s] pass if nothing moves or is about to; whether that is so."""
         ...
 
     def close(self) -> None:
@@ -33,7 +52,33 @@ class Plant(Protocol):
         ...
 
 
-class IdealPlant:
+class RigidPlant:
+    """Base of plants whose joints are rigid: motor, link and encoder turn alike."""
+
+    positions: FloatArray
+    velocities: FloatArray
+
+    @property
+    def motors(self) -> FloatArray:
+        """Angles of the motors (n,): the links'."""
+        return self.positions
+
+    @property
+    def readings(self) -> FloatArray:
+        """Angles at the encoders (n,): the links'."""
+        return self.positions
+
+    @property
+    def reading_rates(self) -> FloatArray:
+        """Velocities at the encoders (n,): the links'."""
+        return self.velocities
+
+    def rest(self, h: float) -> bool:
+        """Whether nothing moves; passing time changes nothing then."""
+        return bool(np.all(np.abs(self.velocities) < REST_VELOCITY))
+
+
+class IdealPlant(RigidPlant):
     """Massless joints that follow their set-points exactly; efforts come from walls alone.
 
     ``walls`` (2, n): no joint goes below the first or above the second; its drive then pushes with ``STIFFNESS``.
@@ -86,7 +131,7 @@ class DriveBank:
         self._high = np.array([j.position_max for j in joints])
         self._velocity = np.array([j.velocity_max for j in joints])
         self._acceleration = np.array([j.acceleration_max for j in joints])
-        self._q = plant.positions.copy()
+        self._q = plant.motors.copy()
         self._v = np.zeros(len(joints))
         self._target = np.zeros(len(joints))
         self._deadline_ns = now_ns
@@ -96,9 +141,6 @@ class DriveBank:
     def set_positions(self) -> FloatArray:
         """Set the drives' set-points (n,)."""
         return self._q
-
-    def _plant_rests(self) -> bool:
-        return bool(np.all(np.abs(self.plant.velocities) < REST_VELOCITY))
 
     def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         """Apply a velocity command (n,) given at ``t_ns``; returns what is sent to the drives, and why it differs."""
@@ -121,9 +163,11 @@ class DriveBank:
             if self.t_ns >= self._deadline_ns and np.any(self._target):
                 self._target = np.zeros_like(self._target)
                 self.timed_out = True
-            if not np.any(self._target) and not np.any(self._v) and self._plant_rests():
-                self.t_ns += (now_ns - self.t_ns) // self._step_ns * self._step_ns
-                return
+            if not np.any(self._target) and not np.any(self._v):
+                left_ns = (now_ns - self.t_ns) // self._step_ns * self._step_ns
+                if self.plant.rest(left_ns * 1e-9):
+                    self.t_ns += left_ns
+                    return
             steps = 1
             if isinstance(self.plant, IdealPlant):
                 # The ramp is exact over any time: one step up to the next event.

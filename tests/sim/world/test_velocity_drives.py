@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.devices import JointSpec
-from stereoservo_sim.world.velocity_drives import DriveBank, IdealPlant, ramp
+from stereoservo_sim.world.velocity_drives import DriveBank, IdealPlant, RigidPlant, ramp
 
 MS = 1_000_000
 JOINT = JointSpec("a", "revolute", -1.0, 1.0, velocity_max=1.0, acceleration_max=4.0)
@@ -92,7 +92,7 @@ def test_time_moves_in_whole_steps_and_never_past_now():
     assert drives.t_ns == 2 * MS
 
 
-class SteppingPlant:
+class SteppingPlant(RigidPlant):
     """A plant that must be stepped, as a physics engine."""
 
     def __init__(self) -> None:

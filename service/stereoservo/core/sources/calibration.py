@@ -16,7 +16,6 @@ from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import Sample
 from stereoservo.core.monitors.collision import learnt_loads
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
-from stereoservo.core.sources.joint_move import ARRIVED
 from stereoservo.core.sources.measure_at_pose import (
     at_target,
     blocked,
@@ -389,7 +388,7 @@ def probe_size(kind: JointKindName) -> float:
 def room(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
     """How far (2,) a joint may go upwards and downwards from its base: its limits, and a sensible largest range."""
     limits = core.limits
-    margin = limits.position_margin + 4.0 * ARRIVED
+    margin = limits.position_margin + 4.0 * core.arrival[joint]
     base = settings.base[joint]
     up = limits.position_max[joint] - margin - base
     down = base - limits.position_min[joint] - margin

@@ -11,7 +11,6 @@ import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.joint_move import ARRIVED
 from stereoservo.core.sources.measure_at_pose import (
     at_target,
     blocked,
@@ -45,7 +44,7 @@ def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
         known = {joint.name: 0.5 * joint.range for joint in model.statistics.joints}
         driven = np.array([known.get(name, r) for name, r in zip(settings.joint_names, driven, strict=True)])
     limits = settings.limits
-    margin = limits.position_margin + 4.0 * ARRIVED
+    margin = limits.position_margin + 4.0 * settings.arrival
     room = np.minimum(limits.position_max - margin - trial.base, trial.base - limits.position_min - margin)
     step = np.maximum(np.minimum(SHARE * np.where(np.isfinite(driven), driven, 0.1), room), 0.0)
     n = trial.base.size

@@ -10,7 +10,7 @@ from stereoservo.core.context import RefusalError, SourceOutput, StepContext
 from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
 from stereoservo.core.goals.resolve import joint_index
 from stereoservo.core.prediction import chain_at
-from stereoservo.core.settings import CoreSettings, LimitSettings
+from stereoservo.core.settings import FINEST_ARRIVAL, CoreSettings, LimitSettings
 from stereoservo.core.state import JointMove
 from stereoservo.messages.goals import Approach, Goal, JointTarget, PlanReport
 from stereoservo.messages.reasons import Reason
@@ -18,7 +18,6 @@ from stereoservo.numerics.arrays import FloatArray
 
 APPROACH_GAIN = 15.0  # [1/s] end of a joint move
 BRAKE_SHARE = 0.6  # of the acceleration limit that a joint move plans with
-ARRIVED = 5e-4  # [rad or m]
 ARRIVED_STEPS = 5
 
 
@@ -153,8 +152,15 @@ def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
 def approach_velocity(
     q: FloatArray, target: FloatArray, settings: CoreSettings, speed_scale: float
 ) -> FloatArray:
-    """Joint velocity (n,) on the straight joint-space line to ``target``, slow enough to brake on it."""
+    """Joint velocity (n,) on the straight joint-space line to ``target``, slow enough to brake on it.
+
+    A joint whose encoder is coarse stays where it has arrived: it would hunt between two counts.
+    """
     distance = target - q
+    if any(settings.resolution):
+        arrival = settings.arrival
+        held = (arrival > FINEST_ARRIVAL) & (np.abs(distance) < arrival)
+        distance = np.where(held, 0.0, distance)
     length = np.maximum(np.abs(distance), 1e-12)
     limits = settings.limits
     speed = np.minimum(
@@ -164,16 +170,21 @@ def approach_velocity(
     return distance * min(float((speed / length).min()), APPROACH_GAIN)
 
 
-def arrived(q: FloatArray, target: FloatArray) -> bool:
-    """Whether every joint is within ``ARRIVED`` of its target."""
-    return bool(np.abs(target - q).max() < ARRIVED)
+def arrived(q: FloatArray, target: FloatArray, settings: CoreSettings) -> bool:
+    """Whether every joint is within its arrival tolerance of its target."""
+    return bool((np.abs(target - q) < settings.arrival).all())
+
+
+def farthest(q: FloatArray, target: FloatArray, settings: CoreSettings) -> int:
+    """The joint that is the most arrival tolerances away from its target."""
+    return int((np.abs(target - q) / settings.arrival).argmax())
 
 
 def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
     """One step of a joint move; it ends when it arrived and rested, or at its time limit."""
-    still = arrived(context.q, move.target)
+    still = arrived(context.q, move.target, context.settings)
     move.settled = move.settled + 1 if still else 0
-    worst = int(np.abs(move.target - context.q).argmax())
+    worst = farthest(context.q, move.target, context.settings)
     if move.settled >= ARRIVED_STEPS:
         context.emit("goal_reached", id=move.id, message="joints at target")
         return SourceOutput(np.zeros_like(context.q), finished=True, reached=True)
@@ -182,8 +193,8 @@ def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
         name = context.settings.joint_names[worst]
         reason = Reason(
             "TIME_LIMIT", "hold", name, elapsed_s, move.time_limit_s, "s",
-            f"joint {name} is {abs(move.target[worst] - context.q[worst]):.4f} from its target: is it blocked, or at "
-            "a limit?",
+            f"joint {name} is {abs(move.target[worst] - context.q[worst]):.4f} from its target "
+            f"({context.settings.arrival_origin(worst)}): is it blocked, or at a limit?",
         )  # fmt: skip
         context.emit("goal_aborted", id=move.id, message="joint move not finished in time", reasons=(reason,))
         return SourceOutput(np.zeros_like(context.q), finished=True)

@@ -15,7 +15,7 @@ from stereoservo.core.cycle import Sample
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.prediction import joints_at
 from stereoservo.core.settings import CoreSettings, TrialSettings
-from stereoservo.core.sources.joint_move import ARRIVED, approach_velocity, arrived
+from stereoservo.core.sources.joint_move import approach_velocity, arrived, farthest
 from stereoservo.core.state import PoseMeasurement
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -138,7 +138,9 @@ def enter(visit: PoseMeasurement, phase: Phase, context: StepContext) -> None:
 
 def at_target(visit: PoseMeasurement, context: StepContext) -> bool:
     """Whether the arm rests at the target."""
-    return arrived(context.q, visit.target) and bool((np.abs(context.state.command) < AT_REST).all())
+    return arrived(context.q, visit.target, context.settings) and bool(
+        (np.abs(context.state.command) < AT_REST).all()
+    )
 
 
 def continue_move(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> SourceOutput:
@@ -154,12 +156,12 @@ def too_slow(visit: PoseMeasurement, context: StepContext, trial: TrialSettings)
     limit_s = 5.0 + 3.0 * float((np.abs(visit.target - visit.start) / (speed * trial.speed_scale)).max())
     if elapsed_s <= limit_s:
         return None
-    joint = int(np.abs(visit.target - context.q).argmax())
+    joint = farthest(context.q, visit.target, context.settings)
     name = context.settings.joint_names[joint]
     return Reason(
         "STOP_NOT_REACHED", "hold", name, float(context.q[joint]), float(visit.target[joint]), "rad or m",
-        f"joint {name} did not reach its stop within {limit_s:.0f} s (tolerance {ARRIVED}): a limit, a keep-out, "
-        "or a blocked joint",
+        f"joint {name} did not reach its stop within {limit_s:.0f} s ({context.settings.arrival_origin(joint)}): a "
+        "limit, a keep-out, or a blocked joint",
     )  # fmt: skip
 
 
@@ -251,9 +253,9 @@ def blocked(target: FloatArray, moving: list[int], context: StepContext) -> str:
     to the stop spans.
     """
     limits = context.settings.limits
-    margin = limits.position_margin + 2.0 * ARRIVED
+    margin = limits.position_margin + 2.0 * context.settings.arrival
     for joint in moving:
-        low, high = limits.position_min[joint] + margin, limits.position_max[joint] - margin
+        low, high = limits.position_min[joint] + margin[joint], limits.position_max[joint] - margin[joint]
         if not low <= target[joint] <= high:
             return "(joint limit)"
     for name, box in zip(limits.keep_out_names, limits.keep_outs, strict=True):

@@ -16,7 +16,6 @@ from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.core.cycle import Event
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.settings import CoreSettings, TrialSettings, core_settings
-from stereoservo.core.sources.joint_move import ARRIVED
 from stereoservo.core.sources.measure_at_pose import (
     add_observation,
     averages,
@@ -128,17 +127,20 @@ def _settings(
         driver=cell.joints.driver,
         joints=tuple(
             JointSpec(
-                name, kind, limits[name].min, limits[name].max, limits[name].velocity, limits[name].acceleration
+                name, kind, limits[name].min, limits[name].max, limits[name].velocity,
+                limits[name].acceleration, resolution,
             )
-            for name, kind in zip(recorded.joint_names, recorded.joint_kinds, strict=True)
+            for name, kind, resolution in zip(
+                recorded.joint_names, recorded.joint_kinds, recorded.resolution or (0.0,) * len(limits), strict=True
+            )
         ),
         rate_hz=recorded.rate_hz, pacing="clock", command_timeout_s=0.1, call_budget_us=0.0,
     )  # fmt: skip
     return core_settings(cell, joints, tuple(camera.description for camera in cameras))
 
 
-SAME_POSITION_TOLERANCE = 4.0 * ARRIVED
-"""Joints nearer than this are in one place [rad or m]: each of two arrivals is within ``ARRIVED``, and settles."""
+SAME_POSITION = 4.0
+"""Joints nearer than so many arrival tolerances are in one place: each of two arrivals is within one, and settles."""
 BEFORE_NS = 500_000_000
 
 
@@ -217,14 +219,15 @@ class RecordedTrialCollector:
                 rests=len(self._stops), frames=self.used,
             )  # fmt: skip
         base = self._base([joints for _, joints in seen])
+        near = SAME_POSITION * self.settings.arrival
         events: list[Event] = []
         places: list[FloatArray] = []
         for stop, joints in seen:
-            moved = np.flatnonzero(np.abs(joints - base) > SAME_POSITION_TOLERANCE)
+            moved = np.flatnonzero(np.abs(joints - base) > near)
             alone = moved[moved != self.trial.spread_joint]
             if alone.size > 1:
                 self._leave_out("more than one joint is away from the base")
-            elif any(bool((np.abs(joints - place) < SAME_POSITION_TOLERANCE).all()) for place in places):
+            elif any(bool((np.abs(joints - place) < near).all()) for place in places):
                 self._leave_out("the arm was there before")
             else:
                 places.append(joints)
@@ -250,7 +253,7 @@ class RecordedTrialCollector:
         differ from that in more than one joint, the configuration from which most others differ in one joint.
         """
         candidates = np.array([self.trial.base, *places])
-        away = np.abs(candidates[:, None] - np.array(places)) > SAME_POSITION_TOLERANCE
+        away = np.abs(candidates[:, None] - np.array(places)) > SAME_POSITION * self.settings.arrival
         if self.trial.spread_joint >= 0:
             away[..., self.trial.spread_joint] = False
         near = (away.sum(axis=-1) <= 1).sum(axis=1)

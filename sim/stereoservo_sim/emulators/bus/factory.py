@@ -22,6 +22,8 @@ from stereoservo_sim.emulators.bus.plant import STEP_NS, AxisPlant, PlantSetting
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.emulators.nodes.node import EmulatedAxis, EmulatedNode
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
+from stereoservo_sim.world.mechanical_plant import MechanicalPlant
+from stereoservo_sim.world.mechanics import MechanicsOption, chosen_mechanics
 from stereoservo_sim.world.velocity_drives import IdealPlant, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -40,6 +42,8 @@ class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     never moved; ``resume``: an arm whose truth file exists starts at its end. ``brake_ms``: what the brakes take
     to open and to close. ``rated_torques`` by joint [N m or N] where they are not the driver's. ``eds``: of the
     emulated drives where it is not the driver's, relative to the cell file. ``machine``: see PlantSettings.
+    ``mechanics``: a preset, or what is not perfect by joint, see `stereoservo_sim.world.mechanics`; encoders have the
+    driver's counts.
     """
 
     plant: Literal["pybullet", "ideal"] = "pybullet"
@@ -50,6 +54,7 @@ class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     rated_torques: dict[str, Positive] = {}
     eds: str = ""
     machine: PlantSettings = PlantSettings()
+    mechanics: MechanicsOption = "none"
 
 
 def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
@@ -97,7 +102,9 @@ def make_bus_emulator(
     start = _start(options, settings)
     positions = newest[1] if newest is not None else start
     plant, rated = _plant(options, settings, positions)
-    axes = [EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(options.joint, positions, strict=True)]
+    axes = [
+        EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(options.joint, plant.motors, strict=True)
+    ]
     eds = _eds(options, settings, cell_dir)
     nodes = [
         _node(options, joint, axis, settings, eds) for joint, axis in zip(options.joint, axes, strict=True)
@@ -155,13 +162,18 @@ def _plant(
     options: CanOptions, settings: DrivesSettings, positions: FloatArray
 ) -> tuple[Plant, list[float] | None]:
     """The plant, and the rated torques that its efforts are shares of."""
+    names = tuple(joint.name for joint in options.joint)
+    try:
+        mechanics = chosen_mechanics(settings.mechanics, names)
+    except ValueError as error:
+        raise EmulationError(f"emulate.drives.{error}") from error
     if settings.plant == "ideal":
-        return IdealPlant(positions), None
+        ideal = IdealPlant(positions)
+        return ideal if mechanics is None else MechanicalPlant(ideal, mechanics, None), None
     from stereoservo_sim.world.physics import PhysicsError, PybulletPlant
     from stereoservo_sim.world.simulated_cell import demo_cell
 
     robot = demo_cell().robot
-    names = tuple(joint.name for joint in options.joint)
     if names != robot.joint_names:
         raise EmulationError(
             f"emulate.drives.plant = 'pybullet' is the simulated arm with joints {', '.join(robot.joint_names)}; this "
@@ -173,9 +185,10 @@ def _plant(
         for joint in options.joint
     ]
     try:
-        return PybulletPlant(robot, positions, STEP_NS * 1e-9), rated
+        links = PybulletPlant(robot, positions, STEP_NS * 1e-9)
     except PhysicsError as error:
         raise EmulationError(str(error)) from error
+    return links if mechanics is None else MechanicalPlant(links, mechanics, robot), rated
 
 
 def _history(runtime_dir: Path | None, joints: int, t_ns: int) -> TrueJointHistory | None:

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from stereoservo_sim.emulators.nodes.node import EmulatedAxis
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.velocity_drives import REST_VELOCITY, Plant
+from stereoservo_sim.world.velocity_drives import Plant
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -188,6 +188,7 @@ class AxisPlant:
         self._record_ns = RECORD_STEPS * step_ns
         self._awake_ns = t_ns + AWAKE_NS
         self._resting = False
+        self._read_encoders()
         self._record()
 
     def due_ns(self, now_ns: int) -> int:
@@ -201,6 +202,8 @@ class AxisPlant:
         """Advance to the last grid point not after ``now_ns``."""
         while (steps := (now_ns - self.t_ns) // self.step_ns) > 0:
             if self._resting:
+                self.plant.rest(steps * self.step_ns * 1e-9)
+                self._read_encoders()
                 self.t_ns += steps * self.step_ns
             else:
                 self._step()
@@ -216,9 +219,10 @@ class AxisPlant:
             return
         self._seen_ns = now_ns
         h = (now_ns - self.t_ns) * 1e-9
+        readings = self.plant.readings
         for k, body in enumerate(self._bodies):
             axis = body.axis
-            axis.position = float(self.plant.positions[k]) + axis.velocity * h
+            axis.position = float(readings[k]) + axis.velocity * h
             if body.command.powered and not body.command.brake_closed:
                 axis.set_position = body.set_position + axis.set_velocity * h
             else:
@@ -256,7 +260,7 @@ class AxisPlant:
         self._resting = (
             self.t_ns >= self._awake_ns
             and all(body.resting() for body in self._bodies)
-            and bool(np.all(np.abs(self.plant.velocities) < REST_VELOCITY))
+            and self.plant.rest(0.0)
         )
         if self._resting:
             for body in self._bodies:
@@ -268,10 +272,11 @@ class AxisPlant:
             body.move(h)
         wanted = np.array([body.position for body in self._bodies])
         self.plant.follow(wanted, np.array([body.velocity for body in self._bodies]), h)
+        self._read_encoders()
+        rates = self.plant.reading_rates
         for k, body in enumerate(self._bodies):
             axis = body.axis
-            axis.position = float(self.plant.positions[k])
-            axis.velocity = float(self.plant.velocities[k])
+            axis.velocity = float(rates[k])
             axis.set_position = body.set_position
             if not body.command.powered or body.command.brake_closed:
                 axis.set_position = axis.position
@@ -282,6 +287,10 @@ class AxisPlant:
             )
             effort = min(max(free + body.held_up(), -self.settings.effort_max), self.settings.effort_max)
             axis.effort += (effort - axis.effort) * h / (h + EFFORT_FILTER_S)
+
+    def _read_encoders(self) -> None:
+        for axis, reading in zip(self.axes, self.plant.readings.tolist(), strict=True):
+            axis.position = reading
 
     def _record(self) -> None:
         if self._history is not None and (self.t_ns // self.step_ns) % RECORD_STEPS == 0:

@@ -11,6 +11,7 @@ from stereoservo_sim.emulators.bus.factory import DrivesSettings, drives_of_cell
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.emulators.nodes.odrive_node import OdriveNode
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
+from stereoservo_sim.world.mechanics import Mechanics
 from stereoservo_sim.world.simulated_cell import demo_cell
 
 MS = 1_000_000
@@ -73,6 +74,24 @@ def test_an_arm_goes_on_where_its_truth_ends_unless_told_otherwise(options, tmp_
     )
     assert not any(node.axis.position for node in fresh.nodes)
     fresh.close()
+
+
+def test_drives_behind_gears_that_sag_report_their_motors(options, tmp_path):
+    sagging = DrivesSettings(plant="ideal", mechanics={"j2": Mechanics(sag=0.02)}, start={"j2": -0.5})
+    emulator = make_bus_emulator(options, sagging, t_ns=0, runtime_dir=tmp_path)
+    emulator.run_until(100 * MS)
+    link = TrueJointHistory.open(tmp_path / FILE_NAME).newest()[1]
+    assert np.allclose(link, [0.0, -0.5, 0.0, 0.0, 0.0, 0.0])
+    motor = emulator.nodes[1].axis.position
+    assert np.isclose(motor + 0.02 * -np.cos(motor), -0.5)
+    assert emulator.nodes[1].axis.following_error == 0.0
+    emulator.close()
+
+
+def test_mechanics_of_a_joint_that_is_not_there_are_refused(options):
+    settings = DrivesSettings(plant="ideal", mechanics={"j9": Mechanics()})
+    with pytest.raises(EmulationError, match=r"emulate\.drives\.mechanics: no joint 'j9'; joints: j1"):
+        make_bus_emulator(options, settings, t_ns=0)
 
 
 def test_a_remapped_pdo_is_shorter_on_the_bus(options):
