@@ -8,14 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom, rank_of, variance_factor
+from stereoservo.calibration.bundle_statistics import (
+    chi2_within,
+    degrees_of_freedom,
+    rank_of,
+    variance_factor,
+)
 from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
+from stereoservo.calibration.diagnosis.input_corrections import Refit
+from stereoservo.calibration.diagnosis.joint_errors import (
+    explains,
+    one_thing_happened,
+    scales_error,
+    wrong_scales,
+)
+from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.lens_estimation import (
@@ -30,6 +44,7 @@ from stereoservo.calibration.lens_estimation import (
     undistorted,
 )
 from stereoservo.calibration.rig_model import (
+    JointNoise,
     Measurements,
     RigModel,
     common_mount,
@@ -39,8 +54,9 @@ from stereoservo.calibration.rig_model import (
 )
 from stereoservo.calibration.single_joint_fit import MIN_MARKERS, JointTrial, fit_single_joint, measurements
 from stereoservo.calibration.static_points import with_static_points
-from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, select_stratum
+from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
+from stereoservo.calibration.variance_components import VarianceComponents, estimate_components, readings
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.displacements import exp_generator
 from stereoservo.geometry.distortion import LensEstimate
@@ -58,6 +74,8 @@ OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implaus
 """Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
 FEW_OUTLIERS = 0.05
 """Share of outliers that may still change in a bundle that has not converged."""
+WILD = 100.0
+"""Squared residual over the median from which a pixel of the linked joints is a wrong one."""
 MIN_SIGHTINGS = 2
 """Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 
@@ -88,22 +106,120 @@ def fit_model(
     chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
     priors = lens_priors or {}
 
+    def fit(data: TrialData, chosen: FitOptions, joint_errors: bool = False) -> _Fitted:
+        return _fit(data, epoch, created, progress or _silent, chosen, priors, joint_errors=joint_errors)
+
     def refit(data: TrialData, chosen: FitOptions) -> CalibrationFit:
-        return _fit(data, epoch, created, _silent, chosen, priors)
+        return _fit(data, epoch, created, _silent, chosen, priors).fit
 
     check_motions(chain)
+    first, noisy = _first_fit(chain, options, fit)
+    if noisy is not None and not noisy.doubtful:
+        result, notes = noisy.fit, review_notes(chain, noisy.fit, refit, options)
+    else:
+
+        def others() -> CalibrationFit | None:
+            return _from_other_lenses(chain, epoch, created, options)
+
+        try:
+            result, notes = _with_exact_joints(chain, options, priors, first, refit, others)
+        except CalibrationError:
+            if noisy is None:
+                raise
+            result, notes = noisy.fit, ()
+        statistics = result.model.statistics
+        if noisy is not None and statistics is not None and not statistics.chi2_ok:
+            result, notes = noisy.fit, review_notes(chain, noisy.fit, refit, options)
+    model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
+    model, of_scene = with_static_points(model, trials.static)
+    report = msgspec.structs.replace(
+        result.report,
+        notes=(*result.report.notes, *notes, *of_scene),
+        untested=untested(chain),
+    )
+    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+
+
+class _Fitted(NamedTuple):
+    """A fit, whether its joint readings have errors, and whether these rather look like one event."""
+
+    fit: CalibrationFit
+    joint_errors: bool = False
+    doubtful: bool = False
+
+
+class _JointErrorsError(Exception):
+    """Errors of the joint readings seemed to explain the data, and do not."""
+
+
+class _ScalesError(Exception):
+    """Errors of the joint readings explain the data beside these scale ``factors`` (n,)."""
+
+    def __init__(self, factors: FloatArray, components: VarianceComponents) -> None:
+        super().__init__("wrong scales")
+        self.factors, self.components = factors, components
+
+
+_FitOfTrials = Callable[[TrialData, FitOptions, bool], _Fitted]
+
+
+def _first_fit(
+    chain: TrialData, options: FitOptions, fit: _FitOfTrials
+) -> tuple[Callable[[], CalibrationFit], _Fitted | None]:
+    """The fit with exact joint readings, to be called, and that with errors of these where they explain the data.
+
+    Raises CalibrationError (``wrong_scale``) for scales that are wrong beside such errors.
+    """
+
+    def exact() -> CalibrationFit:
+        return fit(chain, options, False).fit
+
+    try:
+        tried = fit(chain, options, True)
+    except _JointErrorsError:
+        return exact, None
+    except _ScalesError as wrong:
+        mended = with_scales_removed(chain, wrong.factors)
+        try:
+            fit(mended, options, True)
+        except _ScalesError as more:
+            raise scales_error(chain, wrong.factors * more.factors, more.components) from wrong
+        except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
+            return exact, None
+        raise scales_error(chain, wrong.factors, wrong.components) from wrong
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+        failure = error
+
+        def failed() -> CalibrationFit:
+            raise failure
+
+        return failed, None
+    return (exact, tried) if tried.joint_errors else (lambda: tried.fit, None)
+
+
+def _with_exact_joints(
+    chain: TrialData,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+    first: Callable[[], CalibrationFit],
+    refit: Refit,
+    others: Callable[[], CalibrationFit | None],
+) -> tuple[CalibrationFit, tuple[str, ...]]:
+    """The ``first`` fit, or one of ``others``, from other lenses, with notes. Raises CalibrationError with the cause
+    where there is none.
+    """
 
     def otherwise(cause: CalibrationError) -> CalibrationFit:
         """The fit from other lenses where one explains the data; else ``cause`` is raised."""
         free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
         bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
-        found = _from_other_lenses(chain, epoch, created, options) if bent else None
+        found = others() if bent else None
         if found is None:
             raise cause
         return found
 
     try:
-        result = _fit(chain, epoch, created, progress or _silent, options, priors)
+        result = first()
     except CalibrationError as error:
         result = otherwise(diagnose_failure(chain, error, refit, options))
     except (GeometryError, np.linalg.LinAlgError) as error:
@@ -120,14 +236,37 @@ def fit_model(
     except CalibrationError as cause:
         result = otherwise(cause)
         notes = review_notes(chain, result, refit, options)
-    model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
-    model, of_scene = with_static_points(model, trials.static)
-    report = msgspec.structs.replace(
-        result.report,
-        notes=(*result.report.notes, *notes, *of_scene),
-        untested=untested(chain),
-    )
-    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+    return result, notes
+
+
+class _Start(NamedTuple):
+    """Trials without rare markers, the linked joints, all measurements and the ``clean`` ones among them, and whether
+    the lens model is ``decided`` before the data.
+    """
+
+    trials: TrialData
+    zero: FloatArray
+    linked: Solution
+    every: Measurements
+    clean: Measurements
+    lenses: LensModel
+    decided: bool
+    markers_left_out: tuple[int, ...]
+
+    def with_joint_noise(self, noise: JointNoise) -> _Start:
+        """The same with noise of the joint readings."""
+        return self._replace(
+            every=self.every.with_joint_noise(noise), clean=self.clean.with_joint_noise(noise)
+        )
+
+
+class _Bundles(NamedTuple):
+    """The ``projective`` bundle, the one of the stratum ``raised`` from it, the ``final`` one and its inliers (k,)."""
+
+    projective: Solution
+    raised: StratumSelection
+    final: Solution
+    inliers: BoolArray
 
 
 def _fit(
@@ -138,8 +277,54 @@ def _fit(
     options: FitOptions,
     priors: Mapping[str, LensEstimate],
     bend: float | None = None,
-) -> CalibrationFit:
-    """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from."""
+    joint_errors: bool = False,
+) -> _Fitted:
+    """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from;
+    ``joint_errors``: where the data show them, the joint readings have errors.
+
+    Raises CalibrationError, and where joint readings have errors _JointErrorsError, _ScalesError.
+    """
+    start = _start(trials, report_progress, options, priors, bend)
+    components, doubtful = None, False
+    found = _components_at_start(start) if joint_errors else None
+    if found is not None:
+        start, bundles, components, doubtful = _bundles_with_joint_errors(
+            start, found, report_progress, options
+        )
+    else:
+        bundles = _bundles(start, report_progress, options)
+        if joint_errors:
+            refined = _refined_by_joint_errors(start, bundles, options)
+            if refined is not None:
+                start, bundles, components, doubtful = refined
+    report_progress("report", 0.95)
+    result = build_fit(
+        start.trials,
+        bundles.final,
+        start.every,
+        bundles.inliers,
+        start.zero,
+        bundles.raised.plane,
+        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
+        epoch=epoch,
+        created=created,
+        notes=bundles.raised.notes,
+        projective=(bundles.projective.cost, degrees_of_freedom(bundles.projective)),
+        markers_left_out=start.markers_left_out,
+        components=components,
+    )
+    report_progress("done", 1.0)
+    return _Fitted(result, components is not None, doubtful)
+
+
+def _start(
+    trials: TrialData,
+    report_progress: Progress,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+    bend: float | None,
+) -> _Start:
+    """Initial reconstruction, single-joint fits and linked joints. Raises CalibrationError."""
     report_progress("cameras", 0.0)
     lenses, lens_model = starting_lenses(trials, options.lens, priors, bend)
     cameras, points, usable = initial_reconstruction(undistorted(trials, lenses))
@@ -158,41 +343,107 @@ def _fit(
     )
     clean = every.select(usable[every.camera, every.stop, every.marker])
     linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
-    report_progress("rigid bundle", 0.6)
     decided = options.lens != "auto" or bool(priors) or bend is not None
-    solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
+    return _Start(trials, zero, linked, every, clean, lens_model, decided, left_out)
+
+
+def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _Bundles:
+    """Projective bundle, stratum, final bundle. Raises CalibrationError."""
+    report_progress("rigid bundle", 0.6)
+    trials, every = start.trials, start.every
+    solution, inliers = _projective(
+        start.linked.rig, start.clean, every, start.lenses, options, start.decided
+    )
     _refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
-    raised = select_stratum(solution, every.select(inliers), options)
+    raised = select_stratum(solution, _inside(every, solution, inliers), options)
     final, inliers = refine_to_convergence(
         raised.solution.rig, every, raised.solution.stratum, options, solution.lenses
     )
     if options.lens == "auto" and final.lenses == "none" and (raised.bent or lens_test(final).distorted):
         # Only the constraints of the higher stratum have separated distortion from kinematics.
         solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
-        raised = select_stratum(solution, every.select(inliers), options)
+        raised = select_stratum(solution, _inside(every, solution, inliers), options)
         final, inliers = refine_to_convergence(
             raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS
         )
     _refuse_poor_fit(trials, final, every, inliers, options)
     _refuse_undetermined(final, raised.notes)
-    report_progress("report", 0.95)
-    result = build_fit(
-        trials,
-        final,
-        every,
-        inliers,
-        zero,
-        raised.plane,
-        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
-        epoch=epoch,
-        created=created,
-        notes=raised.notes,
-        projective=(solution.cost, degrees_of_freedom(solution)),
-        markers_left_out=left_out,
-    )
-    report_progress("done", 1.0)
-    return result
+    return _Bundles(solution, raised, final, inliers)
+
+
+def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Measurements:
+    """The inliers, with the errors of the joints as in ``solution``."""
+    return every.corrected(solution.data.joint_errors).select(inliers)
+
+
+def _components_at_start(start: _Start) -> VarianceComponents | None:
+    """Significant variance components of the linked joints, with cameras free; None where there are none."""
+    rig, clean = start.linked.rig, start.clean
+    free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
+    if chi2_within(free.cost, degrees_of_freedom(free)):
+        return None
+    # Wrong pixels would be taken for errors of the joints; those of a stop as a whole would not be seen.
+    squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+    near = squares <= WILD * max(1.0, float(np.median(squares)))
+    free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
+    found = estimate_components(free, readings(start.trials.positions), scales=True)
+    return found if found is not None and found.significant else None
+
+
+def _bundles_with_joint_errors(
+    start: _Start, found: VarianceComponents, report_progress: Progress, options: FitOptions
+) -> tuple[_Start, _Bundles, VarianceComponents, bool]:
+    """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError where
+    they do not explain the data, _ScalesError.
+    """
+    labels = readings(start.trials.positions)
+    factors = wrong_scales(start.trials, found)
+    if (factors != 1.0).any():
+        raise _ScalesError(factors, found)
+    try:
+        noisy = start.with_joint_noise(found.noise(labels))
+        first = _bundles(noisy, report_progress, options)
+        better = _refined_by_joint_errors(noisy, first, options, found)
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+        raise _JointErrorsError from error
+    if better is None:
+        raise _JointErrorsError
+    return better
+
+
+def _refined_by_joint_errors(
+    start: _Start, bundles: _Bundles, options: FitOptions, near: VarianceComponents | None = None
+) -> tuple[_Start, _Bundles, VarianceComponents, bool] | None:
+    """The final bundle whitened by the variance components that it shows, until these stay the same, and whether
+    they look like one event; None where errors of the joints do not explain it. Raises _ScalesError.
+    """
+    labels = readings(start.trials.positions)
+    final, inliers = bundles.final, bundles.inliers
+    beside = estimate_components(final, labels, scales=True, near=near)
+    if beside is None or not beside.significant:
+        return None
+    factors = wrong_scales(start.trials, beside)
+    if (factors != 1.0).any():
+        raise _ScalesError(factors, beside)
+    components = estimate_components(final, labels, scales=False, near=beside)
+    for _ in range(2):
+        if components is None:
+            return None
+        noisy = start.with_joint_noise(components.noise(labels))
+        final, inliers = refine_to_convergence(
+            final.rig, noisy.every, final.stratum, options, final.lenses, inliers=inliers
+        )
+        before = components
+        components = estimate_components(final, labels, scales=False, near=before)
+        if components is not None and components.like(before):
+            components = before
+            break
+    if components is None or not explains(start.trials, final, inliers, components):
+        return None
+    _refuse_undetermined(final, bundles.raised.notes)
+    doubtful = one_thing_happened(start.trials, final)
+    return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
 
 
 def _from_other_lenses(
@@ -203,7 +454,7 @@ def _from_other_lenses(
     """
     for bend in STARTING_BENDS:
         try:
-            result = _fit(trials, epoch, created, _silent, options, {}, bend)
+            result = _fit(trials, epoch, created, _silent, options, {}, bend).fit
         except (CalibrationError, GeometryError, np.linalg.LinAlgError):
             continue  # not from there
         statistics = result.model.statistics
@@ -224,7 +475,8 @@ def _projective(
     robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     if not decided and lenses == "none":
         # Before anything is called an outlier: distortion makes many of them.
-        inside = every.select(inlier_mask(robust.rig, every, options))
+        here = every.corrected(robust.data.joint_errors)
+        inside = here.select(inlier_mask(robust.rig, here, options))
         if lens_test(solve(robust.rig, inside, "projective", max_evaluations=1)).distorted:
             lenses = FREE_LENS
             robust = solve(
@@ -232,6 +484,7 @@ def _projective(
             )
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.
+    every = every.corrected(robust.data.joint_errors)
     solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
     if decided or lens_test(solution).distorted == (lenses == FREE_LENS):
         return solution, inliers
@@ -314,15 +567,19 @@ def refine_to_convergence(
     options: FitOptions,
     lenses: LensModel,
     tolerance: float = 1e-10,
+    inliers: BoolArray | None = None,
 ) -> tuple[Solution, BoolArray]:
-    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same.
+    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same, from
+    ``inliers`` on, or those of ``rig``.
 
     Whether the last solution has converged is for the caller to judge. Raises CalibrationError
     (``no_convergence``).
     """
-    inliers = inlier_mask(rig, every, options)
+    if inliers is None:
+        inliers = inlier_mask(rig, every, options)
     for _ in range(8):
         solution = solve(rig, every.select(inliers), stratum, lenses=lenses, tolerance=tolerance)
+        every = every.corrected(solution.data.joint_errors)
         again = inlier_mask(solution.rig, every, options)
         rig = solution.rig
         if np.array_equal(again, inliers):

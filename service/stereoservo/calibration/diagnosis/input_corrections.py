@@ -28,6 +28,7 @@ from stereoservo.calibration.rig_model import Measurements, projective_rig, stra
 from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import joint_noise_of, readings
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import Kind
 from stereoservo.numerics.arrays import FloatArray
@@ -214,6 +215,16 @@ def solution_of(trials: TrialData, result: CalibrationFit) -> Solution:
         prior_of_lenses(trials, {}),
     )
     bent = any(camera.lens[0] != 0.0 for camera in model.cameras)
+    evaluations = 1
+    if model.joint_accuracy is not None:
+        accuracy = model.joint_accuracy
+        noise = joint_noise_of(accuracy.random, accuracy.repeatable, readings(trials.positions))
+        # The errors of the joints are not kept in the model: they take a step.
+        data, evaluations = data.with_joint_noise(noise), 4
     return solve(
-        stratum_rig(model), data, model.stratum, lenses=FREE_LENS if bent else "none", max_evaluations=1
+        stratum_rig(model),
+        data,
+        model.stratum,
+        lenses=FREE_LENS if bent else "none",
+        max_evaluations=evaluations,
     )

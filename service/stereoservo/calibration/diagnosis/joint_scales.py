@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.normal_equations import arrow_factor
+from stereoservo.calibration.joint_noise import orthogonal_factor
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted, residuals
 from stereoservo.calibration.single_joint_fit import (
     VirtualObservations,
@@ -164,7 +164,7 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
     if not joints:
         return ()
-    factor = arrow_factor(solution.rig, solution.charts, solution.data, _scale_columns(solution, joints))
+    factor = orthogonal_factor(solution.rig, solution.charts, solution.data, _scale_columns(solution, joints))
     # What the other parameters can imitate of a factor is theirs.
     at = solution.charts.start(3)
     moments, rest = factor.core[at:, at:-1], factor.core[at:, -1]
@@ -200,7 +200,7 @@ def lenses_explain_more(solution: Solution) -> bool:
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
     evidence = []
     for columns in (_distortion_columns(solution), _scale_columns(solution, joints)):
-        core = arrow_factor(solution.rig, solution.charts, solution.data, columns).core
+        core = orthogonal_factor(solution.rig, solution.charts, solution.data, columns).core
         at = solution.charts.start(3)
         gain = float((core[at:-1, -1] ** 2).sum()) / max(1.0, variance_factor(solution))
         evidence.append(gain - columns.shape[1] * float(np.log(solution.rows)))
