@@ -17,13 +17,13 @@ from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import (
     chi2_within,
     degrees_of_freedom,
-    rank_of,
-    variance_factor,
 )
 from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
+from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
 from stereoservo.calibration.diagnosis.input_corrections import Refit
 from stereoservo.calibration.diagnosis.joint_errors import (
+    ScalesError,
     explains,
     one_thing_happened,
     scales_error,
@@ -52,13 +52,17 @@ from stereoservo.calibration.rig_model import (
     reversed_trials,
     with_joints_reversed,
 )
-from stereoservo.calibration.single_joint_fit import MIN_MARKERS, JointTrial, fit_single_joint, measurements
+from stereoservo.calibration.single_joint_fit import (
+    MIN_MARKERS,
+    fit_single_joint,
+    link_joints,
+    measurements,
+)
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
 from stereoservo.calibration.variance_components import VarianceComponents, estimate_components, readings
 from stereoservo.geometry.cameras import pixel_normaliser
-from stereoservo.geometry.displacements import exp_generator
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.model import Stratum
@@ -68,14 +72,14 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 Progress = Callable[[str, float], None]
 
 
-VALLEY_VARIANCE = 1.5
-"""Variance factor up to which an unconverged bundle lies in a flat valley of its cost: a direction is undetermined."""
 OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
 """Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
 FEW_OUTLIERS = 0.05
 """Share of outliers that may still change in a bundle that has not converged."""
 WILD = 100.0
 """Squared residual over the median from which a pixel of the linked joints is a wrong one."""
+SCALE_ROUNDS = 3
+"""Times that scales are removed from the readings and estimated again."""
 MIN_SIGHTINGS = 2
 """Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 
@@ -107,7 +111,7 @@ def fit_model(
     priors = lens_priors or {}
 
     def fit(data: TrialData, chosen: FitOptions, joint_errors: bool = False) -> _Fitted:
-        return _fit(data, epoch, created, progress or _silent, chosen, priors, joint_errors=joint_errors)
+        return _fit(data, epoch, created, progress or _silent, chosen, priors, None, joint_errors)
 
     def refit(data: TrialData, chosen: FitOptions) -> CalibrationFit:
         return _fit(data, epoch, created, _silent, chosen, priors).fit
@@ -152,14 +156,6 @@ class _JointErrorsError(Exception):
     """Errors of the joint readings seemed to explain the data, and do not."""
 
 
-class _ScalesError(Exception):
-    """Errors of the joint readings explain the data beside these scale ``factors`` (n,)."""
-
-    def __init__(self, factors: FloatArray, components: VarianceComponents) -> None:
-        super().__init__("wrong scales")
-        self.factors, self.components = factors, components
-
-
 _FitOfTrials = Callable[[TrialData, FitOptions, bool], _Fitted]
 
 
@@ -178,15 +174,8 @@ def _first_fit(
         tried = fit(chain, options, True)
     except _JointErrorsError:
         return exact, None
-    except _ScalesError as wrong:
-        mended = with_scales_removed(chain, wrong.factors)
-        try:
-            fit(mended, options, True)
-        except _ScalesError as more:
-            raise scales_error(chain, wrong.factors * more.factors, more.components) from wrong
-        except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
-            return exact, None
-        raise scales_error(chain, wrong.factors, wrong.components) from wrong
+    except ScalesError as wrong:
+        return _told_by_scales(chain, wrong, exact, lambda data: fit(data, options, True)), None
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
         failure = error
 
@@ -195,6 +184,38 @@ def _first_fit(
 
         return failed, None
     return (exact, tried) if tried.joint_errors else (lambda: tried.fit, None)
+
+
+def _told_by_scales(
+    chain: TrialData,
+    wrong: ScalesError,
+    exact: Callable[[], CalibrationFit],
+    fit: Callable[[TrialData], _Fitted],
+) -> Callable[[], CalibrationFit]:
+    """The fit with ``exact`` joint readings, to be called. Raises CalibrationError (``wrong_scale``) where the trials
+    fit to the noise with the scales removed, and do not with exact readings.
+    """
+    factors, components = wrong.factors, wrong.components
+    for _ in range(SCALE_ROUNDS):
+        try:
+            mended = fit(with_scales_removed(chain, factors)).fit
+            break
+        except ScalesError as more:
+            factors, components = factors * more.factors, more.components
+        except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
+            return exact
+    else:
+        return exact
+    statistics = mended.model.statistics
+    if statistics is None or not statistics.chi2_ok or (factors == 1.0).all():
+        return exact
+    try:
+        plain = exact()
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+        raise scales_error(chain, factors, components) from wrong
+    if plain.model.statistics is not None and plain.model.statistics.chi2_ok:
+        return lambda: plain
+    raise scales_error(chain, factors, components) from wrong
 
 
 def _with_exact_joints(
@@ -282,7 +303,7 @@ def _fit(
     """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from;
     ``joint_errors``: where the data show them, the joint readings have errors.
 
-    Raises CalibrationError, and where joint readings have errors _JointErrorsError, _ScalesError.
+    Raises CalibrationError, and where joint readings have errors _JointErrorsError, ScalesError.
     """
     start = _start(trials, report_progress, options, priors, bend)
     components, doubtful = None, False
@@ -354,7 +375,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     solution, inliers = _projective(
         start.linked.rig, start.clean, every, start.lenses, options, start.decided
     )
-    _refuse_poor_fit(trials, solution, every, inliers, options)
+    refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
     final, inliers = refine_to_convergence(
@@ -367,8 +388,8 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
         final, inliers = refine_to_convergence(
             raised.solution.rig, every, raised.solution.stratum, options, FREE_LENS
         )
-    _refuse_poor_fit(trials, final, every, inliers, options)
-    _refuse_undetermined(final, raised.notes)
+    refuse_poor_fit(trials, final, every, inliers, options)
+    refuse_undetermined(final, raised.notes)
     return _Bundles(solution, raised, final, inliers)
 
 
@@ -395,12 +416,12 @@ def _bundles_with_joint_errors(
     start: _Start, found: VarianceComponents, report_progress: Progress, options: FitOptions
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool]:
     """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError where
-    they do not explain the data, _ScalesError.
+    they do not explain the data, ScalesError.
     """
     labels = readings(start.trials.positions)
     factors = wrong_scales(start.trials, found)
     if (factors != 1.0).any():
-        raise _ScalesError(factors, found)
+        raise ScalesError(factors, found)
     try:
         noisy = start.with_joint_noise(found.noise(labels))
         first = _bundles(noisy, report_progress, options)
@@ -416,7 +437,7 @@ def _refined_by_joint_errors(
     start: _Start, bundles: _Bundles, options: FitOptions, near: VarianceComponents | None = None
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool] | None:
     """The final bundle whitened by the variance components that it shows, until these stay the same, and whether
-    they look like one event; None where errors of the joints do not explain it. Raises _ScalesError.
+    they look like one event; None where errors of the joints do not explain it. Raises ScalesError.
     """
     labels = readings(start.trials.positions)
     final, inliers = bundles.final, bundles.inliers
@@ -425,7 +446,7 @@ def _refined_by_joint_errors(
         return None
     factors = wrong_scales(start.trials, beside)
     if (factors != 1.0).any():
-        raise _ScalesError(factors, beside)
+        raise ScalesError(factors, beside)
     components = estimate_components(final, labels, scales=False, near=beside)
     for _ in range(2):
         if components is None:
@@ -441,7 +462,7 @@ def _refined_by_joint_errors(
             break
     if components is None or not explains(start.trials, final, inliers, components):
         return None
-    _refuse_undetermined(final, bundles.raised.notes)
+    refuse_undetermined(final, bundles.raised.notes)
     doubtful = one_thing_happened(start.trials, final)
     return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
 
@@ -524,42 +545,6 @@ def _without_rare_markers(
     return kept, points[:, often], usable[:, :, often], left_out
 
 
-def link_joints(
-    trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
-) -> RigModel:
-    """Rig of all joints, base to tip: generators transformed from their trials' bases to one zero (5.21), one
-    marker structure (5.53).
-
-    Raises CalibrationError (``too_few_markers``) for a marker that no trial shows.
-    """
-    kinds = trials.joint_kinds
-    generators = np.zeros((len(kinds), 4, 4))
-    for j, trial in enumerate(separate):
-        moved = _chain(kinds[:j], generators[:j], trial.base[:j] - zero[:j])
-        generators[j] = np.linalg.inv(moved) @ trial.generator @ moved
-    # Every trial has seen the markers in its own base configuration; take them all to the zero.
-    clouds = np.array(
-        [trial.points @ np.linalg.inv(_chain(kinds, generators, trial.base - zero)).T for trial in separate]
-    )
-    clouds /= clouds[:, :, 2:3]
-    points = np.empty((len(trials.marker_ids), 4))
-    for i, marker in enumerate(trials.marker_ids):
-        seen = clouds[np.isfinite(clouds[:, i]).all(axis=1), i]
-        if not len(seen):
-            raise CalibrationError(
-                "too_few_markers", f"marker {marker} is shown by no joint's usable stops", marker=marker
-            )
-        points[i] = np.median(seen, axis=0)
-    return RigModel(kinds, generators, cameras, points)
-
-
-def _chain(kinds: tuple[str, ...], generators: FloatArray, offsets: FloatArray) -> FloatArray:
-    product = np.eye(4)
-    for kind, generator, offset in zip(kinds, generators, offsets, strict=True):
-        product = product @ exp_generator(kind, generator, offset)
-    return product
-
-
 def refine_to_convergence(
     rig: RigModel,
     every: Measurements,
@@ -609,91 +594,3 @@ def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> Bool
     factor = max(1.0, float(np.median(squares)) / np.log(4.0))
     inside: BoolArray = squares <= options.outlier_chi2 * factor
     return inside
-
-
-def _refuse_poor_fit(
-    trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
-) -> None:
-    share = float((~inliers).mean())
-    if share > options.max_outliers:
-        raise CalibrationError(
-            "too_many_outliers",
-            f"{share:.0%} of the pixels do not fit the {solution.stratum} model; at most "
-            f"{options.max_outliers:.0%} may",
-            share=share,
-            maximum=options.max_outliers,
-        )
-    for j, name in enumerate(trials.joint_names):
-        own = trials.trials[every.stop] == j
-        lost = float((~inliers[own]).mean()) if own.any() else 0.0
-        if lost > options.max_trial_outliers:
-            raise CalibrationError(
-                "too_many_outliers",
-                f"{lost:.0%} of the pixels of joint {name!r}'s trial do not fit the {solution.stratum} "
-                f"model; at most {options.max_trial_outliers:.0%} may. Are its positions right, did only "
-                "it move?",
-                joint=name,
-                share=lost,
-                maximum=options.max_trial_outliers,
-            )
-    data = every.select(inliers)
-    if degrees_of_freedom(solution) <= 0:
-        raise CalibrationError(
-            "too_few_stops",
-            f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or "
-            "markers are needed",
-            measurements=solution.rows,
-            parameters=solution.charts.size,
-        )
-    factor = float(np.sqrt(variance_factor(solution)))
-    if factor > options.max_sigma_factor:
-        squares = (solution.residuals.reshape(-1, 2) ** 2).sum(axis=1)
-        of_stop = trials.trials[data.stop]
-        per_joint = {
-            name: float(np.sqrt(squares[of_stop == j].mean() / 2))
-            for j, name in enumerate(trials.joint_names)
-            if (of_stop == j).any()
-        }
-        worst = max(per_joint, key=lambda name: per_joint[name])
-        raise CalibrationError(
-            "residual_above_floor",
-            f"residuals are {factor:.3g} times the stated sigmas; at most {options.max_sigma_factor:g} "
-            f"allowed. Worst is joint {worst!r} ({per_joint[worst]:.3g})",
-            sigma_factor=factor,
-            maximum=options.max_sigma_factor,
-            joints=per_joint,
-        )
-
-
-def _refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
-    """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
-    rank = rank_of(solution)
-    because = f" ({'; '.join(notes)})" if notes else ""
-    if rank < solution.charts.size:
-        raise CalibrationError(
-            "not_identifiable",
-            f"the trials determine {rank} of {solution.charts.size} parameters of the {solution.stratum} "
-            f"model{because}; markers off one plane, more stops or larger motions are needed",
-            rank=rank,
-            parameters=solution.charts.size,
-            notes=notes,
-        )
-    if solution.converged:
-        return
-    factor = variance_factor(solution)
-    if factor < VALLEY_VARIANCE:
-        raise CalibrationError(
-            "not_identifiable",
-            f"the {solution.stratum} model fits, but the trials leave a direction of it open{because}; markers "
-            "off one plane, more stops or larger motions are needed",
-            stratum=solution.stratum,
-            notes=notes,
-        )
-    raise CalibrationError(
-        "no_convergence",
-        f"the {solution.stratum} bundle did not converge in {solution.evaluations} evaluations{because}; "
-        f"residual {np.sqrt(factor):.3g} sigmas",
-        stratum=solution.stratum,
-        evaluations=solution.evaluations,
-        notes=notes,
-    )

@@ -30,6 +30,14 @@ LIKE_OTHERS = 3.0
 """Times the joints' own errors that a wrong scale must move a joint over its trial to be told from them."""
 
 
+class ScalesError(Exception):
+    """Errors of the joint readings explain the data beside these scale ``factors`` (n,)."""
+
+    def __init__(self, factors: FloatArray, components: VarianceComponents) -> None:
+        super().__init__("wrong scales")
+        self.factors, self.components = factors, components
+
+
 def explains(
     trials: TrialData, solution: Solution, inliers: BoolArray, components: VarianceComponents | None
 ) -> bool:
