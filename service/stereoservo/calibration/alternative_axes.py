@@ -50,8 +50,9 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
     """
     rig, data = solution.rig, solution.data
     used = np.unique(data.stop)
-    base = np.median(data.offsets[used], axis=0)
-    still = np.asarray((np.delete(np.abs(data.offsets - base), joint, axis=1) <= STILL).all(axis=1))
+    reported = data.corrected(None).offsets
+    base = np.median(reported[used], axis=0)
+    still = np.asarray((np.delete(np.abs(reported - base), joint, axis=1) <= STILL).all(axis=1))
     own = data.select(still[data.stop])
     displacement = data.offsets[:, joint]
     span = float(np.ptp(displacement[still])) if still.any() else 0.0
@@ -66,7 +67,13 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
         rig.points @ after[joint + 1, 0].T,
         rig.lenses,
     )
-    own = replace(own, offsets=data.offsets[:, joint : joint + 1], lens_priors=None)
+    own = replace(
+        own,
+        offsets=data.offsets[:, joint : joint + 1],
+        lens_priors=None,
+        joint_noise=None,
+        joint_errors=None,
+    )
     now = _solved(single, own)
     centroids = [
         _centroid(single, float(end)) for end in (displacement[still].min(), displacement[still].max())

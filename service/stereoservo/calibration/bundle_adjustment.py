@@ -12,10 +12,11 @@ from typing import Literal
 
 import numpy as np
 
+from stereoservo.calibration.joint_noise import StopEquations, StopFactor, orthogonal_factor, stop_equations
 from stereoservo.calibration.normal_equations import (
     ArrowFactor,
+    NormalEquations,
     Weights,
-    arrow_factor,
     by_stop,
     chunks,
     normal_equations,
@@ -23,6 +24,7 @@ from stereoservo.calibration.normal_equations import (
 )
 from stereoservo.calibration.rig_model import (
     Charts,
+    JointErrors,
     Measurements,
     RigModel,
     full_charts,
@@ -48,7 +50,8 @@ FREE_DAMPING = 1e-2
 class Solution:
     """Result of a bundle adjustment of ``data``, with the minimal ``charts`` at its ``rig``.
 
-    ``cost``: sum of squared weighted residuals, those of lens priors included; ``residuals`` (2 k,) without them.
+    ``cost``: sum of squared weighted residuals, those of lens priors and errors of joints included; ``residuals``
+    (2 k,) of the pixels alone. ``data`` includes the estimated errors of the joints, where these have noise.
     """
 
     rig: RigModel
@@ -63,14 +66,14 @@ class Solution:
     evaluations: int
 
     @cached_property
-    def lens_factor(self) -> ArrowFactor:
+    def lens_factor(self) -> ArrowFactor | StopFactor:
         """Orthogonal factor of the Jacobian in which at least the radial parameters of the lenses are free."""
         lenses: LensModel = "radial" if self.lenses == "none" else self.lenses
         free = full_charts(self.rig, self.stratum, cameras=False, points=False, lenses=lenses).lenses
-        return arrow_factor(self.rig, replace(self.charts, lenses=free), self.data)
+        return orthogonal_factor(self.rig, replace(self.charts, lenses=free), self.data)
 
     @cached_property
-    def factor(self) -> ArrowFactor:
+    def factor(self) -> ArrowFactor | StopFactor:
         """Orthogonal factor of the Jacobian by the parameters."""
         fixed = len(self.rig.lenses) if self.lenses == "none" else 0
         return self.lens_factor.without(self.charts.start(2) + np.arange(fixed))
@@ -122,7 +125,7 @@ def solve(
     Columns are scaled to unit length. ``loss_scale`` [sigmas] for the robust losses, which are re-weighted
     iteratively. ``tolerance``: decrease, relative to the cost, below which nothing is left to gain. Raises
     LinAlgError where the start has no finite residuals. Never raises on a bad fit: look at ``converged`` and
-    ``cost``.
+    ``cost``. Where the joints have noise, their errors are estimated with the parameters, from ``data``'s on.
     """
     ordered, _ = by_stop(data)
     weights = _weights(loss, loss_scale)
@@ -130,17 +133,17 @@ def solve(
     def charts_at(rig: RigModel) -> Charts:
         return full_charts(rig, stratum, cameras=cameras, points=points, lenses=lenses)
 
-    def cost_at(rig: RigModel, charts: Charts) -> float:
-        pixels = _loss(residuals(rig, ordered), loss, loss_scale)
+    def cost_at(rig: RigModel, charts: Charts, here: Measurements) -> float:
+        pixels = _loss(residuals(rig, here), loss, loss_scale) + _cost_of_errors(here)
         return pixels + float((prior_rows(rig, charts, data)[:, -1] ** 2).sum())
 
     charts = charts_at(rig)
-    cost = cost_at(rig, charts)
+    cost = cost_at(rig, charts, ordered)
     if not np.isfinite(cost):
         raise np.linalg.LinAlgError("points at infinity or in a focal plane at the start of a bundle")
     damping, evaluations, converged, exhausted = FIRST_DAMPING, 1, False, False
     while not (converged or exhausted):
-        equations = normal_equations(rig, charts, ordered, weights)
+        equations = _equations(rig, charts, ordered, weights)
         if float(np.abs(equations.gradient).max(initial=0.0)) <= GRADIENT:
             converged = True
             break
@@ -153,19 +156,20 @@ def solve(
             except np.linalg.LinAlgError:
                 damping = max(10.0 * damping, 1e-12)
                 continue
-            trial = rig_at(rig, charts, x)
+            trial, there = rig_at(rig, charts, x), ordered.corrected(_errors(equations, x))
             evaluations += 1
-            least = cost_at(trial, charts)
+            least = cost_at(trial, charts, there)
             gain = (cost - least) / expected if expected > 0.0 else 0.0
             converged = damping <= FREE_DAMPING and expected <= tolerance * cost
             if gain > 1e-3:
-                rig, cost = trial, least
+                rig, cost, ordered = trial, least, there
                 charts = charts_at(rig)
                 damping = max(damping * (0.03 if gain > 0.75 else 0.3 if gain > 0.25 else 2.0), LEAST_DAMPING)
                 break
             if converged:
                 break
             damping = 10.0 * max(damping, 1e-12)
+    data = data.corrected(ordered.joint_errors)
     error = residuals(rig, data)
     prior = prior_rows(rig, charts, data)[:, -1]
     return Solution(
@@ -174,12 +178,28 @@ def solve(
         charts,
         stratum,
         lenses,
-        float(error @ error + prior @ prior),
+        float(error @ error + prior @ prior) + _cost_of_errors(data),
         error,
         len(error) + len(prior),
         converged,
         evaluations,
     )
+
+
+def _equations(
+    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
+) -> NormalEquations | StopEquations:
+    if data.joint_noise is None:
+        return normal_equations(rig, charts, data, weights)
+    return stop_equations(rig, charts, data, weights)
+
+
+def _errors(equations: NormalEquations | StopEquations, x: FloatArray) -> JointErrors | None:
+    return equations.errors(x) if isinstance(equations, StopEquations) else None
+
+
+def _cost_of_errors(data: Measurements) -> float:
+    return 0.0 if data.joint_errors is None else data.joint_errors.cost
 
 
 def _loss(error: FloatArray, loss: Loss, scale: float) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.normal_equations import leverages
+from stereoservo.calibration.joint_noise import expected_squares, joint_columns, prediction_leverages
 from stereoservo.calibration.rig_model import Measurements, predicted
 from stereoservo.numerics.arrays import FloatArray
 
@@ -69,12 +69,34 @@ def prediction_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
     at the stated sigmas; NaN where the lens images nothing.
     """
     c, s, m = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
-    camera, stop, marker = (index.ravel() for index in np.indices((c, s, m)))
-    k = len(camera)
-    grid = Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
-    variances = leverages(solution.rig, solution.charts, grid, solution.factor)
+    grid = _grid(solution, offsets)
+    variances = prediction_leverages(solution.rig, solution.charts, grid, solution.factor)
     seen = np.isfinite(predicted(solution.rig, grid)).all(axis=1)
     return np.where(seen, variances, np.nan).reshape(c, s, m)
+
+
+def _grid(solution: Solution, offsets: FloatArray) -> Measurements:
+    """Every marker in every camera at ``offsets`` (s, n), with sigmas of 1 px."""
+    shape = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
+    camera, stop, marker = (index.ravel() for index in np.indices(shape))
+    k = len(camera)
+    return Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
+
+
+def joint_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
+    """Variance (c, s, m, n) [px², of both coordinates together] that a unit variance of each joint's reading gives
+    pixels predicted at ``offsets`` (s, n); NaN where the lens images nothing.
+    """
+    grid = _grid(solution, offsets)
+    slopes = joint_columns(solution.rig, grid).reshape(len(grid.camera), 2, -1)
+    c, m = len(solution.rig.cameras), len(solution.rig.points)
+    seen = np.asarray(np.isfinite(predicted(solution.rig, grid)).all(axis=1))
+    return np.where(seen[:, None], (slopes**2).sum(axis=1), np.nan).reshape(c, len(offsets), m, -1)
+
+
+def residual_expectations(solution: Solution) -> FloatArray:
+    """Expected squared residual (k,) of each measurement of a bundle with joint noise [sigmas², both coordinates]."""
+    return expected_squares(solution.rig, solution.charts, solution.data)
 
 
 class GroupRms(NamedTuple):

@@ -15,14 +15,17 @@ from stereoservo.calibration.bundle_statistics import (
     chi2_within,
     degrees_of_freedom,
     group_rms,
+    joint_variances,
     noise_factor,
     parameter_covariance,
     prediction_variances,
+    residual_expectations,
     variance_factor,
 )
 from stereoservo.calibration.lens_significance import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.trial_data import TrialData
+from stereoservo.calibration.variance_components import VarianceComponents
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics
 from stereoservo.kinematics.model import (
@@ -30,12 +33,13 @@ from stereoservo.kinematics.model import (
     CameraModel,
     CellModel,
     FitStatistics,
+    JointAccuracy,
     JointStatistics,
     ModelCovariance,
     Stratum,
     check_model,
 )
-from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.kinematics.parameterization import Kind, LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 
@@ -75,6 +79,20 @@ class LensReport(msgspec.Struct, frozen=True):
     limit: float
 
 
+class JointErrorReport(msgspec.Struct, frozen=True):
+    """Errors of a joint's readings as standard deviations [rad or m], ``random`` and ``repeatable``, each with its own
+    standard deviation; ``pixels``: by how much they move the markers in the images, rms [px].
+    """
+
+    name: str
+    kind: Kind
+    random: float
+    random_std: float
+    repeatable: float
+    repeatable_std: float
+    pixels: float
+
+
 class Outlier(msgspec.Struct, frozen=True):
     """A pixel that was left out, and how far it lies from the model [px]."""
 
@@ -92,7 +110,9 @@ class CalibrationReport(msgspec.Struct, frozen=True):
     coordinate, ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of
     fx, skew, fy, u0, v0 [px]. ``projective_chi2``, ``projective_degrees_of_freedom``: of the projective
     bundle, which the stratum's is nested in. ``lens``: the lens model and its test.
-    ``untested``: what the model takes as stated because the trials do not determine it.
+    ``untested``: what the model takes as stated because the trials do not determine it. ``joints``: errors of the joint
+    readings; empty where the data show none. Chi-square, residuals and deviations are then those of a model with both
+    noises, residuals what is left of the pixels beside the joints' errors.
     """
 
     stratum: Stratum
@@ -112,6 +132,7 @@ class CalibrationReport(msgspec.Struct, frozen=True):
     notes: tuple[str, ...]
     lens: LensReport
     untested: tuple[str, ...] = ()
+    joints: tuple[JointErrorReport, ...] = ()
 
 
 class CalibrationFit(msgspec.Struct, frozen=True, eq=False):
@@ -135,14 +156,21 @@ def build_fit(
     notes: tuple[str, ...],
     projective: tuple[float, int],
     markers_left_out: tuple[int, ...],
+    components: VarianceComponents | None = None,
 ) -> CalibrationFit:
-    """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame."""
+    """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame; ``components``: of its
+    joint noise.
+    """
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
     squares = (errors**2).sum(axis=1) / 2
     freedom = degrees_of_freedom(solution)
     variances = prediction_variances(solution, every.offsets)
     own = variances[data.camera, data.stop, data.marker]
+    if components is not None:
+        own = data.sigmas**2 * (2.0 - residual_expectations(solution))
+        by_joint = joint_variances(solution, every.offsets)
+        variances = variances + by_joint @ components.stated**2 / noise_factor(solution)
 
     def group(members: BoolArray) -> GroupRms:
         return group_rms(squares[members], data.sigmas[members], own[members])
@@ -159,6 +187,9 @@ def build_fit(
         images=trials.images,
     )
     model = build_model(trials, solution, zero, plane, normaliser, statistics, epoch, created)
+    if components is not None:
+        accuracy = JointAccuracy(components.deviations[:, 0], components.deviations[:, 1], components.stated)
+        model = msgspec.structs.replace(model, joint_accuracy=accuracy)
     shown = variances[np.isfinite(variances)] / 2 * noise_factor(solution)
     tested = lens_test(solution)
     report = CalibrationReport(
@@ -176,13 +207,34 @@ def build_fit(
             _camera_report(trials, c, solution, group(data.camera == c), every, inliers)
             for c in range(len(trials.cameras))
         ),
-        outliers=_outliers(trials, solution.rig, every, inliers),
+        outliers=_outliers(trials, solution.rig, every.corrected(solution.data.joint_errors), inliers),
         left_intrinsics_std=_left_intrinsics_std(solution) if solution.stratum == "metric" else None,
         markers_left_out=markers_left_out,
         notes=notes,
         lens=LensReport(solution.lenses, tested.chi2, tested.freedom, tested.limit),
+        joints=() if components is None else _joint_errors(trials, components, by_joint),
     )
     return CalibrationFit(model, report)
+
+
+def _joint_errors(
+    trials: TrialData, components: VarianceComponents, by_joint: FloatArray
+) -> tuple[JointErrorReport, ...]:
+    """Errors of each joint; ``by_joint`` (c, s, m, n) as from `joint_variances`."""
+    slopes = np.sqrt(np.nanmean(by_joint, axis=(0, 1, 2)) / 2)
+    found, spreads = components.deviations, components.deviations_of_deviations
+    return tuple(
+        JointErrorReport(
+            name,
+            kind,
+            float(found[j, 0]),
+            float(spreads[j, 0]),
+            float(found[j, 1]),
+            float(spreads[j, 1]),
+            float(slopes[j] * np.hypot(*found[j])),
+        )
+        for j, (name, kind) in enumerate(zip(trials.joint_names, trials.joint_kinds, strict=True))
+    )
 
 
 def _camera_report(

@@ -11,7 +11,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.bundle_statistics import degrees_of_freedom, variance_factor
-from stereoservo.calibration.normal_equations import arrow_factor
+from stereoservo.calibration.joint_noise import orthogonal_factor
 from stereoservo.calibration.rig_model import predicted, residuals
 from stereoservo.geometry.distortion import terms_jacobian
 from stereoservo.kinematics.model import pinhole
@@ -112,7 +112,7 @@ def _evidence(solution: Solution) -> tuple[float, float]:
 
 def _gain(solution: Solution, columns: FloatArray) -> tuple[float, int]:
     """Chi-square that ``columns`` (2 k, e) would gain beside the free parameters, to first order, and their number."""
-    core = arrow_factor(solution.rig, solution.charts, solution.data, columns).core
+    core = orthogonal_factor(solution.rig, solution.charts, solution.data, columns).core
     return float((core[solution.charts.start(3) : -1, -1] ** 2).sum()), columns.shape[1]
 
 

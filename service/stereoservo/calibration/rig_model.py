@@ -1,9 +1,9 @@
 """Parametric model of a cell that a calibration estimates (joint generators, cameras, lenses, markers, in any
 stratum), its predicted pixels and residuals, and changes of its frame (thesis 5.53, 5.55 to 5.57).
 
-Joint readings are exact; raw pixels, behind the lens, carry the noise. Parameters are coordinates of the minimal
-charts of :mod:`stereoservo.kinematics.parameterization`, so that the Jacobian has full rank where the data determine
-the model.
+Raw pixels, behind the lens, carry noise; joint readings are exact unless `JointNoise` states otherwise. Parameters are
+coordinates of the minimal charts of :mod:`stereoservo.kinematics.parameterization`, so that the Jacobian has full rank
+where the data determine the model.
 """
 
 from __future__ import annotations
@@ -17,7 +17,14 @@ import numpy.typing as npt
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.distortion import bends, distort
 from stereoservo.kinematics.axes import stratum_frame
-from stereoservo.kinematics.model import CellModel, ModelCovariance, Stratum, check_model, pinhole
+from stereoservo.kinematics.model import (
+    CellModel,
+    JointAccuracy,
+    ModelCovariance,
+    Stratum,
+    check_model,
+    pinhole,
+)
 from stereoservo.kinematics.parameterization import (
     Kind,
     LensModel,
@@ -62,11 +69,42 @@ class LensPriors:
 
 
 @dataclass(frozen=True)
+class JointNoise:
+    """Standard deviations of the errors of joint readings at s stops, true minus reported position [rad or m].
+
+    ``own`` (s, n): of the part that a joint has at that stop alone. ``shared`` (s, n): index of the error that it has
+    in common with other stops at the same reading, -1 where there is none; ``deviations`` (e,) of those errors.
+    """
+
+    own: FloatArray
+    shared: IntArray
+    deviations: FloatArray
+
+
+@dataclass(frozen=True)
+class JointErrors:
+    """Estimated errors of joint readings in standard deviations: ``own`` (s, n) and ``shared`` (e,)."""
+
+    own: FloatArray
+    shared: FloatArray
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares: minus twice the logarithm of their density."""
+        return float((self.own**2).sum() + (self.shared**2).sum())
+
+    def offsets(self, noise: JointNoise) -> FloatArray:
+        """The errors (s, n) [rad or m]."""
+        common = np.append(self.shared * noise.deviations, 0.0)
+        return np.asarray(self.own * noise.own + common[noise.shared])
+
+
+@dataclass(frozen=True)
 class Measurements:
     """Raw pixels in a flat list: camera, stop and marker of each (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px].
 
-    ``offsets`` (s, n): joint positions of each stop minus the zero. ``lens_priors`` count as measurements of
-    those lenses that are free.
+    ``offsets`` (s, n): joint positions of each stop minus the zero, ``joint_errors`` included. ``lens_priors`` count as
+    measurements of those lenses that are free. ``joint_noise``: of the readings; None where they are exact.
     """
 
     offsets: FloatArray
@@ -76,6 +114,30 @@ class Measurements:
     pixels: FloatArray
     sigmas: FloatArray
     lens_priors: LensPriors | None = None
+    joint_noise: JointNoise | None = None
+    joint_errors: JointErrors | None = None
+
+    @property
+    def corrections(self) -> FloatArray:
+        """Estimated errors (s, n) [rad or m] that ``offsets`` include."""
+        if self.joint_noise is None or self.joint_errors is None:
+            return np.zeros_like(self.offsets)
+        return self.joint_errors.offsets(self.joint_noise)
+
+    def corrected(self, errors: JointErrors | None) -> Measurements:
+        """The measurements with other estimated errors of the joint readings; None: as they were reported."""
+        if errors is None and self.joint_errors is None:
+            return self
+        reported = replace(self, offsets=self.offsets - self.corrections, joint_errors=None)
+        if errors is None or self.joint_noise is None:
+            return reported
+        return replace(
+            reported, offsets=reported.offsets + errors.offsets(self.joint_noise), joint_errors=errors
+        )
+
+    def with_joint_noise(self, noise: JointNoise | None) -> Measurements:
+        """The measurements as reported, with another noise of the joint readings."""
+        return replace(self.corrected(None), joint_noise=noise)
 
     def select(self, keep: npt.NDArray[np.bool_] | IntArray) -> Measurements:
         """The measurements where ``keep`` (k,) holds, or those of the indices ``keep``."""
@@ -288,6 +350,11 @@ def with_joints_reversed(model: CellModel) -> CellModel:
     statistics = model.statistics
     if statistics is not None:
         statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])
+    accuracy = model.joint_accuracy
+    if accuracy is not None:
+        accuracy = JointAccuracy(
+            accuracy.random[::-1].copy(), accuracy.repeatable[::-1].copy(), accuracy.stated[::-1].copy()
+        )
     whole = msgspec.structs.replace(
         model,
         joint_names=model.joint_names[::-1],
@@ -296,6 +363,7 @@ def with_joints_reversed(model: CellModel) -> CellModel:
         generators=model.generators[::-1].copy(),
         statistics=statistics,
         mount="eye_in_hand",
+        joint_accuracy=accuracy,
         covariance=None if model.covariance is None else _reversed_covariance(model.covariance),
     )
     check_model(whole)

@@ -8,14 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom, rank_of, variance_factor
+from stereoservo.calibration.bundle_statistics import (
+    chi2_within,
+    degrees_of_freedom,
+)
 from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
+from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
+from stereoservo.calibration.diagnosis.input_corrections import Refit
+from stereoservo.calibration.diagnosis.joint_errors import (
+    ScalesError,
+    explains,
+    one_thing_happened,
+    scales_error,
+    wrong_scales,
+)
+from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.lens_estimation import (
@@ -29,6 +43,7 @@ from stereoservo.calibration.lens_estimation import (
 )
 from stereoservo.calibration.lens_significance import FREE_LENS, FULL_LENS, lens_test, lens_wanted
 from stereoservo.calibration.rig_model import (
+    JointNoise,
     Measurements,
     RigModel,
     common_mount,
@@ -36,12 +51,17 @@ from stereoservo.calibration.rig_model import (
     reversed_trials,
     with_joints_reversed,
 )
-from stereoservo.calibration.single_joint_fit import MIN_MARKERS, JointTrial, fit_single_joint, measurements
+from stereoservo.calibration.single_joint_fit import (
+    MIN_MARKERS,
+    fit_single_joint,
+    link_joints,
+    measurements,
+)
 from stereoservo.calibration.static_points import with_static_points
-from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, select_stratum
+from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
+from stereoservo.calibration.variance_components import VarianceComponents, estimate_components, readings
 from stereoservo.geometry.cameras import pixel_normaliser
-from stereoservo.geometry.displacements import exp_generator
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.model import Stratum
@@ -51,12 +71,14 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 Progress = Callable[[str, float], None]
 
 
-VALLEY_VARIANCE = 1.5
-"""Variance factor up to which an unconverged bundle lies in a flat valley of its cost: a direction is undetermined."""
 OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
 """Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
 FEW_OUTLIERS = 0.05
 """Share of outliers that may still change in a bundle that has not converged."""
+WILD = 100.0
+"""Squared residual over the median from which a pixel of the linked joints is a wrong one."""
+SCALE_ROUNDS = 3
+"""Times that scales are removed from the readings and estimated again."""
 MIN_SIGHTINGS = 2
 """Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 
@@ -87,22 +109,137 @@ def fit_model(
     chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
     priors = lens_priors or {}
 
+    def fit(data: TrialData, chosen: FitOptions, joint_errors: bool = False) -> _Fitted:
+        return _fit(data, epoch, created, progress or _silent, chosen, priors, None, joint_errors)
+
     def refit(data: TrialData, chosen: FitOptions) -> CalibrationFit:
-        return _fit(data, epoch, created, _silent, chosen, priors)
+        return _fit(data, epoch, created, _silent, chosen, priors).fit
 
     check_motions(chain)
+    first, noisy = _first_fit(chain, options, fit)
+    if noisy is not None and not noisy.doubtful:
+        result, notes = noisy.fit, review_notes(chain, noisy.fit, refit, options)
+    else:
+
+        def others() -> CalibrationFit | None:
+            return _from_other_lenses(chain, epoch, created, options)
+
+        try:
+            result, notes = _with_exact_joints(chain, options, priors, first, refit, others)
+        except CalibrationError:
+            if noisy is None:
+                raise
+            result, notes = noisy.fit, ()
+        statistics = result.model.statistics
+        if noisy is not None and statistics is not None and not statistics.chi2_ok:
+            result, notes = noisy.fit, review_notes(chain, noisy.fit, refit, options)
+    model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
+    model, of_scene = with_static_points(model, trials.static)
+    report = msgspec.structs.replace(
+        result.report,
+        notes=(*result.report.notes, *notes, *of_scene),
+        untested=untested(chain),
+    )
+    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+
+
+class _Fitted(NamedTuple):
+    """A fit, whether its joint readings have errors, and whether these rather look like one event."""
+
+    fit: CalibrationFit
+    joint_errors: bool = False
+    doubtful: bool = False
+
+
+class _JointErrorsError(Exception):
+    """Errors of the joint readings seemed to explain the data, and do not."""
+
+
+_FitOfTrials = Callable[[TrialData, FitOptions, bool], _Fitted]
+
+
+def _first_fit(
+    chain: TrialData, options: FitOptions, fit: _FitOfTrials
+) -> tuple[Callable[[], CalibrationFit], _Fitted | None]:
+    """The fit with exact joint readings, to be called, and that with errors of these where they explain the data.
+
+    Raises CalibrationError (``wrong_scale``) for scales that are wrong beside such errors.
+    """
+
+    def exact() -> CalibrationFit:
+        return fit(chain, options, False).fit
+
+    try:
+        tried = fit(chain, options, True)
+    except _JointErrorsError:
+        return exact, None
+    except ScalesError as wrong:
+        return _told_by_scales(chain, wrong, exact, lambda data: fit(data, options, True)), None
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+        failure = error
+
+        def failed() -> CalibrationFit:
+            raise failure
+
+        return failed, None
+    return (exact, tried) if tried.joint_errors else (lambda: tried.fit, None)
+
+
+def _told_by_scales(
+    chain: TrialData,
+    wrong: ScalesError,
+    exact: Callable[[], CalibrationFit],
+    fit: Callable[[TrialData], _Fitted],
+) -> Callable[[], CalibrationFit]:
+    """The fit with ``exact`` joint readings, to be called. Raises CalibrationError (``wrong_scale``) where the trials
+    fit to the noise with the scales removed, and do not with exact readings.
+    """
+    factors, components = wrong.factors, wrong.components
+    for _ in range(SCALE_ROUNDS):
+        try:
+            mended = fit(with_scales_removed(chain, factors)).fit
+            break
+        except ScalesError as more:
+            factors, components = factors * more.factors, more.components
+        except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
+            return exact
+    else:
+        return exact
+    statistics = mended.model.statistics
+    if statistics is None or not statistics.chi2_ok or (factors == 1.0).all():
+        return exact
+    try:
+        plain = exact()
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+        raise scales_error(chain, factors, components) from wrong
+    if plain.model.statistics is not None and plain.model.statistics.chi2_ok:
+        return lambda: plain
+    raise scales_error(chain, factors, components) from wrong
+
+
+def _with_exact_joints(
+    chain: TrialData,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+    first: Callable[[], CalibrationFit],
+    refit: Refit,
+    others: Callable[[], CalibrationFit | None],
+) -> tuple[CalibrationFit, tuple[str, ...]]:
+    """The ``first`` fit, or one of ``others``, from other lenses, with notes. Raises CalibrationError with the cause
+    where there is none.
+    """
 
     def otherwise(cause: CalibrationError) -> CalibrationFit:
         """The fit from other lenses where one explains the data; else ``cause`` is raised."""
         free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
         bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
-        found = _from_other_lenses(chain, epoch, created, options) if bent else None
+        found = others() if bent else None
         if found is None:
             raise cause
         return found
 
     try:
-        result = _fit(chain, epoch, created, progress or _silent, options, priors)
+        result = first()
     except CalibrationError as error:
         result = otherwise(diagnose_failure(chain, error, refit, options))
     except (GeometryError, np.linalg.LinAlgError) as error:
@@ -119,14 +256,37 @@ def fit_model(
     except CalibrationError as cause:
         result = otherwise(cause)
         notes = review_notes(chain, result, refit, options)
-    model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
-    model, of_scene = with_static_points(model, trials.static)
-    report = msgspec.structs.replace(
-        result.report,
-        notes=(*result.report.notes, *notes, *of_scene),
-        untested=untested(chain),
-    )
-    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+    return result, notes
+
+
+class _Start(NamedTuple):
+    """Trials without rare markers, the linked joints, all measurements and the ``clean`` ones among them, and whether
+    the lens model is ``decided`` before the data.
+    """
+
+    trials: TrialData
+    zero: FloatArray
+    linked: Solution
+    every: Measurements
+    clean: Measurements
+    lenses: LensModel
+    decided: bool
+    markers_left_out: tuple[int, ...]
+
+    def with_joint_noise(self, noise: JointNoise) -> _Start:
+        """The same with noise of the joint readings."""
+        return self._replace(
+            every=self.every.with_joint_noise(noise), clean=self.clean.with_joint_noise(noise)
+        )
+
+
+class _Bundles(NamedTuple):
+    """The ``projective`` bundle, the one of the stratum ``raised`` from it, the ``final`` one and its inliers (k,)."""
+
+    projective: Solution
+    raised: StratumSelection
+    final: Solution
+    inliers: BoolArray
 
 
 def _fit(
@@ -137,8 +297,54 @@ def _fit(
     options: FitOptions,
     priors: Mapping[str, LensEstimate],
     bend: float | None = None,
-) -> CalibrationFit:
-    """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from."""
+    joint_errors: bool = False,
+) -> _Fitted:
+    """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from;
+    ``joint_errors``: where the data show them, the joint readings have errors.
+
+    Raises CalibrationError, and where joint readings have errors _JointErrorsError, ScalesError.
+    """
+    start = _start(trials, report_progress, options, priors, bend)
+    components, doubtful = None, False
+    found = _components_at_start(start) if joint_errors else None
+    if found is not None:
+        start, bundles, components, doubtful = _bundles_with_joint_errors(
+            start, found, report_progress, options
+        )
+    else:
+        bundles = _bundles(start, report_progress, options)
+        if joint_errors:
+            refined = _refined_by_joint_errors(start, bundles, options)
+            if refined is not None:
+                start, bundles, components, doubtful = refined
+    report_progress("report", 0.95)
+    result = build_fit(
+        start.trials,
+        bundles.final,
+        start.every,
+        bundles.inliers,
+        start.zero,
+        bundles.raised.plane,
+        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
+        epoch=epoch,
+        created=created,
+        notes=bundles.raised.notes,
+        projective=(bundles.projective.cost, degrees_of_freedom(bundles.projective)),
+        markers_left_out=start.markers_left_out,
+        components=components,
+    )
+    report_progress("done", 1.0)
+    return _Fitted(result, components is not None, doubtful)
+
+
+def _start(
+    trials: TrialData,
+    report_progress: Progress,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+    bend: float | None,
+) -> _Start:
+    """Initial reconstruction, single-joint fits and linked joints. Raises CalibrationError."""
     report_progress("cameras", 0.0)
     lenses, lens_model = starting_lenses(trials, options.lens, priors, bend)
     cameras, points, usable = initial_reconstruction(undistorted(trials, lenses))
@@ -157,12 +363,20 @@ def _fit(
     )
     clean = every.select(usable[every.camera, every.stop, every.marker])
     linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
-    report_progress("rigid bundle", 0.6)
     decided = options.lens != "auto" or bool(priors) or bend is not None
-    solution, inliers = _projective(linked.rig, clean, every, lens_model, options, decided)
-    _refuse_poor_fit(trials, solution, every, inliers, options)
+    return _Start(trials, zero, linked, every, clean, lens_model, decided, left_out)
+
+
+def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _Bundles:
+    """Projective bundle, stratum, final bundle. Raises CalibrationError."""
+    report_progress("rigid bundle", 0.6)
+    trials, every = start.trials, start.every
+    solution, inliers = _projective(
+        start.linked.rig, start.clean, every, start.lenses, options, start.decided
+    )
+    refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
-    raised = select_stratum(solution, every.select(inliers), options)
+    raised = select_stratum(solution, _inside(every, solution, inliers), options)
     final, inliers = refine_to_convergence(
         raised.solution.rig, every, raised.solution.stratum, options, solution.lenses
     )
@@ -174,29 +388,87 @@ def _fit(
             break
         # Only the constraints of the higher stratum have separated distortion from kinematics.
         solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, wanted, 1e-6)
-        raised = select_stratum(solution, every.select(inliers), options)
+        raised = select_stratum(solution, _inside(every, solution, inliers), options)
         final, inliers = refine_to_convergence(
             raised.solution.rig, every, raised.solution.stratum, options, wanted
         )
-    _refuse_poor_fit(trials, final, every, inliers, options)
-    _refuse_undetermined(final, raised.notes)
-    report_progress("report", 0.95)
-    result = build_fit(
-        trials,
-        final,
-        every,
-        inliers,
-        zero,
-        raised.plane,
-        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
-        epoch=epoch,
-        created=created,
-        notes=raised.notes,
-        projective=(solution.cost, degrees_of_freedom(solution)),
-        markers_left_out=left_out,
-    )
-    report_progress("done", 1.0)
-    return result
+    refuse_poor_fit(trials, final, every, inliers, options)
+    refuse_undetermined(final, raised.notes)
+    return _Bundles(solution, raised, final, inliers)
+
+
+def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Measurements:
+    """The inliers, with the errors of the joints as in ``solution``."""
+    return every.corrected(solution.data.joint_errors).select(inliers)
+
+
+def _components_at_start(start: _Start) -> VarianceComponents | None:
+    """Significant variance components of the linked joints, with cameras free; None where there are none."""
+    rig, clean = start.linked.rig, start.clean
+    free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
+    if chi2_within(free.cost, degrees_of_freedom(free)):
+        return None
+    # Wrong pixels would be taken for errors of the joints; those of a stop as a whole would not be seen.
+    squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+    near = squares <= WILD * max(1.0, float(np.median(squares)))
+    free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
+    found = estimate_components(free, readings(start.trials.positions), scales=True)
+    return found if found is not None and found.significant else None
+
+
+def _bundles_with_joint_errors(
+    start: _Start, found: VarianceComponents, report_progress: Progress, options: FitOptions
+) -> tuple[_Start, _Bundles, VarianceComponents, bool]:
+    """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError where
+    they do not explain the data, ScalesError.
+    """
+    labels = readings(start.trials.positions)
+    factors = wrong_scales(start.trials, found)
+    if (factors != 1.0).any():
+        raise ScalesError(factors, found)
+    try:
+        noisy = start.with_joint_noise(found.noise(labels))
+        first = _bundles(noisy, report_progress, options)
+        better = _refined_by_joint_errors(noisy, first, options, found)
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+        raise _JointErrorsError from error
+    if better is None:
+        raise _JointErrorsError
+    return better
+
+
+def _refined_by_joint_errors(
+    start: _Start, bundles: _Bundles, options: FitOptions, near: VarianceComponents | None = None
+) -> tuple[_Start, _Bundles, VarianceComponents, bool] | None:
+    """The final bundle whitened by the variance components that it shows, until these stay the same, and whether
+    they look like one event; None where errors of the joints do not explain it. Raises ScalesError.
+    """
+    labels = readings(start.trials.positions)
+    final, inliers = bundles.final, bundles.inliers
+    beside = estimate_components(final, labels, scales=True, near=near)
+    if beside is None or not beside.significant:
+        return None
+    factors = wrong_scales(start.trials, beside)
+    if (factors != 1.0).any():
+        raise ScalesError(factors, beside)
+    components = estimate_components(final, labels, scales=False, near=beside)
+    for _ in range(2):
+        if components is None:
+            return None
+        noisy = start.with_joint_noise(components.noise(labels))
+        final, inliers = refine_to_convergence(
+            final.rig, noisy.every, final.stratum, options, final.lenses, inliers=inliers
+        )
+        before = components
+        components = estimate_components(final, labels, scales=False, near=before)
+        if components is not None and components.like(before):
+            components = before
+            break
+    if components is None or not explains(start.trials, final, inliers, components):
+        return None
+    refuse_undetermined(final, bundles.raised.notes)
+    doubtful = one_thing_happened(start.trials, final)
+    return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
 
 
 def _from_other_lenses(
@@ -207,7 +479,7 @@ def _from_other_lenses(
     """
     for bend in STARTING_BENDS:
         try:
-            result = _fit(trials, epoch, created, _silent, options, {}, bend)
+            result = _fit(trials, epoch, created, _silent, options, {}, bend).fit
         except (CalibrationError, GeometryError, np.linalg.LinAlgError):
             continue  # not from there
         statistics = result.model.statistics
@@ -228,7 +500,8 @@ def _projective(
     robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
     for _ in range(2 if options.lens == "auto" else 0):
         # Before anything is called an outlier: distortion makes many of them.
-        inside = every.select(inlier_mask(robust.rig, every, options))
+        here = every.corrected(robust.data.joint_errors)
+        inside = here.select(inlier_mask(robust.rig, here, options))
         wanted = lens_wanted(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
         if wanted == lenses:
             break
@@ -238,6 +511,7 @@ def _projective(
         )
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.
+    every = every.corrected(robust.data.joint_errors)
     solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
     if decided or lens_test(solution).distorted == (lenses != "none"):
         return solution, inliers
@@ -277,42 +551,6 @@ def _without_rare_markers(
     return kept, points[:, often], usable[:, :, often], left_out
 
 
-def link_joints(
-    trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
-) -> RigModel:
-    """Rig of all joints, base to tip: generators transformed from their trials' bases to one zero (5.21), one
-    marker structure (5.53).
-
-    Raises CalibrationError (``too_few_markers``) for a marker that no trial shows.
-    """
-    kinds = trials.joint_kinds
-    generators = np.zeros((len(kinds), 4, 4))
-    for j, trial in enumerate(separate):
-        moved = _chain(kinds[:j], generators[:j], trial.base[:j] - zero[:j])
-        generators[j] = np.linalg.inv(moved) @ trial.generator @ moved
-    # Every trial has seen the markers in its own base configuration; take them all to the zero.
-    clouds = np.array(
-        [trial.points @ np.linalg.inv(_chain(kinds, generators, trial.base - zero)).T for trial in separate]
-    )
-    clouds /= clouds[:, :, 2:3]
-    points = np.empty((len(trials.marker_ids), 4))
-    for i, marker in enumerate(trials.marker_ids):
-        seen = clouds[np.isfinite(clouds[:, i]).all(axis=1), i]
-        if not len(seen):
-            raise CalibrationError(
-                "too_few_markers", f"marker {marker} is shown by no joint's usable stops", marker=marker
-            )
-        points[i] = np.median(seen, axis=0)
-    return RigModel(kinds, generators, cameras, points)
-
-
-def _chain(kinds: tuple[str, ...], generators: FloatArray, offsets: FloatArray) -> FloatArray:
-    product = np.eye(4)
-    for kind, generator, offset in zip(kinds, generators, offsets, strict=True):
-        product = product @ exp_generator(kind, generator, offset)
-    return product
-
-
 def refine_to_convergence(
     rig: RigModel,
     every: Measurements,
@@ -320,15 +558,19 @@ def refine_to_convergence(
     options: FitOptions,
     lenses: LensModel,
     tolerance: float = 1e-10,
+    inliers: BoolArray | None = None,
 ) -> tuple[Solution, BoolArray]:
-    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same.
+    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same, from
+    ``inliers`` on, or those of ``rig``.
 
     Whether the last solution has converged is for the caller to judge. Raises CalibrationError
     (``no_convergence``).
     """
-    inliers = inlier_mask(rig, every, options)
+    if inliers is None:
+        inliers = inlier_mask(rig, every, options)
     for _ in range(8):
         solution = solve(rig, every.select(inliers), stratum, lenses=lenses, tolerance=tolerance)
+        every = every.corrected(solution.data.joint_errors)
         again = inlier_mask(solution.rig, every, options)
         rig = solution.rig
         if np.array_equal(again, inliers):
@@ -358,91 +600,3 @@ def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> Bool
     factor = max(1.0, float(np.median(squares)) / np.log(4.0))
     inside: BoolArray = squares <= options.outlier_chi2 * factor
     return inside
-
-
-def _refuse_poor_fit(
-    trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
-) -> None:
-    share = float((~inliers).mean())
-    if share > options.max_outliers:
-        raise CalibrationError(
-            "too_many_outliers",
-            f"{share:.0%} of the pixels do not fit the {solution.stratum} model; at most "
-            f"{options.max_outliers:.0%} may",
-            share=share,
-            maximum=options.max_outliers,
-        )
-    for j, name in enumerate(trials.joint_names):
-        own = trials.trials[every.stop] == j
-        lost = float((~inliers[own]).mean()) if own.any() else 0.0
-        if lost > options.max_trial_outliers:
-            raise CalibrationError(
-                "too_many_outliers",
-                f"{lost:.0%} of the pixels of joint {name!r}'s trial do not fit the {solution.stratum} "
-                f"model; at most {options.max_trial_outliers:.0%} may. Are its positions right, did only "
-                "it move?",
-                joint=name,
-                share=lost,
-                maximum=options.max_trial_outliers,
-            )
-    data = every.select(inliers)
-    if degrees_of_freedom(solution) <= 0:
-        raise CalibrationError(
-            "too_few_stops",
-            f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or "
-            "markers are needed",
-            measurements=solution.rows,
-            parameters=solution.charts.size,
-        )
-    factor = float(np.sqrt(variance_factor(solution)))
-    if factor > options.max_sigma_factor:
-        squares = (solution.residuals.reshape(-1, 2) ** 2).sum(axis=1)
-        of_stop = trials.trials[data.stop]
-        per_joint = {
-            name: float(np.sqrt(squares[of_stop == j].mean() / 2))
-            for j, name in enumerate(trials.joint_names)
-            if (of_stop == j).any()
-        }
-        worst = max(per_joint, key=lambda name: per_joint[name])
-        raise CalibrationError(
-            "residual_above_floor",
-            f"residuals are {factor:.3g} times the stated sigmas; at most {options.max_sigma_factor:g} "
-            f"allowed. Worst is joint {worst!r} ({per_joint[worst]:.3g})",
-            sigma_factor=factor,
-            maximum=options.max_sigma_factor,
-            joints=per_joint,
-        )
-
-
-def _refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
-    """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
-    rank = rank_of(solution)
-    because = f" ({'; '.join(notes)})" if notes else ""
-    if rank < solution.charts.size:
-        raise CalibrationError(
-            "not_identifiable",
-            f"the trials determine {rank} of {solution.charts.size} parameters of the {solution.stratum} "
-            f"model{because}; markers off one plane, more stops or larger motions are needed",
-            rank=rank,
-            parameters=solution.charts.size,
-            notes=notes,
-        )
-    if solution.converged:
-        return
-    factor = variance_factor(solution)
-    if factor < VALLEY_VARIANCE:
-        raise CalibrationError(
-            "not_identifiable",
-            f"the {solution.stratum} model fits, but the trials leave a direction of it open{because}; markers "
-            "off one plane, more stops or larger motions are needed",
-            stratum=solution.stratum,
-            notes=notes,
-        )
-    raise CalibrationError(
-        "no_convergence",
-        f"the {solution.stratum} bundle did not converge in {solution.evaluations} evaluations{because}; "
-        f"residual {np.sqrt(factor):.3g} sigmas",
-        stratum=solution.stratum,
-        evaluations=solution.evaluations,
-        notes=notes,
-    )

@@ -22,6 +22,7 @@ from stereoservo.calibration.generator_initialization import (
 )
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
+from stereoservo.geometry.displacements import exp_generator
 from stereoservo.kinematics.parameterization import Kind
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -407,3 +408,39 @@ def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
 
 def _unit(trials: TrialData, joint: int) -> str:
     return "rad" if trials.joint_kinds[joint] == "revolute" else "m"
+
+
+def link_joints(
+    trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
+) -> RigModel:
+    """Rig of all joints, base to tip: generators transformed from their trials' bases to one zero (5.21), one
+    marker structure (5.53).
+
+    Raises CalibrationError (``too_few_markers``) for a marker that no trial shows.
+    """
+    kinds = trials.joint_kinds
+    generators = np.zeros((len(kinds), 4, 4))
+    for j, trial in enumerate(separate):
+        moved = _chain(kinds[:j], generators[:j], trial.base[:j] - zero[:j])
+        generators[j] = np.linalg.inv(moved) @ trial.generator @ moved
+    # Every trial has seen the markers in its own base configuration; take them all to the zero.
+    clouds = np.array(
+        [trial.points @ np.linalg.inv(_chain(kinds, generators, trial.base - zero)).T for trial in separate]
+    )
+    clouds /= clouds[:, :, 2:3]
+    points = np.empty((len(trials.marker_ids), 4))
+    for i, marker in enumerate(trials.marker_ids):
+        seen = clouds[np.isfinite(clouds[:, i]).all(axis=1), i]
+        if not len(seen):
+            raise CalibrationError(
+                "too_few_markers", f"marker {marker} is shown by no joint's usable stops", marker=marker
+            )
+        points[i] = np.median(seen, axis=0)
+    return RigModel(kinds, generators, cameras, points)
+
+
+def _chain(kinds: tuple[str, ...], generators: FloatArray, offsets: FloatArray) -> FloatArray:
+    product = np.eye(4)
+    for kind, generator, offset in zip(kinds, generators, offsets, strict=True):
+        product = product @ exp_generator(kind, generator, offset)
+    return product

@@ -1,5 +1,6 @@
 """Propagation of a model's covariance to quantities that do not depend on its projective frame, such as axis angles,
-intrinsics or predicted pixels: covariances and standard deviations.
+intrinsics or predicted pixels: covariances and standard deviations. Those of predicted pixels contain the errors of the
+joint readings.
 
 A quantity is a function of the model: an angle between axes, an intrinsic parameter through
 ``projective_to_euclidean``, a predicted pixel. Its derivative is taken along the principal axes of the covariance, a
@@ -13,12 +14,18 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
+from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.kinematics.parameterization import conjugation
 from stereoservo.numerics.arrays import FloatArray
 
 STEP = 0.01
 """Standard deviations to either side over which derivatives are taken."""
+
+
+JOINT_STEP = 1e-5
+"""Change of a joint's position [rad or m] to either side over which derivatives by it are taken."""
 
 
 class NoCovarianceError(ValueError):
@@ -92,6 +99,39 @@ def standard_deviations(model: CellModel, function: Callable[[CellModel], FloatA
     if model.covariance is None:
         return None
     return np.asarray(np.sqrt(np.diag(propagated(model, function)[1])))
+
+
+def predicted_pixels(model: CellModel, positions: FloatArray) -> FloatArray:
+    """Raw pixels (c, s, m, 2) of the markers at joint ``positions`` (s, n), inside the image or not."""
+    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, tip_first=model.tip_first)
+    points = np.array([model.marker_points @ chain.displacement(q).T for q in positions])
+    pixels = []
+    for camera in model.cameras:
+        images = points @ camera.matrix.T
+        pixels.append(distort(camera.lens, images[..., :2] / images[..., 2:]))
+    return np.array(pixels)
+
+
+def pixel_covariances(model: CellModel, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Predicted raw pixels (c, s, m, 2) at reported joint ``positions`` (s, n), and their covariances (c, s, m, 2, 2)
+    [px²] about what is there: of the model's parameters, and of the joint readings, ``J Cov Jᵀ + J_q S_q J_qᵀ``.
+
+    To first order; without the noise of a measurement. Raises NoCovarianceError.
+    """
+    positions = np.asarray(positions, dtype=np.float64)
+    slopes = [
+        (predicted_pixels(displaced_model(model, STEP * axis), positions)
+         - predicted_pixels(displaced_model(model, -STEP * axis), positions)) / (2.0 * STEP)
+        for axis in covariance_axes(model).T
+    ]  # fmt: skip
+    if model.joint_accuracy is not None:
+        for joint, deviation in enumerate(model.joint_accuracy.stated):
+            shift = np.zeros(positions.shape[1])
+            shift[joint] = JOINT_STEP
+            ends = [predicted_pixels(model, positions + sign * shift) for sign in (1.0, -1.0)]
+            slopes.append((ends[0] - ends[1]) * (deviation / (2.0 * JOINT_STEP)))
+    stacked = np.array(slopes)
+    return predicted_pixels(model, positions), np.einsum("pcsma,pcsmb->csmab", stacked, stacked)
 
 
 def covariance_axes(model: CellModel) -> FloatArray:

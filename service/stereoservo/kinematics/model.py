@@ -92,6 +92,20 @@ class JointLoads(msgspec.Struct, frozen=True, eq=False):
     following_errors: FloatArray | None = None
 
 
+class JointAccuracy(msgspec.Struct, frozen=True, eq=False):
+    """Standard deviations (n,) of the errors of joint readings, true minus reported [rad or m], as the trials show
+    them.
+
+    ``random``: changes from stop to stop. ``repeatable``: the same whenever the joint reads the same (gear ripple, play
+    driven from one side, sag). ``stated``: of both together at a reading that the trials have not seen, larger than
+    their root sum of squares by what the estimates leave open.
+    """
+
+    random: FloatArray
+    repeatable: FloatArray
+    stated: FloatArray
+
+
 class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
     """Covariance of all free parameters of a model, with the direction of each, in the model's projective frame.
 
@@ -173,6 +187,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     scene_covariances: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4, 4)))
     marker_groups: tuple[MarkerGroup, ...] | None = None
     """Coplanar groups of its markers; None where they have not been looked for."""
+    joint_accuracy: JointAccuracy | None = None
+    """Errors of the joint readings; None where none are known: predictions then take them for exact."""
 
     @property
     def tip_first(self) -> bool:
@@ -271,6 +287,8 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         _check_covariance(model, model.covariance, path)
     if model.loads is not None:
         check_loads(model.loads, n, path)
+    if model.joint_accuracy is not None:
+        _check_accuracy(model.joint_accuracy, n, path)
     _check_scene(model, path)
     for k, group in enumerate(model.marker_groups or ()):
         if len(set(group.triple)) < 3 or not {*group.triple} <= {*group.members} <= {*range(m)}:
@@ -306,6 +324,22 @@ def check_loads(loads: JointLoads, n: int, path: Path | str = "<loads>") -> None
             )
     if (loads.efforts is None) != (loads.largest_efforts is None):
         raise ModelFileError(path, "loads", "has one of efforts and largest_efforts; both or none are needed")
+
+
+def _check_accuracy(given: JointAccuracy, n: int, path: Path | str) -> None:
+    for key, array in (
+        ("random", given.random),
+        ("repeatable", given.repeatable),
+        ("stated", given.stated),
+    ):
+        if array.shape != (n,):
+            raise ModelFileError(path, f"joint_accuracy.{key}", f"has shape {array.shape}; {(n,)} is needed")
+        if not (np.isfinite(array) & (array >= 0.0)).all():
+            raise ModelFileError(
+                path,
+                f"joint_accuracy.{key}",
+                "has entries that are negative or not finite; deviations are needed",
+            )
 
 
 def _check_cameras(model: CellModel, path: Path | str) -> None:

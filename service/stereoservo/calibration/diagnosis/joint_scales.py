@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.joint_noise import orthogonal_factor
 from stereoservo.calibration.lens_significance import scale_columns
-from stereoservo.calibration.normal_equations import arrow_factor
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.single_joint_fit import (
     VirtualObservations,
@@ -165,7 +165,7 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
     if not joints:
         return ()
-    factor = arrow_factor(solution.rig, solution.charts, solution.data, scale_columns(solution, joints))
+    factor = orthogonal_factor(solution.rig, solution.charts, solution.data, scale_columns(solution, joints))
     # What the other parameters can imitate of a factor is theirs.
     at = solution.charts.start(3)
     moments, rest = factor.core[at:, at:-1], factor.core[at:, -1]

@@ -1,0 +1,296 @@
+"""Least squares with errors in the joint readings: rows whitened stop by stop by ``J_q S_q J_qᵀ + S_px``, normal
+equations, orthogonal factor and leverages (a linear mixed model; Searle, Casella, McCulloch, 2006, ch. 7).
+
+Errors of a stop's own are eliminated within the stop; errors that stops share are columns beside the parameters. What a
+stop's pixels have in common couples its markers, so that these are no longer eliminated one by one: rows are dense.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from stereoservo.calibration.normal_equations import (
+    ArrowFactor,
+    Weights,
+    arrow_factor,
+    by_stop,
+    chunks,
+    leverages,
+    prior_rows,
+)
+from stereoservo.calibration.rig_model import Charts, JointErrors, Measurements, RigModel, partial_products
+from stereoservo.geometry.distortion import bends, distortion_jacobian
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+
+def joint_columns(rig: RigModel, data: Measurements) -> FloatArray:
+    """Derivatives (2 k, n) of the weighted residuals by the positions of the joints at each measurement's stop."""
+    stops, stop = np.unique(data.stop, return_inverse=True)
+    before, after = partial_products(rig, data.offsets[stops])
+    turns = before[:-1] @ rig.generators[:, None] @ after[:-1]
+    shifts = np.einsum("jsab,mb->sjma", turns, rig.points)[stop, :, data.marker]
+    world = np.einsum("sab,mb->sma", after[0], rig.points)[stop, data.marker]
+    matrices = rig.cameras[data.camera]
+    ray = np.einsum("kca,ka->kc", matrices, world)
+    ideal = ray[:, :2] / ray[:, 2:]
+    change = np.einsum("kca,kja->kjc", matrices, shifts)
+    slopes = (change[:, :, :2] - ideal[:, None] * change[:, :, 2:]) / ray[:, None, 2:]
+    for camera, lens in enumerate(rig.lenses):
+        mine = data.camera == camera
+        if bends(lens):
+            slopes[mine] = np.einsum("kab,kjb->kja", distortion_jacobian(lens, ideal[mine]), slopes[mine])
+    slopes /= data.sigmas[:, None, None]
+    return np.ascontiguousarray(slopes.transpose(0, 2, 1)).reshape(2 * len(data.camera), -1)
+
+
+class StopRows(NamedTuple):
+    """Weighted rows of one stop: ``joints`` (2 k, n) by its joints' positions, ``rows`` (2 k, p + 1) by the parameters
+    and the residuals at the reported positions, to first order. ``measurements``: where they are in the sorted data.
+    """
+
+    stop: int
+    measurements: slice
+    joints: FloatArray
+    rows: FloatArray
+
+
+def stop_rows(
+    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None = None
+) -> Iterator[StopRows]:
+    """Rows of ``data``, sorted by :func:`by_stop`, one stop after the other."""
+    corrections = data.corrections
+    edges = [*np.flatnonzero(np.diff(data.stop, prepend=-1)).tolist(), len(data.stop)]
+    first, ends = 0, iter(edges[1:])
+    end = next(ends, 0)
+    rows, joints = np.zeros((0, charts.size + 1)), np.zeros((0, len(rig.kinds)))
+    for here, block in chunks(rig, charts, data):
+        # A chunk may end within a stop, whose rest comes with the next one.
+        rows = np.vstack([rows, block.dense(len(rig.points))])
+        joints = np.vstack([joints, joint_columns(rig, data.select(np.arange(here.start, here.stop)))])
+        while first < end <= here.stop:
+            count, stop = 2 * (end - first), int(data.stop[first])
+            mine, turns = rows[:count], joints[:count]
+            rows, joints = rows[count:], joints[count:]
+            if weights is not None:
+                root = np.sqrt(weights(mine[:, -1] ** 2))[:, None]
+                mine, turns = mine * root, turns * root
+            mine[:, -1] -= turns @ corrections[stop]
+            yield StopRows(stop, slice(first, end), turns, mine)
+            first, end = end, next(ends, 0)
+
+
+class _Whitened(NamedTuple):
+    """A stop's rows (2 k, e + p + 1), by shared errors, parameters and residual, whitened of its own errors; ``basis``
+    (2 k, n) of what these span, ``triangle`` (n, n) their columns in it, ``projected`` (n, e + p + 1) the rows in it
+    before, ``shrink`` (n, n) of the projected rows.
+    """
+
+    rows: FloatArray
+    basis: FloatArray
+    triangle: FloatArray
+    projected: FloatArray
+    shrink: FloatArray
+
+
+def _whitened(one: StopRows, data: Measurements) -> _Whitened:
+    noise = data.joint_noise
+    assert noise is not None
+    e = len(noise.deviations)
+    rows = np.zeros((len(one.rows), e + one.rows.shape[1]))
+    rows[:, e:] = one.rows
+    common = noise.shared[one.stop]
+    for joint in np.flatnonzero(common >= 0):
+        rows[:, common[joint]] += noise.deviations[common[joint]] * one.joints[:, joint]
+    basis, triangle = np.linalg.qr(one.joints * noise.own[one.stop])
+    values, vectors = np.linalg.eigh(np.eye(len(triangle)) + triangle @ triangle.T)
+    shrink = np.eye(len(triangle)) - (vectors / np.sqrt(values)) @ vectors.T
+    projected = basis.T @ rows
+    rows -= basis @ (shrink @ projected)
+    return _Whitened(rows, basis, triangle, projected, shrink)
+
+
+@dataclass(frozen=True)
+class StopEquations:
+    """Normal matrix (e + p + 1, e + p + 1) of whitened rows, columns of ``sizes`` (p,) scaled to unit length, shared
+    errors first and residuals last; what each stop's own errors follow from; ``cost`` at the present errors.
+    """
+
+    matrix: FloatArray
+    sizes: FloatArray
+    cost: float
+    stops: tuple[tuple[int, FloatArray, FloatArray], ...]
+    data: Measurements
+
+    @cached_property
+    def _marginal(self) -> FloatArray:
+        """The normal matrix (p + 1, p + 1) with the shared errors eliminated."""
+        e = len(self.matrix) - len(self.sizes) - 1
+        if not e:
+            return self.matrix
+        half = np.linalg.solve(np.linalg.cholesky(self.matrix[:e, :e]), self.matrix[:e, e:])
+        return np.asarray(self.matrix[e:, e:] - half.T @ half)
+
+    @property
+    def gradient(self) -> FloatArray:
+        """Gradient (p + 1,) on unit columns; its last entry is what other errors of the joints alone would gain."""
+        gain = self.cost - self._marginal[-1, -1]
+        return np.append(self._marginal[:-1, -1], max(gain, 0.0) / max(self.cost, 1.0))
+
+    def step(self, damping: float) -> tuple[FloatArray, float]:
+        """Damped step (p,), not on unit columns, and the decrease it predicts. Raises LinAlgError."""
+        matrix, gradient = self._marginal[:-1, :-1], self._marginal[:-1, -1]
+        root = np.linalg.cholesky(matrix + damping * np.eye(len(matrix)))
+        x = -np.linalg.solve(root.T, np.linalg.solve(root, gradient))
+        least = self._marginal[-1, -1] + 2.0 * float(gradient @ x) + float(x @ matrix @ x)
+        return x / self.sizes, self.cost - least
+
+    def errors(self, x: FloatArray) -> JointErrors:
+        """Errors of the joints after a step ``x`` (p,), to first order."""
+        e = len(self.matrix) - len(self.sizes) - 1
+        step = np.append(x * self.sizes, 1.0)
+        shared = -np.linalg.solve(self.matrix[:e, :e], self.matrix[:e, e:] @ step) if e else np.zeros(0)
+        whole = np.concatenate([shared, x, [1.0]])
+        own = np.zeros_like(self.data.offsets)
+        for stop, triangle, projected in self.stops:
+            information = np.eye(triangle.shape[1]) + triangle.T @ triangle
+            own[stop] = -np.linalg.solve(information, triangle.T @ (projected @ whole))
+        return JointErrors(own, shared)
+
+
+def stop_equations(
+    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
+) -> StopEquations:
+    """Normal equations of sorted ``data`` with joint noise; ``weights`` as for `normal_equations`."""
+    assert data.joint_noise is not None
+    e, p = len(data.joint_noise.deviations), charts.size
+    matrix = np.zeros((e + p + 1, e + p + 1))
+    matrix[np.arange(e), np.arange(e)] = 1.0
+    corrections, cost, stops = data.corrections, 0.0, []
+    for one in stop_rows(rig, charts, data, weights):
+        present = one.rows[:, -1] + one.joints @ corrections[one.stop]
+        cost += float(present @ present)
+        white = _whitened(one, data)
+        matrix += white.rows.T @ white.rows
+        stops.append((one.stop, white.triangle, white.projected))
+    prior = prior_rows(rig, charts, data)
+    matrix[e:, e:] += prior.T @ prior
+    cost += float((prior[:, -1] ** 2).sum()) + (0.0 if data.joint_errors is None else data.joint_errors.cost)
+    sizes = np.sqrt(np.diag(matrix)[e:-1])
+    sizes[sizes == 0.0] = 1.0
+    scale = np.concatenate([np.ones(e), sizes, [1.0]])
+    return StopEquations(matrix / np.outer(scale, scale), sizes, cost, tuple(stops), data)
+
+
+@dataclass(frozen=True)
+class StopFactor:
+    """Orthogonal factor ``triangle`` (p + 1, p + 1) of whitened rows and residuals, the columns of ``markers`` first:
+    the counterpart of `ArrowFactor` where the joints have noise.
+    """
+
+    triangle: FloatArray
+    markers: int
+
+    @property
+    def core(self) -> FloatArray:
+        """The triangle of generators, cameras, lenses and residuals with the markers eliminated."""
+        return self.triangle[self.markers :, self.markers :]
+
+    def without(self, columns: IntArray) -> StopFactor:
+        """The factor without these ``columns`` of generators, cameras and lenses: with them kept fixed."""
+        if not len(columns):
+            return self
+        kept = np.delete(self.triangle, self.markers + columns, axis=1)
+        return StopFactor(np.asarray(np.linalg.qr(kept, mode="r")), self.markers)
+
+    def dense(self) -> FloatArray:
+        """The triangle, columns in the order of the charts and the residuals last."""
+        order = [*range(self.markers, len(self.triangle) - 1), *range(self.markers), len(self.triangle) - 1]
+        return self.triangle[:, order]
+
+
+def orthogonal_factor(
+    rig: RigModel, charts: Charts, data: Measurements, more: FloatArray | None = None
+) -> ArrowFactor | StopFactor:
+    """Orthogonal factor of the Jacobian and residuals, whitened where the joints have noise; ``more`` (2 k, e): columns
+    behind those of the lenses.
+    """
+    noise = data.joint_noise
+    if noise is None:
+        return arrow_factor(rig, charts, data, more)
+    ordered, order = by_stop(data)
+    beside = np.zeros((2 * len(order), 0)) if more is None else more
+    extra = beside.reshape(len(order), 2, -1)[order].reshape(2 * len(order), -1)
+    core, e, markers = charts.start(3), len(noise.deviations), charts.size - charts.start(3)
+    prior = np.insert(prior_rows(rig, charts, data), [core] * extra.shape[1], 0.0, axis=1)
+    width = e + charts.size + extra.shape[1] + 1
+    triangle = np.zeros((e + len(prior), width))
+    triangle[np.arange(e), np.arange(e)] = 1.0
+    triangle[e:, e:] = prior
+    pending = [triangle]
+    for one in stop_rows(rig, charts, ordered):
+        own = extra[2 * one.measurements.start : 2 * one.measurements.stop]
+        rows = np.hstack([one.rows[:, :core], own, one.rows[:, core:]])
+        pending.append(_whitened(one._replace(rows=rows), data).rows)
+        if sum(len(part) for part in pending) > 8 * width:
+            pending = [np.asarray(np.linalg.qr(np.vstack(pending), mode="r"))]
+    # Into the order of a factor: shared errors, markers, the others, residuals.
+    inner = e + core + extra.shape[1]
+    columns = [*range(e), *range(inner, width - 1), *range(e, inner), width - 1]
+    whole = np.linalg.qr(np.vstack(pending)[:, columns], mode="r")
+    square = np.zeros((width, width))
+    square[: len(whole)] = whole
+    return StopFactor(square[e:, e:], markers)
+
+
+def prediction_leverages(
+    rig: RigModel, charts: Charts, data: Measurements, factor: ArrowFactor | StopFactor
+) -> FloatArray:
+    """Leverage (k,) of each measurement by the parameters alone, as `leverages`; ``data`` without joint noise."""
+    if isinstance(factor, ArrowFactor):
+        return leverages(rig, charts, data, factor)
+    ordered, order = by_stop(data)
+    root = _column_root(factor.dense()[:-1, :-1])
+    out = np.empty(len(order))
+    for here, block in chunks(rig, charts, ordered):
+        rows = block.dense(len(rig.points))[:, :-1] @ root
+        out[order[here]] = (rows**2).sum(axis=1).reshape(-1, 2).sum(axis=1)
+    return out
+
+
+def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
+    """Expected squared residual (k,) of each measurement [sigmas², both coordinates] once parameters and errors of the
+    joints are estimated: the diagonal of ``V⁻¹ - V⁻¹ X (Xᵀ V⁻¹ X)⁻¹ Xᵀ V⁻¹``.
+    """
+    noise = data.joint_noise
+    assert noise is not None
+    ordered, order = by_stop(data)
+    e = len(noise.deviations)
+    prior = prior_rows(rig, charts, data)
+    start = np.zeros((e + len(prior), e + charts.size + 1))
+    start[np.arange(e), np.arange(e)] = 1.0
+    start[e:, e:] = prior
+    stops = [(one, _whitened(one, data)) for one in stop_rows(rig, charts, ordered)]
+    triangle = np.asarray(np.linalg.qr(np.vstack([start, *(white.rows for _, white in stops)]), mode="r"))
+    root = _column_root(triangle[:-1, :-1])
+    out = np.empty(len(order))
+    for one, white in stops:
+        # T = I - Q (I - W) Qᵀ whitens; T T is V⁻¹.
+        twice = 2.0 * white.shrink - white.shrink @ white.shrink
+        own = 1.0 - ((white.basis @ twice) * white.basis).sum(axis=1)
+        scaled = white.rows[:, :-1] @ root
+        scaled -= white.basis @ (white.shrink @ (white.basis.T @ scaled))
+        left = own - (scaled**2).sum(axis=1)
+        out[order[one.measurements]] = left.reshape(-1, 2).sum(axis=1)
+    return out
+
+
+def _column_root(triangle: FloatArray) -> FloatArray:
+    """``R⁻¹`` of a factor (p, p), by way of unit columns."""
+    sizes = np.linalg.norm(triangle, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    return np.asarray(np.linalg.inv(triangle / sizes) / sizes[:, None])

@@ -1,0 +1,342 @@
+"""Variance components of a calibration by restricted maximum likelihood: pixels, and for each joint a random error of
+every stop and a repeatable one of every reading (Searle, Casella, McCulloch, Variance Components, 2006, ch. 6).
+
+A repeatable error is the same whenever the joint reads the same: gear ripple, play driven from one side, sag. The
+parameters of the model enter the likelihood linearised, so that what they can imitate is theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.sparse import csc_array, diags_array
+from scipy.stats import chi2 as chi2_distribution
+
+from stereoservo.calibration.bundle_adjustment import Solution
+from stereoservo.calibration.joint_noise import stop_rows
+from stereoservo.calibration.normal_equations import by_stop, prior_rows
+from stereoservo.calibration.rig_model import JointNoise
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+FALSE_ALARM = 1e-4
+"""Probability with which joints without errors are said to have some."""
+SAME_READING, SAME_SHARE = 2e-3, 0.05
+"""Readings nearer than this [rad or m], and than this share of the joint's range, are one place of its gear."""
+MOST_STOPS = 120
+"""Stops, evenly spread, from which the components are estimated: more would know them better than they hold."""
+MOST_SHARED = 120
+"""Readings met at several stops whose errors are columns of the bundle; beyond, they count as each stop's own."""
+ROUNDS = 40
+"""Rounds of Fisher scoring at most."""
+SETTLED = 1e-3
+"""Gain in log-likelihood below which the components have converged."""
+RANK_TOLERANCE = 1e-9
+"""Singular value of the unit columns below which a direction of the parameters is open."""
+
+
+def readings(offsets: FloatArray) -> IntArray:
+    """Which stops (s, n) have one reading of a joint: their number, counted from 0, for each joint."""
+    labels = np.empty(offsets.shape, dtype=np.int64)
+    for joint, values in enumerate(offsets.T):
+        order = np.argsort(values, kind="stable")
+        apart = np.diff(values[order]) > min(SAME_READING, SAME_SHARE * float(np.ptp(values)))
+        labels[order, joint] = np.concatenate([[0], np.cumsum(apart)])
+    return labels
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Estimated variances: ``pixels`` over the stated ones; ``random`` and ``repeatable`` (n,) of the joints' errors
+    [rad² or m²], with the ``covariance`` (2 n, 2 n) of these. ``gain``: twice the logarithm of the likelihood over that
+    of joints without errors. ``scales`` (r,), ``scale_deviations`` (r,): logarithms of the revolute joints' scale
+    factors.
+    """
+
+    pixels: float
+    random: FloatArray
+    repeatable: FloatArray
+    covariance: FloatArray
+    gain: float
+    scales: FloatArray
+    scale_deviations: FloatArray
+
+    @property
+    def significant(self) -> bool:
+        """Whether joints without errors are rejected."""
+        return self.gain > float(chi2_distribution.isf(FALSE_ALARM, 2 * len(self.random)))
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Standard deviations (n, 2) of each joint's errors, random and repeatable [rad or m]."""
+        return np.sqrt(np.stack([self.random, self.repeatable], axis=1))
+
+    @property
+    def deviations_of_deviations(self) -> FloatArray:
+        """Standard deviations (n, 2) of `deviations`, to first order; of the largest that is likely where none was
+        seen.
+        """
+        spreads = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(2, -1).T
+        found = self.deviations
+        return np.where(found**2 > spreads, spreads / (2.0 * np.maximum(found, 1e-300)), np.sqrt(spreads))
+
+    @property
+    def _variance_of_total(self) -> FloatArray:
+        """Variance (n,) of the sum of a joint's two variances."""
+        n = len(self.random)
+        blocks = self.covariance.reshape(2, n, 2, n).sum(axis=(0, 2))
+        return np.maximum(np.diag(blocks), 0.0)
+
+    @property
+    def stated(self) -> FloatArray:
+        """Standard deviation (n,) of a joint's error at another reading: of a variance that is known with ν freedoms
+        the expectation is ν / (ν - 2) times the estimate, of one that may be none about its own deviation.
+        """
+        total, variance = self.random + self.repeatable, self._variance_of_total
+        share = np.minimum(variance, 0.5 * total**2) / np.where(total > 0.0, total**2, 1.0)
+        return np.sqrt(np.maximum(total / (1.0 - share), NONE_SEEN * np.sqrt(variance)))
+
+    def like(self, other: VarianceComponents) -> bool:
+        """Whether the joints' errors are those of another estimate, to a tenth of their deviations."""
+        off = np.concatenate([self.random - other.random, self.repeatable - other.repeatable])
+        return bool((np.abs(off) <= 0.1 * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))).all())
+
+    def noise(self, labels: IntArray) -> JointNoise:
+        """The joints' noise at stops with these ``labels`` (s, n) of their readings."""
+        return joint_noise_of(np.sqrt(self.random), np.sqrt(self.repeatable), labels)
+
+
+def joint_noise_of(random: FloatArray, repeatable: FloatArray, labels: IntArray) -> JointNoise:
+    """Noise at stops with ``labels`` (s, n) of their readings, of joints with errors of these deviations (n,)."""
+    own, shared = np.tile(random**2, (len(labels), 1)), np.full(labels.shape, -1)
+    common = [
+        (int(count), int(joint), label)
+        for joint in np.flatnonzero(repeatable > 0.0)
+        for label, count in enumerate(np.bincount(labels[:, joint]))
+        if count > 1
+    ]
+    common = sorted(common, reverse=True)[:MOST_SHARED]
+    for k, (_, joint, label) in enumerate(common):
+        shared[labels[:, joint] == label, joint] = k
+    own += np.where(shared < 0, repeatable**2, 0.0)
+    deviations = np.array([repeatable[joint] for _, joint, _ in common])
+    return JointNoise(np.sqrt(own), shared, deviations)
+
+
+class _Reduced(NamedTuple):
+    """Rows that carry the components: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales`` (N, r), ``Z`` (N, e) of
+    the joints' errors with the ``component`` (e,) of each; ``squares`` of the ``freedom`` rows left, which only pixels
+    scatter.
+    """
+
+    y: FloatArray
+    X: FloatArray
+    scales: FloatArray
+    Z: csc_array
+    component: IntArray
+    squares: float
+    freedom: int
+
+
+def _reduced(solution: Solution, labels: IntArray) -> _Reduced:
+    """The bundle's linearised rows, reflected so that each stop has one row for each of its joints' errors."""
+    rig, charts = solution.rig, solution.charts
+    data, _ = by_stop(solution.data)
+    used = np.unique(data.stop)
+    if len(used) > MOST_STOPS:
+        used = used[np.linspace(0, len(used) - 1, MOST_STOPS).astype(np.int64)]
+        data = data.select(np.isin(data.stop, used))
+    offsets = data.offsets - data.corrections
+    revolute = [j for j, kind in enumerate(rig.kinds) if kind == "revolute"]
+    n, p, count = len(rig.kinds), charts.size, len(revolute)
+    prior = prior_rows(rig, charts, data)
+    beside = np.zeros((len(prior), p + count + 1))
+    beside[:, :p], beside[:, -1] = prior[:, :p], prior[:, -1]
+    rest, freedom, tops, blocks = [beside], len(prior), [], []
+    for one in stop_rows(rig, charts, data):
+        scales = -one.joints[:, revolute] * offsets[one.stop, revolute]
+        rows = np.hstack([one.rows[:, :-1], scales, one.rows[:, -1:]])
+        basis, block = np.linalg.qr(one.joints)
+        top = basis.T @ rows
+        rest.append(rows - basis @ top)
+        freedom += len(rows) - len(top)
+        tops.append(top)
+        blocks.append(block)
+    triangle = np.asarray(np.linalg.qr(np.vstack(rest), mode="r"))
+    lengths = np.linalg.norm(triangle[:, :p], axis=0)
+    carries = np.linalg.norm(triangle[:, :p] / np.where(lengths > 0.0, lengths, 1.0), axis=1) > 1e-10
+    whole = np.vstack([triangle[carries], *tops])
+    at = int(carries.sum()) + np.concatenate([[0], np.cumsum([len(top) for top in tops])])
+    Z, component = [], []
+    for joint in range(n):
+        own = np.zeros((len(whole), len(blocks)))
+        for k, block in enumerate(blocks):
+            own[at[k] : at[k + 1], k] = block[:, joint]
+        Z.append(own)
+        component += [joint] * len(blocks)
+        places, where = np.unique(labels[used, joint], return_inverse=True)
+        if 1 < len(places) < len(blocks):
+            Z.append(own @ (where[:, None] == np.arange(len(places))))
+            component += [n + joint] * len(places)
+    X = whole[:, :p]
+    size = np.linalg.norm(X, axis=0)
+    _, values, vectors = np.linalg.svd(X / np.where(size > 0.0, size, 1.0), full_matrices=False)
+    known = values > RANK_TOLERANCE * values[0]
+    X = (X / np.where(size > 0.0, size, 1.0)) @ (vectors[known].T / values[known])
+    return _Reduced(
+        whole[:, -1],
+        X,
+        whole[:, p:-1],
+        csc_array(np.hstack(Z)),
+        np.array(component),
+        float((triangle[~carries, -1] ** 2).sum()),
+        freedom - int(carries.sum()),
+    )
+
+
+class _Likelihood:
+    """Restricted likelihood of a reduced problem at variances (1 + 2 n,): pixels, random, repeatable."""
+
+    def __init__(self, reduced: _Reduced, X: FloatArray, variances: FloatArray) -> None:
+        self.reduced, self.variances = reduced, variances
+        weights = variances[1 + reduced.component]
+        used = weights > 0.0
+        scaled = reduced.Z[:, used] @ diags_array(np.sqrt(weights[used]))
+        matrix = (scaled @ scaled.T).toarray()
+        matrix[np.diag_indices(len(matrix))] += variances[0]
+        self.root = np.linalg.cholesky(matrix)
+        self.basis, triangle = np.linalg.qr(solve_triangular(self.root, X, lower=True))
+        white = solve_triangular(self.root, reduced.y, lower=True)
+        self.white = white - self.basis @ (self.basis.T @ white)
+        logs = np.log(np.diag(self.root)).sum() + np.log(np.abs(np.diag(triangle))).sum()
+        left = float(self.white @ self.white) + reduced.squares / variances[0]
+        self.value = -float(logs) - 0.5 * (reduced.freedom * float(np.log(variances[0])) + left)
+
+    def score(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Derivative by the variances, the expected information, and the factor that each takes in a step of
+        minorise-maximise, which never lowers the likelihood.
+        """
+        reduced, pixels = self.reduced, self.variances[0]
+        half = solve_triangular(self.root, np.eye(len(self.root)), lower=True)
+        half -= self.basis @ (self.basis.T @ half)
+        P = half.T @ half
+        Py = half.T @ self.white
+        PZ = (reduced.Z.T @ P).T
+        inner = reduced.Z.T @ PZ
+        count = len(self.variances)
+        member = reduced.component[None] == np.arange(count - 1)[:, None]
+        up, down = np.zeros(count), np.zeros(count)
+        up[1:] = member @ (reduced.Z.T @ Py) ** 2
+        down[1:] = member @ np.diag(inner)
+        up[0] = float(Py @ Py) + reduced.squares / pixels**2
+        down[0] = float(np.trace(P)) + reduced.freedom / pixels
+        information = np.zeros((count, count))
+        information[1:, 1:] = 0.5 * member @ inner**2 @ member.T
+        information[0, 1:] = information[1:, 0] = 0.5 * member @ (PZ**2).sum(axis=0)
+        information[0, 0] = 0.5 * (float((P**2).sum()) + reduced.freedom / pixels**2)
+        factors = np.sqrt(up / np.where(down > 0.0, down, 1.0))
+        return 0.5 * (up - down), information, np.where(down > 0.0, factors, 1.0)
+
+
+def _maximised(reduced: _Reduced, X: FloatArray, start: FloatArray) -> tuple[_Likelihood, FloatArray]:
+    """The likelihood at its maximum over variances that are not negative, and the information there."""
+    here = _Likelihood(reduced, X, start)
+    for _ in range(ROUNDS):
+        score, information, factors = here.score()
+        size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        free = ((here.variances > 0.0) | (score > 0.0)) & (np.diag(information) > 0.0)
+        scaled = information / np.outer(size, size)
+        step = np.zeros_like(score)
+        step[free] = (
+            np.linalg.pinv(scaled[np.ix_(free, free)], rcond=1e-8) @ (score / size)[free] / size[free]
+        )
+        better = None
+        for share in (1.0, 0.5, 0.2):
+            tried = np.maximum(here.variances + share * step, 0.0)
+            if tried[0] <= 0.1 * here.variances[0]:
+                continue
+            there = _Likelihood(reduced, X, tried)
+            if there.value > here.value:
+                better = there
+                break
+        if better is None:
+            better = _Likelihood(reduced, X, here.variances * factors)
+        gain, here = better.value - here.value, better if better.value > here.value else here
+        if gain < SETTLED:
+            break
+    return here, here.score()[1]
+
+
+def estimate_components(
+    solution: Solution, labels: IntArray, *, scales: bool, near: VarianceComponents | None = None
+) -> VarianceComponents | None:
+    """Variance components of a bundle, its present joint noise set aside; ``labels`` (s, n) of `readings`. ``near``: an
+    earlier estimate to start from.
+
+    ``scales``: with scale factors of the revolute joints among the parameters, which errors proportional to the
+    reading are then not taken for. None where nothing in the residuals points to joints.
+    """
+    reduced = _reduced(solution, labels)
+    n = len(solution.rig.kinds)
+    X = np.hstack([reduced.X, _unit(reduced.scales)]) if scales else reduced.X
+    freedom = len(reduced.y) - X.shape[1] + reduced.freedom
+    if freedom <= 0 or len(reduced.y) <= X.shape[1]:
+        return None
+    left = reduced.y - (basis := np.linalg.qr(X)[0]) @ (basis.T @ reduced.y)
+    pixels = max((float(left @ left) + reduced.squares) / freedom, 1e-12)
+    none = _Likelihood(reduced, X, np.append(pixels, np.zeros(2 * n)))
+    score, information, _ = none.score()
+    if not (score[1:] > SCREEN * np.sqrt(np.maximum(np.diag(information)[1:], 0.0))).any():
+        return None
+    there = np.diag(information)[1:] > 0.0
+    guess = np.zeros(2 * n)
+    guess[there] = pixels / np.array([_mean_square(reduced, int(c)) for c in np.flatnonzero(there)])
+    first = np.append(min(pixels, 1.0), guess)
+    if near is not None:
+        first = np.concatenate([[near.pixels], near.random, near.repeatable])
+    best, information = _maximised(reduced, X, first)
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-8) / np.outer(size, size)
+    logs, deviations = _scale_estimates(best, reduced) if scales else (np.zeros(0), np.zeros(0))
+    return VarianceComponents(
+        float(best.variances[0]),
+        best.variances[1 : 1 + n],
+        best.variances[1 + n :],
+        covariance[1:, 1:],
+        2.0 * (best.value - none.value),
+        logs,
+        deviations,
+    )
+
+
+NONE_SEEN = 0.8
+"""Mean of a variance that was estimated as none, flat beforehand, in its standard deviations."""
+SCREEN = 3.0
+"""Deviations of a component's score beyond which the likelihood is maximised."""
+
+
+def _unit(columns: FloatArray) -> FloatArray:
+    sizes = np.linalg.norm(columns, axis=0)
+    return np.asarray(columns / np.where(sizes > 0.0, sizes, 1.0))
+
+
+def _mean_square(reduced: _Reduced, component: int) -> float:
+    """Mean squared length of a component's columns: what a unit of its variance adds to a row, over its rows."""
+    return float((reduced.Z[:, reduced.component == component] ** 2).sum()) / int(
+        (reduced.component == component).sum()
+    )
+
+
+def _scale_estimates(best: _Likelihood, reduced: _Reduced) -> tuple[FloatArray, FloatArray]:
+    """Logarithms (r,) of the scale factors by generalised least squares, and their deviations."""
+    rows = np.hstack([reduced.X, reduced.scales, reduced.y[:, None]])
+    white = solve_triangular(best.root, rows, lower=True)
+    at = reduced.X.shape[1]
+    triangle = np.asarray(np.linalg.qr(white, mode="r"))
+    moments, rest = triangle[at:, at:-1], triangle[at:, -1]
+    information = moments.T @ moments
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-10) / np.outer(size, size)
+    return -covariance @ (moments.T @ rest), np.sqrt(np.diag(covariance))
