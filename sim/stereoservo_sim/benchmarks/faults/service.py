@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from stereoservo.client import Client, ClientError, RefusedError
+from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_sim.benchmarks import service_bench
 from stereoservo_sim.benchmarks.service_bench import (
@@ -36,7 +36,7 @@ from stereoservo_sim.benchmarks.service_bench import (
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.world.history import TrueJointHistory
 
-SLOW = 0.04
+SLOW = 0.03
 """Share of its speed at which the arm moves for longer than a daemon takes to start."""
 RAMP_MS = 60.0
 """From that speed to rest, by the loop's ramp or the drives' own."""
@@ -195,7 +195,8 @@ FAULTS = (
 def run_service(
     repetitions: int, tell: Callable[[dict[str, Any]], None], faults: tuple[ServiceFault, ...] = FAULTS
 ) -> list[dict[str, Any]]:
-    """Rows of all faults, ``repetitions`` trials each; ``tell`` gets each as it comes.
+    """Rows of all faults, ``repetitions`` trials each; ``tell`` gets each as it comes. A trial after which no daemon
+    answers is not within its bound; what was tried stands in the place of what `status` says.
 
     Raises ExperimentError where the drives or a daemon do not come up.
     """
@@ -210,13 +211,18 @@ def run_service(
 def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str, Any]:
     trials: list[dict[str, Any]] = []
     void: list[str] = []
-    while len(trials) < repetitions and len(void) < TRIES:
-        bench.ready()
+    silent: list[str] = []
+    while len(trials) + len(silent) < repetitions and len(void) < TRIES:
         try:
+            bench.ready()
             with StallWatch() as watch:
                 trial = _trial(bench, fault)
         except VoidTrialError as error:
             void.append(str(error))
+            continue
+        except (ClientError, SessionError) as error:
+            silent.append(f"no answer: {error}")
+            bench.end_daemon()
             continue
         finally:
             bench.lasting.close()
@@ -236,9 +242,9 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
         "within": sum(_is_within(trial["rest_ms"], bound, fault.may_go_on) for trial in trials),
         "after": sorted({trial["after"] for trial in trials}),
         "status_right": sum(_status_is_right(trial, fault) for trial in trials),
-        "status_says": sorted({trial["says"] for trial in trials}),
+        "status_says": sorted({*(trial["says"] for trial in trials), *silent}),
         "terminal_events": sorted({count for trial in trials for count in trial["terminal"]}),
-        "trials": len(trials),
+        "trials": len(trials) + len(silent),
         "void": void,
     }
 
@@ -281,12 +287,13 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
             pid = child.pid if child is not None else bench.processes()[fault.process]
             t0 = time.monotonic_ns()
             send(pid, fault.signal)
-        if any(event.kind == "goal_reached" for event in told_live):
-            raise VoidTrialError("the goal was reached before the fault came")
+        _refuse_reached(told_live, "before the fault came")
         time.sleep(max(0.0, ASKED_S - (time.monotonic_ns() - t0) * 1e-9))
         code, told = bench.status()
         time.sleep(max(0.0, WATCHED_S - (time.monotonic_ns() - t0) * 1e-9))
         rest_ms = _rest_ms(history, start, t0)
+        if fault.bound_ms is None:
+            _refuse_reached(told_live, "while the arm was watched")
         bench.lasting.close()
     finally:
         history.close()
@@ -306,6 +313,12 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
         "notes": notes,
         "terminal": counts or (-1,),
     }
+
+
+def _refuse_reached(events: list[EventMessage], when: str) -> None:
+    """Raise VoidTrialError where a goal was reached: the arm rests for that."""
+    if any(event.kind == "goal_reached" for event in events):
+        raise VoidTrialError(f"the goal was reached {when}")
 
 
 def _sent_goal(client: Client, child: subprocess.Popen[str] | None, speed_scale: float) -> str:
