@@ -25,6 +25,8 @@ NOTABLE_JOINT = 1.3
 """Residual of one joint over that of all that is reported."""
 SHORT_DEG, SHORT_M = 5.0, 0.02
 """Trial motions so small that a poor deviation is put down to them."""
+NOTABLE_SHARE = 0.1
+"""Errors of a joint's readings over the largest, in the images, that are reported."""
 NOTABLE_DEVIATION_PX = 0.5
 """Deviation of predicted pixels that is reported."""
 NOTABLE_DEPTH_DEVIATION = 0.05
@@ -89,6 +91,14 @@ REMEDIES = {
 """What to do about each cause of a failed calibration, by the code of its CalibrationError."""
 
 
+JOINT_ERRORS = (
+    "Standard deviations of where the joints are beside what they report. Repeatable errors are the same whenever a "
+    "joint reads the same: gear ripple, sag, play that is driven from one side. Random ones change from stop to stop: "
+    "the encoder's step, friction, play whose flank changes. The deviations that are stated contain them"
+)
+"""What the report's errors of joint readings are."""
+
+
 class Acceptance(msgspec.Struct, frozen=True):
     """Grade of a calibration; ``text`` in a few sentences, ``reasons`` and ``advice`` are its parts."""
 
@@ -115,6 +125,8 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
     stratum = STRATA[model.stratum]
     text = f"{grade}: {'; '.join(reasons)}" if reasons else f"good: {summary}"
     text += f". Stratum {stratum}."
+    if report.joints:
+        text += f" {_joint_errors(report)}."
     if advice:
         text += " " + " ".join(f"{line[0].upper()}{line[1:]}." for line in advice)
     return Acceptance(grade, text, tuple(reasons), tuple(advice))
@@ -149,6 +161,27 @@ def _residuals(model: CellModel, report: CalibrationReport, reasons: list[str], 
     worst = max(statistics.joints, key=lambda joint: joint.rms_px)
     if worst.rms_px > NOTABLE_JOINT * statistics.rms_px:
         reasons.append(f"joint {worst.name} is worst with {worst.rms_px:.3g} px")
+
+
+def _joint_errors(report: CalibrationReport) -> str:
+    """What the joints' readings are off by, largest in the images first, as far as it is seen there."""
+    seen = sorted(report.joints, key=lambda joint: joint.pixels, reverse=True)
+    named = [joint for joint in seen if joint.pixels > NOTABLE_SHARE * seen[0].pixels]
+    parts = []
+    for joint in named:
+        unit = "mrad" if joint.kind == "revolute" else "mm"
+        found = [
+            f"{what} {1e3 * value:.2g} ± {1e3 * deviation:.1g} {unit}"
+            for what, value, deviation in (
+                ("repeatable", joint.repeatable, joint.repeatable_std),
+                ("random", joint.random, joint.random_std),
+            )
+            if value > 2.0 * deviation
+        ]
+        both = float(np.hypot(joint.repeatable, joint.random))
+        told = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
+        parts.append(f"joint {joint.name} {told} ({joint.pixels:.2g} px)")
+    return f"Joint readings have errors, as standard deviations: {'; '.join(parts)}"
 
 
 def _left_out(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:

@@ -186,6 +186,12 @@ def stop_equations(
     return StopEquations(matrix / np.outer(scale, scale), sizes, cost, tuple(stops), data)
 
 
+def estimated_errors(rig: RigModel, charts: Charts, data: Measurements) -> JointErrors:
+    """Errors of the joints that ``data``, which has joint noise, shows at the parameters of ``rig``."""
+    ordered, _ = by_stop(data)
+    return stop_equations(rig, charts, ordered, None).errors(np.zeros(charts.size))
+
+
 @dataclass(frozen=True)
 class StopFactor:
     """Orthogonal factor ``triangle`` (p + 1, p + 1) of whitened rows and residuals, the columns of ``markers`` first:

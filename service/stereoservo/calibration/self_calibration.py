@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_inliers import projective_bundle, refine_to_convergence
 from stereoservo.calibration.bundle_statistics import (
     chi2_within,
     degrees_of_freedom,
@@ -38,16 +39,13 @@ from stereoservo.calibration.lens_estimation import (
     lenses_may_bend,
     prior_of_lenses,
     starting_lenses,
-    straightened,
     undistorted,
 )
-from stereoservo.calibration.lens_significance import FREE_LENS, FULL_LENS, lens_test, lens_wanted
+from stereoservo.calibration.lens_significance import FREE_LENS, FULL_LENS, lens_wanted
 from stereoservo.calibration.rig_model import (
     JointNoise,
     Measurements,
-    RigModel,
     common_mount,
-    residuals,
     reversed_trials,
     with_joints_reversed,
 )
@@ -64,7 +62,6 @@ from stereoservo.calibration.variance_components import VarianceComponents, esti
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.model import Stratum
 from stereoservo.kinematics.parameterization import LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
@@ -73,8 +70,8 @@ Progress = Callable[[str, float], None]
 
 OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
 """Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
-FEW_OUTLIERS = 0.05
-"""Share of outliers that may still change in a bundle that has not converged."""
+OF_JOINT_ERRORS = frozenset({"joint_kind", "too_few_stops"})
+"""Causes by which single joints are refused that errors of the readings imitate."""
 WILD = 100.0
 """Squared residual over the median from which a pixel of the linked joints is a wrong one."""
 SCALE_ROUNDS = 3
@@ -304,9 +301,16 @@ def _fit(
 
     Raises CalibrationError, and where joint readings have errors _JointErrorsError, ScalesError.
     """
-    start = _start(trials, report_progress, options, priors, bend)
+    try:
+        start, inexact = _start(trials, report_progress, options, priors, bend), False
+    except CalibrationError as error:
+        if not joint_errors or error.code not in OF_JOINT_ERRORS:
+            raise
+        start, inexact = _inexact_start(trials, report_progress, options, priors, bend, error), True
     components, doubtful = None, False
     found = _components_at_start(start) if joint_errors else None
+    if inexact and found is None:
+        raise _JointErrorsError
     if found is not None:
         start, bundles, components, doubtful = _bundles_with_joint_errors(
             start, found, report_progress, options
@@ -337,14 +341,33 @@ def _fit(
     return _Fitted(result, components is not None, doubtful)
 
 
+def _inexact_start(
+    trials: TrialData,
+    report_progress: Progress,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+    bend: float | None,
+    strict: CalibrationError,
+) -> _Start:
+    """The start from joints whose readings have errors. Raises ``strict`` where there is none either."""
+    try:
+        return _start(trials, report_progress, options, priors, bend, inexact=True)
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+        raise strict from None
+
+
 def _start(
     trials: TrialData,
     report_progress: Progress,
     options: FitOptions,
     priors: Mapping[str, LensEstimate],
     bend: float | None,
+    *,
+    inexact: bool = False,
 ) -> _Start:
-    """Initial reconstruction, single-joint fits and linked joints. Raises CalibrationError."""
+    """Initial reconstruction, single-joint fits and linked joints; ``inexact``: from readings that may have errors.
+    Raises CalibrationError.
+    """
     report_progress("cameras", 0.0)
     lenses, lens_model = starting_lenses(trials, options.lens, priors, bend)
     cameras, points, usable = initial_reconstruction(undistorted(trials, lenses))
@@ -353,7 +376,7 @@ def _start(
     separate = []
     for j, name in enumerate(trials.joint_names):
         report_progress(f"joint {name}", 0.1 + 0.4 * j / len(trials.joint_names))
-        separate.append(fit_single_joint(ideal, cameras, points, usable, j))
+        separate.append(fit_single_joint(ideal, cameras, points, usable, j, inexact=inexact))
     report_progress("linked joints", 0.5)
     zero = np.median(trials.positions, axis=0)
     rig = replace(link_joints(trials, cameras, separate, zero), lenses=lenses)
@@ -371,7 +394,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     """Projective bundle, stratum, final bundle. Raises CalibrationError."""
     report_progress("rigid bundle", 0.6)
     trials, every = start.trials, start.every
-    solution, inliers = _projective(
+    solution, inliers = projective_bundle(
         start.linked.rig, start.clean, every, start.lenses, options, start.decided
     )
     refuse_poor_fit(trials, solution, every, inliers, options)
@@ -488,40 +511,6 @@ def _from_other_lenses(
     return None
 
 
-def _projective(
-    rig: RigModel,
-    clean: Measurements,
-    every: Measurements,
-    lenses: LensModel,
-    options: FitOptions,
-    decided: bool,
-) -> tuple[Solution, BoolArray]:
-    """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
-    robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
-    for _ in range(2 if options.lens == "auto" else 0):
-        # Before anything is called an outlier: distortion makes many of them.
-        here = every.corrected(robust.data.joint_errors)
-        inside = here.select(inlier_mask(robust.rig, here, options))
-        wanted = lens_wanted(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
-        if wanted == lenses:
-            break
-        lenses = wanted
-        robust = solve(
-            robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
-        )
-    # A flat target may leave the projective bundle with open directions that the metric one closes: no need
-    # to walk such a valley to its end here.
-    every = every.corrected(robust.data.joint_errors)
-    solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
-    if decided or lens_test(solution).distorted == (lenses != "none"):
-        return solution, inliers
-    if lenses == "none":
-        return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
-    return refine_to_convergence(
-        straightened(solution.rig, every), every, "projective", options, "none", 1e-6
-    )
-
-
 def _silent(stage: str, fraction: float) -> None:
     return
 
@@ -549,54 +538,3 @@ def _without_rare_markers(
         sigmas=trials.sigmas[:, :, often],
     )
     return kept, points[:, often], usable[:, :, often], left_out
-
-
-def refine_to_convergence(
-    rig: RigModel,
-    every: Measurements,
-    stratum: Stratum,
-    options: FitOptions,
-    lenses: LensModel,
-    tolerance: float = 1e-10,
-    inliers: BoolArray | None = None,
-) -> tuple[Solution, BoolArray]:
-    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same, from
-    ``inliers`` on, or those of ``rig``.
-
-    Whether the last solution has converged is for the caller to judge. Raises CalibrationError
-    (``no_convergence``).
-    """
-    if inliers is None:
-        inliers = inlier_mask(rig, every, options)
-    for _ in range(8):
-        solution = solve(rig, every.select(inliers), stratum, lenses=lenses, tolerance=tolerance)
-        every = every.corrected(solution.data.joint_errors)
-        again = inlier_mask(solution.rig, every, options)
-        rig = solution.rig
-        if np.array_equal(again, inliers):
-            break
-        inliers = again
-    else:
-        if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
-            # A projective bundle that still moves along an undetermined direction: a higher stratum may close it.
-            # Whether the last solution has converged is asked at the end.
-            return solution, inliers
-        raise CalibrationError(
-            "no_convergence",
-            f"the set of outliers does not settle: {int((~inliers).sum())} of {len(inliers)} pixels in the "
-            "last round. Did a camera move, are positions wrong?",
-            outliers=int((~inliers).sum()),
-            pixels=len(inliers),
-        )
-    return solution, inliers
-
-
-def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> BoolArray:
-    """Mask (k,) of the pixels that fit the rig, by their squared distance, with the noise estimated from the
-    median.
-    """
-    squares = (residuals(rig, every).reshape(-1, 2) ** 2).sum(axis=1)
-    # The median of a chi-square with two degrees of freedom is ln 4.
-    factor = max(1.0, float(np.median(squares)) / np.log(4.0))
-    inside: BoolArray = squares <= options.outlier_chi2 * factor
-    return inside

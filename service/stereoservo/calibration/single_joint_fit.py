@@ -47,9 +47,11 @@ ALIKE = 1e-3
 FULL, SHORT = 80, 20
 """Evaluations of a start, and of each of many."""
 WRONG_SQUARE = 100.0
-"""Squared residual [sigmas²] at which the cost of a pixel saturates."""
+"""Squared residual over that of the typical one, or over sigmas², at which the cost of a pixel saturates."""
 MISFIT = 20.0
 """Median residual [sigmas] of a joint's own trial above which its stated kind is rejected."""
+MISFIT_SHARE = 0.02
+"""The same as a share of the images' motion, where readings may have errors."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +79,14 @@ def measurements(trials: TrialData, usable: BoolArray, offsets: FloatArray) -> M
     )
 
 
-def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntArray, IntArray, FloatArray]:
+def trial_stops(
+    trials: TrialData, points: FloatArray, joint: int, *, inexact: bool = False
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Stops (k,) at which only ``joint`` moves, the distal configuration of each (k,), and the base (n,).
 
     Joints before ``joint`` are as at the base; joints behind it are in one of the configurations in which the
     trial was driven, counted from 0, the base's own. Stops of other trials that happen to be there belong to it,
-    too. Raises CalibrationError.
+    too. ``inexact``: see `locked_ranges`. Raises CalibrationError.
     """
     name, unit = trials.joint_names[joint], _unit(trials, joint)
     own = trials.trials == joint
@@ -105,17 +109,18 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
             range=moved,
             minimum=LOCKED_RANGE,
         )
-    base, groups = _distal_groups(positions, own, joint, locked_ranges(trials))
+    locked = locked_ranges(trials, inexact=inexact)
+    base, groups = _distal_groups(positions, own, joint, locked)
     shown = finite_rows(points).sum(axis=1) >= MIN_SHOWN
     stops = np.flatnonzero((groups >= 0) & shown)
-    distinct = len(np.unique(np.round(positions[stops, joint] / locked_ranges(trials)[joint])))
+    distinct = len(np.unique(np.round(positions[stops, joint] / locked[joint])))
     if distinct < MIN_STOPS:
         lost, strayed = int((own & ~shown).sum()), int((own & (groups < 0)).sum())
         raise CalibrationError(
             "too_few_stops",
             f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of "
             f"{int(own.sum())} stops, {lost} show fewer than {MIN_SHOWN} markers that two cameras agree "
-            f"on, and at {strayed} other joints strayed by more than {locked_ranges(trials).max():g}",
+            f"on, and at {strayed} other joints strayed by more than {locked.max():g}",
             joint=name,
             stops=distinct,
             minimum=MIN_STOPS,
@@ -127,13 +132,15 @@ def trial_stops(trials: TrialData, points: FloatArray, joint: int) -> tuple[IntA
     return stops, groups[stops], base
 
 
-def locked_ranges(trials: TrialData) -> FloatArray:
-    """How far each joint (n,) may stray from where it stands in others' trials [rad or m]."""
+def locked_ranges(trials: TrialData, *, inexact: bool = False) -> FloatArray:
+    """How far each joint (n,) may stray from where it stands in others' trials [rad or m]; ``inexact``: of arms that
+    give way under load.
+    """
     locked = np.full(len(trials.joint_names), LOCKED_RANGE)
     for joint in np.unique(trials.trials[trials.trials >= 0]):
         moved = float(np.ptp(trials.positions[trials.trials == joint, joint]))
         if moved > LOCKED_RANGE:
-            locked[joint] = min(LOCKED_RANGE, LOCKED_SHARE * moved)
+            locked[joint] = LOCKED_SHARE * moved if inexact else min(LOCKED_RANGE, LOCKED_SHARE * moved)
     return locked
 
 
@@ -165,16 +172,23 @@ def _distal_groups(
 
 
 def fit_single_joint(
-    trials: TrialData, cameras: FloatArray, points: FloatArray, usable: BoolArray, joint: int
+    trials: TrialData,
+    cameras: FloatArray,
+    points: FloatArray,
+    usable: BoolArray,
+    joint: int,
+    *,
+    inexact: bool = False,
 ) -> JointTrial:
     """Generator of ``joint`` and the markers from its own trial, cameras (c, 3, 4) fixed (5.52).
 
     ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). Starts one after the other until one fits: linear
     over all pairs of stops; as if the cameras were nominal ones; axes all around. Then least squares with free
-    markers, each of a distal configuration its own. Raises CalibrationError naming the joint.
+    markers, each of a distal configuration its own. ``inexact``: readings may have errors that are small beside the
+    motion. Raises CalibrationError naming the joint.
     """
     name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
-    stops, groups, base = trial_stops(trials, points, joint)
+    stops, groups, base = trial_stops(trials, points, joint, inexact=inexact)
     observations = virtual_markers(trials, points, usable, stops, groups)
     angles = trials.positions[stops, joint] - base[joint]
     m = len(trials.marker_ids)
@@ -198,16 +212,17 @@ def fit_single_joint(
             markers=common,
             minimum=MIN_MARKERS,
         )
-    if best is None or not least < MISFIT:
+    largest = max(MISFIT, MISFIT_SHARE * _image_motion(trials, stops, joint)[0]) if inexact else MISFIT
+    if best is None or not least < largest:
         raise CalibrationError(
             "joint_kind",
             f"joint {name!r}: its trial does not look like a "
             f"{'rotation' if kind == 'revolute' else 'translation'} by the reported positions: typical "
-            f"residual {least:.3g} sigmas, at most {MISFIT:g} expected. Is the joint {kind}, are its "
+            f"residual {least:.3g} sigmas, at most {largest:.3g} expected. Is the joint {kind}, are its "
             "positions right, did only it move?",
             joint=name,
             residual_sigmas=least,
-            maximum=MISFIT,
+            maximum=largest,
         )
     shown = np.asarray(observations.usable[:, :, :m].any(axis=(0, 1)))
     return JointTrial(
@@ -370,7 +385,7 @@ def _solve_from(
     squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
     # A wrong axis may fit the half of the markers that hardly move.
-    score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE).mean() / 2.0))
+    score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE * max(1.0, typical**2)).mean() / 2.0))
     if not np.isfinite(score):
         return []
     return [_StartResult(fit.rig, typical, score, fit.converged)]
@@ -379,6 +394,25 @@ def _solve_from(
 def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
     """Raise CalibrationError for a joint whose trial does not change the images by more than their noise does."""
     name, unit = trials.joint_names[joint], _unit(trials, joint)
+    motion, noise = _image_motion(trials, stops, joint)
+    if motion < MIN_IMAGE_MOTION * noise:
+        needed = MIN_IMAGE_MOTION * noise
+        raise CalibrationError(
+            "joint_without_effect",
+            f"joint {name!r} reports a motion of {np.ptp(trials.positions[stops, joint]):.3g} {unit}, but the markers "
+            f"moved by {motion:.3g} sigmas only in the images, which noise alone may do; at least {needed:.3g} are "
+            "needed. Does it drive what the cameras see? If it does, a larger range, or less noise by more frames at "
+            "each stop, shows it",
+            joint=name,
+            motion_sigmas=motion,
+            minimum=needed,
+        )
+
+
+def _image_motion(trials: TrialData, stops: IntArray, joint: int) -> tuple[float, float]:
+    """Motion of the markers in the images over a joint's ``stops`` (k,) [sigmas], and noise of the images, 1 where it
+    is as stated.
+    """
     stops = stops[np.argsort(trials.positions[stops, joint], kind="stable")]
     visible = trials.visible[:, stops]
     motions, bends = [], [np.zeros(0)]
@@ -388,22 +422,10 @@ def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
         pixels = trials.pixels[c, seen, i] / np.median(trials.sigmas[c, seen, i])
         motions.append(float(np.linalg.norm(np.ptp(np.quantile(pixels, [0.1, 0.9], axis=0), axis=0))))
         bends.append(np.diff(pixels, n=2, axis=0).ravel() / np.sqrt(6.0))
-    largest = float(np.quantile(motions, 0.8)) if motions else 0.0
     # Where the detector understates its noise, second differences show it; a motion's own are far below its range.
     scatter = np.abs(np.concatenate(bends))
     noise = max(1.0, float(np.median(scatter)) / NORMAL_MEDIAN) if len(scatter) else 1.0
-    if largest < MIN_IMAGE_MOTION * noise:
-        needed = MIN_IMAGE_MOTION * noise
-        raise CalibrationError(
-            "joint_without_effect",
-            f"joint {name!r} reports a motion of {np.ptp(trials.positions[stops, joint]):.3g} {unit}, but the markers "
-            f"moved by {largest:.3g} sigmas only in the images, which noise alone may do; at least {needed:.3g} are "
-            "needed. Does it drive what the cameras see? If it does, a larger range, or less noise by more frames at "
-            "each stop, shows it",
-            joint=name,
-            motion_sigmas=largest,
-            minimum=needed,
-        )
+    return (float(np.quantile(motions, 0.8)) if motions else 0.0), noise
 
 
 def _unit(trials: TrialData, joint: int) -> str:

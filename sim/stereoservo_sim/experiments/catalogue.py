@@ -84,6 +84,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(12),),
         ),
         Experiment(
+            "random-mechanics",
+            "the random rigs with ripple, coarse encoders, play, sag or coupling: usable, refused, what ellipses hold",
+            "arms.random_mechanics",
+            (repetitions(10),),
+        ),
+        Experiment(
             "inverse-kinematics",
             "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
             "arms.inverse_kinematics",

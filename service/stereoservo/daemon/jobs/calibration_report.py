@@ -29,9 +29,11 @@ from matplotlib.figure import Figure
 
 from stereoservo.calibration.calibration_result import CalibrationReport
 from stereoservo.calibration.change.model_changes import known_measurements
-from stereoservo.calibration.fit_assessment import STRATA, Acceptance
-from stereoservo.calibration.rig_model import Measurements, acting_order, acting_rig, predicted
+from stereoservo.calibration.fit_assessment import JOINT_ERRORS, STRATA, Acceptance
+from stereoservo.calibration.joint_noise import estimated_errors
+from stereoservo.calibration.rig_model import Measurements, acting_order, acting_rig, full_charts, predicted
 from stereoservo.calibration.trial_data import TrialData
+from stereoservo.calibration.variance_components import joint_noise_of, readings
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo.kinematics.model import CellModel
 
@@ -64,9 +66,19 @@ class Residuals:
 
 
 def residuals_of(model: CellModel, trials: TrialData, report: CalibrationReport) -> Residuals:
-    """Residuals of every pixel of the model's markers. Raises CalibrationError where the trials are not the model's."""
+    """Residuals of every pixel of the model's markers, beside the errors that its joints' readings have. Raises
+    CalibrationError where the trials are not the model's.
+    """
     rig, order = acting_rig(model), acting_order(model)
     data = known_measurements(model, trials, order)
+    accuracy = model.joint_accuracy
+    if accuracy is not None:
+        acting = list(order)
+        labels = readings(trials.positions[:, acting])
+        data = data.with_joint_noise(
+            joint_noise_of(accuracy.random[acting], accuracy.repeatable[acting], labels)
+        )
+        data = data.corrected(estimated_errors(rig, full_charts(rig, model.stratum), data))
     pixels = data.pixels - predicted(rig, data)
     outliers = {(out.camera, out.stop, out.marker) for out in report.outliers}
     names = [camera.name for camera in model.cameras]
@@ -138,6 +150,7 @@ def _page(
             "wrong scale or an encoder fault; a camera far above all others has a lens or a detector of its own.</p>",
             _image(draw_levels(model, report, rest)),
             _joints(model, rest),
+            *_joint_errors(report),
             "<h2>Residual histograms</h2>",
             "<p>Residuals in stated sigmas against the Gaussian that they should be (line).</p>",
             _image(draw_histograms(model, rest)),
@@ -226,6 +239,28 @@ def _joints(model: CellModel, rest: Residuals) -> str:
         span = f"{np.degrees(joint.range):.1f}°" if kind == "revolute" else f"{joint.range:.4f} m"
         rows.append((joint.name, kind, joint.stops, span, f"{joint.rms_px:.4f}", f"{floor:.4f}"))
     return _table(("joint", "kind", "stops", "moved", "rms [px]", "floor [px]"), rows)
+
+
+def _joint_errors(report: CalibrationReport) -> list[str]:
+    """Section of what the joints' readings are off by; empty where the trials show nothing of it."""
+    if not report.joints:
+        return []
+    rows: list[tuple[object, ...]] = []
+    for joint in report.joints:
+        unit = "mrad" if joint.kind == "revolute" else "mm"
+        rows.append(
+            (
+                joint.name,
+                f"{1e3 * joint.repeatable:.3g} ± {1e3 * joint.repeatable_std:.1g} {unit}",
+                f"{1e3 * joint.random:.3g} ± {1e3 * joint.random_std:.1g} {unit}",
+                f"{joint.pixels:.3g}",
+            )
+        )
+    return [
+        "<h2>Errors of the joint readings</h2>",
+        f"<p>{_e(JOINT_ERRORS)}.</p>",
+        _table(("joint", "repeatable", "random", "in the images [px]"), rows),
+    ]
 
 
 def _quantities(model: CellModel) -> str:

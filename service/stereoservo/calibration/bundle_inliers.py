@@ -1,0 +1,126 @@
+"""Bundles on their inliers: a robust start, then gating and solving in turn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.joint_noise import stop_rows
+from stereoservo.calibration.lens_estimation import straightened
+from stereoservo.calibration.lens_significance import FREE_LENS, lens_test, lens_wanted
+from stereoservo.calibration.normal_equations import by_stop
+from stereoservo.calibration.rig_model import JointErrors, Measurements, RigModel, residuals
+from stereoservo.calibration.stratum_selection import FitOptions
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.kinematics.model import Stratum
+from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.numerics.arrays import BoolArray
+
+FEW_OUTLIERS = 0.05
+"""Share of outliers that may still change in a bundle that has not converged."""
+LIKELY = 5.0
+"""Deviations up to which an error of a joint may explain a stop."""
+
+
+def projective_bundle(
+    rig: RigModel,
+    clean: Measurements,
+    every: Measurements,
+    lenses: LensModel,
+    options: FitOptions,
+    decided: bool,
+) -> tuple[Solution, BoolArray]:
+    """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
+    robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
+    for _ in range(2 if options.lens == "auto" else 0):
+        # Before anything is called an outlier: distortion makes many of them.
+        here = every.corrected(robust.data.joint_errors)
+        inside = here.select(inlier_mask(robust.rig, here, options))
+        wanted = lens_wanted(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
+        if wanted == lenses:
+            break
+        lenses = wanted
+        robust = solve(
+            robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
+        )
+    # A flat target may leave the projective bundle with open directions that the metric one closes: no need
+    # to walk such a valley to its end here.
+    every = every.corrected(robust.data.joint_errors)
+    solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
+    if decided or lens_test(solution).distorted == (lenses != "none"):
+        return solution, inliers
+    if lenses == "none":
+        return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
+    return refine_to_convergence(
+        straightened(solution.rig, every), every, "projective", options, "none", 1e-6
+    )
+
+
+def refine_to_convergence(
+    rig: RigModel,
+    every: Measurements,
+    stratum: Stratum,
+    options: FitOptions,
+    lenses: LensModel,
+    tolerance: float = 1e-10,
+    inliers: BoolArray | None = None,
+) -> tuple[Solution, BoolArray]:
+    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same, from
+    ``inliers`` on, or those of ``rig``.
+
+    Whether the last solution has converged is for the caller to judge. Raises CalibrationError
+    (``no_convergence``).
+    """
+    if inliers is None:
+        inliers = inlier_mask(rig, every, options)
+    for _ in range(8):
+        solution = solve(rig, every.select(inliers), stratum, lenses=lenses, tolerance=tolerance)
+        every = every.corrected(_joint_errors(solution, every, inliers))
+        again = inlier_mask(solution.rig, every, options)
+        rig = solution.rig
+        if np.array_equal(again, inliers):
+            break
+        inliers = again
+    else:
+        if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
+            # A projective bundle that still moves along an undetermined direction: a higher stratum may close it.
+            # Whether the last solution has converged is asked at the end.
+            return solution, inliers
+        raise CalibrationError(
+            "no_convergence",
+            f"the set of outliers does not settle: {int((~inliers).sum())} of {len(inliers)} pixels in the "
+            "last round. Did a camera move, are positions wrong?",
+            outliers=int((~inliers).sum()),
+            pixels=len(inliers),
+        )
+    return solution, inliers
+
+
+def _joint_errors(solution: Solution, every: Measurements, inliers: BoolArray) -> JointErrors | None:
+    """Errors of the joints as in a solution, and as likely ones as explain stops that are outliers as a whole."""
+    noise, errors = every.joint_noise, solution.data.joint_errors
+    left = np.setdiff1d(every.stop, every.stop[inliers])
+    if noise is None or errors is None or not len(left):
+        return errors
+    lost, _ = by_stop(every.corrected(errors).select(np.isin(every.stop, left)))
+    own = errors.own.copy()
+    for one in stop_rows(solution.rig, solution.charts, lost):
+        present = one.rows[:, -1] + one.joints @ lost.corrections[one.stop]
+        slopes = one.joints * noise.own[one.stop]
+        found = own[one.stop] - np.linalg.solve(np.eye(len(own[0])) + slopes.T @ slopes, slopes.T @ present)
+        if np.abs(found).max() < LIKELY:
+            own[one.stop] = found
+    return replace(errors, own=own)
+
+
+def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> BoolArray:
+    """Mask (k,) of the pixels that fit the rig, by their squared distance, with the noise estimated from the
+    median.
+    """
+    squares = (residuals(rig, every).reshape(-1, 2) ** 2).sum(axis=1)
+    # The median of a chi-square with two degrees of freedom is ln 4.
+    factor = max(1.0, float(np.median(squares)) / np.log(4.0))
+    inside: BoolArray = squares <= options.outlier_chi2 * factor
+    return inside

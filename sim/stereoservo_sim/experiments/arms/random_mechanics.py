@@ -1,0 +1,207 @@
+"""Experiment: self-calibration of arms that are not perfect, on the random rigs: how many models are usable, which
+causes are named although nothing but the gears and encoders is wrong, and whether stated ellipses hold.
+
+Cases are those of `random_rigs` with noise of 0.01 to 0.5 px and one mechanism each, all joints alike: gear ripple of
+0.02 to 1 mrad, encoders of 4096 counts a turn, play up to 1.5°, sag up to 2.5°, a wrist coupled by up to 5 %. A range
+of seeds is continued with another: ``--seed 100 --seeds 100`` are the cases behind ``--seeds 100``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from rich.console import Console
+
+from stereoservo.calibration.fit_assessment import assess_fit
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.kinematics.covariance import pixel_covariances
+from stereoservo.kinematics.model import CellModel
+from stereoservo_sim.experiments.experiment import show_rows
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.mechanical_trials import links_and_readings, mechanical_trials
+from stereoservo_sim.world.mechanics import Mechanics
+from stereoservo_sim.world.random_cells import RandomCase, hidden_out_of_view, random_case
+from stereoservo_sim.world.synthetic import FIRST_MARKER
+
+SEEDS = 10
+"""Cases of the command by default: two of each mechanism."""
+NOISES = (0.01, 0.5)
+"""[px], log-uniform."""
+MECHANISMS = ("ripple", "encoder", "play", "sag", "coupling")
+"""The mechanism of seed k is the one at k modulo their number."""
+INSIDE = 5.991
+"""Squared distance that holds 95 % of two Gaussian coordinates."""
+WELL = 0.85
+"""Share inside their ellipses below which a model must not be called good."""
+
+
+class MechanicsVerdict(msgspec.Struct, frozen=True):
+    """Outcome of a case: ``size`` of its mechanism [rad or share], ``inside``: share of unseen markers inside their
+    95 % ellipses, ``code`` and ``message`` of a refusal.
+    """
+
+    seed: int
+    mechanism: str
+    size: float
+    sigma_px: float
+    usable: bool
+    inside: float = 0.0
+    grade: str = ""
+    stratum: str = ""
+    code: str = ""
+    message: str = ""
+    seconds: float = 0.0
+
+
+def random_mechanics(seed: int) -> tuple[RandomCase, str, float, tuple[Mechanics, ...], float]:
+    """Case of ``seed``, its mechanism with its size, the mechanics of all joints, and the noise [px]."""
+    case = random_case(seed)
+    rng = np.random.default_rng([seed, 4])
+    sigma = float(np.exp(rng.uniform(*np.log(NOISES))))
+    mechanism, n = MECHANISMS[seed % len(MECHANISMS)], len(case.cell.home)
+    if mechanism == "ripple":
+        size = float(np.exp(rng.uniform(*np.log((0.02e-3, 1e-3)))))
+        orders, phases = rng.uniform(100.0, 320.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
+        gears = [
+            Mechanics(ripple=size, ripple_order=order, ripple_phase=phase)
+            for order, phase in zip(orders.tolist(), phases.tolist(), strict=True)
+        ]
+    elif mechanism == "encoder":
+        size = float(2.0 * np.pi / 4096)
+        gears = [Mechanics(encoder_step=size, encoder_side="joint")] * n
+    elif mechanism == "play":
+        size = float(np.deg2rad(rng.uniform(0.0, 1.5)))
+        gears = [Mechanics(play=size)] * n
+    elif mechanism == "sag":
+        size = float(np.deg2rad(rng.uniform(0.0, 2.5)))
+        gears = [Mechanics(sag=size)] * n
+    else:
+        size = float(rng.uniform(0.0, 0.05))
+        gears = [*[Mechanics()] * (n - 1), Mechanics(coupling=size)]
+    return case, mechanism, size, tuple(gears), sigma
+
+
+def judged_mechanics(seed: int) -> MechanicsVerdict:
+    """Outcome of the case of ``seed``, calibrated without prior knowledge."""
+    case, mechanism, size, gears, sigma = random_mechanics(seed)
+    trials = mechanical_trials(case.cell, gears, sigma, np.random.default_rng([seed, 1]), case.stops)
+    trials = hidden_out_of_view(case.cell, trials)
+    begin = time.process_time()
+    try:
+        result = fit_model(trials, epoch=1)
+    except CalibrationError as error:
+        seconds = time.process_time() - begin
+        return MechanicsVerdict(
+            seed, mechanism, size, sigma, False, code=error.code, message=error.message, seconds=seconds
+        )
+    seconds = time.process_time() - begin
+    inside = share_inside(case, gears, result.model)
+    grade = assess_fit(result.model, result.report).grade
+    return MechanicsVerdict(
+        seed, mechanism, size, sigma, True, inside, grade, result.model.stratum, seconds=seconds
+    )
+
+
+def share_inside(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> float:
+    """Share of the markers in view, at poses that the trials have not seen, inside the ellipses that the model states
+    for them.
+    """
+    links, readings = links_and_readings(case.cell, gears, case.held_out())
+    kept = [i - FIRST_MARKER for i in model.marker_ids]
+    pixels, covariances = pixel_covariances(model, readings)
+    off = pixels - case.cell.pixels(links)[:, :, kept]
+    squares = np.einsum("csma,csmab,csmb->csm", off, np.linalg.inv(covariances), off)
+    return float((squares[case.cell.in_view(links)[:, :, kept]] < INSIDE).mean())
+
+
+def run_random_mechanics(
+    seeds: int = SEEDS, seed: int = 0, progress: ProgressCall | None = None
+) -> dict[str, Any]:
+    """Cases ``seed`` to ``seed + seeds - 1``: a row for each mechanism, the refusals by cause, every case that is not
+    usable, and those called good whose ellipses hold less than ``WELL``.
+
+    Raises ValueError for fewer than one case.
+    """
+    if seeds < 1:
+        raise ValueError(f"{seeds} cases; at least 1 is needed")
+    verdicts = []
+    for k in range(seeds):
+        verdicts.append(judged_mechanics(seed + k))
+        if progress is not None:
+            progress("cases", k + 1, seeds)
+    refused = [verdict for verdict in verdicts if not verdict.usable]
+    praised = [v for v in verdicts if v.usable and v.grade == "good" and v.inside < WELL]
+    return {
+        "experiment": "random-mechanics",
+        "seed": seed,
+        "seeds": seeds,
+        "title": f"random-mechanics: cases {seed} to {seed + seeds - 1} by mechanism",
+        "usable": len(verdicts) - len(refused),
+        "refused_by_cause": dict(Counter(verdict.code for verdict in refused)),
+        "rows": [_row(name, [v for v in verdicts if v.mechanism == name]) for name in MECHANISMS],
+        "refused": [msgspec.structs.asdict(verdict) for verdict in refused],
+        "good_and_not_true": [msgspec.structs.asdict(verdict) for verdict in praised],
+        "thesis": {"note": "none: the thesis has joints without errors"},
+    }
+
+
+def _row(name: str, verdicts: list[MechanicsVerdict]) -> dict[str, Any]:
+    usable = [verdict for verdict in verdicts if verdict.usable]
+    shares = [verdict.inside for verdict in usable]
+    return {
+        "mechanism": name,
+        "cases": len(verdicts),
+        "usable": len(usable),
+        "good": sum(verdict.grade == "good" for verdict in usable),
+        "inside_mean": float(np.mean(shares)) if shares else None,
+        "inside_least": min(shares, default=None),
+        "seconds_median": float(np.median([verdict.seconds for verdict in verdicts])) if verdicts else None,
+    }
+
+
+def draw_random_mechanics(answer: dict[str, Any], folder: Path) -> list[Path]:
+    """Usable and refused cases by mechanism, as bars. Raises OSError."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = answer["rows"]
+    places = np.arange(len(rows))
+    usable = np.array([row["usable"] for row in rows])
+    refused = np.array([row["cases"] for row in rows]) - usable
+    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
+    axes.barh(places, usable, label="usable")
+    axes.barh(places, refused, left=usable, label="refused")
+    axes.set_yticks(places, [row["mechanism"] for row in rows])
+    axes.legend()
+    path = folder / "random_mechanics.png"
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+    return [path]
+
+
+def show_random_mechanics(answer: dict[str, Any], console: Console) -> None:
+    """Print rows, counts, every refused case, and every one that is called good and is not."""
+    show_rows(answer, console)
+    causes = ", ".join(f"{code} {count}" for code, count in sorted(answer["refused_by_cause"].items()))
+    console.print(
+        f"{answer['usable']} of {answer['seeds']} usable" + (f"; refused: {causes}" if causes else "")
+    )
+    for case in answer["refused"]:
+        console.print(
+            f"case {case['seed']}: {case['mechanism']} {case['size']:.2g}, {case['sigma_px']:.3f} px, {case['code']} "
+            f"{case['message']}"
+        )
+    for case in answer["good_and_not_true"]:
+        console.print(
+            f"case {case['seed']}: {case['mechanism']} {case['size']:.2g}, {case['sigma_px']:.3f} px, called good; "
+            f"{case['inside']:.0%} inside"
+        )
