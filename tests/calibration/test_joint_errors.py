@@ -9,6 +9,7 @@ from scipy.stats import binom
 
 from stereoservo.calibration.bundle_adjustment import jacobian, solve
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
+from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.joint_noise import expected_squares, joint_columns
 from stereoservo.calibration.rig_model import JointNoise, residuals
 from stereoservo.calibration.self_calibration import fit_model
@@ -16,7 +17,11 @@ from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.calibration.variance_components import estimate_components, readings
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
+from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, share_inside
 from stereoservo_sim.world import synthetic
+from stereoservo_sim.world.mechanical_trials import mechanical_trials
+from stereoservo_sim.world.mechanics import preset
+from stereoservo_sim.world.random_cells import hidden_out_of_view, random_case
 
 INSIDE = 5.991
 """Squared distance that holds 95 % of two Gaussian coordinates."""
@@ -44,7 +49,7 @@ def trials_with(cell, error, sigma, rng, stated=None):
     return msgspec.structs.replace(there, positions=positions)
 
 
-def share_inside(cell, model, error, rng):
+def share_of_cell(cell, model, error, rng):
     """Share of the markers, at unseen poses and in view, inside their 95 % ellipses."""
     q = cell.held_out(rng, 40)
     pixels, covariances = pixel_covariances(model, q)
@@ -68,17 +73,20 @@ def test_bundle_with_joint_noise_is_generalised_least_squares():
     s, n = linearised.data.offsets.shape
     shared = np.where(linearised.data.offsets == 0.0, np.arange(n), -1)
     own, common = 1e-4, 2e-4
-    noise = JointNoise(np.full((s, n), own), shared, np.full(n, common))
+    features = readings(linearised.data.offsets).features
+    r, giving = features.shape[1], np.array([3e-4] * (n - 1) + [0.0])
+    noise = JointNoise(np.full((s, n), own), shared, np.full(n, common), features, giving)
     solution = solve(linearised.rig, linearised.data.with_joint_noise(noise), "metric")
     assert solution.converged
     assert solution.cost < linearised.cost
     D, stop = joint_columns(solution.rig, solution.data), np.repeat(solution.data.stop, 2)
     rows = np.arange(len(D))
-    Z = np.zeros((len(D), s * n + n))
+    Z = np.zeros((len(D), s * n + n + n * r))
     for j in range(n):
         Z[rows, stop * n + j] = D[:, j] * own
         mine = np.flatnonzero(shared[stop, j] >= 0)
         Z[mine, s * n + j] = D[mine, j] * common
+        Z[:, s * n + n + j * r : s * n + n + (j + 1) * r] = D[:, [j]] * giving[j] * features[stop]
     V = np.eye(len(D)) + Z @ Z.T
     X = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), solution.data)
     y = solution.residuals - (D * solution.data.corrections[stop]).sum(axis=1)
@@ -142,12 +150,42 @@ def test_a_wrong_scale_is_told_beside_errors_of_the_joints(mechanics):
     error = (lambda q: 0.0 * q) if mechanics is None else MECHANICS[mechanics](cell, 0.2e-3, rng)
     trials = trials_with(cell, error, 0.05, rng)
     positions = trials.positions.copy()
-    positions[:, 2] = cell.home[2] + 1.03 * (positions[:, 2] - cell.home[2])
+    positions[:, 2] = cell.home[2] + 1.1 * (positions[:, 2] - cell.home[2])
     with pytest.raises(CalibrationError) as caught:
         fit_model(msgspec.structs.replace(trials, positions=positions), epoch=1)
     assert caught.value.code == "wrong_scale"
     assert list(caught.value.data["joints"]) == ["j3"]
-    assert caught.value.data["joints"]["j3"]["factor"] == pytest.approx(1.03, abs=0.008)
+    found = caught.value.data["joints"]["j3"]
+    assert found["factor"] == pytest.approx(1.1, abs=4.5 * found["deviation"])
+    assert found["deviation"] < 0.01
+
+
+def test_a_scale_that_gears_may_imitate_is_told_as_either():
+    """Three per cent too much are a wrong scale, sag, or coupling: the arm calibrates, and the note names all."""
+    cell, rng = synthetic.rx90(), np.random.default_rng(3)
+    trials = trials_with(cell, lambda q: 0.0 * q, 0.05, rng)
+    positions = trials.positions.copy()
+    positions[:, 2] = cell.home[2] + 1.03 * (positions[:, 2] - cell.home[2])
+    result = fit_model(msgspec.structs.replace(trials, positions=positions), epoch=1)
+    [told] = [note for note in result.report.notes if note.startswith("joint 'j3' reports 1.0")]
+    factor, _, deviation = told.removeprefix("joint 'j3' reports ").split(" ")[:3]
+    assert abs(float(factor) - 1.03) < 4.5 * float(deviation) < 0.02
+    assert "its drive's scale may be wrong, or it gives way under its load" in told
+    assert result.model.joint_accuracy.posture.argmax() == 2
+    assert result.model.statistics.chi2_ok
+
+
+@pytest.mark.parametrize("name", ["strain_wave", "planetary_qdd", "serial_servo"])
+def test_the_presets_calibrate(name):
+    """The first two were refused as wrong scales or outliers that do not settle, the third as no rotation."""
+    case = random_case(3)
+    gears = preset(name, len(case.cell.home))
+    trials = mechanical_trials(case.cell, gears, 0.03, np.random.default_rng(1), positions=driven_stops(case))
+    result = fit_model(hidden_out_of_view(case.cell, trials), epoch=1)
+    assert result.model.statistics.chi2_ok
+    assert result.model.joint_accuracy is not None
+    assert share_inside(case, gears, result.model) > 0.6
+    assert "Joint readings have errors" in assess_fit(result.model, result.report).text
 
 
 @pytest.mark.slow  # in the suite: test_diagnosis, without joints in mind
@@ -169,7 +207,7 @@ def test_components_are_those_of_the_joints(linearised):
         order = (data.camera, data.stop, data.marker)
 
         here = solve(linearised.rig, replace(data, pixels=trials.pixels[order]), "metric", max_evaluations=1)
-        found = estimate_components(here, readings(trials.positions), scales=False)
+        found = estimate_components(here, readings(trials.positions - cell.home), scales=False)
         assert found.significant
         assert found.pixels == pytest.approx(1.0, abs=0.1)
         # Of the first joint, which moves the markers most; of the last ones the two kinds are hardly told apart.
@@ -181,7 +219,7 @@ def test_model_files_keep_the_accuracy_of_joints():
     cell, rng = synthetic.rx90(), np.random.default_rng(2)
     model = fit_model(trials_with(cell, scatter(cell, 0.3e-3, rng), 0.05, rng), epoch=1).model
     again = decode_model(encode_model(model))
-    for key in ("random", "repeatable", "stated"):
+    for key in ("random", "repeatable", "stated", "posture"):
         assert np.array_equal(getattr(again.joint_accuracy, key), getattr(model.joint_accuracy, key))
     older = msgspec.structs.replace(model, joint_accuracy=None)
     assert decode_model(encode_model(older)).joint_accuracy is None
@@ -207,7 +245,7 @@ def pooled(seeds, arms, sizes):
             except CalibrationError as cause:
                 causes.append((kind, seed, cause.code))
                 continue
-            shares[kind].append(share_inside(cell, model, error, rng))
+            shares[kind].append(share_of_cell(cell, model, error, rng))
     for kind, found in shares.items():
         print(f"{kind}: {np.mean(found):.4f} of {len(found)} models, least {min(found):.3f}")
     return shares, causes

@@ -80,8 +80,8 @@ class LensReport(msgspec.Struct, frozen=True):
 
 
 class JointErrorReport(msgspec.Struct, frozen=True):
-    """Errors of a joint's readings as standard deviations [rad or m], ``random`` and ``repeatable``, each with its own
-    standard deviation; ``pixels``: by how much they move the markers in the images, rms [px].
+    """Errors of a joint's readings as standard deviations [rad or m], ``random``, ``repeatable`` and by ``posture``,
+    each with its own standard deviation; ``pixels``: by how much they move the markers in the images, rms [px].
     """
 
     name: str
@@ -90,6 +90,8 @@ class JointErrorReport(msgspec.Struct, frozen=True):
     random_std: float
     repeatable: float
     repeatable_std: float
+    posture: float
+    posture_std: float
     pixels: float
 
 
@@ -170,7 +172,9 @@ def build_fit(
     if components is not None:
         own = data.sigmas**2 * (2.0 - residual_expectations(solution))
         by_joint = joint_variances(solution, every.offsets)
-        variances = variances + by_joint @ components.stated**2 / noise_factor(solution)
+        there = _accuracy(components).deviations(every.offsets - every.corrections)
+        by_error = (by_joint * there[None, :, None] ** 2).sum(axis=3)
+        variances = variances + by_error / noise_factor(solution)
 
     def group(members: BoolArray) -> GroupRms:
         return group_rms(squares[members], data.sigmas[members], own[members])
@@ -188,8 +192,7 @@ def build_fit(
     )
     model = build_model(trials, solution, zero, plane, normaliser, statistics, epoch, created)
     if components is not None:
-        accuracy = JointAccuracy(components.deviations[:, 0], components.deviations[:, 1], components.stated)
-        model = msgspec.structs.replace(model, joint_accuracy=accuracy)
+        model = msgspec.structs.replace(model, joint_accuracy=_accuracy(components))
     shown = variances[np.isfinite(variances)] / 2 * noise_factor(solution)
     tested = lens_test(solution)
     report = CalibrationReport(
@@ -217,6 +220,11 @@ def build_fit(
     return CalibrationFit(model, report)
 
 
+def _accuracy(components: VarianceComponents) -> JointAccuracy:
+    found = components.deviations
+    return JointAccuracy(found[:, 0], found[:, 1], components.stated, components.stated_posture)
+
+
 def _joint_errors(
     trials: TrialData, components: VarianceComponents, by_joint: FloatArray
 ) -> tuple[JointErrorReport, ...]:
@@ -231,7 +239,9 @@ def _joint_errors(
             float(spreads[j, 0]),
             float(found[j, 1]),
             float(spreads[j, 1]),
-            float(slopes[j] * np.hypot(*found[j])),
+            float(found[j, 2]),
+            float(spreads[j, 2]),
+            float(slopes[j] * np.linalg.norm(found[j])),
         )
         for j, (name, kind) in enumerate(zip(trials.joint_names, trials.joint_kinds, strict=True))
     )

@@ -93,8 +93,9 @@ REMEDIES = {
 
 JOINT_ERRORS = (
     "Standard deviations of where the joints are beside what they report. Repeatable errors are the same whenever a "
-    "joint reads the same: gear ripple, sag, play that is driven from one side. Random ones change from stop to stop: "
-    "the encoder's step, friction, play whose flank changes. The deviations that are stated contain them"
+    "joint reads the same: gear ripple, play that is driven from one side. Random ones change from stop to stop: the "
+    "encoder's step, friction, play whose flank changes. Those by posture change slowly with the positions of all "
+    "joints: sag under the arm's weight, a joint that turns with another. The deviations that are stated contain them"
 )
 """What the report's errors of joint readings are."""
 
@@ -175,10 +176,11 @@ def _joint_errors(report: CalibrationReport) -> str:
             for what, value, deviation in (
                 ("repeatable", joint.repeatable, joint.repeatable_std),
                 ("random", joint.random, joint.random_std),
+                ("by posture", joint.posture, joint.posture_std),
             )
             if value > 2.0 * deviation
         ]
-        both = float(np.hypot(joint.repeatable, joint.random))
+        both = float(np.linalg.norm([joint.repeatable, joint.random, joint.posture]))
         told = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
         parts.append(f"joint {joint.name} {told} ({joint.pixels:.2g} px)")
     return f"Joint readings have errors, as standard deviations: {'; '.join(parts)}"

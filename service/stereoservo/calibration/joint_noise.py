@@ -100,12 +100,7 @@ class _Whitened(NamedTuple):
 def _whitened(one: StopRows, data: Measurements) -> _Whitened:
     noise = data.joint_noise
     assert noise is not None
-    e = len(noise.deviations)
-    rows = np.zeros((len(one.rows), e + one.rows.shape[1]))
-    rows[:, e:] = one.rows
-    common = noise.shared[one.stop]
-    for joint in np.flatnonzero(common >= 0):
-        rows[:, common[joint]] += noise.deviations[common[joint]] * one.joints[:, joint]
+    rows = np.hstack([one.joints @ noise.common_factors(one.stop), one.rows])
     basis, triangle = np.linalg.qr(one.joints * noise.own[one.stop])
     values, vectors = np.linalg.eigh(np.eye(len(triangle)) + triangle @ triangle.T)
     shrink = np.eye(len(triangle)) - (vectors / np.sqrt(values)) @ vectors.T
@@ -153,13 +148,13 @@ class StopEquations:
         """Errors of the joints after a step ``x`` (p,), to first order."""
         e = len(self.matrix) - len(self.sizes) - 1
         step = np.append(x * self.sizes, 1.0)
-        shared = -np.linalg.solve(self.matrix[:e, :e], self.matrix[:e, e:] @ step) if e else np.zeros(0)
-        whole = np.concatenate([shared, x, [1.0]])
+        common = -np.linalg.solve(self.matrix[:e, :e], self.matrix[:e, e:] @ step) if e else np.zeros(0)
+        whole = np.concatenate([common, x, [1.0]])
         own = np.zeros_like(self.data.offsets)
         for stop, triangle, projected in self.stops:
             information = np.eye(triangle.shape[1]) + triangle.T @ triangle
             own[stop] = -np.linalg.solve(information, triangle.T @ (projected @ whole))
-        return JointErrors(own, shared)
+        return JointErrors(own, common)
 
 
 def stop_equations(
@@ -167,7 +162,7 @@ def stop_equations(
 ) -> StopEquations:
     """Normal equations of sorted ``data`` with joint noise; ``weights`` as for `normal_equations`."""
     assert data.joint_noise is not None
-    e, p = len(data.joint_noise.deviations), charts.size
+    e, p = data.joint_noise.common, charts.size
     matrix = np.zeros((e + p + 1, e + p + 1))
     matrix[np.arange(e), np.arange(e)] = 1.0
     corrections, cost, stops = data.corrections, 0.0, []
@@ -231,7 +226,7 @@ def orthogonal_factor(
     ordered, order = by_stop(data)
     beside = np.zeros((2 * len(order), 0)) if more is None else more
     extra = beside.reshape(len(order), 2, -1)[order].reshape(2 * len(order), -1)
-    core, e, markers = charts.start(3), len(noise.deviations), charts.size - charts.start(3)
+    core, e, markers = charts.start(3), noise.common, charts.size - charts.start(3)
     prior = np.insert(prior_rows(rig, charts, data), [core] * extra.shape[1], 0.0, axis=1)
     width = e + charts.size + extra.shape[1] + 1
     triangle = np.zeros((e + len(prior), width))
@@ -275,7 +270,7 @@ def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> Float
     noise = data.joint_noise
     assert noise is not None
     ordered, order = by_stop(data)
-    e = len(noise.deviations)
+    e = noise.common
     prior = prior_rows(rig, charts, data)
     start = np.zeros((e + len(prior), e + charts.size + 1))
     start[np.arange(e), np.arange(e)] = 1.0

@@ -19,7 +19,6 @@ from stereoservo.geometry.distortion import bends, distort
 from stereoservo.kinematics.axes import stratum_frame
 from stereoservo.kinematics.model import (
     CellModel,
-    JointAccuracy,
     ModelCovariance,
     Stratum,
     check_model,
@@ -74,29 +73,62 @@ class JointNoise:
 
     ``own`` (s, n): of the part that a joint has at that stop alone. ``shared`` (s, n): index of the error that it has
     in common with other stops at the same reading, -1 where there is none; ``deviations`` (e,) of those errors.
+    ``posture`` (n,): of the part that changes slowly with the posture, whose course at the stops ``features`` (s, r)
+    span with coefficients of unit variance.
     """
 
     own: FloatArray
     shared: IntArray
     deviations: FloatArray
+    features: FloatArray
+    posture: FloatArray
+
+    @property
+    def giving_way(self) -> IntArray:
+        """Joints that have errors which change with the posture."""
+        return np.flatnonzero(self.posture > 0.0)
+
+    @property
+    def common(self) -> int:
+        """Number of errors that stops have in common."""
+        return len(self.deviations) + len(self.giving_way) * int(self.features.shape[1])
+
+    def common_factors(self, stop: int) -> FloatArray:
+        """Error (n, common) of each joint at ``stop`` for a unit of each error that stops have in common."""
+        n, e, r = len(self.posture), len(self.deviations), self.features.shape[1]
+        factors = np.zeros((n, self.common))
+        shared = self.shared[stop]
+        for joint in np.flatnonzero(shared >= 0):
+            factors[joint, shared[joint]] = self.deviations[shared[joint]]
+        for k, joint in enumerate(self.giving_way):
+            factors[joint, e + k * r : e + (k + 1) * r] = self.posture[joint] * self.features[stop]
+        return factors
+
+    def common_offsets(self, common: FloatArray) -> FloatArray:
+        """Errors (s, n) [rad or m] by those that stops have in common (common,)."""
+        e, r = len(self.deviations), self.features.shape[1]
+        found = np.append(common[:e] * self.deviations, 0.0)[self.shared]
+        for k, joint in enumerate(self.giving_way):
+            course = self.features @ common[e + k * r : e + (k + 1) * r]
+            found[:, joint] += self.posture[joint] * course
+        return np.asarray(found)
 
 
 @dataclass(frozen=True)
 class JointErrors:
-    """Estimated errors of joint readings in standard deviations: ``own`` (s, n) and ``shared`` (e,)."""
+    """Estimated errors of joint readings in standard deviations: ``own`` (s, n), and the ``common`` ones of stops."""
 
     own: FloatArray
-    shared: FloatArray
+    common: FloatArray
 
     @property
     def cost(self) -> float:
         """Sum of squares: minus twice the logarithm of their density."""
-        return float((self.own**2).sum() + (self.shared**2).sum())
+        return float((self.own**2).sum() + (self.common**2).sum())
 
     def offsets(self, noise: JointNoise) -> FloatArray:
         """The errors (s, n) [rad or m]."""
-        common = np.append(self.shared * noise.deviations, 0.0)
-        return np.asarray(self.own * noise.own + common[noise.shared])
+        return np.asarray(self.own * noise.own + noise.common_offsets(self.common))
 
 
 @dataclass(frozen=True)
@@ -352,9 +384,7 @@ def with_joints_reversed(model: CellModel) -> CellModel:
         statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])
     accuracy = model.joint_accuracy
     if accuracy is not None:
-        accuracy = JointAccuracy(
-            accuracy.random[::-1].copy(), accuracy.repeatable[::-1].copy(), accuracy.stated[::-1].copy()
-        )
+        accuracy = accuracy.in_order(np.arange(len(model.joint_names))[::-1])
     whole = msgspec.structs.replace(
         model,
         joint_names=model.joint_names[::-1],

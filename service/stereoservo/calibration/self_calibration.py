@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,6 +28,7 @@ from stereoservo.calibration.diagnosis.joint_errors import (
     explains,
     one_thing_happened,
     scales_error,
+    small_scales,
     wrong_scales,
 )
 from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
@@ -106,30 +107,30 @@ def fit_model(
     chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
     priors = lens_priors or {}
 
-    def fit(data: TrialData, chosen: FitOptions, joint_errors: bool = False) -> _Fitted:
+    def fit(data: TrialData, chosen: FitOptions, joint_errors: JointErrorsTaken = "none") -> _Fitted:
         return _fit(data, epoch, created, progress or _silent, chosen, priors, None, joint_errors)
 
     def refit(data: TrialData, chosen: FitOptions) -> CalibrationFit:
         return _fit(data, epoch, created, _silent, chosen, priors).fit
 
     check_motions(chain)
-    first, noisy = _first_fit(chain, options, fit)
-    if noisy is not None and not noisy.doubtful:
-        result, notes = noisy.fit, review_notes(chain, noisy.fit, refit, options)
-    else:
 
-        def others() -> CalibrationFit | None:
-            return _from_other_lenses(chain, epoch, created, options)
+    def others() -> CalibrationFit | None:
+        return _from_other_lenses(chain, epoch, created, options)
 
+    try:
+        result, notes = _chosen_fit(chain, options, priors, fit, refit, others)
+    except CalibrationError as cause:
+        small = small_scales(cause)
+        if not small:
+            raise
         try:
-            result, notes = _with_exact_joints(chain, options, priors, first, refit, others)
-        except CalibrationError:
-            if noisy is None:
-                raise
-            result, notes = noisy.fit, ()
-        statistics = result.model.statistics
-        if noisy is not None and statistics is not None and not statistics.chi2_ok:
-            result, notes = noisy.fit, review_notes(chain, noisy.fit, refit, options)
+            result = fit(chain, options, "scales too").fit
+        except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
+            raise cause from None
+        if not result.report.joints:
+            raise
+        notes = (small, *review_notes(chain, result, refit, options))
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
     model, of_scene = with_static_points(model, trials.static)
     report = msgspec.structs.replace(
@@ -138,6 +139,32 @@ def fit_model(
         untested=untested(chain),
     )
     return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+
+
+def _chosen_fit(
+    chain: TrialData,
+    options: FitOptions,
+    priors: Mapping[str, LensEstimate],
+    fit: _FitOfTrials,
+    refit: Refit,
+    others: Callable[[], CalibrationFit | None],
+) -> tuple[CalibrationFit, tuple[str, ...]]:
+    """The fit with or without errors of the joint readings, whichever explains the data, with notes. Raises
+    CalibrationError with the cause where neither does.
+    """
+    first, noisy = _first_fit(chain, options, fit)
+    if noisy is not None and not noisy.doubtful:
+        return noisy.fit, review_notes(chain, noisy.fit, refit, options)
+    try:
+        result, notes = _with_exact_joints(chain, options, priors, first, refit, others)
+    except CalibrationError:
+        if noisy is None:
+            raise
+        return noisy.fit, ()
+    statistics = result.model.statistics
+    if noisy is not None and statistics is not None and not statistics.chi2_ok:
+        return noisy.fit, review_notes(chain, noisy.fit, refit, options)
+    return result, notes
 
 
 class _Fitted(NamedTuple):
@@ -152,7 +179,11 @@ class _JointErrorsError(Exception):
     """Errors of the joint readings seemed to explain the data, and do not."""
 
 
-_FitOfTrials = Callable[[TrialData, FitOptions, bool], _Fitted]
+JointErrorsTaken = Literal["none", "beside scales", "scales too"]
+"""What joint readings are taken for: exact; with errors that scales of the joints do not explain better; with errors
+that scales may be among."""
+
+_FitOfTrials = Callable[[TrialData, FitOptions, JointErrorsTaken], _Fitted]
 
 
 def _first_fit(
@@ -164,14 +195,14 @@ def _first_fit(
     """
 
     def exact() -> CalibrationFit:
-        return fit(chain, options, False).fit
+        return fit(chain, options, "none").fit
 
     try:
-        tried = fit(chain, options, True)
+        tried = fit(chain, options, "beside scales")
     except _JointErrorsError:
         return exact, None
     except ScalesError as wrong:
-        return _told_by_scales(chain, wrong, exact, lambda data: fit(data, options, True)), None
+        return _told_by_scales(chain, wrong, exact, lambda data: fit(data, options, "beside scales")), None
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
         failure = error
 
@@ -294,21 +325,21 @@ def _fit(
     options: FitOptions,
     priors: Mapping[str, LensEstimate],
     bend: float | None = None,
-    joint_errors: bool = False,
+    joint_errors: JointErrorsTaken = "none",
 ) -> _Fitted:
     """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from;
-    ``joint_errors``: where the data show them, the joint readings have errors.
+    ``joint_errors``: which errors the joint readings have where the data show them.
 
     Raises CalibrationError, and where joint readings have errors _JointErrorsError, ScalesError.
     """
     try:
         start, inexact = _start(trials, report_progress, options, priors, bend), False
     except CalibrationError as error:
-        if not joint_errors or error.code not in OF_JOINT_ERRORS:
+        if joint_errors == "none" or error.code not in OF_JOINT_ERRORS:
             raise
         start, inexact = _inexact_start(trials, report_progress, options, priors, bend, error), True
     components, doubtful = None, False
-    found = _components_at_start(start) if joint_errors else None
+    found = _components_at_start(start) if joint_errors == "beside scales" else None
     if inexact and found is None:
         raise _JointErrorsError
     if found is not None:
@@ -317,8 +348,10 @@ def _fit(
         )
     else:
         bundles = _bundles(start, report_progress, options)
-        if joint_errors:
-            refined = _refined_by_joint_errors(start, bundles, options)
+        if joint_errors != "none":
+            refined = _refined_by_joint_errors(
+                start, bundles, options, beside_scales=joint_errors == "beside scales"
+            )
             if refined is not None:
                 start, bundles, components, doubtful = refined
     report_progress("report", 0.95)
@@ -435,7 +468,7 @@ def _components_at_start(start: _Start) -> VarianceComponents | None:
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     near = squares <= WILD * max(1.0, float(np.median(squares)))
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
-    found = estimate_components(free, readings(start.trials.positions), scales=True)
+    found = estimate_components(free, readings(start.trials.positions - start.zero), scales=True)
     return found if found is not None and found.significant else None
 
 
@@ -445,12 +478,12 @@ def _bundles_with_joint_errors(
     """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError where
     they do not explain the data, ScalesError.
     """
-    labels = readings(start.trials.positions)
+    at = readings(start.trials.positions - start.zero)
     factors = wrong_scales(start.trials, found)
     if (factors != 1.0).any():
         raise ScalesError(factors, found)
     try:
-        noisy = start.with_joint_noise(found.noise(labels))
+        noisy = start.with_joint_noise(found.noise(at))
         first = _bundles(noisy, report_progress, options)
         better = _refined_by_joint_errors(noisy, first, options, found)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
@@ -461,29 +494,36 @@ def _bundles_with_joint_errors(
 
 
 def _refined_by_joint_errors(
-    start: _Start, bundles: _Bundles, options: FitOptions, near: VarianceComponents | None = None
+    start: _Start,
+    bundles: _Bundles,
+    options: FitOptions,
+    near: VarianceComponents | None = None,
+    *,
+    beside_scales: bool = True,
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool] | None:
     """The final bundle whitened by the variance components that it shows, until these stay the same, and whether
     they look like one event; None where errors of the joints do not explain it. Raises ScalesError.
     """
-    labels = readings(start.trials.positions)
+    at = readings(start.trials.positions - start.zero)
     final, inliers = bundles.final, bundles.inliers
-    beside = estimate_components(final, labels, scales=True, near=near)
-    if beside is None or not beside.significant:
-        return None
-    factors = wrong_scales(start.trials, beside)
-    if (factors != 1.0).any():
-        raise ScalesError(factors, beside)
-    components = estimate_components(final, labels, scales=False, near=beside)
+    beside = near
+    if beside_scales:
+        beside = estimate_components(final, at, scales=True, near=near)
+        if beside is None or not beside.significant:
+            return None
+        factors = wrong_scales(start.trials, beside)
+        if (factors != 1.0).any():
+            raise ScalesError(factors, beside)
+    components = estimate_components(final, at, scales=False, near=beside)
     for _ in range(2):
         if components is None:
             return None
-        noisy = start.with_joint_noise(components.noise(labels))
+        noisy = start.with_joint_noise(components.noise(at))
         final, inliers = refine_to_convergence(
             final.rig, noisy.every, final.stratum, options, final.lenses, inliers=inliers
         )
         before = components
-        components = estimate_components(final, labels, scales=False, near=before)
+        components = estimate_components(final, at, scales=False, near=before)
         if components is not None and components.like(before):
             components = before
             break

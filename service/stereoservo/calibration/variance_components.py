@@ -1,8 +1,10 @@
 """Variance components of a calibration by restricted maximum likelihood: pixels, and for each joint a random error of
-every stop and a repeatable one of every reading (Searle, Casella, McCulloch, Variance Components, 2006, ch. 6).
+every stop, a repeatable one of every reading and one that changes slowly with the posture (Searle, Casella, McCulloch,
+Variance Components, 2006, ch. 6).
 
-A repeatable error is the same whenever the joint reads the same: gear ripple, play driven from one side, sag. The
-parameters of the model enter the likelihood linearised, so that what they can imitate is theirs.
+A repeatable error is the same whenever the joint reads the same: gear ripple, play driven from one side. One by posture
+is what gives way under load (sag) or turns with other joints (coupling): a Gaussian process over the positions of all
+joints. The parameters of the model enter the likelihood linearised, so that what they can imitate is theirs.
 """
 
 from __future__ import annotations
@@ -19,12 +21,15 @@ from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.joint_noise import stop_rows
 from stereoservo.calibration.normal_equations import by_stop, prior_rows
 from stereoservo.calibration.rig_model import JointNoise
+from stereoservo.kinematics.model import JointAccuracy, posture_correlation
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 FALSE_ALARM = 1e-4
 """Probability with which joints without errors are said to have some."""
 SAME_READING, SAME_SHARE = 2e-3, 0.05
 """Readings nearer than this [rad or m], and than this share of the joint's range, are one place of its gear."""
+LEAST_FEATURE = 1e-4
+"""Share of the largest variance of a course over postures below which a course is left out."""
 MOST_STOPS = 120
 """Stops, evenly spread, from which the components are estimated: more would know them better than they hold."""
 MOST_SHARED = 120
@@ -37,27 +42,40 @@ RANK_TOLERANCE = 1e-9
 """Singular value of the unit columns below which a direction of the parameters is open."""
 
 
-def readings(offsets: FloatArray) -> IntArray:
-    """Which stops (s, n) have one reading of a joint: their number, counted from 0, for each joint."""
-    labels = np.empty(offsets.shape, dtype=np.int64)
+class Readings(NamedTuple):
+    """What joints report at s stops: ``places`` (s, n), the number of each reading, counted from 0; ``features`` (s, r)
+    that span courses over the postures, none of which shows at the zero.
+    """
+
+    places: IntArray
+    features: FloatArray
+
+
+def readings(offsets: FloatArray) -> Readings:
+    """Readings of joints at positions ``offsets`` (s, n) from the zero."""
+    places = np.empty(offsets.shape, dtype=np.int64)
     for joint, values in enumerate(offsets.T):
         order = np.argsort(values, kind="stable")
         apart = np.diff(values[order]) > min(SAME_READING, SAME_SHARE * float(np.ptp(values)))
-        labels[order, joint] = np.concatenate([[0], np.cumsum(apart)])
-    return labels
+        places[order, joint] = np.concatenate([[0], np.cumsum(apart)])
+    at_zero = posture_correlation(offsets, np.zeros((1, offsets.shape[1])))
+    values, vectors = np.linalg.eigh(posture_correlation(offsets, offsets) - at_zero @ at_zero.T)
+    kept = values > LEAST_FEATURE * max(float(values[-1]), LEAST_FEATURE)
+    return Readings(places, vectors[:, kept] * np.sqrt(values[kept]))
 
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """Estimated variances: ``pixels`` over the stated ones; ``random`` and ``repeatable`` (n,) of the joints' errors
-    [rad² or m²], with the ``covariance`` (2 n, 2 n) of these. ``gain``: twice the logarithm of the likelihood over that
-    of joints without errors. ``scales`` (r,), ``scale_deviations`` (r,): logarithms of the revolute joints' scale
-    factors.
+    """Estimated variances: ``pixels`` over the stated ones; ``random``, ``repeatable`` and ``posture`` (n,) of the
+    joints' errors [rad² or m²], with the ``covariance`` (3 n, 3 n) of these. ``gain``: twice the logarithm of the
+    likelihood over that of joints without errors. ``scales`` (r,), ``scale_deviations`` (r,): logarithms of the
+    revolute joints' scale factors.
     """
 
     pixels: float
     random: FloatArray
     repeatable: FloatArray
+    posture: FloatArray
     covariance: FloatArray
     gain: float
     scales: FloatArray
@@ -66,27 +84,27 @@ class VarianceComponents:
     @property
     def significant(self) -> bool:
         """Whether joints without errors are rejected."""
-        return self.gain > float(chi2_distribution.isf(FALSE_ALARM, 2 * len(self.random)))
+        return self.gain > float(chi2_distribution.isf(FALSE_ALARM, 3 * len(self.random)))
 
     @property
     def deviations(self) -> FloatArray:
-        """Standard deviations (n, 2) of each joint's errors, random and repeatable [rad or m]."""
-        return np.sqrt(np.stack([self.random, self.repeatable], axis=1))
+        """Standard deviations (n, 3) of each joint's errors, random, repeatable and by posture [rad or m]."""
+        return np.sqrt(np.stack([self.random, self.repeatable, self.posture], axis=1))
 
     @property
     def deviations_of_deviations(self) -> FloatArray:
-        """Standard deviations (n, 2) of `deviations`, to first order; of the largest that is likely where none was
+        """Standard deviations (n, 3) of `deviations`, to first order; of the largest that is likely where none was
         seen.
         """
-        spreads = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(2, -1).T
+        spreads = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(3, -1).T
         found = self.deviations
         return np.where(found**2 > spreads, spreads / (2.0 * np.maximum(found, 1e-300)), np.sqrt(spreads))
 
     @property
     def _variance_of_total(self) -> FloatArray:
-        """Variance (n,) of the sum of a joint's two variances."""
+        """Variance (n,) of the sum of a joint's random and repeatable variance."""
         n = len(self.random)
-        blocks = self.covariance.reshape(2, n, 2, n).sum(axis=(0, 2))
+        blocks = self.covariance[: 2 * n, : 2 * n].reshape(2, n, 2, n).sum(axis=(0, 2))
         return np.maximum(np.diag(blocks), 0.0)
 
     @property
@@ -94,35 +112,56 @@ class VarianceComponents:
         """Standard deviation (n,) of a joint's error at another reading: of a variance that is known with ν freedoms
         the expectation is ν / (ν - 2) times the estimate, of one that may be none about its own deviation.
         """
-        total, variance = self.random + self.repeatable, self._variance_of_total
-        share = np.minimum(variance, 0.5 * total**2) / np.where(total > 0.0, total**2, 1.0)
-        return np.sqrt(np.maximum(total / (1.0 - share), NONE_SEEN * np.sqrt(variance)))
+        return _stated(self.random + self.repeatable, self._variance_of_total)
+
+    @property
+    def stated_posture(self) -> FloatArray:
+        """The same (n,) of the error by posture; none where none was seen."""
+        n = len(self.random)
+        variance = np.maximum(np.diag(self.covariance)[2 * n :], 0.0)
+        return np.where(self.posture > 0.0, _stated(self.posture, variance), 0.0)
 
     def like(self, other: VarianceComponents) -> bool:
         """Whether the joints' errors are those of another estimate, to a tenth of their deviations."""
-        off = np.concatenate([self.random - other.random, self.repeatable - other.repeatable])
+        off = np.concatenate(
+            [self.random - other.random, self.repeatable - other.repeatable, self.posture - other.posture]
+        )
         return bool((np.abs(off) <= 0.1 * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))).all())
 
-    def noise(self, labels: IntArray) -> JointNoise:
-        """The joints' noise at stops with these ``labels`` (s, n) of their readings."""
-        return joint_noise_of(np.sqrt(self.random), np.sqrt(self.repeatable), labels)
+    def noise(self, at: Readings) -> JointNoise:
+        """The joints' noise at stops with these readings."""
+        return joint_noise_of(np.sqrt(self.random), np.sqrt(self.repeatable), np.sqrt(self.posture), at)
 
 
-def joint_noise_of(random: FloatArray, repeatable: FloatArray, labels: IntArray) -> JointNoise:
-    """Noise at stops with ``labels`` (s, n) of their readings, of joints with errors of these deviations (n,)."""
-    own, shared = np.tile(random**2, (len(labels), 1)), np.full(labels.shape, -1)
+def _stated(variances: FloatArray, spreads: FloatArray) -> FloatArray:
+    """Deviations (n,) of errors with estimated ``variances`` (n,), these of variance ``spreads`` (n,)."""
+    share = np.minimum(spreads, 0.5 * variances**2) / np.where(variances > 0.0, variances**2, 1.0)
+    return np.sqrt(np.maximum(variances / (1.0 - share), NONE_SEEN * np.sqrt(spreads)))
+
+
+def joint_noise_of(
+    random: FloatArray, repeatable: FloatArray, posture: FloatArray, at: Readings
+) -> JointNoise:
+    """Noise at stops with the readings ``at``, of joints with errors of these deviations (n,)."""
+    places = at.places
+    own, shared = np.tile(random**2, (len(places), 1)), np.full(places.shape, -1)
     common = [
-        (int(count), int(joint), label)
+        (int(count), int(joint), place)
         for joint in np.flatnonzero(repeatable > 0.0)
-        for label, count in enumerate(np.bincount(labels[:, joint]))
+        for place, count in enumerate(np.bincount(places[:, joint]))
         if count > 1
     ]
     common = sorted(common, reverse=True)[:MOST_SHARED]
-    for k, (_, joint, label) in enumerate(common):
-        shared[labels[:, joint] == label, joint] = k
+    for k, (_, joint, place) in enumerate(common):
+        shared[places[:, joint] == place, joint] = k
     own += np.where(shared < 0, repeatable**2, 0.0)
     deviations = np.array([repeatable[joint] for _, joint, _ in common])
-    return JointNoise(np.sqrt(own), shared, deviations)
+    return JointNoise(np.sqrt(own), shared, deviations, at.features, posture)
+
+
+def noise_of_accuracy(accuracy: JointAccuracy, at: Readings) -> JointNoise:
+    """Noise at stops with the readings ``at``, of joints with the errors that a model states."""
+    return joint_noise_of(accuracy.random, accuracy.repeatable, accuracy.posture, at)
 
 
 class _Reduced(NamedTuple):
@@ -140,7 +179,7 @@ class _Reduced(NamedTuple):
     freedom: int
 
 
-def _reduced(solution: Solution, labels: IntArray) -> _Reduced:
+def _reduced(solution: Solution, at_stops: Readings) -> _Reduced:
     """The bundle's linearised rows, reflected so that each stop has one row for each of its joints' errors."""
     rig, charts = solution.rig, solution.charts
     data, _ = by_stop(solution.data)
@@ -176,10 +215,12 @@ def _reduced(solution: Solution, labels: IntArray) -> _Reduced:
             own[at[k] : at[k + 1], k] = block[:, joint]
         Z.append(own)
         component += [joint] * len(blocks)
-        places, where = np.unique(labels[used, joint], return_inverse=True)
+        places, where = np.unique(at_stops.places[used, joint], return_inverse=True)
         if 1 < len(places) < len(blocks):
             Z.append(own @ (where[:, None] == np.arange(len(places))))
             component += [n + joint] * len(places)
+        Z.append(own @ at_stops.features[used])
+        component += [2 * n + joint] * at_stops.features.shape[1]
     X = whole[:, :p]
     size = np.linalg.norm(X, axis=0)
     _, values, vectors = np.linalg.svd(X / np.where(size > 0.0, size, 1.0), full_matrices=False)
@@ -197,7 +238,7 @@ def _reduced(solution: Solution, labels: IntArray) -> _Reduced:
 
 
 class _Likelihood:
-    """Restricted likelihood of a reduced problem at variances (1 + 2 n,): pixels, random, repeatable."""
+    """Restricted likelihood of a reduced problem at variances (1 + 3 n,): pixels, random, repeatable, posture."""
 
     def __init__(self, reduced: _Reduced, X: FloatArray, variances: FloatArray) -> None:
         self.reduced, self.variances = reduced, variances
@@ -270,15 +311,15 @@ def _maximised(reduced: _Reduced, X: FloatArray, start: FloatArray) -> tuple[_Li
 
 
 def estimate_components(
-    solution: Solution, labels: IntArray, *, scales: bool, near: VarianceComponents | None = None
+    solution: Solution, at: Readings, *, scales: bool, near: VarianceComponents | None = None
 ) -> VarianceComponents | None:
-    """Variance components of a bundle, its present joint noise set aside; ``labels`` (s, n) of `readings`. ``near``: an
-    earlier estimate to start from.
+    """Variance components of a bundle, its present joint noise set aside, whose stops have the readings ``at``.
+    ``near``: an earlier estimate to start from.
 
     ``scales``: with scale factors of the revolute joints among the parameters, which errors proportional to the
     reading are then not taken for. None where nothing in the residuals points to joints.
     """
-    reduced = _reduced(solution, labels)
+    reduced = _reduced(solution, at)
     n = len(solution.rig.kinds)
     X = np.hstack([reduced.X, _unit(reduced.scales)]) if scales else reduced.X
     freedom = len(reduced.y) - X.shape[1] + reduced.freedom
@@ -286,16 +327,16 @@ def estimate_components(
         return None
     left = reduced.y - (basis := np.linalg.qr(X)[0]) @ (basis.T @ reduced.y)
     pixels = max((float(left @ left) + reduced.squares) / freedom, 1e-12)
-    none = _Likelihood(reduced, X, np.append(pixels, np.zeros(2 * n)))
+    none = _Likelihood(reduced, X, np.append(pixels, np.zeros(3 * n)))
     score, information, _ = none.score()
     if not (score[1:] > SCREEN * np.sqrt(np.maximum(np.diag(information)[1:], 0.0))).any():
         return None
     there = np.diag(information)[1:] > 0.0
-    guess = np.zeros(2 * n)
+    guess = np.zeros(3 * n)
     guess[there] = pixels / np.array([_mean_square(reduced, int(c)) for c in np.flatnonzero(there)])
     first = np.append(min(pixels, 1.0), guess)
     if near is not None:
-        first = np.concatenate([[near.pixels], near.random, near.repeatable])
+        first = np.concatenate([[near.pixels], near.random, near.repeatable, near.posture])
     best, information = _maximised(reduced, X, first)
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-8) / np.outer(size, size)
@@ -303,7 +344,8 @@ def estimate_components(
     return VarianceComponents(
         float(best.variances[0]),
         best.variances[1 : 1 + n],
-        best.variances[1 + n :],
+        best.variances[1 + n : 1 + 2 * n],
+        best.variances[1 + 2 * n :],
         covariance[1:, 1:],
         2.0 * (best.value - none.value),
         logs,

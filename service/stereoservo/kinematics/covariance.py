@@ -125,11 +125,12 @@ def pixel_covariances(model: CellModel, positions: FloatArray) -> tuple[FloatArr
         for axis in covariance_axes(model).T
     ]  # fmt: skip
     if model.joint_accuracy is not None:
-        for joint, deviation in enumerate(model.joint_accuracy.stated):
+        deviations = model.joint_accuracy.deviations(positions - model.zero)
+        for joint, deviation in enumerate(deviations.T):
             shift = np.zeros(positions.shape[1])
             shift[joint] = JOINT_STEP
             ends = [predicted_pixels(model, positions + sign * shift) for sign in (1.0, -1.0)]
-            slopes.append((ends[0] - ends[1]) * (deviation / (2.0 * JOINT_STEP)))
+            slopes.append((ends[0] - ends[1]) * (deviation[None, :, None, None] / (2.0 * JOINT_STEP)))
     stacked = np.array(slopes)
     return predicted_pixels(model, positions), np.einsum("pcsma,pcsmb->csmab", stacked, stacked)
 

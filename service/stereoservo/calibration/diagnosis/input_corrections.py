@@ -28,7 +28,7 @@ from stereoservo.calibration.rig_model import Measurements, projective_rig, stra
 from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.calibration.variance_components import joint_noise_of, readings
+from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import Kind, lens_model_of
 from stereoservo.numerics.arrays import FloatArray
@@ -217,8 +217,7 @@ def solution_of(trials: TrialData, result: CalibrationFit) -> Solution:
     rig = stratum_rig(model)
     evaluations = 1
     if model.joint_accuracy is not None:
-        accuracy = model.joint_accuracy
-        noise = joint_noise_of(accuracy.random, accuracy.repeatable, readings(trials.positions))
+        noise = noise_of_accuracy(model.joint_accuracy, readings(trials.positions - model.zero))
         # The errors of the joints are not kept in the model: they take a step.
         data, evaluations = data.with_joint_noise(noise), 4
     lenses = lens_model_of(rig.lenses)

@@ -26,6 +26,8 @@ WRONG_SHARE = 0.5
 """Error over reported displacement of a joint that stands elsewhere in another's trial, from which it is wrong."""
 LEAST_STOPS = 4
 """Stops of a trial from which single ones can be told."""
+MOST_GIVEN = 0.06
+"""Largest share of its motion that a joint may seem to have too much or too little by sag or coupling."""
 LIKE_OTHERS = 3.0
 """Times the joints' own errors that a wrong scale must move a joint over its trial to be told from them."""
 
@@ -84,7 +86,7 @@ def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArra
     """
     factors = np.ones(len(trials.joint_names))
     revolute = [j for j, kind in enumerate(trials.joint_kinds) if kind == "revolute"]
-    total = np.sqrt(components.random + components.repeatable)
+    total = np.sqrt(components.random + components.repeatable + components.posture)
     for joint, log, deviation in zip(revolute, components.scales, components.scale_deviations, strict=True):
         own = trials.positions[trials.trials == joint, joint]
         if not len(own):
@@ -98,6 +100,24 @@ def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArra
         ):
             factors[joint] = float(np.exp(log))
     return factors
+
+
+def small_scales(cause: CalibrationError) -> str:
+    """What may be instead of wrong scales where gears that give way may report as much, as a note; "" where they
+    cannot.
+    """
+    joints = cause.data.get("joints") if cause.code == "wrong_scale" else None
+    if not joints or any(abs(one["factor"] - 1.0) > MOST_GIVEN for one in joints.values()):
+        return ""
+    listed = ", ".join(
+        f"{name!r} reports {one['factor']:.4g} ± {one['deviation']:.1g} times its motion"
+        for name, one in joints.items()
+    )
+    return (
+        f"joint {listed}: its drive's scale may be wrong, or it gives way under its load, or turns with the joint "
+        "beside it; the trials do not tell which, and the model takes it for an error of the reading. What tells: its "
+        "angle by a protractor over its whole range, the arm's weight on and off it"
+    )
 
 
 def scales_error(trials: TrialData, factors: FloatArray, components: VarianceComponents) -> CalibrationError:

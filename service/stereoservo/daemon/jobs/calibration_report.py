@@ -33,7 +33,7 @@ from stereoservo.calibration.fit_assessment import JOINT_ERRORS, STRATA, Accepta
 from stereoservo.calibration.joint_noise import estimated_errors
 from stereoservo.calibration.rig_model import Measurements, acting_order, acting_rig, full_charts, predicted
 from stereoservo.calibration.trial_data import TrialData
-from stereoservo.calibration.variance_components import joint_noise_of, readings
+from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo.kinematics.model import CellModel
 
@@ -73,11 +73,9 @@ def residuals_of(model: CellModel, trials: TrialData, report: CalibrationReport)
     data = known_measurements(model, trials, order)
     accuracy = model.joint_accuracy
     if accuracy is not None:
-        acting = list(order)
-        labels = readings(trials.positions[:, acting])
-        data = data.with_joint_noise(
-            joint_noise_of(accuracy.random[acting], accuracy.repeatable[acting], labels)
-        )
+        acting = np.array(order)
+        at = readings((trials.positions - model.zero)[:, acting])
+        data = data.with_joint_noise(noise_of_accuracy(accuracy.in_order(acting), at))
         data = data.corrected(estimated_errors(rig, full_charts(rig, model.stratum), data))
     pixels = data.pixels - predicted(rig, data)
     outliers = {(out.camera, out.stop, out.marker) for out in report.outliers}
@@ -253,13 +251,14 @@ def _joint_errors(report: CalibrationReport) -> list[str]:
                 joint.name,
                 f"{1e3 * joint.repeatable:.3g} ± {1e3 * joint.repeatable_std:.1g} {unit}",
                 f"{1e3 * joint.random:.3g} ± {1e3 * joint.random_std:.1g} {unit}",
+                f"{1e3 * joint.posture:.3g} ± {1e3 * joint.posture_std:.1g} {unit}",
                 f"{joint.pixels:.3g}",
             )
         )
     return [
         "<h2>Errors of the joint readings</h2>",
         f"<p>{_e(JOINT_ERRORS)}.</p>",
-        _table(("joint", "repeatable", "random", "in the images [px]"), rows),
+        _table(("joint", "repeatable", "random", "by posture", "in the images [px]"), rows),
     ]
 
 

@@ -22,6 +22,7 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.experiments.experiment import show_rows
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.mechanical_trials import links_and_readings, mechanical_trials
@@ -90,7 +91,9 @@ def random_mechanics(seed: int) -> tuple[RandomCase, str, float, tuple[Mechanics
 def judged_mechanics(seed: int) -> MechanicsVerdict:
     """Outcome of the case of ``seed``, calibrated without prior knowledge."""
     case, mechanism, size, gears, sigma = random_mechanics(seed)
-    trials = mechanical_trials(case.cell, gears, sigma, np.random.default_rng([seed, 1]), case.stops)
+    trials = mechanical_trials(
+        case.cell, gears, sigma, np.random.default_rng([seed, 1]), positions=driven_stops(case)
+    )
     trials = hidden_out_of_view(case.cell, trials)
     begin = time.process_time()
     try:
@@ -106,6 +109,16 @@ def judged_mechanics(seed: int) -> MechanicsVerdict:
     return MechanicsVerdict(
         seed, mechanism, size, sigma, True, inside, grade, result.model.stratum, seconds=seconds
     )
+
+
+def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
+    """Positions (s, n) of the case's trials and the joint (s,) that moves, in the order of the trial programme: each
+    joint from its middle to one end, then beyond the middle to the other.
+    """
+    motors, moved = case.cell.stops(case.stops)
+    offsets = motors[np.arange(len(motors)), moved] - case.cell.home[moved]
+    order = np.lexsort((np.abs(offsets), offsets < 0.0, moved))
+    return motors[order], moved[order]
 
 
 def share_inside(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> float:
