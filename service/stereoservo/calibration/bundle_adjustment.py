@@ -12,7 +12,12 @@ from typing import Literal
 
 import numpy as np
 
-from stereoservo.calibration.joint_noise import StopEquations, StopFactor, orthogonal_factor, stop_equations
+from stereoservo.calibration.joint_errors.joint_noise import (
+    StopEquations,
+    StopFactor,
+    orthogonal_factor,
+    stop_equations,
+)
 from stereoservo.calibration.normal_equations import (
     ArrowFactor,
     NormalEquations,

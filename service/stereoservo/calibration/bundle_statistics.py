@@ -10,7 +10,11 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.joint_noise import expected_squares, joint_columns, prediction_leverages
+from stereoservo.calibration.joint_errors.joint_noise import (
+    expected_squares,
+    joint_columns,
+    prediction_leverages,
+)
 from stereoservo.calibration.rig_model import Measurements, predicted
 from stereoservo.numerics.arrays import FloatArray
 

@@ -22,18 +22,18 @@ from stereoservo.calibration.bundle_statistics import (
     residual_expectations,
     variance_factor,
 )
+from stereoservo.calibration.joint_errors.variance_components import VarianceComponents
 from stereoservo.calibration.lens_significance import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.trial_data import TrialData
-from stereoservo.calibration.variance_components import VarianceComponents
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics
+from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.model import (
     MODEL_SCHEMA,
     CameraModel,
     CellModel,
     FitStatistics,
-    JointAccuracy,
     JointStatistics,
     ModelCovariance,
     Stratum,

@@ -11,7 +11,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.bundle_statistics import degrees_of_freedom, variance_factor
-from stereoservo.calibration.joint_noise import orthogonal_factor
+from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
 from stereoservo.calibration.rig_model import predicted, residuals
 from stereoservo.geometry.distortion import terms_jacobian
 from stereoservo.kinematics.model import pinhole

@@ -34,6 +34,11 @@ from stereoservo.calibration.diagnosis.joint_errors import (
 from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
+from stereoservo.calibration.joint_errors.variance_components import (
+    VarianceComponents,
+    estimate_components,
+    readings,
+)
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     implausible_lens,
@@ -59,7 +64,6 @@ from stereoservo.calibration.single_joint_fit import (
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
-from stereoservo.calibration.variance_components import VarianceComponents, estimate_components, readings
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError

@@ -11,8 +11,12 @@ from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.diagnosis.joint_scales import LEAST_FACTOR
 from stereoservo.calibration.diagnosis.marker_tracks import find_step
+from stereoservo.calibration.joint_errors.variance_components import (
+    FALSE_ALARM,
+    SAME_READING,
+    VarianceComponents,
+)
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.calibration.variance_components import FALSE_ALARM, SAME_READING, VarianceComponents
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 EXPLAINED = 1.5

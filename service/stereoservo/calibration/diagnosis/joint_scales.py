@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.joint_noise import orthogonal_factor
+from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
 from stereoservo.calibration.lens_significance import scale_columns
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.single_joint_fit import (

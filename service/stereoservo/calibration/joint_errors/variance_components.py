@@ -18,10 +18,10 @@ from scipy.sparse import csc_array, diags_array
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.joint_noise import stop_rows
+from stereoservo.calibration.joint_errors.joint_noise import stop_rows
 from stereoservo.calibration.normal_equations import by_stop, prior_rows
 from stereoservo.calibration.rig_model import JointNoise
-from stereoservo.kinematics.model import JointAccuracy, posture_correlation
+from stereoservo.kinematics.joint_accuracy import JointAccuracy, posture_correlation
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 FALSE_ALARM = 1e-4

@@ -1,0 +1,46 @@
+"""Errors of joint readings that a model states: random, repeatable, and by posture."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+POSTURE_LENGTH = 1.0
+"""Distance of postures [rad, m] over which errors by posture change their course."""
+
+
+class JointAccuracy(msgspec.Struct, frozen=True, eq=False):
+    """Standard deviations (n,) of the errors of joint readings, true minus reported [rad or m], as the trials show
+    them.
+
+    ``random``: changes from stop to stop. ``repeatable``: the same whenever the joint reads the same (gear ripple, play
+    driven from one side). ``stated``: of both together at a reading that the trials have not seen, larger than their
+    root sum of squares by what the estimates leave open. ``posture``: of what changes slowly with the posture of the
+    whole arm (sag, coupled joints), far from that of the model's zero; see `posture_deviations`.
+    """
+
+    random: FloatArray
+    repeatable: FloatArray
+    stated: FloatArray
+    posture: FloatArray
+
+    def in_order(self, order: IntArray) -> JointAccuracy:
+        """The same of joints in another order (n,)."""
+        return JointAccuracy(
+            self.random[order], self.repeatable[order], self.stated[order], self.posture[order]
+        )
+
+    def deviations(self, offsets: FloatArray) -> FloatArray:
+        """Deviations (s, n) of the readings at positions ``offsets`` (s, n) from the model's zero."""
+        alike = posture_correlation(offsets, np.zeros((1, offsets.shape[1])))
+        return np.asarray(np.sqrt(self.stated**2 + self.posture**2 * (1.0 - alike**2)))
+
+
+def posture_correlation(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Correlation (s, t) of errors by posture at positions (s, n) and (t, n): squared exponential (Rasmussen, Williams,
+    2006, 4.2).
+    """
+    squares = ((one[:, None] - other[None]) ** 2).sum(axis=2)
+    return np.asarray(np.exp(-0.5 * squares / POSTURE_LENGTH**2))
