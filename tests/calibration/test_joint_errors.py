@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import binom
 
 from stereoservo.calibration.bundle_adjustment import jacobian, solve
+from stereoservo.calibration.change.model_check import check_model_holds
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.joint_errors.joint_noise import expected_squares, joint_columns
@@ -176,8 +177,10 @@ def test_a_scale_that_gears_may_imitate_is_told_as_either():
 
 
 @pytest.mark.parametrize("name", ["strain_wave", "planetary_qdd", "serial_servo"])
-def test_the_presets_calibrate(name):
-    """The first two were refused as wrong scales or outliers that do not settle, the third as no rotation."""
+def test_the_presets_calibrate_and_are_checked(name):
+    """The first two were refused as wrong scales or outliers that do not settle, the third as no rotation; checks named
+    what they do not explain, and a zero that drifts is still told.
+    """
     case = random_case(3)
     gears = preset(name, len(case.cell.home))
     trials = mechanical_trials(case.cell, gears, 0.03, np.random.default_rng(1), positions=driven_stops(case))
@@ -186,6 +189,19 @@ def test_the_presets_calibrate(name):
     assert result.model.joint_accuracy is not None
     assert share_inside(case, gears, result.model) > 0.6
     assert "Joint readings have errors" in assess_fit(result.model, result.report).text
+    smaller = replace(case, cell=replace(case.cell, ranges=0.6 * case.cell.ranges), stops=5)
+    check = hidden_out_of_view(
+        case.cell,
+        mechanical_trials(case.cell, gears, 0.03, np.random.default_rng(2), positions=driven_stops(smaller)),
+    )
+    assert check_model_holds(result.model, check).status == "holds"
+    exact = msgspec.structs.replace(result.model, joint_accuracy=None)
+    assert check_model_holds(exact, check).status == "recalibrate"
+    drift = 0.02 * (np.arange(6) == 2)
+    drifted = check_model_holds(
+        result.model, msgspec.structs.replace(check, positions=check.positions + drift)
+    )
+    assert [(cause.kind, cause.subject) for cause in drifted.causes] == [("joint", "j3")]
 
 
 @pytest.mark.slow  # in the suite: test_diagnosis, without joints in mind

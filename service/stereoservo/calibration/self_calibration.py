@@ -125,16 +125,11 @@ def fit_model(
     try:
         result, notes = _chosen_fit(chain, options, priors, fit, refit, others)
     except CalibrationError as cause:
-        small = small_scales(cause)
-        if not small:
+        note = small_scales(cause)
+        absorbed = _absorbed(lambda: fit(chain, options, "scales too")) if note else None
+        if absorbed is None:
             raise
-        try:
-            result = fit(chain, options, "scales too").fit
-        except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
-            raise cause from None
-        if not result.report.joints:
-            raise
-        notes = (small, *review_notes(chain, result, refit, options))
+        result, notes = absorbed, (note, *review_notes(chain, absorbed, refit, options))
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
     model, of_scene = with_static_points(model, trials.static)
     report = msgspec.structs.replace(
@@ -169,6 +164,17 @@ def _chosen_fit(
     if noisy is not None and statistics is not None and not statistics.chi2_ok:
         return noisy.fit, review_notes(chain, noisy.fit, refit, options)
     return result, notes
+
+
+def _absorbed(fit: Callable[[], _Fitted]) -> CalibrationFit | None:
+    """A fit whose joint readings have errors that small scale factors may be among; None where they do not explain the
+    data, or look like one event.
+    """
+    try:
+        fitted = fit()
+    except (_JointErrorsError, CalibrationError, GeometryError, np.linalg.LinAlgError):
+        return None
+    return fitted.fit if fitted.joint_errors and not fitted.doubtful else None
 
 
 class _Fitted(NamedTuple):

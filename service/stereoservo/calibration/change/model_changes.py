@@ -11,10 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from stereoservo.calibration.bundle_adjustment import jacobian
+from stereoservo.calibration.joint_errors.joint_noise import error_columns
+from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
 from stereoservo.calibration.normal_equations import triangle_of
 from stereoservo.calibration.rig_model import (
     Charts,
@@ -161,11 +164,20 @@ def with_corrected_zeros(
 def _stated_uncertainty(
     model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
 ) -> FloatArray:
-    """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` by the model's stated covariance."""
+    """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` by the model's stated covariance, and by the
+    errors of its joints' readings.
+    """
     slopes, columns = covariance_jacobian(model, stated, data, order)
     values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
     root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    return root
+    accuracy = model.joint_accuracy
+    if accuracy is None:
+        return root
+    unseen = msgspec.structs.replace(
+        accuracy, random=np.sqrt(np.maximum(accuracy.stated**2 - accuracy.repeatable**2, accuracy.random**2))
+    )
+    noise = noise_of_accuracy(unseen.in_order(np.array(order)), readings(data.offsets))
+    return np.hstack([root, error_columns(acting_rig(model), data.with_joint_noise(noise))])
 
 
 def covariance_jacobian(

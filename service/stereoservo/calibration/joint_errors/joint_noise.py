@@ -48,6 +48,23 @@ def joint_columns(rig: RigModel, data: Measurements) -> FloatArray:
     return np.ascontiguousarray(slopes.transpose(0, 2, 1)).reshape(2 * len(data.camera), -1)
 
 
+def error_columns(rig: RigModel, data: Measurements) -> FloatArray:
+    """Derivatives (2 k, e) of the weighted residuals by all errors of the joints of ``data``, which has joint noise, in
+    their standard deviations: the root of what they add to the covariance of the residuals.
+    """
+    noise, slopes = data.joint_noise, joint_columns(rig, data)
+    assert noise is not None
+    stop = np.repeat(data.stop, 2)
+    stops = np.unique(stop)
+    own = np.where(stop[:, None, None] == stops[:, None], (slopes * noise.own[stop])[:, None], 0.0)
+    common = np.zeros((len(slopes), noise.common))
+    for one in stops:
+        here = stop == one
+        common[here] = slopes[here] @ noise.common_factors(one)
+    columns = np.hstack([own.reshape(len(slopes), -1), common])
+    return columns[:, columns.any(axis=0)]
+
+
 class StopRows(NamedTuple):
     """Weighted rows of one stop: ``joints`` (2 k, n) by its joints' positions, ``rows`` (2 k, p + 1) by the parameters
     and the residuals at the reported positions, to first order. ``measurements``: where they are in the sorted data.
