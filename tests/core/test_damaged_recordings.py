@@ -75,6 +75,23 @@ def test_a_flipped_byte_is_refused_or_changes_no_message(small: Path) -> None:
             assert found == messages
 
 
+def test_a_record_of_another_kind_or_length_is_refused_or_changes_no_message(small: Path) -> None:
+    whole = small.read_bytes()
+    messages = read(small, whole)
+    begins, at = [], 8
+    while at < len(whole) - 8:
+        begins.append(at)
+        at += 9 + int(struct.unpack_from("<Q", whole, at + 1)[0])
+    assert at == len(whole) - 8
+    for at in begins:
+        for where, values in ((at, range(1, 256)), (at + 1, range(1, 256, 7)), (at + 2, (1, 2, 64))):
+            for value in values:
+                data = bytearray(whole)
+                data[where] ^= value
+                found = read(small, bytes(data))
+                assert isinstance(found, RecordingError) or found == messages, (where - at, whole[at], value)
+
+
 @pytest.mark.parametrize("count", FILES)
 def test_no_file_raises_anything_else(small: Path, count: int) -> None:
     whole = small.read_bytes()

@@ -86,7 +86,9 @@ class FlightRecorder:
         self._stream = _OutputFile(path, durable)
         due = int(settings.rate_hz * CHUNK_S) * LEAST_STEP_BYTES
         chunk = min(CHUNK_BYTES, max(LEAST_CHUNK_BYTES, due))
-        self._writer = Writer(self._stream, chunk_size=chunk, compression=CompressionType.LZ4)
+        self._writer = Writer(
+            self._stream, chunk_size=chunk, compression=CompressionType.LZ4, enable_data_crcs=True
+        )
         self._writer.start(profile=FORMAT, library="stereoservo")
         encoded = encode(settings)
         self._channels = {

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import msgspec
 import numpy as np
 from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Chunk, Header, McapRecord, Message
+from mcap.records import Channel, Chunk, Header, McapRecord, Message, Statistics
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 import stereoservo
@@ -244,7 +244,8 @@ class _BoundedFile:
 
 def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
     """Topic and payload in file order. Raises RecordingError naming how far the file is good."""
-    steps = 0
+    steps = messages = 0
+    stated: int | None = None
     topics: dict[int, str] = {}
     source: _BoundedFile | None = None
 
@@ -268,8 +269,13 @@ def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
                 topics[record.id] = record.topic
             elif isinstance(record, Message):
                 topic = topics[record.channel_id]
+                messages += 1
                 steps += topic == "step"
                 yield topic, record.data
+            elif isinstance(record, Statistics):
+                stated = record.message_count
+        if stated != messages:  # a reader skips records of kinds that it does not know: a damaged kind is one
+            raise ValueError(f"it states {stated} messages and {messages} were read")
 
 
 def _records(source: _BoundedFile) -> Iterator[McapRecord]:
