@@ -208,3 +208,20 @@ _encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
 def encode(value: object) -> bytes:
     """A struct, or anything made of structs and arrays, as msgpack; arrays bit for bit."""
     return _encoder.encode(value)
+
+
+def check_observation(observation: CameraObservation) -> None:
+    """Raise ValueError where an observation's arrays are not of the shapes and types that it is to have: compiled
+    kernels take no others.
+    """
+    ids = observation.ids
+    if ids.ndim != 1 or ids.dtype.kind not in "iu":
+        raise ValueError(f"ids are {ids.dtype} of shape {ids.shape}; integers (k,) are needed")
+    for name, array, shape in (
+        ("pixels", observation.pixels, (len(ids), 2)),
+        ("covariances", observation.covariances, (len(ids), 2, 2)),
+    ):
+        if array.shape != shape or array.dtype.char != "d":
+            raise ValueError(
+                f"{name} are {array.dtype} of shape {array.shape}; float64 {shape} are needed for {len(ids)} ids"
+            )

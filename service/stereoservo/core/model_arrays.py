@@ -11,6 +11,7 @@ import numpy as np
 from stereoservo.control.marker_groups import MarkerGroups, groups_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.cameras import camera_centre
+from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
 from stereoservo.kinematics.model import CellModel, lens_size
 from stereoservo.numerics.arrays import FloatArray
@@ -41,6 +42,8 @@ class ModelArrays:
     """Rows of `FrameResiduals`: the markers, then the static points."""
     groups: MarkerGroups | None
     """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
+    joint_accuracy: JointAccuracy | None
+    """Errors of joint readings, where the trials have shown some."""
 
 
 def _require_numbers(model: CellModel) -> None:
@@ -122,6 +125,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         scene_pixels=scene_pixels,
         rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
         groups=groups_of(model),
+        joint_accuracy=model.joint_accuracy,
     )
 
 

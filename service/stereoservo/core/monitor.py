@@ -39,7 +39,7 @@ from stereoservo.core.monitor_state import (
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, stated_thresholds, worst_contact
 from stereoservo.core.monitors.diagnosis import camera_moved_findings, emit_diagnosis, mask_marker
-from stereoservo.core.monitors.fault_isolation import bench_now, diagnosed
+from stereoservo.core.monitors.fault_isolation import Bench, bench_now, diagnosed, without_joint_errors
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
@@ -372,7 +372,19 @@ def _judged(
         suspicious |= not (likely or _late(sighting, used, settings))
     if not suspicious:
         return ModelDiagnosis()
-    return diagnosed(bench_now(watching, known, arrays, settings))
+    bench = bench_now(watching, known, arrays, settings)
+    return ModelDiagnosis() if _joint_errors_explain(bench) else diagnosed(bench)
+
+
+def _joint_errors_explain(bench: Bench) -> bool:
+    """Whether play, sag, ripple and encoder steps, as large as the model states them, leave nothing but noise."""
+    found = without_joint_errors(bench)
+    if found is None:
+        return False
+    left, chi2 = found
+    largest = float(((left * bench.weights[..., None]) ** 2).sum(axis=-1).max())
+    freedoms = 2.0 * float((bench.weights > 0.0).sum())
+    return chi2 <= _improbable(freedoms) and largest <= gate_threshold(bench.settings.gate_sigma)
 
 
 def _likely(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from stereoservo.core.cycle import Event, Status, decode_array, encode
+from stereoservo.core.cycle import Event, Status, check_observation, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.daemon.pacing import LoopStatistics
 from stereoservo.kinematics.model import CellModel
@@ -25,7 +25,6 @@ from stereoservo.ports.devices import (
     DriverContext,
     JointDriverDescription,
     Prior,
-    check_observation,
 )
 from stereoservo.recording.step_records import StepMessage
 

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereoservo.core.cycle import encode
+from stereoservo.core.cycle import check_observation, encode
 from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
@@ -33,7 +33,7 @@ from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
 from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
-from stereoservo.messages.decoding import RecordBoundary, decoding
+from stereoservo.messages.decoding import RecordBoundary, cause_of
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, hardware_lock_path
 from stereoservo.messages.recording_request import RecordedImages, request_path
@@ -47,7 +47,6 @@ from stereoservo.ports.devices import (
     DriverError,
     Frame,
     Prior,
-    check_observation,
 )
 
 if TYPE_CHECKING:
@@ -107,8 +106,10 @@ class VisionSlots:
         """The newest prior that decodes, of any age; None before the first."""
         data = self._priors.poll()
         if data is not None:
-            with self._boundary:
+            try:
                 self._prior = prior_decoder.decode(data)
+            except Exception as error:  # a decoder may raise anything
+                self._boundary.refuse(error)
         return self._prior
 
     def publish_observation(self, observation: CameraObservation) -> None:
@@ -165,15 +166,17 @@ class CameraPipeline:
         and with code ``frame`` for whatever else driver or detector raise.
         """
         self._beat(VISION_HANG_S if self.written else CAMERA_OPENS_S)
-        with decoding(
-            lambda cause: DriverError("frame", f"a frame cannot be used: {cause}", retry=True), (DriverError,)
-        ):
+        try:
             arrived = self._driver.poll()
             if not arrived:
                 return False
             self.frames += len(arrived)
             observation = self._observed(arrived[-1])
             check_observation(observation)
+        except DriverError:
+            raise
+        except Exception as error:  # of a third party's driver or detector
+            raise DriverError("frame", f"a frame cannot be used: {cause_of(error)}", retry=True) from error
         self._links.publish_observation(observation)
         self.written += 1
         if self._images is not None:

@@ -15,7 +15,7 @@ from stereoservo.messages.wire import MessageError, Reply
 
 LOG_INTERVAL_S = 1.0
 MAX_TEXT_CHARS = 2000
-"""Of a refusal or a line of the log: both may quote a message of 64 KiB, and the last 10 000 events are kept."""
+"""Of a refusal or a line of the log: both may quote a message of 64 KiB, and the last 2 000 events are kept."""
 EXPECTED_ERRORS = (MessageError, InvalidKeyError, TransferError)
 """What the gateway's own checks raise; their texts are made for clients."""
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import zenoh
 
@@ -41,7 +42,8 @@ from stereoservo.messages.wire import (
 )
 from stereoservo.ports.devices import CameraObservation
 
-KEPT_EVENTS = 10_000
+KEPT_EVENTS = 2_000
+"""Asked for by a client that was away. Each as its bytes: a tenth of what its objects take."""
 EVENTS_A_REPLY = 300
 SILENT = frozenset({"reply"})
 """Core events that are answers, not news."""
@@ -89,7 +91,7 @@ class EventLog:
         self._boot = boot
         self._publish = publish
         self._observe = observe
-        self._kept: deque[EventMessage] = deque(maxlen=KEPT_EVENTS)
+        self._kept: deque[bytes] = deque(maxlen=KEPT_EVENTS)
         self.last = 0
 
     def add(self, kind: str, *, t_ns: int | None = None, **fields: Any) -> EventMessage:
@@ -105,8 +107,9 @@ class EventLog:
             kind=kind,
             **fields,
         )
-        self._kept.append(message)
-        self._publish(encode(message))
+        encoded = encode(message)
+        self._kept.append(encoded)
+        self._publish(encoded)
         self._observe(message)
         return message
 
@@ -128,10 +131,11 @@ class EventLog:
 
     def since(self, number: int) -> EventList:
         """Events from ``number`` on, as many as fit into one reply."""
-        first = self._kept[0].seq if self._kept else self.last + 1
+        first = self.last + 1 - len(self._kept)
         begin = min(max(number, first), self.last + 1)
         offset = begin - first
-        some = tuple(self._kept[i] for i in range(offset, min(offset + EVENTS_A_REPLY, len(self._kept))))
+        asked = range(offset, min(offset + EVENTS_A_REPLY, len(self._kept)))
+        some = tuple(msgspec.json.decode(self._kept[i], type=EventMessage) for i in asked)
         return EventList(self._boot, first, begin + len(some), some)
 
 

@@ -79,9 +79,13 @@ class RecordBoundary:
     ) -> bool:
         if error is None or not isinstance(error, Exception):
             return False
+        self.refuse(error)
+        return True
+
+    def refuse(self, error: Exception) -> None:
+        """Count a record whose handling raised ``error``, and log it where it is its turn."""
         self.refused += 1
         self._cause = cause_of(error)[:500]
         if self._log is not None and self.refused == self._logged:
             self._logged *= 10
             self._log(self.note)
-        return True

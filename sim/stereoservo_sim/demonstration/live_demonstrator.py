@@ -12,8 +12,14 @@ import numpy.typing as npt
 from stereoservo.client import Client, ClientError, GoalHandle, GoalResult, TimedOutError
 from stereoservo.kinematics.model import load_model
 from stereoservo.messages.goals import JointTarget, LawName
-from stereoservo.messages.wire import EventMessage
-from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
+from stereoservo.messages.wire import EventMessage, FeaturesMessage
+from stereoservo_sim.demonstration.scenario import (
+    SIGHT_S,
+    Calibrated,
+    MarkerSights,
+    SightCollection,
+    VisualTarget,
+)
 
 LOOK_EVERY_S = 2.0
 RECENT_EVENTS = 50
@@ -56,6 +62,19 @@ class LiveDemonstrator:
     def joints(self) -> npt.NDArray[np.float64]:
         """Measured joint positions (n,)."""
         return np.array(list(self._client.status().joints.values()))
+
+    def sights(self, frames: int) -> MarkerSights:
+        """What the cameras see, so many frames of each."""
+        found = SightCollection((camera.name for camera in self._client.info().cameras), frames)
+        until_s = time.monotonic() + SIGHT_S
+        for message in self._client.watch(features=True):
+            if time.monotonic() > until_s:
+                raise ClientError(found.missing)
+            if isinstance(message, FeaturesMessage):
+                found.add(message.camera, message.ids, message.pixels)
+            if found.complete:
+                break
+        return found.sights
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
         """Seconds that the goal's plan needs."""

@@ -7,10 +7,17 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.daemon.lockstep import LockstepCell
 from stereoservo.messages.goals import JointTarget, LawName
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
-from stereoservo_sim.demonstration.scenario import Calibrated, VisualTarget
+from stereoservo_sim.demonstration.scenario import (
+    SIGHT_S,
+    Calibrated,
+    MarkerSights,
+    SightCollection,
+    VisualTarget,
+)
 
 
 class LockstepDemonstrator:
@@ -49,6 +56,28 @@ class LockstepDemonstrator:
     def joints(self) -> npt.NDArray[np.float64]:
         """Measured joint positions (n,), a step later."""
         return self._cell.step().status.positions
+
+    def sights(self, frames: int) -> MarkerSights:
+        """What the cameras see, so many frames of each; virtual time passes."""
+        found = SightCollection((camera.name for camera in self._cell.settings.cameras), frames)
+        before = self._cell.on_step
+
+        def collect(inputs: StepInputs, outputs: StepOutputs) -> None:
+            for seen in inputs.observations:
+                found.add(seen.camera, seen.ids.tolist(), seen.pixels.tolist())
+            if before is not None:
+                before(inputs, outputs)
+
+        self._cell.on_step = collect
+        try:
+            until_ns = self._cell.clock.now_ns() + round(SIGHT_S * 1e9)
+            while not found.complete:
+                if self._cell.clock.now_ns() > until_ns:
+                    raise RuntimeError(found.missing)
+                self._cell.step()
+        finally:
+            self._cell.on_step = before
+        return found.sights
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
         """Seconds that the goal's plan needs."""

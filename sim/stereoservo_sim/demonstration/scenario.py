@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
 
-from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.joint_angles import measured_joints
+from stereoservo.kinematics.joint_reprojection import joint_problem, seen_chain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import DisplacementTarget, LawName, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
 
 TEACH_FRAMES = 20
+SEEN_FRAMES = 20
+"""Of each camera, whose mean is what was seen."""
+SIGHT_S = 20.0
+"""For so many frames, at most."""
+SEEN_PX = 0.1
+"""Deviation of what was seen: markers differ in how their centres are found at different postures."""
 REST_S = 0.4  # after a move, before the cameras are believed
 JUDGE_S = 1.2  # rest after a goal, of which one second is judged
 
@@ -48,6 +55,34 @@ class Calibrated:
 
 
 VisualTarget = TaughtTarget | DisplacementTarget
+MarkerSights = Mapping[str, Mapping[int, Sequence[tuple[float, float]]]]
+"""By camera and marker: raw pixels, one a frame."""
+
+
+class SightCollection:
+    """Frames of the ``cameras``, collected until there are ``frames`` of each."""
+
+    def __init__(self, cameras: Iterable[str], frames: int) -> None:
+        self.sights: dict[str, dict[int, list[tuple[float, float]]]] = {name: {} for name in cameras}
+        self._left = dict.fromkeys(self.sights, frames)
+
+    def add(self, camera: str, ids: Iterable[int], pixels: Iterable[tuple[float, float]]) -> None:
+        """A frame."""
+        if self._left[camera] > 0:
+            self._left[camera] -= 1
+            for marker, pixel in zip(ids, pixels, strict=True):
+                self.sights[camera].setdefault(marker, []).append(pixel)
+
+    @property
+    def complete(self) -> bool:
+        """Whether there are enough frames."""
+        return not any(self._left.values())
+
+    @property
+    def missing(self) -> str:
+        """Sentence on the frames that did not come in `SIGHT_S`."""
+        late = ", ".join(f"{name} {left}" for name, left in self._left.items() if left)
+        return f"frames that did not come in {SIGHT_S:g} s, by camera: {late}"
 
 
 class Operator(Protocol):
@@ -67,6 +102,10 @@ class Operator(Protocol):
 
     def joints(self) -> FloatArray:
         """Measured joint positions (n,) [rad]."""
+        ...
+
+    def sights(self, frames: int) -> MarkerSights:
+        """What the cameras see of the arm at rest, so many frames of each."""
         ...
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
@@ -96,18 +135,22 @@ def perform(
     statistics = calibrated.model.statistics
     rms = "" if statistics is None else f", residual {statistics.rms_px:.4f} px"
     tell(f"calibrated in {calibrated.seconds:.0f} s{rms}")
+    shown: dict[str, FloatArray] = {}
     for goal in goals:
         tell(f"showing goal {goal.name!r}")
         operator.move(dict(zip(joint_names, configurations[goal.name].tolist(), strict=True)))
         operator.rest(REST_S)
         operator.teach(goal.name, TEACH_FRAMES)
+        if goal.stated == "displacement":
+            shown[goal.name] = joints_by_images(calibrated.model, operator)
     outcomes = {}
     for goal in goals:
         operator.home()
         operator.rest(REST_S)
         target: VisualTarget = TaughtTarget(goal.name)
         if goal.stated == "displacement":
-            target = displacement_to(calibrated.model, operator.joints(), configurations[goal.name])
+            here = joints_by_images(calibrated.model, operator)
+            target = displacement_between(calibrated.model, here, shown[goal.name])
         seconds = operator.planned_s(target, goal.law)
         tell(f"goal {goal.name!r}, stated as {goal.stated}, with law {goal.law}: planned {seconds:.1f} s")
         outcomes[goal.name] = operator.servo(target, goal.law)
@@ -116,8 +159,24 @@ def perform(
     return calibrated, outcomes
 
 
-def displacement_to(model: CellModel, joints: FloatArray, goal: FloatArray) -> DisplacementTarget:
-    """Displacement of the marker body from its pose at ``joints`` (n,) to that at ``goal`` (n,)."""
-    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
-    H = chain.displacement(goal) @ np.linalg.inv(chain.displacement(joints))
+def joints_by_images(model: CellModel, operator: Operator) -> FloatArray:
+    """Joints (n,) at which the model has the marker body where the cameras see it.
+
+    An arm with play, sag or ripple stands elsewhere than its joints say, and what is shown are pictures. Raises
+    JointAnglesError where no joints explain them.
+    """
+    sights = operator.sights(SEEN_FRAMES)
+    pixels = np.full((len(model.cameras), len(model.marker_ids), 2), np.nan)
+    for c, camera in enumerate(model.cameras):
+        for marker, seen in sights[camera.name].items():
+            if marker in model.marker_ids:
+                pixels[c, model.marker_ids.index(marker)] = np.mean(seen, axis=0)
+    problem = joint_problem(seen_chain(model), model.marker_points, pixels, SEEN_PX)
+    return measured_joints(problem, start=operator.joints(), largest_deviation=np.inf)[0].q
+
+
+def displacement_between(model: CellModel, here: FloatArray, there: FloatArray) -> DisplacementTarget:
+    """Displacement of the marker body from its pose at joints ``here`` (n,) to that at ``there`` (n,)."""
+    chain = seen_chain(model).chain
+    H = chain.displacement(there) @ np.linalg.inv(chain.displacement(here))
     return DisplacementTarget(tuple(H.ravel().tolist()), model_epoch=model.epoch)

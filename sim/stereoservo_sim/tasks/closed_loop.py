@@ -269,6 +269,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         scene_pixels=np.zeros((len(knowledge.matrices), 0, 2)),
         rows={i: i for i in range(m)},
         groups=None,
+        joint_accuracy=None,
     )
 
 

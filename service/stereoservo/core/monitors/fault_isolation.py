@@ -2,7 +2,8 @@
 explains the innovations best, and whether moved cameras can be distinguished from a moved arm.
 
 All cameras moved as one, and an arm that stands elsewhere than its joints say (play, a zero, the marker body), look
-alike in the images of the arm. `doubt` says whether something else tells them apart.
+alike in the images of the arm. `doubt` says whether something else tells them apart. Before any cause is asked for,
+`without_joint_errors` takes out what the errors of joint readings explain that the model states of its arm.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, used_rows
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.linear import damped_least_squares
 
 FALSE_ALARMS_PER_HOUR = 1e-3
 """Of one round, in noise as stated; a verdict needs two of three besides."""
 LEAST_PX = 0.5
 """Rms change of the pixels below which no cause is told: models are off by as much where nothing has changed."""
+LEAST_JOINT_ERROR = 1e-9
+"""[rad or m]: what no reading is better than."""
 FEWEST_ON_ARM = 4
 """Markers on the arm by which a camera may confirm that the arm is where its joints say."""
 FEWEST_STATIC = 3
@@ -84,7 +88,7 @@ class Bench:
         self, arrays: ModelArrays, settings: CoreSettings, known: list[int], q: FloatArray,
         innovation: FloatArray, weights: FloatArray,
     ) -> None:  # fmt: skip
-        self.arrays, self.settings, self.known = arrays, settings, known
+        self.arrays, self.settings, self.known, self.q = arrays, settings, known, q
         H, self.operators = chain_at(arrays, q)
         self.points = transform_points(H, arrays.marker_points)
         self.innovation, self.weights = innovation, weights
@@ -246,6 +250,29 @@ def _joint_deviation(bench: Bench, joint: int) -> float:
     weights = bench.weights[:, : len(bench.points)]
     information = float((weights[..., None] ** 2 * jacobian[..., joint] ** 2).sum())
     return 1.0 / math.sqrt(information) if information > 0.0 else 0.0
+
+
+def without_joint_errors(bench: Bench) -> tuple[FloatArray, float] | None:
+    """Innovations (c, k, 2) [px] that are left, and the chi-square of all with that of the joints, where the arm stands
+    beside its readings by the errors of joint readings that the model states, at their most probable; None where it
+    states none.
+    """
+    arrays = bench.arrays
+    if arrays.joint_accuracy is None:
+        return None
+    q = bench.q
+    n, m = len(q), len(bench.points)
+    deviations = arrays.joint_accuracy.deviations((q - arrays.zero)[None])[0]
+    known = 1.0 / np.maximum(deviations, LEAST_JOINT_ERROR)
+    J = np.zeros((*bench.innovation.shape, n))
+    J[:, :m] = image_jacobian(bench.operators, arrays.matrices[bench.known], bench.points)
+    weights = np.concatenate([np.repeat(bench.weights.reshape(-1), 2), known])
+    rows = np.concatenate([J.reshape(-1, n), np.eye(n)])
+    errors = np.concatenate([bench.innovation.reshape(-1), np.zeros(n)])
+    found, _ = damped_least_squares(rows, errors, weights, 0.0)
+    left = bench.innovation - (J * found).sum(axis=-1)
+    chi2 = float(((left * bench.weights[..., None]) ** 2).sum() + ((found * known) ** 2).sum())
+    return left, chi2
 
 
 def bench_now(watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
