@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo.core import prediction
+from stereoservo.core import prediction, report
 from stereoservo.geometry import distortion
 from stereoservo.kinematics import kernels
 
@@ -62,7 +62,7 @@ def test_expected_pixels_carry_velocity_and_covariance(lens: tuple[float, ...]) 
     """Moving for a moment and then distorting is distorting and then moving."""
     lens_array, pixels, covariances = np.array(lens), scattered(4), spread(4)
     velocities = np.random.default_rng(5).normal(0, 300, (40, 2))
-    raw, speed, found, seen = prediction.distort_expected(lens_array, pixels, velocities, covariances)
+    raw, speed, found, seen = report.distort_expected(lens_array, pixels, velocities, covariances)
     assert seen.all()
     dt = 1e-6
     ahead = distortion.distort(lens_array, pixels + dt * velocities)
@@ -78,4 +78,4 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     far = np.array([[319.5 + 230.0, 239.5], [np.nan, 1.0], [319.5, 239.5]])
     assert prediction.undistort_sights(lens, far, spread(0, 3))[2].tolist() == [False, False, True]
     far = np.array([[319.5 + 340.0, 239.5], [np.nan, 1.0], [319.5, 239.5]])
-    assert prediction.distort_expected(lens, far, far, spread(0, 3))[3].tolist() == [False, False, True]
+    assert report.distort_expected(lens, far, far, spread(0, 3))[3].tolist() == [False, False, True]

@@ -50,7 +50,7 @@ def estimate(context: StepContext) -> StepContext:
     context.arrays = arrays
     context.prediction = predict(arrays, context.q)
     context.weights = marker_weights(state.cameras, context.now_ns, context.settings.limits.coast_s)
-    state.correction = joint_correction(context.prediction, state.cameras, context.weights)
+    state.correction = joint_correction(arrays, context.q, context.prediction, state.cameras, context.weights)
     context.pixels = pixels_now(context.prediction, state.cameras)
     if any(state.mobile):
         context = moving_camera.step(context)

@@ -44,6 +44,8 @@ class ModelArrays:
     """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
     joint_accuracy: JointAccuracy | None
     """Errors of joint readings, where the trials have shown some."""
+    joint_variances: FloatArray
+    """The most that these are at any posture (n,) [rad² or m²]; zeros where there are none."""
 
 
 def _require_numbers(model: CellModel) -> None:
@@ -126,7 +128,13 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
         groups=groups_of(model),
         joint_accuracy=model.joint_accuracy,
+        joint_variances=_joint_variances(model),
     )
+
+
+def _joint_variances(model: CellModel) -> FloatArray:
+    accuracy = model.joint_accuracy
+    return np.zeros(len(model.zero)) if accuracy is None else accuracy.stated**2 + accuracy.posture**2
 
 
 def _metric_basis(model: CellModel) -> FloatArray | None:

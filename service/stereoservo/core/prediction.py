@@ -26,7 +26,6 @@ from stereoservo.core.state import HISTORY, CameraEstimate, JointHistory, ServoG
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import (
     chain_forward,
-    distort_pixel,
     distortion_jacobian,
     image_jacobian,
     project_points,
@@ -37,12 +36,15 @@ from stereoservo.kinematics.kernels import (
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
-from stereoservo.ports.devices import CameraObservation, Prior
+from stereoservo.ports.devices import CameraObservation
 
 MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
 TIMING_SIGMA_S = 0.003  # uncertainty of a shutter stamp against the joint stamps
 FIRST_SIGHT_SIGMA_PX = 6.0  # before a marker's innovation is known
 CORRECTION_DAMPING = 1e-4  # relative to the largest diagonal of the normal matrix
+LARGE_CORRECTION = 3e-3
+"""[rad or m], from which on one step is not exact to a tenth of a pixel."""
+FURTHER_STEPS = 3
 UNKNOWN_NS = 100_000_000
 """A frame that is so much later than the newest joint sample (drives that are silent) is compared with nothing."""
 SUSPECT_FRAMES = 8  # refused ones in a row, of one camera
@@ -181,7 +183,8 @@ class FrameResiduals:
     """One frame against the prediction at its shutter, k rows: the model's markers, then its static points.
 
     ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) by detector and timing, ``noise`` (k,) [px²] of a
-    coordinate by the detector alone, what was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s] by the joints.
+    coordinate by the detector alone, what was ``seen`` (k,), the ``velocity`` (k, 2) [px/s] by the joints, and the
+    variance ``joint_error`` (k,) [px²] of a coordinate by the errors of joint readings that the model states.
     """
 
     t_shutter_ns: int
@@ -190,6 +193,7 @@ class FrameResiduals:
     noise: FloatArray
     seen: BoolArray
     velocity: FloatArray
+    joint_error: FloatArray
 
 
 def frame_sights(
@@ -205,14 +209,14 @@ def frame_sights(
     """
     rows = np.array([arrays.rows.get(i, -1) for i in observation.ids.tolist()], dtype=np.int64)
     standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
-    innovation, spread, seen, velocity = innovations(
+    innovation, spread, seen, velocity, joint_error = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
         np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
-        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
+        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S, arrays.joint_variances,
     )  # fmt: skip
     noise, known = np.ones(seen.size), rows >= 0
     noise[rows[known]] = 0.5 * (observation.covariances[known, 0, 0] + observation.covariances[known, 1, 1])
-    return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity)
+    return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity, joint_error)
 
 
 def fold_residuals(watching: ModelMonitor, camera: int, sights: FrameResiduals, q: FloatArray) -> None:
@@ -323,8 +327,8 @@ def accept_sights(
     """
     m = used.size
     accepted, rejected, squares = fold_in(
-        sights.innovation[:m], sights.spread[:m], sights.seen[:m] & used, sights.noise[:m], sights.t_shutter_ns,
-        estimate.innovation, estimate.sigma, estimate.seen_ns,
+        sights.innovation[:m], sights.spread[:m], sights.seen[:m] & used, sights.noise[:m], sights.joint_error[:m],
+        sights.t_shutter_ns, estimate.innovation, estimate.sigma, estimate.seen_ns,
         settings.limits.coast_s + 1.0, settings.filter_s, gate_threshold(settings.gate_sigma), MODEL_SIGMA_PX,
         FIRST_SIGHT_SIGMA_PX,
     )  # fmt: skip
@@ -356,16 +360,29 @@ def pixels_now(prediction: Prediction, cameras: list[CameraEstimate]) -> FloatAr
 
 
 def joint_correction(
-    prediction: Prediction, cameras: list[CameraEstimate], weights: FloatArray
-) -> FloatArray:
-    """Joint-space correction (n,) that explains the innovations best, so that corrected points stay one rigid body."""
-    n = prediction.operators.shape[0]
+    arrays: ModelArrays, q: FloatArray, prediction: Prediction, cameras: list[CameraEstimate],
+    weights: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Joint-space correction (n,) that explains the innovations best, so that corrected points stay one rigid body.
+
+    One step of Gauss and Newton from the ``prediction`` at ``q`` (n,); more where it is large, as of arms with play.
+    """
+    n = len(q)
     innovation = np.array([e.innovation for e in cameras])
+    pixels = prediction.pixels + innovation
     row_weights = np.repeat(weights.reshape(-1), 2)
-    correction: FloatArray = _joint_step(
+    step = _joint_step(
         prediction.jacobian.reshape(-1, n), innovation.reshape(-1), row_weights, CORRECTION_DAMPING
     )
-    return correction
+    total = step
+    for _ in range(FURTHER_STEPS):
+        if float(np.abs(step).max()) < LARGE_CORRECTION:
+            break
+        there = predict(arrays, q + total)
+        apart = (pixels - there.pixels).reshape(-1)
+        step = _joint_step(there.jacobian.reshape(-1, n), apart, row_weights, CORRECTION_DAMPING)
+        total = total + step
+    return total
 
 
 def points_now(
@@ -406,46 +423,6 @@ def centre_of(source: ServoGoal, joints: FloatArray, arrays: ModelArrays, points
     return moved
 
 
-def priors(
-    arrays: ModelArrays, settings: CoreSettings, prediction: Prediction, cameras: list[CameraEstimate],
-    velocities: FloatArray, now_ns: int, unknown: tuple[str, ...] = (),
-) -> tuple[Prior, ...]:  # fmt: skip
-    """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back.
-
-    None for cameras of whose place nothing is known: their detectors look in the whole image.
-    """
-    ids: IntArray = np.array(arrays.marker_ids, dtype=np.int64)
-    found = []
-    for camera, estimate in enumerate(cameras):
-        if settings.cameras[camera].name in unknown:
-            continue
-        speed = (prediction.jacobian[camera] * velocities).sum(axis=-1)
-        fresh = (now_ns - estimate.seen_ns <= 1_000_000_000) & (estimate.seen_ns > 0)
-        sigma = np.where(fresh, 1.0, FIRST_SIGHT_SIGMA_PX) + TIMING_SIGMA_S * np.abs(speed).max(axis=-1)
-        covariance = np.zeros((ids.size, 2, 2))
-        covariance[:, 0, 0] = covariance[:, 1, 1] = sigma * sigma
-        pixels = prediction.pixels[camera] + np.where(fresh[:, None], estimate.innovation, 0.0)
-        prior = Prior(settings.cameras[camera].name, now_ns, ids, pixels, speed, covariance)
-        found.append(_raw_prior(prior, arrays.lenses[camera]))
-    return tuple(found)
-
-
-def _raw_prior(prior: Prior, lens: FloatArray) -> Prior:
-    """A prior as the camera's lens shows it; markers beyond its fold are left out."""
-    if len(lens) == 4 and lens[0] == 0.0:
-        return prior
-    pixels, velocities, covariances, seen = distort_expected(
-        lens, prior.pixels, prior.velocities, prior.covariances
-    )
-    return msgspec.structs.replace(
-        prior,
-        ids=prior.ids[seen],
-        pixels=pixels[seen],
-        velocities=velocities[seen],
-        covariances=covariances[seen],
-    )
-
-
 HUBER = 2.5
 """Mahalanobis distance up to which a sight has its full weight: 4 % of good ones lie beyond."""
 FAR_SIGMA = 30.0
@@ -474,17 +451,18 @@ def distance2(x: float, y: float, a: float, b: float, c: float) -> float:
 @kernel
 def innovations(
     rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, jacobian: FloatArray,
-    speed: FloatArray, timing_s: float,
-) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:  # fmt: skip
+    speed: FloatArray, timing_s: float, joint_variances: FloatArray,
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:  # fmt: skip
     """Of each marker of the model: observed less ``predicted`` (m, 2) [px], its covariance (m, 2, 2) by detector and
-    timing, whether it was seen (m,), and its velocity (m, 2) [px/s].
+    timing, whether it was seen (m,), its velocity (m, 2) [px/s], and the larger of its two variances (m,) [px²] by
+    ``joint_variances`` (n,).
 
     ``rows`` (k,): the model's marker of each sight, or -1. ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter
     stamp that is off by ``timing_s`` [s] moves.
     """
     m, n = jacobian.shape[0], jacobian.shape[2]
     innovation, spread, velocity = np.zeros((m, 2)), np.zeros((m, 2, 2)), np.zeros((m, 2))
-    seen = np.zeros(m, dtype=np.bool_)
+    seen, joint_error = np.zeros(m, dtype=np.bool_), np.zeros(m)
     for k in range(rows.size):
         i = rows[k]
         if i < 0:
@@ -492,29 +470,33 @@ def innovations(
         seen[i] = True
         for a in range(2):
             innovation[i, a] = pixels[k, a] - predicted[i, a]
-        u = v = 0.0
+        u = v = uu = vv = 0.0
         for j in range(n):
             u += jacobian[i, 0, j] * speed[j]
             v += jacobian[i, 1, j] * speed[j]
+            uu += jacobian[i, 0, j] ** 2 * joint_variances[j]
+            vv += jacobian[i, 1, j] ** 2 * joint_variances[j]
+        joint_error[i] = max(uu, vv)
         velocity[i, 0], velocity[i, 1] = u, v
         t = timing_s * timing_s
         spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
         spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
         spread[i, 1, 0] = spread[i, 0, 1]
         spread[i, 1, 1] = covariances[k, 1, 1] + t * v * v
-    return innovation, spread, seen, velocity
+    return innovation, spread, seen, velocity, joint_error
 
 
 @kernel
 def fold_in(
-    innovation: FloatArray, spread: FloatArray, seen: BoolArray, noise: FloatArray, t_ns: int,
-    filtered: FloatArray, sigma: FloatArray, seen_ns: IntArray,
+    innovation: FloatArray, spread: FloatArray, seen: BoolArray, noise: FloatArray, joint_error: FloatArray,
+    t_ns: int, filtered: FloatArray, sigma: FloatArray, seen_ns: IntArray,
     known_s: float, filter_s: float, gate: float, model_px: float, first_px: float,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Fold a frame's innovations (m, 2) into the ``filtered`` ones, each by its weight; those refused leave it alone.
 
     ``noise`` (m,): variance of a coordinate by the detector alone; ``gate``: squared distance; ``model_px``,
-    ``first_px``: what a prediction may be off by, for markers last seen within ``known_s`` and for others. Gives how
+    ``first_px``: what a prediction may be off by, for markers last seen within ``known_s`` and for others, beside the
+    variance ``joint_error`` (m,) [px²], by which it changes where play is passed through. Gives how
     many were accepted and refused, and the sum of squares of the accepted innovations [px²].
     """
     accepted = refused = 0
@@ -529,9 +511,8 @@ def fold_in(
             x -= filtered[i, 0]
             y -= filtered[i, 1]
         model = model_px if known else first_px
-        d2 = distance2(
-            x, y, spread[i, 0, 0] + model * model, spread[i, 0, 1], spread[i, 1, 1] + model * model
-        )
+        off = model * model + joint_error[i]
+        d2 = distance2(x, y, spread[i, 0, 0] + off, spread[i, 0, 1], spread[i, 1, 1] + off)
         if not d2 <= gate:
             refused += 1
             continue
@@ -551,7 +532,7 @@ def fold_in(
 
 
 @kernel
-def _propagate(a: float, b: float, d: float, C: FloatArray, out: FloatArray) -> None:
+def propagate_covariance(a: float, b: float, d: float, C: FloatArray, out: FloatArray) -> None:
     """``out = J C Jᵀ`` for the symmetric ``J = (a b; b d)`` and (2, 2) ``C``."""
     uu, uv = a * C[0, 0] + b * C[1, 0], a * C[0, 1] + b * C[1, 1]
     vu, vv = b * C[0, 0] + d * C[1, 0], b * C[0, 1] + d * C[1, 1]
@@ -574,25 +555,5 @@ def undistort_sights(
         a, b, d = distortion_jacobian(lens, u, v)
         determinant = a * d - b * b
         seen[i] = math.isfinite(u) and math.isfinite(v) and determinant > 0.0
-        _propagate(d / determinant, -b / determinant, a / determinant, covariances[i], spread[i])
+        propagate_covariance(d / determinant, -b / determinant, a / determinant, covariances[i], spread[i])
     return ideal, spread, seen
-
-
-@kernel
-def distort_expected(
-    lens: FloatArray, pixels: FloatArray, velocities: FloatArray, covariances: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Raw pixels (k, 2), velocities (k, 2), covariances (k, 2, 2) of ideal ones, and which (k,) lie within the fold."""
-    n = pixels.shape[0]
-    raw = np.empty((n, 2))
-    speed = np.empty((n, 2))
-    spread = np.empty((n, 2, 2))
-    seen = np.empty(n, dtype=np.bool_)
-    for i in range(n):
-        raw[i, 0], raw[i, 1] = distort_pixel(lens, pixels[i, 0], pixels[i, 1])
-        a, b, d = distortion_jacobian(lens, pixels[i, 0], pixels[i, 1])
-        speed[i, 0] = a * velocities[i, 0] + b * velocities[i, 1]
-        speed[i, 1] = b * velocities[i, 0] + d * velocities[i, 1]
-        _propagate(a, b, d, covariances[i], spread[i])
-        seen[i] = math.isfinite(raw[i, 0]) and math.isfinite(raw[i, 1])
-    return raw, speed, spread, seen

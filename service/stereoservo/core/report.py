@@ -7,22 +7,28 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgspec
+import numpy as np
+
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import Event, Status, StepOutputs
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
 from stereoservo.core.limit import SafetyResult
+from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import CameraTiming, ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
-from stereoservo.core.prediction import priors
+from stereoservo.core.prediction import FIRST_SIGHT_SIGMA_PX, TIMING_SIGMA_S, Prediction, propagate_covariance
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import Contact, CoreState
+from stereoservo.core.state import CameraEstimate, Contact, CoreState
+from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
 from stereoservo.messages.reasons import Level, Reason
 from stereoservo.messages.status import CameraHealth, Health, Lifecycle, ModelReadiness
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import Prior
 
 LEVELS: tuple[Level, ...] = ("info", "slow", "hold", "fault")
@@ -216,3 +222,75 @@ def advice(timing: CameraTiming) -> str:
         f"its shutter opens {1e3 * abs(late):.1f} ms {'later' if late > 0 else 'earlier'} than stated "
         f"(± {1e3 * deviation:.1f}): {1e3 * abs(late):.0f} ms {way} latency_s would be right"
     )
+
+
+# -- priors --------------------------------------------------------------------------------------------------
+
+
+def priors(
+    arrays: ModelArrays, settings: CoreSettings, prediction: Prediction, cameras: list[CameraEstimate],
+    velocities: FloatArray, now_ns: int, unknown: tuple[str, ...] = (),
+) -> tuple[Prior, ...]:  # fmt: skip
+    """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back.
+
+    None for cameras of whose place nothing is known: their detectors look in the whole image.
+    """
+    ids: IntArray = np.array(arrays.marker_ids, dtype=np.int64)
+    found = []
+    for camera, estimate in enumerate(cameras):
+        if settings.cameras[camera].name in unknown:
+            continue
+        speed = (prediction.jacobian[camera] * velocities).sum(axis=-1)
+        fresh = (now_ns - estimate.seen_ns <= 1_000_000_000) & (estimate.seen_ns > 0)
+        unseen_px = _unseen_sigma(prediction.jacobian[camera], arrays)
+        sigma = np.where(fresh, 1.0, unseen_px) + TIMING_SIGMA_S * np.abs(speed).max(axis=-1)
+        covariance = np.zeros((ids.size, 2, 2))
+        covariance[:, 0, 0] = covariance[:, 1, 1] = sigma * sigma
+        pixels = prediction.pixels[camera] + np.where(fresh[:, None], estimate.innovation, 0.0)
+        prior = Prior(settings.cameras[camera].name, now_ns, ids, pixels, speed, covariance)
+        found.append(_raw_prior(prior, arrays.lenses[camera]))
+    return tuple(found)
+
+
+def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> float | FloatArray:
+    """Deviation [px] of markers that were not seen of late, by their ``jacobian`` (m, 2, n)."""
+    if arrays.joint_accuracy is None:
+        return FIRST_SIGHT_SIGMA_PX
+    by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
+    return np.asarray(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints))
+
+
+def _raw_prior(prior: Prior, lens: FloatArray) -> Prior:
+    """A prior as the camera's lens shows it; markers beyond its fold are left out."""
+    if len(lens) == 4 and lens[0] == 0.0:
+        return prior
+    pixels, velocities, covariances, seen = distort_expected(
+        lens, prior.pixels, prior.velocities, prior.covariances
+    )
+    return msgspec.structs.replace(
+        prior,
+        ids=prior.ids[seen],
+        pixels=pixels[seen],
+        velocities=velocities[seen],
+        covariances=covariances[seen],
+    )
+
+
+@kernel
+def distort_expected(
+    lens: FloatArray, pixels: FloatArray, velocities: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Raw pixels (k, 2), velocities (k, 2), covariances (k, 2, 2) of ideal ones, and which (k,) lie within the fold."""
+    n = pixels.shape[0]
+    raw = np.empty((n, 2))
+    speed = np.empty((n, 2))
+    spread = np.empty((n, 2, 2))
+    seen = np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        raw[i, 0], raw[i, 1] = distort_pixel(lens, pixels[i, 0], pixels[i, 1])
+        a, b, d = distortion_jacobian(lens, pixels[i, 0], pixels[i, 1])
+        speed[i, 0] = a * velocities[i, 0] + b * velocities[i, 1]
+        speed[i, 1] = b * velocities[i, 0] + d * velocities[i, 1]
+        propagate_covariance(a, b, d, covariances[i], spread[i])
+        seen[i] = math.isfinite(raw[i, 0]) and math.isfinite(raw[i, 1])
+    return raw, speed, spread, seen

@@ -270,6 +270,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         rows={i: i for i in range(m)},
         groups=None,
         joint_accuracy=None,
+        joint_variances=np.zeros(n),
     )
 
 
