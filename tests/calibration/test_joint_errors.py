@@ -116,7 +116,7 @@ def test_joint_columns_are_derivatives(linearised):
 
 @pytest.mark.parametrize(
     ("mechanics", "size", "sigma"),
-    [("ripple", 0.05e-3, 0.014), ("random", 1e-3, 0.05)],
+    [("ripple", 0.05e-3, 0.014), pytest.param("random", 1e-3, 0.05, marks=pytest.mark.slow)],
     ids=["ripple", "random"],
 )
 def test_arms_that_are_not_perfect_calibrate(mechanics, size, sigma):

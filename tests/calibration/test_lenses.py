@@ -93,7 +93,7 @@ def check_seeds(name, seeds):
     return chi2, freedom
 
 
-@pytest.mark.parametrize(("name", "seeds"), CASES)
+@pytest.mark.parametrize(("name", "seeds"), [pytest.param(*CASES[0], marks=pytest.mark.slow), *CASES[1:]])
 def test_strong_distortion_is_estimated_to_its_covariance(name, seeds):
     assert chi2_within(*check_seeds(name, range(40, 40 + seeds)))
 

@@ -178,6 +178,10 @@ def _check_range(joint: CanJoint) -> None:
         raise _refusal("position_min, position_max", (joint.position_min, joint.position_max), valid, joint)
 
 
+STOPPING = {(0x6007, 0), (0x605A, 0), (0x605E, 0)}
+"""Objects that say how a drive stops: abort connection option, quick stop option, fault reaction."""
+
+
 def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
     try:
         parse_sdo_key(key)
@@ -185,6 +189,12 @@ def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
         raise _refusal("sdo", key, str(error), joint) from error
     if not -(2**31) <= value <= UINT32_MAX:
         raise _refusal(f"sdo {key}", value, "an integer of at most 32 bits", joint)
+    if parse_sdo_key(key) in STOPPING and value == 0:
+        valid = (
+            "another value: with 0 the drive does nothing, or lets its axis run out, where it is to stop (options "
+            "abort_option and quick_stop_option are the usual way)"
+        )
+        raise _refusal(f"sdo {key}", value, valid, joint)
 
 
 def _refusal(option: str, value: object, valid: str, joint: CanJoint | None = None) -> DriverError:

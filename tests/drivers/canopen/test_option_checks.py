@@ -133,6 +133,12 @@ def test_sdo_keys_and_values() -> None:
     assert "32 bits" in refused(joint(sdo={"0x60C2:1": 2**32}))
 
 
+@pytest.mark.parametrize("key", ["0x6007:0", "0x605A:0", "0x605e:0"])
+def test_no_further_write_keeps_a_drive_from_stopping(key: str) -> None:
+    assert "run out" in refused(joint(sdo={key: 0}))
+    check_options(options(joint(sdo={key: 2})))
+
+
 def test_what_would_be_ignored_or_cannot_be() -> None:
     assert "feedback = ['effort', 'effort']; valid: each once" in refused(feedback=["effort", "effort"])
     assert "emcy_ignore = 0x142100; valid: codes of 16 bits" in refused(emcy_ignore=[0x142100])
