@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.core.cycle import ModelUpdate
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.messages.goals import FeatureTarget
 
@@ -67,24 +68,74 @@ def test_the_same_play_unstated_is_told(benches: Any) -> None:
         assert told.name == "cameras_or_arm", seed
 
 
-def test_a_bumped_camera_is_told_of_an_arm_with_play(benches: Any) -> None:
+def standing_beside(benches: Any, seed: int) -> tuple[Any, np.random.Generator]:
+    """A bench at rest whose joints stand beside their readings by up to half a degree, as the model states."""
+    rng = np.random.default_rng(seed)
+    bench = imperfect(benches, seed, 0.0, stated(np.radians(0.3)))
+    bench.zero_offset = np.radians(0.5) * rng.uniform(-1.0, 1.0, 6)
+    bench.run(0.5)
+    assert bench.log[-1][1].status.health.verdict == "ok"
+    return bench, rng
+
+
+@pytest.mark.parametrize("degrees", [0.3, 2.0])
+def test_a_bumped_camera_is_told_of_an_arm_beside_its_readings(benches: Any, degrees: float) -> None:
     for seed in SEEDS:
-        play = np.radians(0.5)
-        bench = imperfect(benches, seed, play, stated(play))
+        bench, _ = standing_beside(benches, seed)
+        angle = np.radians(degrees)
         turn = np.eye(4)
-        turn[:2, :2] = [[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]]
+        turn[np.ix_([0, 2], [0, 2])] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
         K = np.array([[800, 0, 320], [0, 800, 240], [0, 0, 1.0]])
         camera = seed % 2
         extrinsic = np.linalg.solve(K, bench.truth.cameras[camera])
         bench.truth.cameras[camera] = K @ (turn @ np.vstack([extrinsic, [0, 0, 0, 1.0]]))[:3]
         told = bench.until(lambda event: event.kind == "health", 1.0)
+        assert told.name == "camera_moved", (seed, told.message)
         assert told.cameras == (("left", "right")[camera],), seed
+
+
+def test_a_slipped_marker_is_told_of_an_arm_beside_its_readings(benches: Any) -> None:
+    for seed in SEEDS:
+        bench, rng = standing_beside(benches, seed)
+        marker = int(rng.integers(8))
+        bench.bias_px = np.zeros((8, 2))
+        bench.bias_px[marker] = (4.0, -3.0)
+        told = bench.until(lambda event: event.kind == "health", 1.0)
+        assert told.name == "marker_slipped", (seed, told.message)
+        assert f"marker {marker} " in told.message, seed
+        bench.bias_px = 0.0
+        bench.until(lambda event: "used again" in event.message, 5.0)
+
+
+def test_an_outlier_is_left_out_where_joints_pass_through_their_play(benches: Any) -> None:
+    for seed in SEEDS:
+        bench, _ = standing_beside(benches, seed)
+        before = bench.core.state.cameras[0].innovation.copy()
+        bench.zero_offset = -bench.zero_offset
+        bench.bias_px = np.zeros((8, 2))
+        bench.bias_px[3] = (30.0, 10.0)
+        bench.run(0.05)  # a frame
+        found = bench.core.state.cameras[0]
+        assert found.last_visible == 7, seed
+        assert np.array_equal(found.innovation[3], before[3]), seed
+        assert not np.array_equal(found.innovation[2], before[2]), seed
+
+
+def test_what_a_model_states_of_its_joints_has_a_bound(benches: Any) -> None:
+    bench = imperfect(benches, 0, 0.0, stated(1e6))
+    bench.zero_offset[0] = 0.9
+    assert bench.until(lambda event: event.kind == "health", 1.0).name != "ok"
+    short = msgspec.structs.replace(
+        bench.truth.model, joint_accuracy=JointAccuracy(*(np.zeros(2),) * 4), epoch=8
+    )
+    bench.step(model_update=ModelUpdate(short))
+    assert "errors of joint readings" in bench.events[-1].message
 
 
 def test_a_zero_that_is_off_by_far_more_is_told(benches: Any) -> None:
     for seed in SEEDS:
-        bench = imperfect(benches, seed, 0.0, stated(np.radians(0.05)))
-        bench.zero_offset[seed] = np.radians(1.5)
+        bench = imperfect(benches, seed, 0.0, stated(np.radians(0.1)))
+        bench.zero_offset[seed] = np.radians(0.8)
         told = bench.until(lambda event: event.kind == "health", 1.0)
         assert told.name == "joint_zero", seed
         assert f"joint {bench.settings.joint_names[seed]} " in told.message

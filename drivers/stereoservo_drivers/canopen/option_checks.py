@@ -178,8 +178,14 @@ def _check_range(joint: CanJoint) -> None:
         raise _refusal("position_min, position_max", (joint.position_min, joint.position_max), valid, joint)
 
 
-STOPPING = {(0x6007, 0), (0x605A, 0), (0x605E, 0)}
-"""Objects that say how a drive stops: abort connection option, quick stop option, fault reaction."""
+BY_OPTION = {
+    (0x6007, 0): "abort_option",
+    (0x605A, 0): "quick_stop_option",
+    (0x6060, 0): "mode",
+    (0x6085, 0): "quick_stop_deceleration",
+}
+"""Objects by which a drive stops, which are checked as options."""
+FAULT_REACTION = (0x605E, 0)
 
 
 def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
@@ -189,11 +195,11 @@ def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
         raise _refusal("sdo", key, str(error), joint) from error
     if not -(2**31) <= value <= UINT32_MAX:
         raise _refusal(f"sdo {key}", value, "an integer of at most 32 bits", joint)
-    if parse_sdo_key(key) in STOPPING and value == 0:
-        valid = (
-            "another value: with 0 the drive does nothing, or lets its axis run out, where it is to stop (options "
-            "abort_option and quick_stop_option are the usual way)"
-        )
+    own = BY_OPTION.get(parse_sdo_key(key))
+    if own is not None:
+        raise _refusal(f"sdo {key}", value, f"this object is set by option {own}", joint)
+    if parse_sdo_key(key) == FAULT_REACTION and value == 0:
+        valid = "another value: with 0 the drive lets its axis run out at a fault, where it is to stop"
         raise _refusal(f"sdo {key}", value, valid, joint)
 
 

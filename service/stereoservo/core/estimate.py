@@ -18,6 +18,7 @@ from stereoservo.core.monitors.diagnosis import start_model_monitor
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
     accept_sights,
+    common_change,
     fold_residuals,
     frame_sights,
     ideal_observation,
@@ -166,7 +167,9 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
             )
         fold_residuals(state.watching, camera, sights, at_shutter)
     if not _unknown(camera, state, settings):
-        accept_sights(estimate, sights, state.watching.masked == 0.0, settings)
+        used = state.watching.masked == 0.0
+        common = common_change(estimate, sights, used, prediction.jacobian[camera], arrays)
+        accept_sights(estimate, sights, used, settings, common)
 
 
 def _unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:

@@ -43,7 +43,7 @@ class ModelArrays:
     groups: MarkerGroups | None
     """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
     joint_accuracy: JointAccuracy | None
-    """Errors of joint readings, where the trials have shown some."""
+    """Errors of joint readings, where the trials have shown some; none larger than `LARGEST_JOINT_ERROR`."""
     joint_variances: FloatArray
     """The most that these are at any posture (n,) [rad² or m²]; zeros where there are none."""
 
@@ -63,6 +63,10 @@ def _require_numbers(model: CellModel) -> None:
             for camera in model.cameras
         ),
     ]
+    if model.joint_accuracy is not None:
+        arrays += [
+            ("errors of joint readings", errors, (joints,)) for errors in _errors(model.joint_accuracy)
+        ]
     if model.projective_to_euclidean is not None:
         arrays.append(("Euclidean frame", model.projective_to_euclidean, (4, 4)))
     for what, values, shape in arrays:
@@ -109,6 +113,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
     centres = np.array([camera_centre(P) for P in matrices])
     scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
     scene_pixels, _ = project_points(matrices, scene)
+    accuracy = _bounded_accuracy(model)
     return ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
@@ -127,14 +132,28 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         scene_pixels=scene_pixels,
         rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
         groups=groups_of(model),
-        joint_accuracy=model.joint_accuracy,
-        joint_variances=_joint_variances(model),
+        joint_accuracy=accuracy,
+        joint_variances=np.zeros(len(model.zero))
+        if accuracy is None
+        else accuracy.stated**2 + accuracy.posture**2,
     )
 
 
-def _joint_variances(model: CellModel) -> FloatArray:
+LARGEST_JOINT_ERROR = 0.1
+"""[rad or m]: nothing that a model states of its joints lets the monitors take a cell for sound beyond it."""
+
+
+def _bounded_accuracy(model: CellModel) -> JointAccuracy | None:
+    """The errors of joint readings that monitors believe."""
     accuracy = model.joint_accuracy
-    return np.zeros(len(model.zero)) if accuracy is None else accuracy.stated**2 + accuracy.posture**2
+    if accuracy is None:
+        return None
+    bounded = (np.minimum(np.asarray(e, dtype=np.float64), LARGEST_JOINT_ERROR) for e in _errors(accuracy))
+    return JointAccuracy(*bounded)
+
+
+def _errors(accuracy: JointAccuracy) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    return accuracy.random, accuracy.repeatable, accuracy.stated, accuracy.posture
 
 
 def _metric_basis(model: CellModel) -> FloatArray | None:

@@ -17,7 +17,6 @@ diagnosis needs two rounds of the last three.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
@@ -39,7 +38,13 @@ from stereoservo.core.monitor_state import (
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, stated_thresholds, worst_contact
 from stereoservo.core.monitors.diagnosis import camera_moved_findings, emit_diagnosis, mask_marker
-from stereoservo.core.monitors.fault_isolation import Bench, bench_now, diagnosed, without_joint_errors
+from stereoservo.core.monitors.fault_isolation import (
+    bench_now,
+    diagnosed_beside_joint_errors,
+    improbable,
+    likely_errors,
+    without_joint_errors,
+)
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
@@ -355,15 +360,21 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     if not known:
         return None
     watching.rounds += 1
-    watching.last = [*watching.last[1 - OF :], _judged(watching, known, arrays, context.settings)]
+    proven = context.state.reanchoring is not None
+    watching.last = [
+        *watching.last[1 - OF :],
+        _judged(watching, known, arrays, context.settings, proven=proven),
+    ]
     _unmask_returned(watching, known, context)
     return _changed(watching)
 
 
 def _judged(
-    watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings
+    watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings, *, proven: bool
 ) -> ModelDiagnosis:
-    """What one round says, of the cameras ``known``."""
+    """What one round says, of the cameras ``known``. ``proven``: that a camera has moved; errors of the joints alone do
+    not take it back.
+    """
     suspicious = False
     for c in known:
         sighting = watching.sightings[c]
@@ -373,18 +384,16 @@ def _judged(
     if not suspicious:
         return ModelDiagnosis()
     bench = bench_now(watching, known, arrays, settings)
-    return ModelDiagnosis() if _joint_errors_explain(bench) else diagnosed(bench)
-
-
-def _joint_errors_explain(bench: Bench) -> bool:
-    """Whether play, sag, ripple and encoder steps, as large as the model states them, leave nothing but noise."""
-    found = without_joint_errors(bench)
-    if found is None:
-        return False
-    left, chi2 = found
-    largest = float(((left * bench.weights[..., None]) ** 2).sum(axis=-1).max())
-    freedoms = 2.0 * float((bench.weights > 0.0).sum())
-    return chi2 <= _improbable(freedoms) and largest <= gate_threshold(bench.settings.gate_sigma)
+    found = without_joint_errors(bench, bench.weights)
+    everywhere = np.ones(bench.weights.shape, dtype=bool)
+    if (
+        found is not None
+        and not proven
+        and likely_errors(found[1])
+        and bench.with_innovation(found[0]).explained(everywhere)
+    ):
+        return ModelDiagnosis()
+    return diagnosed_beside_joint_errors(bench)
 
 
 def _likely(
@@ -393,7 +402,7 @@ def _likely(
 ) -> bool:  # fmt: skip
     """Whether innovations (k, 2) look like noise, all together and each of them."""
     chi2, _, _, largest = camera_chi2(innovation, spread, used, model_px)
-    return chi2 <= _improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
+    return chi2 <= improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
 
 
 def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
@@ -411,12 +420,6 @@ def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> 
     rest = sighting.innovation - late_s * sighting.velocity
     model_px = MODEL_SIGMA_PX if abs(late_s) <= LATE_S else LATEST_MODEL_PX
     return _likely(rest, sighting.spread, used, settings, model_px)
-
-
-def _improbable(freedoms: float) -> float:
-    """Chi-square that is exceeded as rarely as five standard deviations (Wilson and Hilferty 1931)."""
-    part = 2.0 / (9.0 * max(freedoms, 1.0))
-    return freedoms * (1.0 - part + 5.0 * math.sqrt(part)) ** 3
 
 
 def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:
@@ -442,14 +445,24 @@ def _unmask_returned(watching: ModelMonitor, known: list[int], context: StepCont
     """A masked marker that stands where it should again, to every camera that sees it, is used again."""
     arrays = context.arrays
     assert arrays is not None
-    for i in np.flatnonzero(watching.masked > 0.0):
-        seen = [watching.sightings[c] for c in known if watching.sightings[c].seen[i] > 0.0]
+    masked = np.flatnonzero(watching.masked > 0.0)
+    if not masked.size:
+        return
+    bench = bench_now(watching, known, arrays, context.settings)
+    found = without_joint_errors(bench, bench.weights)
+    innovation = bench.innovation if found is None else found[0]
+    for i in masked:
+        seen = [
+            (watching.sightings[c].spread, innovation[row])
+            for row, c in enumerate(known)
+            if watching.sightings[c].seen[i] > 0.0
+        ]
         if not seen:
             continue
         only, alone = slice(i, i + 1), np.ones(1)
         good = all(
-            camera_chi2(s.innovation[only], s.spread[only], alone, MODEL_SIGMA_PX)[0] <= _improbable(2.0)
-            for s in seen
+            camera_chi2(shown[only], spread[only], alone, MODEL_SIGMA_PX)[0] <= improbable(2.0)
+            for spread, shown in seen
         )
         watching.back[i] = watching.back[i] + 1 if good else 0
         if watching.back[i] >= BACK_ROUNDS:

@@ -183,8 +183,7 @@ class FrameResiduals:
     """One frame against the prediction at its shutter, k rows: the model's markers, then its static points.
 
     ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) by detector and timing, ``noise`` (k,) [px²] of a
-    coordinate by the detector alone, what was ``seen`` (k,), the ``velocity`` (k, 2) [px/s] by the joints, and the
-    variance ``joint_error`` (k,) [px²] of a coordinate by the errors of joint readings that the model states.
+    coordinate by the detector alone, what was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s] by the joints.
     """
 
     t_shutter_ns: int
@@ -193,7 +192,6 @@ class FrameResiduals:
     noise: FloatArray
     seen: BoolArray
     velocity: FloatArray
-    joint_error: FloatArray
 
 
 def frame_sights(
@@ -209,14 +207,14 @@ def frame_sights(
     """
     rows = np.array([arrays.rows.get(i, -1) for i in observation.ids.tolist()], dtype=np.int64)
     standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
-    innovation, spread, seen, velocity, joint_error = innovations(
+    innovation, spread, seen, velocity = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
         np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
-        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S, arrays.joint_variances,
+        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
     )  # fmt: skip
     noise, known = np.ones(seen.size), rows >= 0
     noise[rows[known]] = 0.5 * (observation.covariances[known, 0, 0] + observation.covariances[known, 1, 1])
-    return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity, joint_error)
+    return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity)
 
 
 def fold_residuals(watching: ModelMonitor, camera: int, sights: FrameResiduals, q: FloatArray) -> None:
@@ -318,16 +316,18 @@ def camera_chi2(
 
 
 def accept_sights(
-    estimate: CameraEstimate, sights: FrameResiduals, used: BoolArray, settings: CoreSettings
-) -> None:
+    estimate: CameraEstimate, sights: FrameResiduals, used: BoolArray, settings: CoreSettings,
+    common: FloatArray,
+) -> None:  # fmt: skip
     """Gate one frame and fold it into the camera's estimate; markers that are not ``used`` (m,) are left out.
 
-    The gate is chi-square with two freedoms on the deviation from the filtered innovation, with the covariances of
-    detector, timing and model. Near the gate a sight counts less: in the filter, and in triangulation by its sigma.
+    The gate is chi-square with two freedoms on the deviation from the filtered innovation and its ``common`` change
+    (m, 2) [px], with the covariances of detector, timing and model. Near the gate a sight counts less: in the filter,
+    and in triangulation by its sigma.
     """
     m = used.size
     accepted, rejected, squares = fold_in(
-        sights.innovation[:m], sights.spread[:m], sights.seen[:m] & used, sights.noise[:m], sights.joint_error[:m],
+        sights.innovation[:m], sights.spread[:m], sights.seen[:m] & used, sights.noise[:m], common,
         sights.t_shutter_ns, estimate.innovation, estimate.sigma, estimate.seen_ns,
         settings.limits.coast_s + 1.0, settings.filter_s, gate_threshold(settings.gate_sigma), MODEL_SIGMA_PX,
         FIRST_SIGHT_SIGMA_PX,
@@ -340,6 +340,46 @@ def accept_sights(
     estimate.rejected_frames = estimate.rejected_frames + 1 if rejected > accepted else 0
     if accepted >= 3:
         estimate.accepted_ns = sights.t_shutter_ns
+
+
+COMMON_ROUNDS = 8
+"""Of reweighting, in which sights that the joints do not explain lose their weight."""
+
+
+def common_change(
+    estimate: CameraEstimate,
+    sights: FrameResiduals,
+    used: BoolArray,
+    jacobian: FloatArray,
+    arrays: ModelArrays,
+) -> FloatArray:
+    """Change of the innovations (m, 2) [px] since the filtered ones that joints explain which pass through their play
+    or step, within the errors that the model states of them; zeros where it states none, or where nothing changed.
+
+    ``jacobian`` (m, 2, n). By iterated weights of Huber: what is common moves all markers, an outlier one.
+    """
+    m, n = used.size, jacobian.shape[2]
+    none = np.zeros((m, 2))
+    rows = sights.seen[:m] & used & (estimate.seen_ns > 0)
+    if arrays.joint_accuracy is None or int(rows.sum()) < 3:
+        return none
+    change = (sights.innovation[:m] - estimate.innovation)[rows]
+    variance = MODEL_SIGMA_PX**2 + 0.5 * (sights.spread[:m][rows, 0, 0] + sights.spread[:m][rows, 1, 1])
+    deviations = np.sqrt(arrays.joint_variances)
+    J = jacobian[rows] * deviations
+    equations = np.concatenate([J.reshape(-1, n), np.eye(n)])
+    wanted = np.concatenate([change.reshape(-1), np.zeros(n)])
+    left = change
+    if float(((left**2).sum(axis=-1) / variance).max()) <= HUBER * HUBER:
+        return none
+    step = np.zeros(n)
+    for _ in range(COMMON_ROUNDS):
+        distance = np.sqrt((left**2).sum(axis=-1) / variance)
+        weights = np.sqrt(np.minimum(1.0, HUBER / np.maximum(distance, 1e-9)) / variance)
+        step = _joint_step(equations, wanted, np.concatenate([np.repeat(weights, 2), np.ones(n)]), 0.0)
+        left = change - (J * step).sum(axis=-1)
+    common: FloatArray = (jacobian * (deviations * step)).sum(axis=-1)
+    return common
 
 
 def marker_weights(cameras: list[CameraEstimate], now_ns: int, coast_s: float) -> FloatArray:
@@ -365,7 +405,8 @@ def joint_correction(
 ) -> FloatArray:  # fmt: skip
     """Joint-space correction (n,) that explains the innovations best, so that corrected points stay one rigid body.
 
-    One step of Gauss and Newton from the ``prediction`` at ``q`` (n,); more where it is large, as of arms with play.
+    One step of Gauss and Newton from the ``prediction`` at ``q`` (n,); more where it is large, as of arms with play, as
+    long as they explain more.
     """
     n = len(q)
     innovation = np.array([e.innovation for e in cameras])
@@ -374,12 +415,16 @@ def joint_correction(
     step = _joint_step(
         prediction.jacobian.reshape(-1, n), innovation.reshape(-1), row_weights, CORRECTION_DAMPING
     )
-    total = step
+    total, before = step, math.inf
     for _ in range(FURTHER_STEPS):
         if float(np.abs(step).max()) < LARGE_CORRECTION:
             break
         there = predict(arrays, q + total)
         apart = (pixels - there.pixels).reshape(-1)
+        left = float(((row_weights * apart) ** 2).sum())
+        if not left < before:
+            return total - step
+        before = left
         step = _joint_step(there.jacobian.reshape(-1, n), apart, row_weights, CORRECTION_DAMPING)
         total = total + step
     return total
@@ -451,18 +496,17 @@ def distance2(x: float, y: float, a: float, b: float, c: float) -> float:
 @kernel
 def innovations(
     rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, jacobian: FloatArray,
-    speed: FloatArray, timing_s: float, joint_variances: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:  # fmt: skip
+    speed: FloatArray, timing_s: float,
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:  # fmt: skip
     """Of each marker of the model: observed less ``predicted`` (m, 2) [px], its covariance (m, 2, 2) by detector and
-    timing, whether it was seen (m,), its velocity (m, 2) [px/s], and the larger of its two variances (m,) [px²] by
-    ``joint_variances`` (n,).
+    timing, whether it was seen (m,), and its velocity (m, 2) [px/s].
 
     ``rows`` (k,): the model's marker of each sight, or -1. ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter
     stamp that is off by ``timing_s`` [s] moves.
     """
     m, n = jacobian.shape[0], jacobian.shape[2]
     innovation, spread, velocity = np.zeros((m, 2)), np.zeros((m, 2, 2)), np.zeros((m, 2))
-    seen, joint_error = np.zeros(m, dtype=np.bool_), np.zeros(m)
+    seen = np.zeros(m, dtype=np.bool_)
     for k in range(rows.size):
         i = rows[k]
         if i < 0:
@@ -470,33 +514,30 @@ def innovations(
         seen[i] = True
         for a in range(2):
             innovation[i, a] = pixels[k, a] - predicted[i, a]
-        u = v = uu = vv = 0.0
+        u = v = 0.0
         for j in range(n):
             u += jacobian[i, 0, j] * speed[j]
             v += jacobian[i, 1, j] * speed[j]
-            uu += jacobian[i, 0, j] ** 2 * joint_variances[j]
-            vv += jacobian[i, 1, j] ** 2 * joint_variances[j]
-        joint_error[i] = max(uu, vv)
         velocity[i, 0], velocity[i, 1] = u, v
         t = timing_s * timing_s
         spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
         spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
         spread[i, 1, 0] = spread[i, 0, 1]
         spread[i, 1, 1] = covariances[k, 1, 1] + t * v * v
-    return innovation, spread, seen, velocity, joint_error
+    return innovation, spread, seen, velocity
 
 
 @kernel
 def fold_in(
-    innovation: FloatArray, spread: FloatArray, seen: BoolArray, noise: FloatArray, joint_error: FloatArray,
+    innovation: FloatArray, spread: FloatArray, seen: BoolArray, noise: FloatArray, common: FloatArray,
     t_ns: int, filtered: FloatArray, sigma: FloatArray, seen_ns: IntArray,
     known_s: float, filter_s: float, gate: float, model_px: float, first_px: float,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Fold a frame's innovations (m, 2) into the ``filtered`` ones, each by its weight; those refused leave it alone.
 
     ``noise`` (m,): variance of a coordinate by the detector alone; ``gate``: squared distance; ``model_px``,
-    ``first_px``: what a prediction may be off by, for markers last seen within ``known_s`` and for others, beside the
-    variance ``joint_error`` (m,) [px²], by which it changes where play is passed through. Gives how
+    ``first_px``: what a prediction may be off by, for markers last seen within ``known_s`` and for others; ``common``
+    (m, 2) [px]: change of all of them together since the filtered ones, which the gate leaves out. Gives how
     many were accepted and refused, and the sum of squares of the accepted innovations [px²].
     """
     accepted = refused = 0
@@ -511,8 +552,9 @@ def fold_in(
             x -= filtered[i, 0]
             y -= filtered[i, 1]
         model = model_px if known else first_px
-        off = model * model + joint_error[i]
-        d2 = distance2(x, y, spread[i, 0, 0] + off, spread[i, 0, 1], spread[i, 1, 1] + off)
+        off = model * model
+        a, b = (x - common[i, 0], y - common[i, 1]) if known else (x, y)
+        d2 = distance2(a, b, spread[i, 0, 0] + off, spread[i, 0, 1], spread[i, 1, 1] + off)
         if not d2 <= gate:
             refused += 1
             continue

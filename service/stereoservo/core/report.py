@@ -252,12 +252,16 @@ def priors(
     return tuple(found)
 
 
+LARGEST_WINDOW_PX = 20.0
+"""Deviation beyond which a detector does better to look in the whole image."""
+
+
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> float | FloatArray:
     """Deviation [px] of markers that were not seen of late, by their ``jacobian`` (m, 2, n)."""
     if arrays.joint_accuracy is None:
         return FIRST_SIGHT_SIGMA_PX
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
-    return np.asarray(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints))
+    return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
 
 
 def _raw_prior(prior: Prior, lens: FloatArray) -> Prior:

@@ -96,18 +96,18 @@ class EventLog:
 
     def add(self, kind: str, *, t_ns: int | None = None, **fields: Any) -> EventMessage:
         """Publish an event of the gateway, or of another process."""
-        self.last += 1
         now_ns = time.monotonic_ns()
         stamp = now_ns if t_ns is None else t_ns
         message = EventMessage(
-            seq=self.last,
+            seq=self.last + 1,
             boot=self._boot,
             t_ns=stamp,
             t_wall=time.time() - (now_ns - stamp) * 1e-9,
             kind=kind,
             **fields,
         )
-        encoded = encode(message)
+        encoded = encode(message)  # a number that is not finite raises here, and is no event
+        self.last = message.seq
         self._kept.append(encoded)
         self._publish(encoded)
         self._observe(message)

@@ -19,7 +19,7 @@ SEEN_FRAMES = 20
 """Of each camera, whose mean is what was seen."""
 SIGHT_S = 20.0
 """For so many frames, at most."""
-SEEN_PX = 0.1
+SEEN_PX = 0.3
 """Deviation of what was seen: markers differ in how their centres are found at different postures."""
 REST_S = 0.4  # after a move, before the cameras are believed
 JUDGE_S = 1.2  # rest after a goal, of which one second is judged

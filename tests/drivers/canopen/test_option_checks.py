@@ -133,10 +133,13 @@ def test_sdo_keys_and_values() -> None:
     assert "32 bits" in refused(joint(sdo={"0x60C2:1": 2**32}))
 
 
-@pytest.mark.parametrize("key", ["0x6007:0", "0x605A:0", "0x605e:0"])
-def test_no_further_write_keeps_a_drive_from_stopping(key: str) -> None:
-    assert "run out" in refused(joint(sdo={key: 0}))
-    check_options(options(joint(sdo={key: 2})))
+def test_no_further_write_keeps_a_drive_from_stopping() -> None:
+    for key, option in (
+        ("0x6007:0", "abort_option"), ("0x605a:0", "quick_stop_option"), ("0x6085:0", "quick_stop_deceleration"),
+    ):  # fmt: skip
+        assert f"set by option {option}" in refused(joint(sdo={key: 1}))
+    assert "run out" in refused(joint(sdo={"0x605E:0": 0}))
+    check_options(options(joint(sdo={"0x605E:0": 1})))
 
 
 def test_what_would_be_ignored_or_cannot_be() -> None:

@@ -2,13 +2,16 @@
 explains the innovations best, and whether moved cameras can be distinguished from a moved arm.
 
 All cameras moved as one, and an arm that stands elsewhere than its joints say (play, a zero, the marker body), look
-alike in the images of the arm. `doubt` says whether something else tells them apart. Before any cause is asked for,
-`without_joint_errors` takes out what the errors of joint readings explain that the model states of its arm.
+alike in the images of the arm. `doubt` says whether something else tells them apart.
+
+What the errors of joint readings explain that the model states of its arm is no change. Beside such errors a camera or
+a marker is named where it alone is at odds with the joints as the others see them.
 """
 
 from __future__ import annotations
 
 import math
+from copy import copy
 from functools import lru_cache
 from typing import Literal
 
@@ -18,18 +21,18 @@ from stereoservo.calibration.change.change_detection import ChangeDiagnosis, Iso
 from stereoservo.calibration.change.hypothesis_test import Thresholds, alarm_thresholds
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis, ModelMonitor, VerdictKind
-from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, used_rows
+from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, gate_threshold, used_rows
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.numerics.linear import damped_least_squares
 
 FALSE_ALARMS_PER_HOUR = 1e-3
 """Of one round, in noise as stated; a verdict needs two of three besides."""
 LEAST_PX = 0.5
 """Rms change of the pixels below which no cause is told: models are off by as much where nothing has changed."""
-LEAST_JOINT_ERROR = 1e-9
-"""[rad or m]: what no reading is better than."""
+SUSPECT_MARKERS = 3
+"""Of which each is left out in turn."""
 FEWEST_ON_ARM = 4
 """Markers on the arm by which a camera may confirm that the arm is where its joints say."""
 FEWEST_STATIC = 3
@@ -92,6 +95,22 @@ class Bench:
         H, self.operators = chain_at(arrays, q)
         self.points = transform_points(H, arrays.marker_points)
         self.innovation, self.weights = innovation, weights
+
+    def with_innovation(self, innovation: FloatArray) -> Bench:
+        """The same moment with other innovations (c, k, 2) [px]."""
+        other = copy(self)
+        other.innovation = innovation
+        return other
+
+    def explained(self, among: BoolArray) -> bool:
+        """Whether the innovations ``among`` (c, k) the sights are noise: in each camera together, and each of them."""
+        squares = ((self.innovation * (self.weights * among)[..., None]) ** 2).sum(axis=-1)
+        counts = 2.0 * ((self.weights > 0.0) & among).sum(axis=1)
+        together = all(
+            float(total) <= improbable(float(count))
+            for total, count in zip(squares.sum(axis=1), counts, strict=True)
+        )
+        return together and float(squares.max()) <= gate_threshold(self.settings.gate_sigma)
 
     def diagnose(self, row: int | None = None, *, static_alone: bool = False) -> ChangeDiagnosis:
         """What all cameras show, or the one of a ``row``; ``static_alone``: without the markers on the arm."""
@@ -252,27 +271,72 @@ def _joint_deviation(bench: Bench, joint: int) -> float:
     return 1.0 / math.sqrt(information) if information > 0.0 else 0.0
 
 
-def without_joint_errors(bench: Bench) -> tuple[FloatArray, float] | None:
-    """Innovations (c, k, 2) [px] that are left, and the chi-square of all with that of the joints, where the arm stands
-    beside its readings by the errors of joint readings that the model states, at their most probable; None where it
-    states none.
+def without_joint_errors(bench: Bench, believed: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Innovations (c, k, 2) [px] less what the arm shows that stands beside its readings, and by how much (n,), over
+    the deviations that the model states; None where it states none.
+
+    The most probable joints are estimated from the sights of weight ``believed`` (c, k) [1/px].
     """
     arrays = bench.arrays
     if arrays.joint_accuracy is None:
         return None
-    q = bench.q
-    n, m = len(q), len(bench.points)
-    deviations = arrays.joint_accuracy.deviations((q - arrays.zero)[None])[0]
-    known = 1.0 / np.maximum(deviations, LEAST_JOINT_ERROR)
+    n, m = len(bench.q), len(bench.points)
+    deviations = arrays.joint_accuracy.deviations((bench.q - arrays.zero)[None])[0]
     J = np.zeros((*bench.innovation.shape, n))
-    J[:, :m] = image_jacobian(bench.operators, arrays.matrices[bench.known], bench.points)
-    weights = np.concatenate([np.repeat(bench.weights.reshape(-1), 2), known])
+    J[:, :m] = image_jacobian(bench.operators, arrays.matrices[bench.known], bench.points) * deviations
+    J = np.where(np.isfinite(J), J, 0.0)
+    weights = np.concatenate([np.repeat(believed.reshape(-1), 2), np.ones(n)])
     rows = np.concatenate([J.reshape(-1, n), np.eye(n)])
     errors = np.concatenate([bench.innovation.reshape(-1), np.zeros(n)])
     found, _ = damped_least_squares(rows, errors, weights, 0.0)
-    left = bench.innovation - (J * found).sum(axis=-1)
-    chi2 = float(((left * bench.weights[..., None]) ** 2).sum() + ((found * known) ** 2).sum())
-    return left, chi2
+    return bench.innovation - (J * found).sum(axis=-1), found
+
+
+def diagnosed_beside_joint_errors(bench: Bench) -> ModelDiagnosis:
+    """What explains the innovations of one moment of an arm whose joints have errors.
+
+    Where the innovations name neither a camera nor a marker, the joints are estimated without each camera, and without
+    each of the markers that is farthest from them, in turn: what was left out is named where it alone is what changed.
+    """
+    plain = diagnosed(bench)
+    if bench.arrays.joint_accuracy is None or plain.kind in ("camera_moved", "marker_slipped", "joint_zero"):
+        return plain
+    for left_out in _suspects(bench):
+        found = without_joint_errors(bench, bench.weights * ~left_out)
+        if found is None or not likely_errors(found[1]):
+            continue
+        cleared = bench.with_innovation(found[0])
+        if not cleared.explained(~left_out):
+            continue
+        again = diagnosed(cleared)
+        if again.kind in ("camera_moved", "marker_slipped"):
+            return again
+    return plain
+
+
+def _suspects(bench: Bench) -> list[BoolArray]:
+    """Sights (c, k) of each camera, where there are others, and of the markers that fit worst to the joints."""
+    weights = bench.weights
+    found = []
+    if len(bench.known) > 1:
+        found += [np.arange(len(bench.known))[:, None] == row for row in range(len(bench.known))]
+    fitted = without_joint_errors(bench, weights)
+    if fitted is not None:
+        distance = ((fitted[0] * weights[..., None]) ** 2).sum(axis=(0, 2))[: len(bench.points)]
+        worst = np.argsort(-distance, kind="stable")[:SUSPECT_MARKERS]
+        found += [np.arange(weights.shape[1])[None] == marker for marker in worst]
+    return [np.broadcast_to(one, weights.shape) for one in found]
+
+
+def likely_errors(found: FloatArray) -> bool:
+    """Whether joints may stand beside their readings by ``found`` (n,) standard deviations."""
+    return float((found * found).sum()) <= improbable(float(found.size))
+
+
+def improbable(freedoms: float) -> float:
+    """Chi-square that is exceeded as rarely as five standard deviations (Wilson and Hilferty 1931)."""
+    part = 2.0 / (9.0 * max(freedoms, 1.0))
+    return freedoms * (1.0 - part + 5.0 * math.sqrt(part)) ** 3
 
 
 def bench_now(watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
