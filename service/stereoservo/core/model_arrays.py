@@ -11,6 +11,7 @@ import numpy as np
 from stereoservo.control.marker_groups import MarkerGroups, groups_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.cameras import camera_centre
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
 from stereoservo.kinematics.model import CellModel, lens_size
@@ -25,6 +26,8 @@ class ModelArrays:
     kinds: np.ndarray[tuple[int], np.dtype[np.uint8]]
     zero: FloatArray
     tip_first: bool
+    composition: int
+    """How the arm's joints compose (`kinematics.composition`), for laws and plans."""
     matrices: FloatArray
     lenses: FloatArray
     marker_points: FloatArray
@@ -119,6 +122,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
         zero=np.ascontiguousarray(model.zero, dtype=np.float64),
         tip_first=model.tip_first,
+        composition=int(Composition.TIP_FIRST if model.tip_first else Composition.BASE_FIRST),
         matrices=matrices,
         lenses=np.array([by_name[camera.name].lens for camera in settings.cameras], dtype=np.float64),
         marker_points=np.ascontiguousarray(model.marker_points, dtype=np.float64),

@@ -41,7 +41,6 @@ from stereoservo.core.monitors.diagnosis import camera_moved_findings, emit_diag
 from stereoservo.core.monitors.fault_isolation import (
     bench_now,
     diagnosed_beside_joint_errors,
-    improbable,
     likely_errors,
     without_joint_errors,
 )
@@ -52,6 +51,7 @@ from stereoservo.core.prediction import (
     TRUSTED_FRAMES,
     camera_chi2,
     gate_threshold,
+    improbable,
     used_rows,
 )
 from stereoservo.core.settings import CoreSettings

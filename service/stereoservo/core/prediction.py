@@ -1,5 +1,5 @@
 """Marker positions and pixels at a given time, predicted by projective kinematics (thesis 8.35) and corrected by
-camera frames: innovations, outlier gating, filtering, time offset of each camera, priors for the detectors.
+camera frames: innovations, outlier gating, filtering, time offset of each camera.
 
 Cameras speak in raw pixels. Here they become ideal ones, in which everything behind is linear in homogeneous
 coordinates; priors leave in raw pixels again.
@@ -23,7 +23,6 @@ from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.monitor_state import CameraMonitor, CameraTiming, ModelMonitor
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import HISTORY, CameraEstimate, JointHistory, ServoGoal
-from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import (
     chain_forward,
     distortion_jacobian,
@@ -256,8 +255,6 @@ FORGETTING_S = 30.0
 """Time constant, in seconds of seen motion, with which old frames are forgotten."""
 MOVING_PX_S = 20.0
 """Mean pixel speed below which a frame says nothing of time."""
-MODEL_PX = 0.3
-"""What the model may be off by, beside the noise [px]."""
 
 
 def fold_timing(
@@ -287,7 +284,7 @@ def _timing_sums(
     for i in range(variances.shape[0]):
         vu, vv = velocities[i, 0], velocities[i, 1]
         speed += math.sqrt(vu * vu + vv * vv)
-        weight = 1.0 / (variances[i] + MODEL_PX * MODEL_PX)
+        weight = 1.0 / (variances[i] + MODEL_SIGMA_PX * MODEL_SIGMA_PX)
         product += weight * (vu * innovations[i, 0] + vv * innovations[i, 1])
         square += weight * (vu * vu + vv * vv)
     return speed, product, square
@@ -451,12 +448,7 @@ def scene_of(
 ) -> Scene:
     """The present as laws take it: operators, cameras, points (m, 4), pixels (c, m, 2) and their weights (c, m)."""
     matrices, centres = arrays.matrices, arrays.camera_centres
-    return Scene(prediction.operators, composition_of(arrays), matrices, centres, points, pixels, weights)
-
-
-def composition_of(arrays: ModelArrays) -> int:
-    """How the arm's joints compose, for laws and plans."""
-    return int(Composition.TIP_FIRST if arrays.tip_first else Composition.BASE_FIRST)
+    return Scene(prediction.operators, arrays.composition, matrices, centres, points, pixels, weights)
 
 
 def centre_of(source: ServoGoal, joints: FloatArray, arrays: ModelArrays, points: FloatArray) -> FloatArray:
@@ -482,6 +474,12 @@ def gate_threshold(sigmas: float) -> float:
     if sigmas >= FAR_SIGMA:
         return sigmas * sigmas + 2.0 * math.log(sigmas * math.sqrt(0.5 * math.pi))
     return -2.0 * math.log(math.erfc(sigmas / math.sqrt(2.0)))
+
+
+def improbable(freedoms: float) -> float:
+    """Chi-square that is exceeded as rarely as five standard deviations (Wilson and Hilferty 1931)."""
+    part = 2.0 / (9.0 * max(freedoms, 1.0))
+    return freedoms * (1.0 - part + 5.0 * math.sqrt(part)) ** 3
 
 
 @kernel

@@ -17,6 +17,7 @@ from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Tas
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.goals.marker_body import goal_pose
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.numerics.arrays import FloatArray
@@ -256,6 +257,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         kinds=np.zeros(n, dtype=np.uint8),
         zero=np.zeros(n),
         tip_first=False,
+        composition=int(Composition.BASE_FIRST),
         matrices=knowledge.matrices,
         lenses=np.zeros((len(knowledge.matrices), 4)),
         marker_points=np.zeros((m, 4)),

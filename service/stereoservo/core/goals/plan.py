@@ -15,7 +15,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import BodyState, view_of
 from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
-from stereoservo.core.prediction import centre_of, chain_at, composition_of
+from stereoservo.core.prediction import centre_of, chain_at
 from stereoservo.core.state import PlanJob, Purpose, ServoGoal
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.messages import goals
@@ -71,7 +71,7 @@ def _plan_request(
     kept = (view_of(place, place.points)[1][used] * source.wanted[used]).min(axis=0)
     return PlanRequest(
         operators=chain_at(arrays, joints)[1],
-        composition=composition_of(arrays),
+        composition=arrays.composition,
         joints=joints.copy(),
         matrices=np.ascontiguousarray(arrays.matrices[used]),
         camera_centres=np.ascontiguousarray(arrays.camera_centres[used]),

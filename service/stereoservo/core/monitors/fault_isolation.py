@@ -21,7 +21,7 @@ from stereoservo.calibration.change.change_detection import ChangeDiagnosis, Iso
 from stereoservo.calibration.change.hypothesis_test import Thresholds, alarm_thresholds
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis, ModelMonitor, VerdictKind
-from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, gate_threshold, used_rows
+from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, gate_threshold, improbable, used_rows
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
 from stereoservo.numerics.arrays import BoolArray, FloatArray
@@ -296,11 +296,13 @@ def diagnosed_beside_joint_errors(bench: Bench) -> ModelDiagnosis:
     """What explains the innovations of one moment of an arm whose joints have errors.
 
     Where the innovations name neither a camera nor a marker, the joints are estimated without each camera, and without
-    each of the markers that is farthest from them, in turn: what was left out is named where it alone is what changed.
+    each of the markers that is farthest from them, in turn: what was left out is named where it alone is what changed,
+    and nothing else that was left out would be.
     """
     plain = diagnosed(bench)
     if bench.arrays.joint_accuracy is None or plain.kind in ("camera_moved", "marker_slipped", "joint_zero"):
         return plain
+    named_by: dict[tuple[str, tuple[str, ...]], ModelDiagnosis] = {}
     for left_out in _suspects(bench):
         found = without_joint_errors(bench, bench.weights * ~left_out)
         if found is None or not likely_errors(found[1]):
@@ -310,8 +312,8 @@ def diagnosed_beside_joint_errors(bench: Bench) -> ModelDiagnosis:
             continue
         again = diagnosed(cleared)
         if again.kind in ("camera_moved", "marker_slipped"):
-            return again
-    return plain
+            named_by.setdefault((again.kind, again.subjects), again)
+    return next(iter(named_by.values())) if len(named_by) == 1 else plain
 
 
 def _suspects(bench: Bench) -> list[BoolArray]:
@@ -331,12 +333,6 @@ def _suspects(bench: Bench) -> list[BoolArray]:
 def likely_errors(found: FloatArray) -> bool:
     """Whether joints may stand beside their readings by ``found`` (n,) standard deviations."""
     return float((found * found).sum()) <= improbable(float(found.size))
-
-
-def improbable(freedoms: float) -> float:
-    """Chi-square that is exceeded as rarely as five standard deviations (Wilson and Hilferty 1931)."""
-    part = 2.0 / (9.0 * max(freedoms, 1.0))
-    return freedoms * (1.0 - part + 5.0 * math.sqrt(part)) ** 3
 
 
 def bench_now(watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
