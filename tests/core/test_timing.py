@@ -7,7 +7,7 @@ import pytest
 
 from stereoservo.core.ingest import remember_joints
 from stereoservo.core.monitor_state import CameraTiming
-from stereoservo.core.prediction import MODEL_PX, fold_timing, motion_at
+from stereoservo.core.prediction import MODEL_SIGMA_PX, fold_timing, motion_at
 from stereoservo.core.report import advice, offset_s
 from stereoservo.core.state import HISTORY, JointHistory
 from stereoservo.ports.devices import JointState
@@ -38,10 +38,10 @@ def test_the_offset_is_found_within_its_deviation(late_ms: float) -> None:
     for seed in range(40):
         late, deviation = offset_s(seen(1e-3 * late_ms, seed=seed))
         deviations.append((late - 1e-3 * late_ms) / deviation)
-    # The stated deviation supposes that the model is off by MODEL_PX anew in each frame: an upper bound here, but for
-    # the curvature of the swing, cos(w late) to second order.
+    # The stated deviation supposes that the model is off by MODEL_SIGMA_PX anew in each frame: an upper bound here, but
+    # for the curvature of the swing, cos(w late) to second order.
     assert np.abs(deviations).max() < 5.0
-    assert MODEL_PX > 0.1
+    assert MODEL_SIGMA_PX > 0.1
 
 
 def test_nothing_is_said_of_an_arm_at_rest() -> None:
