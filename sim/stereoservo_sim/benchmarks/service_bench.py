@@ -179,7 +179,7 @@ class ServiceBench:
 
     def end_daemon(self) -> None:
         """End the daemon, whatever became of its processes."""
-        for pid in processes_of(self.directories.runtime).values():
+        for pid in self.processes().values():
             send(pid, signal.SIGCONT)
         self.daemon.stop()
         until = time.monotonic() + 10.0
@@ -191,7 +191,7 @@ class ServiceBench:
 
     def ready(self) -> None:
         """A daemon that lives, without fault or stop, its drives on."""
-        for pid in processes_of(self.directories.runtime).values():
+        for pid in self.processes().values():
             send(pid, signal.SIGCONT)
         if self.daemon.process.poll() is not None:
             self.end_daemon()
