@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import ContactSettings
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.messages.goals import (
     AcknowledgeGoal,
@@ -408,3 +409,34 @@ def test_law_hands_over_to_the_face_that_is_seen(bench: Any) -> None:
     assert not chosen & before
     assert bench.ended().kind == "goal_reached"
     assert bench.error_px(goal_q) < 0.3
+
+
+@pytest.mark.parametrize("by", ["stop", "contact"])
+def test_stop_and_contact_end_the_queue_with_the_goal(bench: Any, by: str) -> None:
+    if by == "contact":
+        bench.settings = msgspec.structs.replace(
+            bench.settings,
+            watch_following=True,
+            contact=ContactSettings(True, np.full(6, 5.0), np.full(6, np.nan), 2.0, 5, ("N m",) * 6),
+        )
+        bench.core = ServoCore(bench.settings)
+        bench.loads = lambda b: (np.full(6, 50.0 if pressed else 0.0), np.zeros(6))
+    pressed = False
+    bench.ready()
+    first = bench.goal(features(bench, bench.q + DISPLACED))
+    assert bench.reply(first).accepted
+    second = bench.goal(features(bench, bench.q - DISPLACED), mode="queue")
+    assert bench.reply(second).accepted
+    bench.run(0.5)
+    assert np.abs(bench.commands[-1]).max() > 0.0
+    pressed = True
+    if by == "stop":
+        bench.step(stop=True)
+    bench.run(1.0)
+    assert kinds(bench, first.goal.id)[-1] == "goal_aborted"
+    assert [kind for kind in kinds(bench, second.goal.id) if kind.startswith("goal_")] == ["goal_cancelled"]
+    pressed = False
+    bench.step(Resume())
+    begun = len(bench.commands)
+    bench.run(1.0)
+    assert not np.any(bench.commands[begun:])
