@@ -440,3 +440,21 @@ def test_stop_and_contact_end_the_queue_with_the_goal(bench: Any, by: str) -> No
     begun = len(bench.commands)
     bench.run(1.0)
     assert not np.any(bench.commands[begun:])
+
+
+def test_a_plan_keeps_time_where_the_loop_misses_cycles(bench: Any) -> None:
+    """The arm goes on with the last velocity meanwhile; where the plan does not know, it runs ahead, past the end."""
+    bench.ready()
+    start, goal_q = bench.q.copy(), bench.q + DISPLACED
+    assert bench.reply(bench.goal(features(bench, goal_q), law="trajectory", gain=1.0)).accepted
+    whole = np.linalg.norm(goal_q - start)
+    period_ns = round(1e9 / bench.settings.rate_hz)
+    farthest, ended = 0.0, len(bench.events)
+    while not any(event.kind == "goal_reached" for event in bench.events[ended:]):
+        assert bench.seq < 6000
+        bench.step()
+        if bench.seq % 4 == 1:  # a fifth of the cycles
+            bench.now_ns += period_ns
+            bench._drive(bench.commands[-1] * period_ns * 1e-9)
+        farthest = max(farthest, float((bench.q - start) @ (goal_q - start)) / whole**2)
+    assert farthest < 1.01

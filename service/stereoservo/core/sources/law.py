@@ -257,6 +257,9 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
     """The task of law ``trajectory`` now: where the plan has set-points and joints, and how fast; its time goes on."""
     plan = source.plan
     assert plan is not None
+    if source.plan_s > 0.0:  # cycles that the loop missed: the arm went on with the velocity of the last one
+        missed = round(context.ingested.elapsed_s / context.dt_s) - 1
+        source.plan_s = min(max(0.0, source.plan_s + missed * context.dt_s), float(plan.times[-1]))
     begin_s = source.plan_s
     set_points, share = _planned_set_points(source, scene)
     wanted = np.ones_like(source.wanted) if share < 1.0 else source.wanted
