@@ -190,15 +190,14 @@ FAULT_REACTION = (0x605E, 0)
 
 def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
     try:
-        parse_sdo_key(key)
+        name = parse_sdo_key(key)
     except ValueError as error:
         raise _refusal("sdo", key, str(error), joint) from error
     if not -(2**31) <= value <= UINT32_MAX:
         raise _refusal(f"sdo {key}", value, "an integer of at most 32 bits", joint)
-    own = BY_OPTION.get(parse_sdo_key(key))
-    if own is not None:
-        raise _refusal(f"sdo {key}", value, f"this object is set by option {own}", joint)
-    if parse_sdo_key(key) == FAULT_REACTION and value == 0:
+    if name in BY_OPTION:
+        raise _refusal(f"sdo {key}", value, f"this object is set by option {BY_OPTION[name]}", joint)
+    if name == FAULT_REACTION and value == 0:
         valid = "another value: with 0 the drive lets its axis run out at a fault, where it is to stop"
         raise _refusal(f"sdo {key}", value, valid, joint)
 

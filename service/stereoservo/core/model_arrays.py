@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from stereoservo.control.marker_groups import MarkerGroups, groups_of
@@ -67,9 +68,8 @@ def _require_numbers(model: CellModel) -> None:
         ),
     ]
     if model.joint_accuracy is not None:
-        arrays += [
-            ("errors of joint readings", errors, (joints,)) for errors in _errors(model.joint_accuracy)
-        ]
+        errors = msgspec.structs.astuple(model.joint_accuracy)
+        arrays += [("errors of joint readings", values, (joints,)) for values in errors]
     if model.projective_to_euclidean is not None:
         arrays.append(("Euclidean frame", model.projective_to_euclidean, (4, 4)))
     for what, values, shape in arrays:
@@ -152,12 +152,8 @@ def _bounded_accuracy(model: CellModel) -> JointAccuracy | None:
     accuracy = model.joint_accuracy
     if accuracy is None:
         return None
-    bounded = (np.minimum(np.asarray(e, dtype=np.float64), LARGEST_JOINT_ERROR) for e in _errors(accuracy))
-    return JointAccuracy(*bounded)
-
-
-def _errors(accuracy: JointAccuracy) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    return accuracy.random, accuracy.repeatable, accuracy.stated, accuracy.posture
+    errors = msgspec.structs.astuple(accuracy)
+    return JointAccuracy(*(np.minimum(np.asarray(e, dtype=np.float64), LARGEST_JOINT_ERROR) for e in errors))
 
 
 def _metric_basis(model: CellModel) -> FloatArray | None:

@@ -41,7 +41,6 @@ from stereoservo.core.monitors.diagnosis import camera_moved_findings, emit_diag
 from stereoservo.core.monitors.fault_isolation import (
     bench_now,
     diagnosed_beside_joint_errors,
-    likely_errors,
     without_joint_errors,
 )
 from stereoservo.core.move import MOTION_SOURCES
@@ -372,9 +371,7 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
 def _judged(
     watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings, *, proven: bool
 ) -> ModelDiagnosis:
-    """What one round says, of the cameras ``known``. ``proven``: that a camera has moved; errors of the joints alone do
-    not take it back.
-    """
+    """What one round says, of the cameras ``known``. ``proven``: that a camera has moved."""
     suspicious = False
     for c in known:
         sighting = watching.sightings[c]
@@ -383,17 +380,7 @@ def _judged(
         suspicious |= not (likely or _late(sighting, used, settings))
     if not suspicious:
         return ModelDiagnosis()
-    bench = bench_now(watching, known, arrays, settings)
-    found = without_joint_errors(bench, bench.weights)
-    everywhere = np.ones(bench.weights.shape, dtype=bool)
-    if (
-        found is not None
-        and not proven
-        and likely_errors(found[1])
-        and bench.with_innovation(found[0]).explained(everywhere)
-    ):
-        return ModelDiagnosis()
-    return diagnosed_beside_joint_errors(bench)
+    return diagnosed_beside_joint_errors(bench_now(watching, known, arrays, settings), proven=proven)
 
 
 def _likely(

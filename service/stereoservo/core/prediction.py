@@ -357,8 +357,8 @@ def common_change(
     """
     m, n = used.size, jacobian.shape[2]
     none = np.zeros((m, 2))
-    rows = sights.seen[:m] & used & (estimate.seen_ns > 0)
-    if arrays.joint_accuracy is None or int(rows.sum()) < 3:
+    known = used & (estimate.seen_ns > 0)
+    if arrays.joint_accuracy is None or int((rows := sights.seen[:m] & known).sum()) < 3:
         return none
     change = (sights.innovation[:m] - estimate.innovation)[rows]
     variance = MODEL_SIGMA_PX**2 + 0.5 * (sights.spread[:m][rows, 0, 0] + sights.spread[:m][rows, 1, 1])

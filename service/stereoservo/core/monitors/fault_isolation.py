@@ -24,7 +24,7 @@ from stereoservo.core.monitor_state import ModelDiagnosis, ModelMonitor, Verdict
 from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, gate_threshold, improbable, used_rows
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
-from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
 
 FALSE_ALARMS_PER_HOUR = 1e-3
@@ -102,10 +102,10 @@ class Bench:
         other.innovation = innovation
         return other
 
-    def explained(self, among: BoolArray) -> bool:
-        """Whether the innovations ``among`` (c, k) the sights are noise: in each camera together, and each of them."""
-        squares = ((self.innovation * (self.weights * among)[..., None]) ** 2).sum(axis=-1)
-        counts = 2.0 * ((self.weights > 0.0) & among).sum(axis=1)
+    def explained(self, believed: FloatArray) -> bool:
+        """Whether sights of weight ``believed`` (c, k) [1/px] are noise: in each camera together, and each of them."""
+        squares = ((self.innovation * believed[..., None]) ** 2).sum(axis=-1)
+        counts = 2.0 * (believed > 0.0).sum(axis=1)
         together = all(
             float(total) <= improbable(float(count))
             for total, count in zip(squares.sum(axis=1), counts, strict=True)
@@ -292,23 +292,29 @@ def without_joint_errors(bench: Bench, believed: FloatArray) -> tuple[FloatArray
     return bench.innovation - (J * found).sum(axis=-1), found
 
 
-def diagnosed_beside_joint_errors(bench: Bench) -> ModelDiagnosis:
-    """What explains the innovations of one moment of an arm whose joints have errors.
+def diagnosed_beside_joint_errors(bench: Bench, *, proven: bool) -> ModelDiagnosis:
+    """What explains the innovations of one moment of an arm whose joints may have errors; nothing where these do.
+    ``proven``: that a camera has moved; errors of the joints alone do not take it back.
 
     Where the innovations name neither a camera nor a marker, the joints are estimated without each camera, and without
     each of the markers that is farthest from them, in turn: what was left out is named where it alone is what changed,
     and nothing else that was left out would be.
     """
+    fitted = without_joint_errors(bench, bench.weights)
+    if fitted is None:
+        return diagnosed(bench)
+    if not proven and _likely_errors(fitted[1]) and bench.with_innovation(fitted[0]).explained(bench.weights):
+        return ModelDiagnosis()
     plain = diagnosed(bench)
-    if bench.arrays.joint_accuracy is None or plain.kind in ("camera_moved", "marker_slipped", "joint_zero"):
+    if plain.kind in ("camera_moved", "marker_slipped", "joint_zero"):
         return plain
     named_by: dict[tuple[str, tuple[str, ...]], ModelDiagnosis] = {}
-    for left_out in _suspects(bench):
-        found = without_joint_errors(bench, bench.weights * ~left_out)
-        if found is None or not likely_errors(found[1]):
+    for believed in _with_one_left_out(bench, fitted[0]):
+        found = without_joint_errors(bench, believed)
+        if found is None or not _likely_errors(found[1]):
             continue
         cleared = bench.with_innovation(found[0])
-        if not cleared.explained(~left_out):
+        if not cleared.explained(believed):
             continue
         again = diagnosed(cleared)
         if again.kind in ("camera_moved", "marker_slipped"):
@@ -316,21 +322,19 @@ def diagnosed_beside_joint_errors(bench: Bench) -> ModelDiagnosis:
     return next(iter(named_by.values())) if len(named_by) == 1 else plain
 
 
-def _suspects(bench: Bench) -> list[BoolArray]:
-    """Sights (c, k) of each camera, where there are others, and of the markers that fit worst to the joints."""
+def _with_one_left_out(bench: Bench, left: FloatArray) -> list[FloatArray]:
+    """Weights (c, k) without each camera, where there are others, and without each of the markers that fit worst to
+    the joints, by what is ``left`` (c, k, 2) [px].
+    """
     weights = bench.weights
-    found = []
-    if len(bench.known) > 1:
-        found += [np.arange(len(bench.known))[:, None] == row for row in range(len(bench.known))]
-    fitted = without_joint_errors(bench, weights)
-    if fitted is not None:
-        distance = ((fitted[0] * weights[..., None]) ** 2).sum(axis=(0, 2))[: len(bench.points)]
-        worst = np.argsort(-distance, kind="stable")[:SUSPECT_MARKERS]
-        found += [np.arange(weights.shape[1])[None] == marker for marker in worst]
-    return [np.broadcast_to(one, weights.shape) for one in found]
+    cameras, markers = np.arange(len(bench.known)), np.arange(weights.shape[1])
+    found = [weights * (cameras != row)[:, None] for row in cameras] if len(cameras) > 1 else []
+    distance = ((left * weights[..., None]) ** 2).sum(axis=(0, 2))[: len(bench.points)]
+    worst = np.argsort(-distance, kind="stable")[:SUSPECT_MARKERS]
+    return found + [weights * (markers != marker) for marker in worst]
 
 
-def likely_errors(found: FloatArray) -> bool:
+def _likely_errors(found: FloatArray) -> bool:
     """Whether joints may stand beside their readings by ``found`` (n,) standard deviations."""
     return float((found * found).sum()) <= improbable(float(found.size))
 
