@@ -305,11 +305,35 @@ def test_a_command_within_every_limit_passes_bit_for_bit():
         ),
         ({"keep_outs": [[[-np.inf, np.inf]] * 3], "keep_out_names": ("a",)}, "bounds no joint"),
         ({"keep_outs": [[[-0.1, 0.1]] * 3], "keep_out_names": ()}, "1 keep-outs have 0 names"),
+        ({"keep_outs": [[[-0.1, 0.1]] * 3], "keep_out_names": ("a", "b")}, "1 keep-outs have 2 names"),
     ],
 )
 def test_limits_that_cannot_work_are_refused_by_name(changes, text):
     with pytest.raises(SafetyConfigurationError, match=text):
         make_limits(**changes)
+
+
+@pytest.mark.parametrize("length", [2, 4])
+@pytest.mark.parametrize("name", ["raw", "positions", "previous"])
+def test_arrays_of_a_wrong_length_are_refused(name, length):
+    whole = SafetyInputs(np.zeros(3), np.zeros(3), np.zeros(3), DT, 0.0, 0.0, False)
+    with pytest.raises(SafetyConfigurationError, match=rf"{name} \({length},\)"):
+        safety_stage(dataclasses.replace(whole, **{name: np.zeros(length)}), make_limits())
+
+
+@pytest.mark.parametrize(("beyond", "told"), [(1e-12, False), (1e-6, True)])
+def test_only_a_change_that_counts_is_told(beyond, told):
+    limits = make_limits()
+    raw = np.array([limits.acceleration_max[0] * DT * (1.0 + beyond), 0.0, 0.0])
+    result = safety_stage(SafetyInputs(raw, np.zeros(3), np.zeros(3), DT, 0.0, 0.0, False), limits)
+    assert (limit.ACCELERATION_LIMITED in codes(result)) == told
+
+
+def test_the_shortest_period_gives_reasons_with_numbers():
+    inputs = SafetyInputs(np.full(3, 9.0), np.zeros(3), np.zeros(3), 5e-324, 0.0, 0.0, False)
+    result = safety_stage(inputs, make_limits())
+    assert limit.ACCELERATION_LIMITED in codes(result)
+    assert all(reason.value is None or math.isfinite(reason.value) for reason in result.reasons)
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf])

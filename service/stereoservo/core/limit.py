@@ -33,6 +33,8 @@ BRAKING = "BRAKING"
 
 TOUCHED = 1e-9
 """Relative change of a command that is worth a reason."""
+TINY = 1e-300
+"""Share of a command's step that is none."""
 
 
 class SafetyConfigurationError(ValueError):
@@ -216,7 +218,7 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
                 ACCELERATION_LIMITED,
                 "info",
                 limits.joint_names[j],
-                float(limits.acceleration_max[j] / scales[2]) if scales[2] > 0.0 else None,
+                _number(float(limits.acceleration_max[j]) / max(float(scales[2]), TINY)),
                 float(limits.acceleration_max[j]),
                 "1/s²",
                 "passes by itself",
