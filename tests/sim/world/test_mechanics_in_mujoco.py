@@ -1,4 +1,4 @@
-"""The simulated mechanics against MuJoCo, which models play, friction and compliance by contacts and forces of its own."""
+"""The simulated mechanics against MuJoCo, which has models of play, friction and compliance of its own."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ LIMITS = (
 GEARED_LINK = """
 <mujoco>
   <option timestep="{step}" gravity="0 0 -9.81" integrator="implicitfast" iterations="200" tolerance="1e-12"/>
+  <default><joint type="hinge" axis="0 1 0" solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001"/></default>
   <worldbody>
     <body name="motor">
-      <joint name="motor" type="hinge" axis="0 1 0" solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001" damping="{motor_damping}" frictionloss="{motor_friction}"/>
+      <joint name="motor" damping="{motor_damping}" frictionloss="{motor_friction}"/>
       <inertial pos="0 0 0" mass="0.5" diaginertia="0.05 0.05 0.05"/>
     </body>
     <body name="link">
-      <joint name="link" type="hinge" axis="0 1 0" solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001" frictionloss="{friction}" damping="1.0"/>
+      <joint name="link" frictionloss="{friction}" damping="1.0"/>
       <inertial pos="{arm} 0 0" mass="{mass}" diaginertia="0.002 0.002 0.002"/>
     </body>
   </worldbody>
@@ -141,7 +142,7 @@ def test_friction_holds_a_motor_within_its_dead_band() -> None:
     kp, friction = 200.0, 2.0
     band = 2.0 * friction / kp
     there = GearedLink('stiffness="1e4" damping="10"', motor_friction=friction, kp=kp, gravity=0.0)
-    ours = Transmission([Mechanics(dead_band=band)], np.zeros(1), lambda q: np.zeros_like(q))
+    ours = Transmission([Mechanics(dead_band=band)], np.zeros(1), np.zeros_like)
     at = 0.0
     for stop in (0.1, 0.11, 0.095, 0.085, 0.05, 0.065, 0.2):
         motor, _ = there.drive(stop)
