@@ -21,13 +21,16 @@ from stereoservo.ports.devices import (
 )
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
-from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
+from stereoservo_drivers.simulated_camera import ArmByRow, CameraOptions, SimulatedCamera
+from stereoservo_sim.world.camera_rig import PinholeCamera
 from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.velocity_drives import DriveBank, IdealPlant, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Count = Annotated[int, Meta(ge=1)]
+SHUTTER_ROUNDS = 3
+"""In which the row that shows a marker of a moving arm is found."""
 
 
 class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -206,16 +209,21 @@ class FakeCameraDriver(SimulatedCamera):
         return self.describe_as("observations", tuple(int(i) for i in ids))
 
     def deliver(
-        self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
+        self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator
     ) -> CameraObservation:
-        """The markers that this camera sees with the arm at ``q`` (n,)."""
-        pixels, _ = self.cell.in_world(self.camera, q).image_of(self.cell.marker_positions(q))
-        seen, ids = self.cell.visible(q, self.camera), self.cell.body.ids
+        """The markers that this camera sees with the ``arm`` where it is."""
+        q, camera = arm.middle, self.camera.focused(self.focus)
+        pixels = self._image_of(camera, q)
+        if arm.moves:
+            for marker in range(len(pixels)):
+                for _ in range(SHUTTER_ROUNDS):
+                    pixels[marker] = self._image_of(camera, arm.at(pixels[marker, 1]))[marker]
+        seen, ids = self.cell.visible(q, camera), self.cell.body.ids
         part, pose = self.cell.workpiece, self.workpiece_pose()
         if part is not None and pose is not None:
-            beside, _ = self.cell.in_world(self.camera, q).image_of(part.marker_positions(pose))
+            beside, _ = self.cell.in_world(camera, q).image_of(part.marker_positions(pose))
             pixels, ids = np.concatenate([pixels, beside]), np.append(ids, part.body.ids)
-            seen = np.append(seen, self.cell.workpiece_visible(q, pose, self.camera))
+            seen = np.append(seen, self.cell.workpiece_visible(q, pose, camera))
         # The same numbers are drawn whatever is seen: one marker's fate does not change another's noise.
         noise = rng.standard_normal(pixels.shape) * self._fake.noise_px
         seen &= rng.random(len(seen)) >= self._fake.marker_drop_rate
@@ -230,6 +238,9 @@ class FakeCameraDriver(SimulatedCamera):
             pixels=(pixels + noise)[seen],
             covariances=np.broadcast_to(np.eye(2) * sigma**2, (k, 2, 2)).copy(),
         )
+
+    def _image_of(self, camera: PinholeCamera, q: FloatArray) -> FloatArray:
+        return self.cell.in_world(camera, q).image_of(self.cell.marker_positions(q))[0]
 
 
 def _due(limit: int | None, count: int) -> bool:

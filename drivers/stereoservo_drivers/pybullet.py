@@ -16,7 +16,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, DriverContext, DriverError, Frame
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
-from stereoservo_drivers.simulated_camera import CameraOptions, SimulatedCamera
+from stereoservo_drivers.simulated_camera import ArmByRow, CameraOptions, SimulatedCamera
 from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.velocity_drives import Plant
 
@@ -92,9 +92,9 @@ class PybulletCameraDriver(SimulatedCamera):
         return Renderer(self.cell, self.camera, settings)
 
     def deliver(
-        self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
+        self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator
     ) -> Frame:
-        """The image with the arm at ``q`` (n,)."""
+        """The image with the ``arm`` where it is."""
         assert self._renderer is not None  # active: the lifecycle was checked
         if self._renderer.camera is not self.camera:  # it was bumped
             self._renderer = self._redraw()
@@ -103,5 +103,7 @@ class PybulletCameraDriver(SimulatedCamera):
             seq=seq,
             t_shutter_ns=t_shutter_ns,
             t_received_ns=t_received_ns,
-            image=self._renderer.render(q, rng, self.workpiece_pose()),
+            image=self._renderer.render(
+                arm.middle, rng, self.workpiece_pose(), focus=self.focus, at_row=arm.at if arm.moves else None
+            ),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,6 +26,26 @@ class Bump(Moved, frozen=True, forbid_unknown_fields=True, kw_only=True):
     at_s: NonNegative
 
 
+class ArmByRow(NamedTuple):
+    """Joint positions (n,) when the ``first``, ``middle`` and ``last`` of an image's ``height`` rows were exposed."""
+
+    first: FloatArray
+    middle: FloatArray
+    last: FloatArray
+    height: int
+
+    @property
+    def moves(self) -> bool:
+        """Whether the rows see the arm at different positions."""
+        return not (np.array_equal(self.first, self.middle) and np.array_equal(self.last, self.middle))
+
+    def at(self, row: float) -> FloatArray:
+        """Joint positions (n,) when ``row`` was exposed, one outside of the image with the nearest."""
+        t = float(np.clip(2.0 * row / (self.height - 1) - 1.0, -1.0, 1.0))
+        bend = 0.5 * (self.first + self.last) - self.middle
+        return self.middle + 0.5 * t * (self.last - self.first) + t * t * bend
+
+
 class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of every simulated camera.
 
@@ -38,7 +58,9 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
     ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
     after activation without frames; ``freeze_after_s``: from then on the picture stands still though frames keep
-    coming. ``seed``: of noise and losses (default: the context's).
+    coming. ``readout_s``: from the exposure of the first row to that of the last, of a rolling shutter; the stamp is
+    the middle row's. ``breathing``: share by which an autofocus swings the focal length to and fro, once in
+    ``breathing_s``. ``seed``: of noise and losses (default: the context's).
     """
 
     view: str = ""
@@ -53,6 +75,9 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     drop_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
     dropouts: tuple[tuple[float, float], ...] = ()
     freeze_after_s: float | None = None
+    readout_s: Annotated[float, Meta(ge=0, le=0.2)] = 0.0
+    breathing: Annotated[float, Meta(ge=0, le=0.2)] = 0.0
+    breathing_s: Annotated[float, Meta(gt=0)] = 10.0
     seed: int | None = None
 
 
@@ -91,6 +116,13 @@ class SimulatedCamera:
                 f"{self.camera.least_k1:.3f} or more is valid",
                 k1=options.k1,
             )
+        if options.readout_s > 2.0 * options.latency_s:
+            raise DriverError(
+                "option",
+                f"driver {self.driver!r}: readout_s: {options.readout_s:g}; at most {2.0 * options.latency_s:g} is "
+                "valid, twice latency_s: a frame does not arrive before its last row",
+                readout_s=options.readout_s,
+            )
         self._life = DriverLifecycle(f"camera driver {self.driver!r} ({self.name})")
         self._history: TrueJointHistory | None = None
         self._seed = context.seed if options.seed is None else options.seed
@@ -102,12 +134,14 @@ class SimulatedCamera:
         self._frozen: FloatArray | None = None
         self._workpiece = MovedFile(context.runtime_dir)
         self._workpiece_pose: FloatArray | None = None
+        self.focus = 1.0
+        """Focal length over its mean."""
         self.blackout = False
 
     def deliver(
-        self, seq: int, t_shutter_ns: int, t_received_ns: int, q: FloatArray, rng: np.random.Generator
+        self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator
     ) -> Frame | CameraObservation:
-        """Frame or observation of the arm at ``q`` (n,) and the workpiece at its pose."""
+        """Frame or observation of the ``arm`` as each row sees it and the workpiece at its pose."""
         raise NotImplementedError
 
     def bump(self, moved: Moved) -> None:
@@ -182,7 +216,13 @@ class SimulatedCamera:
         rng = np.random.default_rng((self._seed & 0xFFFFFFFF, zlib.crc32(self.name.encode()), k))
         if self._lost(t_shutter_ns, rng):
             return []
-        return [self.deliver(k, t_shutter_ns + self._stamped_late_ns, now_ns, q, rng)]  # type: ignore[return-value]
+        self.focus = 1.0 + self._options.breathing * float(
+            np.sin(2.0 * np.pi * (t_shutter_ns - self._activated_ns) * 1e-9 / self._options.breathing_s)
+        )
+        half_ns = round(0.5e9 * self._options.readout_s)
+        first, last = (self._arm_at(t_shutter_ns + late, now_ns) for late in (-half_ns, half_ns))
+        arm = ArmByRow(q if first is None else first, q, q if last is None else last, self.camera.height)
+        return [self.deliver(k, t_shutter_ns + self._stamped_late_ns, now_ns, arm, rng)]  # type: ignore[return-value]
 
     def deactivate(self) -> None:
         """Stop delivering frames. Idempotent."""

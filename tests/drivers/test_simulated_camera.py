@@ -81,6 +81,55 @@ def test_markers_are_where_the_arm_was_at_the_shutter(tmp_path):
         assert np.abs(item.pixels - truth).max() < 1e-6
 
 
+def test_each_row_of_a_rolling_shutter_shows_the_arm_at_its_own_time(tmp_path):
+    readout_s, rows = 0.03, CELL.rig.cameras[0].height
+    cell = Cell(tmp_path, [fake(noise_px=0.0, latency_s=0.03, readout_s=readout_s)])
+    (items,) = cell.run(1.5, velocity=[0.2, -0.1, 0.1, 0.3, 0.2, -0.5])
+    skews = []
+    for item in items[20:]:
+        for marker, pixel in enumerate(item.pixels):
+            late_ns = round((pixel[1] / (rows - 1) - 0.5) * readout_s * 1e9)
+            truth = CELL.truth_pixels(cell.world.at(item.t_shutter_ns + late_ns))["left"][marker]
+            assert np.abs(pixel - truth).max() < 2e-3
+            skews.append(
+                np.linalg.norm(pixel - CELL.truth_pixels(cell.world.at(item.t_shutter_ns))["left"][marker])
+            )
+    assert max(skews) > 0.1  # what the shutter does is no rounding
+
+
+def test_a_rolling_shutter_is_rendered_band_by_band(tmp_path):
+    shutter = {"latency_s": 0.03, "readout_s": 0.03}
+    drawn = PybulletCameraDriver, {"noise": 0.0, "background": "plain", **shutter}
+    cell = Cell(tmp_path, [drawn, fake(noise_px=0.0, **shutter)])
+    frames, items = cell.run(0.8, velocity=[0.2, -0.1, 0.1, 0.3, 0.2, -0.5])
+    detector, frame, item = DotDetector({}, cell.context("left")), frames[-1], items[-1]
+    found = detector.detect(frame, None)
+    still = CELL.truth_pixels(cell.world.at(item.t_shutter_ns))["left"][found.ids]
+    expected = item.pixels[np.searchsorted(item.ids, found.ids)]
+    assert len(found.ids) == 14
+    assert np.abs(found.pixels - expected).max() < 0.04  # a band sees all of its rows at once
+    assert np.abs(still - expected).max() > 0.1
+
+
+def test_a_rolling_shutter_that_ends_after_the_frame_is_there_is_refused(tmp_path):
+    with pytest.raises(DriverError, match=r"readout_s: 0\.03; at most 0\.024"):
+        Cell(tmp_path, [fake(latency_s=0.012, readout_s=0.03)])
+
+
+def test_an_autofocus_that_breathes_swings_the_picture_about_its_centre(tmp_path):
+    cell = Cell(tmp_path, [fake(noise_px=0.0, breathing=0.02, breathing_s=2.0)])
+    (items,) = cell.run(2.5)
+    centre = CELL.rig.cameras[0].K[:2, 2]
+    truth = CELL.truth_pixels(CELL.base)["left"] - centre
+    factors = []
+    for item in items:
+        factor = float((item.pixels - centre).ravel() @ truth.ravel() / (truth**2).sum())
+        assert np.allclose(item.pixels - centre, factor * truth, atol=1e-9)
+        factors.append(factor)
+    assert max(factors) == pytest.approx(1.02, abs=1e-4)
+    assert min(factors) == pytest.approx(0.98, abs=1e-4)
+
+
 def test_noise_is_gaussian_with_the_declared_covariance(tmp_path):
     cell = Cell(tmp_path, [fake(noise_px=0.2, rate_hz=200.0)])
     (items,) = cell.run(2.0)

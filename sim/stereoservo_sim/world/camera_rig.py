@@ -60,6 +60,14 @@ class PinholeCamera:
         """This camera after ``displacement`` (4, 4), in its own frame."""
         return replace(self, world_to_camera=inverse_pose(displacement) @ self.world_to_camera)
 
+    def focused(self, factor: float) -> PinholeCamera:
+        """This camera with its focal length times ``factor``."""
+        if factor == 1.0:
+            return self
+        K = self.K.copy()
+        K[:2, :2] *= factor
+        return replace(self, K=K)
+
     @property
     def P(self) -> FloatArray:
         """Projection matrix from the world to ideal pixels, (3, 4)."""

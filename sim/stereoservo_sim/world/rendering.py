@@ -29,6 +29,8 @@ from stereoservo_sim.world.simulated_cell import SimulatedCell
 DOT_LEVEL = 225.0
 PLATE_LEVEL = 24.0
 BACK_LEVEL = 70.0
+BAND = 16
+"""Rows of a rolling shutter that are exposed at one time."""
 _NOISE_MARGIN = 64
 Region = tuple[int, int, int, int]
 """Left, top, right, bottom [px]; right and bottom are the first beyond."""
@@ -66,13 +68,34 @@ class Renderer:
         self._noise = field.astype(np.float32)
 
     def render(
-        self, q: FloatArray, rng: np.random.Generator, workpiece: FloatArray | None = None
+        self,
+        q: FloatArray,
+        rng: np.random.Generator,
+        workpiece: FloatArray | None = None,
+        *,
+        focus: float = 1.0,
+        at_row: Callable[[float], FloatArray] | None = None,
     ) -> ImageArray:
         """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise.
 
         ``workpiece`` (4, 4): where it stands in the world; default: where it stood at first. Links that are nearer
-        than the workpiece are drawn over it where they are nearer than the body, too.
+        than the workpiece are drawn over it where they are nearer than the body, too. ``focus``: focal length of what
+        is drawn of the body over the camera's. ``at_row``: where the arm is when a row is exposed, in bands of
+        ``BAND`` rows, in place of ``q``.
         """
+        camera = self.camera.focused(focus)
+        if at_row is None:
+            return self._expose(self._drawn(q, workpiece, camera), rng)
+        image = np.empty((camera.height, camera.width), dtype=np.float32)
+        for top in range(0, camera.height, BAND):
+            rows = slice(top, min(top + BAND, camera.height))
+            image[rows] = self._drawn(at_row(0.5 * (rows.start + rows.stop - 1)), workpiece, camera)[rows]
+        return self._expose(image, rng)
+
+    def _drawn(
+        self, q: FloatArray, workpiece: FloatArray | None, camera: PinholeCamera
+    ) -> npt.NDArray[np.float32]:
+        """The image before the sensor's noise."""
         background, front = self._backdrop.image(q), []
         if self.settings.background == "arm":
             background = background.copy()
@@ -80,10 +103,10 @@ class Renderer:
         elif self.settings.background == "pybullet":
             front = self._draw_arm(background.copy(), q)  # only what stands before the body is drawn again
         image = self._bending.image(background).astype(np.float32)
-        for region in self._draw_markers(image, q, front, workpiece):
+        for region in self._draw_markers(image, q, front, workpiece, camera):
             if self.settings.blur_px > 0:
                 _blur(image, region, self.settings.blur_px)
-        return self._expose(image, rng)
+        return image
 
     def _draw_markers(
         self,
@@ -91,20 +114,21 @@ class Renderer:
         q: FloatArray,
         front: list[Link],
         workpiece: FloatArray | None,
+        camera: PinholeCamera,
     ) -> list[Region]:
         """Body, workpiece and the links in ``front`` of the body, far ones first; the regions touched, none twice."""
         layers: list[Callable[[], Region | None]] = [
-            lambda: draw_body(image, self.cell, self.camera, q),
+            lambda: draw_body(image, self.cell, camera, q),
             *(partial(self._draw_link, image, outline, level) for outline, level, _ in front),
         ]
         part = self.cell.workpiece
         if part is not None:
-            camera, pose = self.cell.in_world(self.camera, q), part.stand if workpiece is None else workpiece
-            depth = float(project(camera.P, part.marker_positions(pose))[1].min())
-            body_depth = float(project(camera.P, self.cell.marker_positions(q))[1].min())
+            placed, pose = self.cell.in_world(camera, q), part.stand if workpiece is None else workpiece
+            depth = float(project(placed.P, part.marker_positions(pose))[1].min())
+            body_depth = float(project(placed.P, self.cell.marker_positions(q))[1].min())
             depths = [body_depth, *(nearest + 0.03 for _, _, nearest in front)]
             place = next((k for k, other in enumerate(depths) if other < depth), len(depths))
-            layers.insert(place, lambda: draw_faces(image, part.body, pose, camera))
+            layers.insert(place, lambda: draw_faces(image, part.body, pose, placed))
         return _apart([region for draw in layers if (region := draw()) is not None])
 
     def _draw_link(self, image: npt.NDArray[np.float32], outline: FloatArray, level: float) -> None:
