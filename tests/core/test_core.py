@@ -94,6 +94,32 @@ def test_arm_brakes_when_joints_are_silent(bench: Any) -> None:
     assert "JOINTS_STALE" in {reason.code for reason in outputs.status.reasons}
 
 
+@pytest.mark.parametrize("law", ["stereo", "cartesian3", "trajectory", "joints"])
+def test_a_goal_goes_on_from_rest_once_the_joints_are_heard_again(bench: Any, law: str) -> None:
+    bench.ready()
+    target = bench.q + 0.5 * DISPLACED
+    command = goal(bench, target, law=law) if law != "joints" else RunGoal(
+        Goal("0000000c", JointTarget(dict(zip(bench.settings.joint_names, target.tolist(), strict=True))))
+    )  # fmt: skip
+    assert bench.reply(command).accepted
+    assert np.abs(bench.run(0.4).command).max() > 0.1
+    bench.joints_on = False
+    assert np.abs(bench.run(1.0).command).max() == 0.0
+    bench.joints_on = True
+    step = bench.settings.limits.acceleration_max / bench.settings.rate_hz
+    before, fastest = np.zeros(6), 0.0
+    for _ in range(30):
+        outputs = bench.step()
+        assert (np.abs(outputs.command - before) <= step * 1.000001).all()
+        assert outputs.status.goal == command.goal.id
+        before, fastest = outputs.command, max(fastest, np.abs(outputs.command).max())
+    assert fastest > 0.1  # nobody asked it to
+    assert "JOINTS_STALE" not in {reason.code for reason in outputs.status.reasons}
+    end = bench.until(ended, 25.0)
+    assert (end.kind, end.id) == ("goal_reached", command.goal.id)
+    assert bench.error_px(target) < 0.5
+
+
 def moving(bench: Any) -> None:
     bench.ready()
     bench.reply(goal(bench, bench.q + DISPLACED))
@@ -253,6 +279,39 @@ def test_model_waits_for_rest_and_unknown_models_are_refused(bench: Any) -> None
     events = bench.step(model_update=ModelUpdate(foreign)).events
     assert any("refused" in e.message for e in events)
     assert bench.run(0.1).status.model_epoch == 9
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda m: {"joint_kinds": ("revolute",) * 5 + ("prismatic",)}, "joint kinds"),
+        (lambda m: {"mount": "eye_in_hand"}, "learnt with cameras mounted eye_in_hand"),
+        (
+            lambda m: {"cameras": (m.cameras[0], msgspec.structs.replace(m.cameras[1], width=1280))},
+            "1280x480 images of camera 'right'",
+        ),
+        (
+            lambda m: {"cameras": (m.cameras[0], msgspec.structs.replace(m.cameras[1], name="top"))},
+            "the cell also has 'right'",
+        ),
+    ],
+    ids=["joint kinds", "mount", "image size", "cameras"],
+)
+def test_a_model_of_another_cell_is_refused_and_the_one_in_force_stays(
+    bench: Any, change: Any, told: str
+) -> None:
+    moving(bench)
+    model, source = bench.core.state.model, bench.core.state.source
+    foreign = msgspec.structs.replace(model, epoch=9, **change(model))
+    (event,) = bench.step(model_update=ModelUpdate(foreign)).events
+    assert event.kind == "warning"
+    assert event.message.startswith("model refused: ")
+    assert told in event.message
+    assert bench.core.state.source is source
+    assert bench.until(ended, 25.0).kind == "goal_reached"
+    bench.run(1.0)  # at rest, where one that waited would be taken
+    assert bench.core.state.model is model
+    assert bench.log[-1][1].status.model_epoch == 7
 
 
 def test_images_that_contradict_the_model_make_it_suspect_and_abort(bench: Any) -> None:

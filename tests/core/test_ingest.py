@@ -12,8 +12,20 @@ import pytest
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import decode_state, encode_state
-from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Goal, Jog, Resume, RunGoal
-from stereoservo.ports.devices import JointState
+from stereoservo.messages.goals import (
+    Calibrate,
+    Enable,
+    Feature,
+    FeatureTarget,
+    Goal,
+    IncidenceSpec,
+    IncidenceTarget,
+    Jog,
+    JointTarget,
+    Resume,
+    RunGoal,
+)
+from stereoservo.ports.devices import CameraObservation, JointState
 
 HOUR_NS = 3_600_000_000_000
 DISPLACED = np.array([0.25, -0.2, 0.15, 0.4, -0.3, 0.5])
@@ -323,6 +335,77 @@ def test_a_frame_of_the_future_stops_what_works_by_images_and_is_not_kept(bench:
     ).accepted
     assert bench.until(lambda e: e.kind == "goal_reached", 25.0)
     assert "CAMERA_STAMP" not in codes(bench.log[-1][1])
+
+
+@pytest.mark.parametrize("code", ["CAMERA_STAMP", "CAMERA_VALUE"])
+@pytest.mark.parametrize("source", ["incidence", "check", "joints"])
+def test_a_wrong_frame_stops_incidences_and_checks_and_is_only_told_to_a_joint_goal(
+    bench: Any, source: str, code: str
+) -> None:
+    bench.q = bench.q + 0.1
+    bench.ready()
+    goal_q = bench.q + DISPLACED
+    if source == "incidence":
+        point = tuple(bench.projective(bench.truth.points(goal_q))[4].tolist())
+        spec = IncidenceSpec("point-on-point", Feature(markers=(4,)), Feature(points=(point,)))
+        assert bench.reply(bench.goal(IncidenceTarget((spec,), model_epoch=7))).accepted
+    elif source == "check":
+        assert bench.reply(Calibrate("00000012", check=True)).accepted
+    else:
+        joints = dict(zip(bench.settings.joint_names, goal_q.tolist(), strict=True))
+        assert bench.reply(bench.goal(JointTarget(joints))).accepted
+    speed = np.abs(bench.run(0.2).command).max()
+    assert speed > 0.02
+    moving = bench.core.state.source
+    while not bench.pending or bench.pending[0].t_received_ns > bench.now_ns + 10_000_000:
+        bench.step()
+    wrong: dict[str, Any] = {"pixels": np.full((8, 2), np.nan)}
+    if code == "CAMERA_STAMP":
+        wrong = {"t_shutter_ns": bench.pending[0].t_shutter_ns + HOUR_NS}
+    bench.pending[0] = msgspec.structs.replace(bench.pending[0], **wrong)
+    outputs = bench.step()
+    assert code in codes(outputs)
+    if source == "joints":
+        assert bench.core.state.source is moving
+        assert not bench.core.state.stopped
+        assert bench.ended().kind == "goal_reached"
+        return
+    (end,) = (e for e in outputs.events if e.kind in ("goal_aborted", "calibration_aborted"))
+    assert end.reasons[0].code == code
+    outputs = bench.run(1.0)  # the frames are good again
+    assert np.abs(outputs.command).max() == 0.0
+    assert codes(outputs)[-2:] == [code, "STOPPED"]
+
+
+@pytest.mark.parametrize(("slowest_hz", "bound_s"), [(25.0, 0.15), (10.0, 0.25)])
+def test_a_law_coasts_for_two_and_a_half_frames_and_015_s_even_where_the_cell_allows_none(
+    benches: Any, slowest_hz: float, bound_s: float
+) -> None:
+    bench = benches(0)
+    left, right = bench.settings.cameras
+    bench.settings = msgspec.structs.replace(
+        bench.settings,
+        limits=msgspec.structs.replace(bench.settings.limits, coast_s=0.0),
+        cameras=(left, msgspec.structs.replace(right, rate_hz=slowest_hz)),
+    )
+    bench.core = ServoCore(bench.settings)
+    servoing(bench)
+    bench.cameras_on[:] = [False, False]
+    bench.run(0.04)
+    shutter_ns = max(estimate.accepted_ns for estimate in bench.core.state.cameras)
+    assert bench.now_ns - shutter_ns < 0.1e9
+    while "FEATURES_STALE" not in codes(bench.step()):
+        assert bench.now_ns - shutter_ns <= bound_s * 1e9
+    assert bound_s * 1e9 <= bench.now_ns - shutter_ns <= bound_s * 1e9 + 10_000_000
+    assert np.abs(bench.run(0.5).command).max() == 0.0
+    for late_s, counted in ((bound_s - 0.01, 0), (bound_s + 0.01, 1)):  # how late a frame may come
+        seen = CameraObservation(
+            "left", bench.seq + 1000, bench.now_ns + 10_000_000 - round(late_s * 1e9), bench.now_ns, np.arange(8),
+            bench.truth.pixels(bench.q)[0], np.tile(1e-4 * np.eye(2), (8, 1, 1)),
+        )  # fmt: skip
+        bench.pending = [seen]
+        assert ("CAMERA_LATE" in codes(bench.step())) == bool(counted)
+        assert bench.core.state.refused_frames[0].count == counted
 
 
 def test_frames_of_the_future_are_told_and_stop_no_jog(bench: Any) -> None:

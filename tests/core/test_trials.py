@@ -139,6 +139,37 @@ def test_a_keep_out_on_the_way_ends_a_side_before_it(bench: Any) -> None:
     ]
 
 
+@pytest.mark.parametrize("check", [False, True], ids=["trials", "check"])
+def test_no_command_is_faster_than_the_speed_scale_of_the_calibration(bench: Any, check: bool) -> None:
+    """From an arm that stands away from the base: the way there, the stops, and the way back."""
+    bench = with_trials(bench, speed_scale=0.2, stops=4, frames=1, range=np.full(6, 0.06))
+    bench.q = bench.q + 0.05
+    bench.ready()
+    end, _ = calibrated(bench, check=check)
+    assert end.kind == ("check_finished" if check else "calibration_finished"), end
+    bound = 0.2 * bench.settings.limits.velocity_max
+    fastest = np.abs(np.array(bench.commands)).max(axis=0)
+    assert (fastest <= bound * (1.0 + 1e-9)).all(), fastest
+    assert (fastest > 0.9 * bound).any()
+
+
+@pytest.mark.parametrize(("kind", "farthest"), [("revolute", 0.6), ("prismatic", 0.2)])
+def test_without_a_range_a_joint_that_keeps_the_markers_in_view_goes_to_the_largest_range_and_no_farther(
+    benches: Any, kind: str, farthest: float
+) -> None:
+    """The last joint turns the body on the spot; of which kind it is, is the drive's to say."""
+    bench = benches(0)
+    bench.settings = msgspec.structs.replace(bench.settings, joint_kinds=("revolute",) * 5 + (kind,))
+    bench = with_trials(bench, range=np.array([0.06] * 5 + [np.nan]), frames=1)
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    base = bench.settings.trials.base[5]
+    offsets = moved(samples, 5, bench.settings.trials.base)
+    assert [offsets.min(), offsets.max()] == pytest.approx([-farthest, farthest], abs=1e-3)
+    on_the_way = np.array([inputs.joints.positions[5] for inputs, _ in bench.log]) - base
+    assert np.abs(on_the_way).max() <= farthest + 1e-3
+
+
 def test_state_in_mid_calibration_survives_serialisation(bench: Any) -> None:
     with_trials(bench, range=np.full(6, np.nan))
     bench.run(0.1)

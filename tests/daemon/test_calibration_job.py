@@ -1,5 +1,11 @@
 """From calibration events to trial data."""
 
+import errno
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import msgspec
 import numpy as np
 import pytest
@@ -7,8 +13,9 @@ import pytest
 from stereoservo.calibration.trial_data import CalibrationError, check_trials
 from stereoservo.core.cycle import Event, Sample
 from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.daemon.jobs import fit_job
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
-from stereoservo.daemon.kernel_compilation import example_settings
+from stereoservo.daemon.kernel_compilation import example_model, example_settings
 from stereoservo.kinematics.model import JointLoads
 
 
@@ -111,3 +118,18 @@ def test_where_no_noise_is_seen_or_stated_the_detector_is_believed(
     job = TrialCollector(msgspec.structs.replace(settings, cameras=cameras))
     job.add(stop(1, 0, sample("left", [1, 4])))
     np.testing.assert_allclose(job.trials().sigmas[0, 0], np.sqrt(0.02))
+
+
+def test_a_fit_that_fails_for_a_full_disk_leaves_no_model_to_be_taken_up_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    fit: Any = SimpleNamespace(model=example_model(), report={})
+    monkeypatch.setattr(fit_job, "fit_model", lambda trials, **_: fit)
+    monkeypatch.setattr(fit_job, "write_atomically", full)  # the model itself still has room
+    path = tmp_path / "model-000008.json"
+    with pytest.raises(OSError, match="No space left"):
+        fit_job.fit_trials(None, path, 8)  # type: ignore[arg-type]
+    assert not path.exists()

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 
-from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT, HangWatch, HeartbeatWriter
+from stereoservo.daemon.heartbeat import (
+    CAMERA_OPENS_S,
+    DRIVER_CALL_S,
+    GATEWAY_HANG_S,
+    HEARTBEAT_BYTES,
+    HEARTBEAT_LAYOUT,
+    REQUEST_S,
+    SERVO_HANG_S,
+    SUPERVISOR_HANG_S,
+    VISION_HANG_S,
+    HangWatch,
+    HeartbeatWriter,
+)
 from stereoservo.daemon.seqlock import create_slot
 from stereoservo.daemon.supervisor import LATE_S, WATCH_EVERY_S, ServoDiedError, Supervisor
+from stereoservo.gateway.process import Gateway
 from stereoservo.messages.directories import CellDirectories
 
 
@@ -66,6 +81,63 @@ def test_a_new_process_is_not_judged_by_the_beats_of_the_one_before(bench: Bench
     process.beat(2.0)
     assert bench.watch.look(2001.0) == ""
     assert bench.watch.look(2004.0) != ""
+
+
+def test_limits_are_those_of_the_page() -> None:
+    """When servo and vision announce the longer one is tested beside their cycles."""
+    page = (Path(__file__).parents[2] / "docs/safety.md").read_text(encoding="utf-8")
+    told = {
+        row[1]: [float(limit) for limit in re.findall(r"([\d.]+) s\b", row[2])]
+        for row in re.finditer(r"^\| (servo|gateway|vision|supervisor) \| ([^|]*) \|", page, re.MULTILINE)
+    }
+    assert told == {
+        "servo": [SERVO_HANG_S, DRIVER_CALL_S],
+        "gateway": [GATEWAY_HANG_S, REQUEST_S],
+        "vision": [VISION_HANG_S, CAMERA_OPENS_S],
+        "supervisor": [SUPERVISOR_HANG_S],
+    }
+
+
+def test_a_gateway_has_its_longer_limit_while_it_serves_a_request_and_no_longer(bench: Bench) -> None:
+    gateway = MagicMock(
+        _announce_due_s=None, _state=None, _observations=[], _stop=MagicMock(enables=[]), _command_queries=[],
+        _gateway_queries=[], _heartbeat=bench.process,
+    )  # fmt: skip
+    gateway._servo.events.return_value = ()
+    for source in (
+        "goal_puts",
+        "goal_queries",
+        "event_queries",
+        "state_queries",
+        "info_queries",
+        "schema_queries",
+    ):
+        getattr(gateway, f"_{source}").try_recv.side_effect = lambda: None
+    gateway._queries = lambda: Gateway._queries(gateway)
+    clock = [1000.0]
+    served = []
+
+    def hung_after(seconds: float) -> str:
+        return bench.watch.look(clock[0] + seconds)
+
+    def serve(query: object) -> None:
+        clock[0] += 1000.0
+        served.append(query)
+        assert hung_after(0.0) == ""
+        assert hung_after(59.9) == ""
+        assert "(limit 60 s)" in hung_after(60.1)
+
+    gateway._intake.goal_query = serve
+    assert not Gateway.run_once(gateway)
+    assert hung_after(0.0) == ""
+    assert hung_after(4.9) == ""
+    assert "(limit 5 s)" in hung_after(5.1)
+    gateway._goal_queries.try_recv.side_effect = ["a query", None]
+    assert Gateway.run_once(gateway)
+    assert served == ["a query"]
+    clock[0] += 1000.0
+    assert hung_after(0.0) == ""
+    assert "(limit 5 s)" in hung_after(5.1)
 
 
 # -- the supervisor -----------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """Newest-only slots and the stop slot: nothing torn is ever believed, a crash leaves nothing stuck."""
 
+import errno
+import os
 import struct
 import subprocess
 import sys
@@ -124,6 +126,35 @@ def test_creating_again_keeps_the_file_and_its_record(tmp_path: Path) -> None:
     assert path.stat().st_ino == inode
     with SlotReader(path, LAYOUT) as reader:
         assert reader.poll() == b"kept"
+
+
+def test_a_slot_has_all_of_its_memory_however_little_an_earlier_attempt_got(tmp_path: Path) -> None:
+    """A hole in a file of shared memory that is full kills whoever writes there."""
+    path = tmp_path / "a.slot"
+    size = 64 + 100_000
+    path.touch()
+    os.truncate(path, size)
+    assert path.stat().st_blocks == 0
+    assert create_slot(path, 100_000, LAYOUT)
+    assert path.stat().st_size == size
+    assert path.stat().st_blocks * 512 >= size
+
+
+def test_a_slot_for_which_there_is_no_memory_is_an_error_and_no_slot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "a.slot"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "posix_fallocate", full)
+        for _ in range(2):
+            with pytest.raises(OSError, match="No space left"):
+                create_slot(path, 100, LAYOUT)
+    with pytest.raises(SlotError):
+        SlotReader(path, LAYOUT)
+    assert create_slot(path, 100, LAYOUT)
 
 
 WRITER = """

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
+import os
+import tempfile
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,18 +18,22 @@ import pytest
 from stereoservo.client import FailedError
 from stereoservo.core.cycle import Event, Sample
 from stereoservo.daemon.kernel_compilation import example_model, example_settings
+from stereoservo.daemon.supervisor import record_run
 from stereoservo.gateway import persistence, recordings
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.crash_records import OpenGoalRecord
 from stereoservo.gateway.observation_cache import ObservationCache
 from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.publisher import EventLog, KeeperNotes
 from stereoservo.gateway.recordings import Recordings
+from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.kinematics.model import save_model
 from stereoservo.messages import files
 from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.run_record import begin_run, end_run, read_goals, read_run
 from stereoservo.messages.wire import EventMessage
 from stereoservo.recording import flight_recorder
 from stereoservo.recording.step_records import RecordedStep, RecordingStart, fingerprint
@@ -183,6 +191,84 @@ def test_a_goal_that_cannot_be_stored_is_refused_with_the_reason(
     monkeypatch.undo()
     assert teaching.taught(taught_event()) is True
     assert TaughtStore(tmp_path / "taught.json").names == ("pick",)
+
+
+# -- all that is replaced as a whole ------------------------------------------------------------------------
+
+
+class HalfWritten(io.FileIO):
+    """A file of which the disk takes one half."""
+
+    def write(self, data: Any) -> int:
+        super().write(bytes(data)[: len(data) // 2])
+        return int(full_disk())
+
+
+def break_disk(patch: pytest.MonkeyPatch, stage: str) -> str:
+    """Let writing files fail at a ``stage``; returns the words of the error."""
+    really = io.open
+
+    def read_only(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    def open_file(path: Any, mode: str = "r", *rest: Any, **named: Any) -> Any:
+        if "w" not in mode:
+            return really(path, mode, *rest, **named)
+        return HalfWritten(path, "w") if stage == "write" else read_only()
+
+    if stage == "replace":
+        patch.setattr(os, "replace", read_only)
+    else:
+        patch.setattr(io, "open", open_file)
+    if stage == "open":
+        patch.setattr(tempfile, "mkstemp", read_only)
+    return os.strerror(errno.ENOSPC if stage == "write" else errno.EROFS)
+
+
+@pytest.mark.parametrize("stage", ["open", "write", "replace"])
+def test_what_cannot_be_written_keeps_its_bytes_is_told_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    directories = CellDirectories("cell", tmp_path, tmp_path)
+    directories.models.mkdir()
+    store = models(directories.models, MODEL.epoch)
+    begin_run(directories, "boot", 7)
+    goals = OpenGoalRecord(directories, "boot")
+    log = EventLog("boot", lambda _: None, goals.observe)
+    log.add("goal_accepted", id="one")
+    teaching = TaughtGoalRegistry(
+        TaughtStore(directories.taught), ObservationCache({"left": 0.0}), lambda: MODEL, log
+    )
+    assert teaching.taught(taught_event())
+    link = cast(ServoConnection, StubLink())
+    cameras = RelocalizationJobs(store, link, log, lambda: MODEL, lambda _: None)
+    calibration = CalibrationJobs(SETTINGS, store, link, log, directories.checks)
+    for seq in (2, 3):
+        sample = msgspec.structs.replace(taught_event().samples[0], camera=SETTINGS.cameras[0].name)
+        stop = Event(seq, seq, "calibration_sample", id="g", joints=np.zeros(6), samples=(sample,), trial=-1)
+        calibration.core_event(stop, fresh=True)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    told = len(log.since(1).events)
+    with monkeypatch.context() as patch:
+        words = break_disk(patch, stage)
+        name, matrix = MODEL.cameras[1].name, 2.0 * MODEL.cameras[1].matrix
+        adjusted = Event(4, 4, "camera_adjusted", name=name, matrix=matrix, epoch=MODEL.epoch)
+        cameras.core_event(adjusted, fresh=True)
+        assert not teaching.taught(msgspec.structs.replace(taught_event(5), name="place"))
+        calibration.core_event(Event(6, 6, "calibration_finished", id="g"), fresh=True)
+        record_run(partial(end_run, directories, "a cause"))
+        log.add("goal_accepted", id="two")
+    events = log.since(1).events[told:]
+    assert [e.kind for e in events] == ["warning", "warning", "calibration_failed", "goal_accepted"]
+    assert all(words in event.message for event in events[:3])
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert {path: data for path, data in kept.items() if path.suffix != ".new"} == before
+    record_run(partial(end_run, directories, "a cause"))
+    log.add("goal_reached", id="one")
+    run = read_run(directories)
+    assert run is not None
+    assert run.cause == "a cause"
+    assert [goal.id for goal in read_goals(directories)] == ["two"]
 
 
 # -- journal ------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.recording_request import RecordedImages, read_request, request_path
 from stereoservo.messages.wire import EventMessage, decode
+from stereoservo.recording.ring import RingLimits
 from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, fingerprint
 
 
@@ -120,6 +121,19 @@ def test_cameras_without_pictures_are_refused_with_the_reason(
         bench.orders.check()
     request_path(bench.directories).write_text('{"number": 1, "directory": "/old"}')
     assert Bench(tmp_path, monkeypatch, left="frames").ordered() is None, "of a gateway that has died"
+
+
+def test_a_cell_that_says_nothing_keeps_ten_minutes_in_half_a_gibibyte_and_four_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[tuple[Path, RingLimits]] = []
+    monkeypatch.setattr(recordings, "RingThread", lambda *what: made.append(what))
+    directories = CellDirectories("cell", tmp_path, tmp_path)
+    plan: Any = SimpleNamespace(
+        directories=directories, cameras=[], record="", cell=SimpleNamespace(recording=RecordingSection())
+    )
+    Recordings(plan, EventLog("boot", lambda _: None), lambda topic, text: None)
+    assert made == [(directories.recordings, RingLimits(600.0, 512 << 20, 2048 << 20, 4))]
 
 
 def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
+import tomllib
 from pathlib import Path
 from typing import Literal
 
@@ -10,7 +13,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.settings import CoreSettings, core_settings
-from stereoservo.messages.cell_file import CellFileError, load_cell_file
+from stereoservo.messages.cell_file import CellFileError, RecordingSection, load_cell_file
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointSpec
 
 GOOD = """
@@ -80,6 +83,14 @@ def test_contact_is_watched_by_default_and_thresholds_stand_in_joint_order(tmp_p
     assert given is not None
     assert (given.enabled, given.factor, given.samples) == (False, 3.0, 3)
     assert given.efforts.tolist() == [12.0]
+
+
+def test_the_flight_rings_defaults_are_those_of_the_page() -> None:
+    page = (Path(__file__).parents[2] / "docs/safety.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^    \[recording\]\n(?:    .*\n?)+", page, re.MULTILINE)
+    stated = tomllib.loads(textwrap.dedent(block))["recording"]
+    assert stated == msgspec.structs.asdict(RecordingSection())
+    assert stated == {"ring_minutes": 10, "ring_mib": 512, "reserve_mib": 2048, "kept_faults": 4}
 
 
 CASES = {

@@ -55,7 +55,8 @@ def create_slot(path: Path, capacity: int, layout: str) -> bool:
     """Create the file of a slot for records of up to ``capacity`` bytes; returns whether anything had to be written.
 
     An existing one of that layout is left as it is. Another one is overwritten in place: processes may have it mapped,
-    and where it is shorter, their next access would kill them.
+    and where it is shorter, their next access would kill them. Raises OSError, also where there is no memory for all
+    of it.
     """
     size = _HEADER_BYTES + capacity
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -66,6 +67,7 @@ def create_slot(path: Path, capacity: int, layout: str) -> bool:
         if header == expected and found == size:
             return False
         os.ftruncate(fd, size)
+        os.posix_fallocate(fd, 0, size)  # a hole, where the memory is full, would kill whoever writes there
         if found != size:
             os.pwrite(fd, bytes(size), 0)  # what lies between belongs to another layout
         os.pwrite(fd, expected, 0)

@@ -5,9 +5,16 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.core.cycle import DriverFault, StepInputs
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import core_settings
+from stereoservo.messages.cell_file import check_cell
+from stereoservo.messages.goals import Enable, Jog, Request, Reset, Resume
+from stereoservo.ports.devices import CameraDescription, JointDriverDescription
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import AxisFault
 from stereoservo_drivers.canopen.master import MasterFault, Mode
@@ -187,6 +194,113 @@ def test_a_loop_that_does_not_call_latches_within_its_limit(bus) -> None:
     assert bus.master.fault.code == "loop_hung"
     assert bus.cycles - start <= 27
     assert bus.orders[-1][0] == "quick stop"
+
+
+class Loop:
+    """A control core that commands the bus's axes in every cycle, as the servo process does."""
+
+    def __init__(self, bus) -> None:
+        settings = bus.master.settings
+        joints = JointDriverDescription(
+            "canopen", tuple(joint.spec() for joint in settings.joints), settings.rate_hz, "clock",
+            settings.command_timeout_s, 100.0,
+        )  # fmt: skip
+        limits = [
+            {"joint": j.name, "min": -2.9, "max": 2.9, "velocity": 1.0, "acceleration": 50.0}
+            for j in joints.joints
+        ]
+        cell = check_cell(
+            {
+                "schema": 1,
+                "cell": {"name": "bus"},
+                "joints": {"driver": "canopen"},
+                "camera": [{"name": "left", "driver": "fake"}],
+                "safety": {"limit": limits},
+            }
+        )
+        camera = CameraDescription("fake", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2))
+        self.bus = bus
+        self.core = ServoCore(core_settings(cell, joints, (camera,)))
+        self.active = False
+        self.asked = 0
+        bus.calls_port = False  # but by this loop
+        bus.cycle(2)
+
+    def step(self, *commands):
+        """A cycle of the bus, then one of the core; returns the core's outputs."""
+        bus = self.bus
+        bus.cycle()
+        bus.master.port_called(bus.t_ns)
+        fault = bus.master.fault
+        self.asked += len(commands)
+        outputs = self.core.step(
+            StepInputs(
+                bus.t_ns, bus.period_ns, bus.master.sample(),
+                requests=tuple(Request(self.asked, "test", command) for command in commands),
+                driver_active=self.active and fault is None,
+                driver_fault=None if fault is None else DriverFault(fault.code, fault.text()),
+            )
+        )  # fmt: skip
+        if outputs.driver_request == "activate":
+            bus.master.request_enable(bus.t_ns)
+            bus.cycle(4)
+            self.active = bus.master.mode is Mode.RUNNING
+        elif outputs.driver_request:
+            self.active = False
+            if outputs.driver_request == "reset":
+                bus.master.clear()
+        elif outputs.command is not None and self.active and fault is None:
+            bus.master.set_command(outputs.command, bus.t_ns)
+        return outputs
+
+    def run(self, cycles: int):
+        for _ in range(cycles):
+            outputs = self.step()
+        return outputs
+
+    def ask(self, command) -> bool:
+        return next(e.accepted for e in self.step(command).events if e.kind == "reply")
+
+
+@pytest.mark.parametrize("gap_ms", [200, 500])
+def test_a_loop_that_stood_still_finds_the_arm_at_rest_and_moves_it_only_when_told_to(bus, gap_ms) -> None:
+    """The bus thread commands zero from the command's time-out (100 ms) on, and from the loop's (300 ms) on latches."""
+    bus.master.settings = msgspec.structs.replace(bus.master.settings, loop_timeout_ms=300)
+    loop = Loop(bus)
+    assert loop.ask(Enable())
+    loop.run(5)
+    assert loop.ask(Jog({"j1": 0.5}, 60.0))
+    loop.run(20)
+    bus.orders.clear()
+    bus.cycle(gap_ms // 4)
+    words = [word for word, _ in bus.orders]
+    assert all(speeds[0] == pytest.approx(0.5) for _, speeds in bus.orders[:25])
+    assert not any(speeds[0] for _, speeds in bus.orders[27:])
+    assert set(words[:75]) == {"command"}
+    assert set(words[77:]) == (set() if gap_ms < 300 else {"quick stop"})
+    at_rest = bus.positions.copy()
+    outputs = loop.step()
+    first = "LOOP_GAP"
+    if gap_ms > 300:
+        assert "loop_hung" in outputs.status.reasons[0].hint
+        first = "DRIVER_FAULT"
+    assert first in [reason.code for reason in outputs.status.reasons]
+    assert not loop.ask(Jog({"j1": 0.5}, 60.0))
+    if gap_ms > 300:
+        loop.ask(Resume())
+        assert not loop.ask(Jog({"j1": 0.5}, 60.0))
+        assert not loop.ask(Enable())
+        assert loop.ask(Reset())
+        loop.run(5)
+        assert not loop.ask(Jog({"j1": 0.5}, 60.0))
+        assert loop.ask(Enable())
+    loop.run(50)
+    np.testing.assert_array_equal(bus.positions, at_rest)
+    loop.ask(Resume())
+    outputs = loop.step(Jog({"j1": 0.5}, 60.0))
+    assert 0.0 < outputs.command[0] <= 50.0 * 0.004 * (1.0 + 1e-9)
+    loop.run(20)
+    assert bus.positions[0] > at_rest[0] + 0.01
 
 
 def test_nobody_needs_to_call_while_the_arm_is_off(bus) -> None:

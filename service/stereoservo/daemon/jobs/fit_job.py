@@ -78,9 +78,10 @@ def fit_trials(
     """
     created = datetime.now(UTC).isoformat(timespec="seconds")
     result = fit_model(trials, epoch=epoch, created=created, progress=progress, lens_priors=lens_priors)
-    save_model(with_groups(result.model), model_path)
     figures = msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n"
     write_atomically(figures_file(model_path), figures)
+    # Last: a model that is there is used from the next start on, also of a fit that failed for a full disk.
+    save_model(with_groups(result.model), model_path)
     return result, assess_fit(result.model, result.report, depth_spread(result.model, trials))
 
 
