@@ -11,7 +11,7 @@ from rich.console import Console
 
 from stereoservo.cli import main as cli
 from stereoservo_sim.benchmarks.faults import bench, inputs, service, wall
-from stereoservo_sim.benchmarks.faults.page import reliability_page
+from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 
@@ -101,6 +101,43 @@ def test_rows_and_tables(one_case, monkeypatch):
         "JOINT_VALUE",
     ):
         assert word in text
+
+
+def test_a_sentence_that_differs_in_times_and_numbers_alone_is_printed_once():
+    silent = "the gateway has given no sign of life for {} s, since {}. The supervisor kills a gateway that hangs for 5 s"
+    ended = "Its last run ended at {} {}: the supervisor (process {}) was killed (signal 9)"
+    note = (
+        "s/recordings/hil-can-{}.mcap: {} steps; it is set aside as model-000004.json.damaged-{}; of joint j1"
+    )
+    assert distinct_sentences(
+        [
+            silent.format("1.8", "18:49:47"),
+            silent.format("2.0", "18:50:21"),
+            "nothing is wrong",
+            ended.format("2026-11-23", "14:13:25", 4482),
+            ended.format("2026-11-24", "14:13:26", 51),
+            silent.format("11", "18:50:21"),
+            note.format("20261123T141550.371310Z", 250, 1),
+            note.format("20261123T141605.079062Z", 251, 2),
+            "nothing is wrong",
+        ]
+    ) == [
+        silent.format("N", "HH:MM:SS"),
+        "nothing is wrong",
+        ended.format("YYYY-MM-DD", "HH:MM:SS", "N"),
+        note.format("STAMP", "N", "N"),
+    ]
+
+
+def test_numbers_that_are_alike_and_sentences_that_are_others_stay():
+    said = ["killed by signal 9 after 3 s", "killed by signal 9 after 4 s", "ended by signal 9 after 3 s"]
+    assert distinct_sentences(said) == ["killed by signal 9 after N s", "ended by signal 9 after 3 s"]
+    assert distinct_sentences(["joint j1 is slow", "joint j2 is slow"]) == [
+        "joint j1 is slow",
+        "joint j2 is slow",
+    ]
+    assert distinct_sentences(["200 sockets, epoch 3"]) == ["200 sockets, epoch 3"]
+    assert distinct_sentences([]) == []
 
 
 def test_the_page_has_a_row_for_each_fault_of_the_service():
