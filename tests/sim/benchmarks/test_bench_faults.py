@@ -104,7 +104,7 @@ def test_rows_and_tables(one_case, monkeypatch):
 
 
 def test_a_sentence_that_differs_in_times_and_numbers_alone_is_printed_once():
-    silent = "the gateway has given no sign of life for {} s, since {}. The supervisor kills a gateway that hangs for 5 s"
+    silent = "the gateway has given no sign of life for {} s, since {}. One that hangs for 5 s is killed"
     ended = "Its last run ended at {} {}: the supervisor (process {}) was killed (signal 9)"
     note = (
         "s/recordings/hil-can-{}.mcap: {} steps; it is set aside as model-000004.json.damaged-{}; of joint j1"
