@@ -124,7 +124,7 @@ def test_a_full_disk_does_not_refuse_a_lock(
 
 def test_a_lock_file_on_a_read_only_disk_is_as_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.lock"
-    path.touch()
+    path.write_text("1\n")  # of a holder before, which nobody may be told to kill
     opened = os.open
 
     def read_only(name: Path, flags: int, mode: int = 0o777) -> int:

@@ -163,5 +163,19 @@ def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> P
 
 
 def _read_pid(fd: int) -> int:
+    """The holder, by its number in the lock file; 0 where there is none, or a full disk has kept an older one."""
     text = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
-    return int(text) if text.isdigit() else 0
+    return int(text) if text.isdigit() and _may_hold(int(text), fd) else 0
+
+
+def _may_hold(pid: int, fd: int) -> bool:
+    """Whether the kernel does not name other processes as those that lock the file."""
+    inode = f":{os.fstat(fd).st_ino}"
+    try:
+        lines = [line.split() for line in Path("/proc/locks").read_text(encoding="ascii").splitlines()]
+    except OSError:
+        return True
+    pids = {
+        words[4] for words in lines if len(words) > 5 and words[1] == "FLOCK" and words[5].endswith(inode)
+    }
+    return not pids or str(pid) in pids
