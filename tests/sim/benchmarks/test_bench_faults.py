@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.benchmarks.faults import bench, inputs, service, wall
+from stereoservo_sim.benchmarks.faults import bench, disks, inputs, service, wall
 from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
@@ -146,6 +149,23 @@ def test_the_page_has_a_row_for_each_fault_of_the_service():
     assert [name for name in rows if name in {f.name for f in service.FAULTS}] == [
         fault.name for fault in service.FAULTS
     ]
+
+
+@pytest.mark.parametrize("disk", [disks.memory_disk, disks.image_disk])
+def test_where_nothing_may_be_mounted_the_trials_are_void_with_the_reason(tmp_path, monkeypatch, disk):
+    def refused(words, **_):
+        raise subprocess.CalledProcessError(32, words, stderr="must be superuser to use mount.\n")
+
+    monkeypatch.setattr(disks.subprocess, "run", refused)
+    with ExitStack() as mounts:
+        bench = SimpleNamespace(
+            folder=tmp_path, directories=SimpleNamespace(state=tmp_path / "s"), mounts=mounts, lasting=ExitStack(),
+            goals=[], end_daemon=lambda: None, forget_state=lambda: None,
+        )  # fmt: skip
+        row = service._row(bench, next(fault for fault in service.FAULTS if fault.disk is disk), 3)
+    assert (row["trials"], row["within"], row["rest_ms"]) == (0, 0, None)
+    assert len(row["void"]) == service.TRIES
+    assert all("must be superuser to use mount" in why for why in row["void"])
 
 
 def test_the_page_has_a_row_for_each_fault_of_the_inputs():
