@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +26,7 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from stereoservo.client import Client, ClientError, SessionError
+from stereoservo.daemon.heartbeat import HeartbeatReader
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.kinematics.model import encode_model
 from stereoservo.messages.directories import CellDirectories, cell_directories
@@ -238,6 +239,18 @@ class ServiceBench:
         if self.daemon.process.poll() is None:
             found["supervisor"] = self.daemon.process.pid
         return found
+
+    def await_process(self, name: str) -> None:
+        """Wait until a process of the daemon, which may be being started again, lives and gives a sign of it.
+
+        Raises VoidTrialError.
+        """
+        until = time.monotonic() + READY_S
+        with closing(HeartbeatReader(self.directories.heartbeat_slot(name))) as reader:
+            while name not in self.processes() or (beat := reader.newest()) is None or beat.silent_s(0.0):
+                if time.monotonic() > until:
+                    raise VoidTrialError(f"there was no {name} process within {READY_S:g} s")
+                time.sleep(0.05)
 
     def truth(self) -> TrueJointHistory:
         """Where the emulated arm was; to be closed."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from stereoservo.client import Client
 from stereoservo_sim.benchmarks.service_bench import CELL, ServiceBench, VoidTrialError
 
-DISK_MIB = 32
+DISK_MIB = 64
 RECORDS_S = 10.0
 """After which a recording that was asked for has begun, or has not."""
 GROWS_S = 20.0
@@ -127,7 +127,7 @@ def records_again(bench: ServiceBench) -> str:
             client.record(on=False)
     except VoidTrialError as error:
         return str(error)
-    return _unexpected(bench) if file.is_file() and file.stat().st_size else f"nothing is in {file}"
+    return unexpected(bench) if file.is_file() and file.stat().st_size else f"nothing is in {file}"
 
 
 def starts_again(bench: ServiceBench) -> str:
@@ -136,13 +136,13 @@ def starts_again(bench: ServiceBench) -> str:
     """
     code = bench.daemon.stop()
     wrong = [f"the daemon ended with exit code {code}"] if code else []
-    wrong.append(_unexpected(bench))
+    wrong.append(unexpected(bench))
     bench.ready()
-    wrong.append(_unexpected(bench))
+    wrong.append(unexpected(bench))
     return "; ".join(filter(None, wrong))
 
 
-def _unexpected(bench: ServiceBench) -> str:
+def unexpected(bench: ServiceBench) -> str:
     """Lines of the daemon's log that no disk is a reason for: a process that ended, a traceback; empty without."""
     words = ("Traceback", "starting again", "Error")
     return "; ".join(

@@ -121,10 +121,9 @@ class ServiceFault:
     rest; None where the arm goes on; with ``may_go_on`` it rests by then or goes on. ``after``: what `status` may tell
     a second later, the lifecycle or the code of its error. ``client``: the program of a client in a process of its own,
     which moves the arm; else one of the bench does, at ``speed_scale``. ``note``: what a note in the status says once
-    the daemon is ready again; its state is forgotten then. ``notes``: what those a second later say,
-    where ``disk`` is what the state directory lies on for a trial. ``reaches``: the goal goes on until it is reached
-    before the cause is gone. ``check``: what is wrong when it is. ``trials_a_daemon``: after so many it is ended, 0
-    where it goes on.
+    the daemon is ready again; its state is forgotten then. ``disk``: what the state directory lies on while a daemon
+    runs. ``notes``: what those a second later say. ``reaches``: the goal goes on until it is reached, with the cause
+    there. ``check``: what is wrong once it is gone. ``trials_a_daemon``: after so many it is ended, 0 where it goes on.
     """
 
     name: str
@@ -150,9 +149,9 @@ class ServiceFault:
 
 
 ACTIVE = ("active",)
-PAUSES = 2
-"""Trials in which a process ends after which a new daemon costs less time than the supervisor's next pause, which grows
-to 10 s.
+PAUSES = 3
+"""Trials in which a process ends, after which a new daemon costs no more time than the supervisor's next pauses, which
+grow to 10 s.
 """
 ENDED = ("not_running", "servo_silent")
 NOT_RECORDED = ("flight ring", "left out")
@@ -192,11 +191,11 @@ FAULTS = (
     ),
     ServiceFault(
         "disk full", None, ACTIVE, act=disks.full_disk, disk=disks.memory_disk, notes=NOT_RECORDED, reaches=True,
-        check=disks.records_again, trials_a_daemon=1, speed_scale=FASTER,
+        check=disks.records_again, speed_scale=FASTER,
     ),
     ServiceFault(
         "`stereoservo stop`, disk full", COMMAND_MS, ACTIVE, disk=disks.memory_disk, notes=NOT_RECORDED,
-        act=during(disks.full_disk, service_bench.stop_command), check=disks.records_again, trials_a_daemon=1,
+        act=during(disks.full_disk, service_bench.stop_command), check=disks.records_again,
     ),
     ServiceFault(
         "file system read-only", None, ACTIVE, act=disks.read_only_disk, disk=disks.image_disk, notes=NOT_RECORDED,
@@ -204,7 +203,7 @@ FAULTS = (
     ),
     ServiceFault(
         "`stereoservo stop`, file system read-only", COMMAND_MS, ACTIVE, disk=disks.image_disk, notes=NOT_RECORDED,
-        act=during(disks.read_only_disk, service_bench.stop_command), check=disks.starts_again, trials_a_daemon=1,
+        act=during(disks.read_only_disk, service_bench.stop_command), check=disks.unexpected, trials_a_daemon=1,
     ),
     ServiceFault("gateway without memory", SILENCE_MS, (*ACTIVE, *NO_GATEWAY), act=service_bench.memory_exhausted,
                  may_go_on=True),
@@ -246,14 +245,17 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
     void: list[str] = []
     silent: list[str] = []
     took_s: list[float] = []
-    tried = 0
+    tried, anew = 0, True
     while len(trials) + len(silent) < repetitions and len(void) < TRIES:
         began_s = time.monotonic()
         try:
-            if fault.disk is not None:
+            if fault.disk is not None and anew:
                 bench.end_daemon()
                 fault.disk(bench)
+                anew = False
             bench.ready()
+            if fault.process not in ("", "client"):
+                bench.await_process(fault.process)
             trial = _trial(bench, fault)
         except VoidTrialError as error:
             void.append(str(error))
@@ -268,15 +270,17 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
             tried += 1
             if fault.trials_a_daemon and tried % fault.trials_a_daemon == 0:
                 bench.end_daemon()
-            if fault.note or fault.disk is not None:
+                anew = True
+            if fault.note or (fault.disk is not None and anew):
                 bench.forget_state()
             took_s.append(time.monotonic() - began_s)
         if trial["stall_s"] > STALL_S:
             void.append(f"the machine stalled for {trial['stall_s'] * 1e3:.0f} ms")
         else:
             trials.append(trial)
-    if fault.trials_a_daemon:
+    if fault.trials_a_daemon or fault.disk is not None:
         bench.end_daemon()
+        bench.forget_state()
     rests = [trial["rest_ms"] for trial in trials if trial["rest_ms"] is not None]
     bound = None if fault.bound_ms is None else fault.bound_ms + RAMP_MS
     return {
@@ -356,10 +360,10 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
     counts, notes = _afterwards(bench, fault, told_live)
     wrong.append(fault.check(bench))
     says = str(told["error"]["message"]) if "error" in told else _reasons(told)
-    now = tuple(note.replace(f"{bench.folder}/", "") for note in told.get("notes", ()))
+    now = sorted(note.replace(f"{bench.folder}/", "") for note in told.get("notes", ()))
     for title, more in (
-        ("Notes", now if fault.notes else ()),
-        ("Later", notes if fault.note else ()),
+        ("Notes", now if fault.notes else []),
+        ("Later", list(notes) if fault.note else []),
         ("Wrong", [text for text in wrong if text]),
     ):
         says += f". {title}: {'; '.join(more)}" if more else ""
