@@ -6,13 +6,13 @@ import sys
 import threading
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from stereoservo.cli import dispatch
+from stereoservo.cli import dispatch, output
 from stereoservo.cli import main as cli
 from stereoservo.client import InvalidReplyError
 from stereoservo.daemon.seqlock import StopSlot, create_stop_slot
@@ -339,3 +339,12 @@ def test_an_unexpected_error_shows_its_traceback_and_still_one_json_object(
     assert code == 1
     assert result["error"]["message"] == "division by zero"
     assert "Traceback" in err
+
+
+def test_a_full_disk_behind_stderr_loses_a_remark_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Path("/dev/full").open("w", buffering=1)  # noqa: SIM115 - what it holds is never written
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", full)
+        output.note("the cell is up")
+    with suppress(OSError):
+        full.close()

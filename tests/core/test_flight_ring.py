@@ -153,6 +153,25 @@ def test_a_full_disk_ends_a_segment_and_not_the_ring(flight: Flight, monkeypatch
     assert replay(flight.segments()[-1]).identical is True
 
 
+def test_a_disk_without_any_room_leaves_no_empty_segments_and_is_trouble_until_a_chunk_is_written(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Any, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("stereoservo.recording.flight_recorder._OutputFile.write", full)
+        flight.fly(1.0)
+        assert flight.ring.trouble == "No space left on device"
+    assert flight.segments() == []
+    assert [kind for kind, _ in flight.said] == ["warning"]
+    flight.fly(1.0)
+    assert flight.ring.trouble == ""
+    assert len(flight.said) == 1
+    flight.ring.close()
+    assert replay(flight.segments()[-1]).identical is True
+
+
 def test_the_ring_is_kept_at_a_fault_with_what_follows(
     flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:

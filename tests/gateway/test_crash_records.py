@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from stereoservo.core.cycle import Event
+from stereoservo.gateway import crash_records
 from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.run_record import begin_run, end_run, read_goals, run_is_up
+from stereoservo.messages.run_record import OpenGoal, begin_run, end_run, read_goals, run_is_up
 
 
 class Gateway:
@@ -129,3 +133,60 @@ def test_where_it_is_damaged_nothing_of_before_the_start_is_done_twice(tmp_path:
     third = HandledEvents(path, lambda *note: told.append(note))
     assert third.is_acted_on(after)
     assert len(told) == 1
+
+
+class FullDisk:
+    """Takes no goals while it is full; a clock of its own."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.full, self.now = True, 100.0
+        write = crash_records.write_goals
+
+        def write_goals(directories: CellDirectories, goals: tuple[OpenGoal, ...]) -> None:
+            if self.full:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            write(directories, goals)
+
+        monkeypatch.setattr(crash_records, "write_goals", write_goals)
+        monkeypatch.setattr(crash_records, "time", SimpleNamespace(monotonic=lambda: self.now))
+
+
+def test_a_goal_that_ended_on_a_full_disk_does_not_end_again(
+    directories: CellDirectories, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin_run(directories, "a", 7)
+    run_is_up(directories)
+    first = Gateway(directories, "a")
+    first.log.add("goal_accepted", id="g")
+    disk = FullDisk(monkeypatch)
+    first.log.add("goal_reached", id="g")
+    for _ in range(50):
+        disk.now += 0.1
+        first.goals.poll()
+    assert [goal.id for goal in read_goals(directories)] == ["g"]
+    assert capsys.readouterr().err.count("No space left") == 1
+    disk.full = False
+    disk.now += 1.0
+    first.goals.poll()
+    assert read_goals(directories) == ()
+    begin_run(directories, "b", 8)
+    assert Gateway(directories, "b").ends == []
+
+
+def test_the_next_gateway_mends_what_a_full_disk_has_left(
+    directories: CellDirectories, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin_run(directories, "a", 7)
+    run_is_up(directories)
+    first = Gateway(directories, "a")
+    first.log.add("goal_accepted", id="g")
+    disk = FullDisk(monkeypatch)
+    events = [first.log.add("goal_started", id="g"), first.log.add("goal_reached", id="g")]
+    events.append(first.log.add("goal_started", id="later"))
+    disk.full = False
+    second = Gateway(directories, "a")
+    assert second.goals.any_of_this_run
+    for told in events:  # the core's events come to it again
+        second.goals.observe(told, repeated=True)
+    second.goals.poll()
+    assert [goal.id for goal in read_goals(directories)] == ["later"]

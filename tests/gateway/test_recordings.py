@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from collections import deque
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +13,7 @@ import msgspec
 import pytest
 
 from stereoservo.gateway import recordings
-from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.publisher import EventLog, KeeperNotes
 from stereoservo.gateway.recordings import CannotRecordError, ImageRecordings, Recordings
 from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
@@ -178,3 +181,85 @@ def test_the_ring_is_always_written_and_a_recording_on_request_beside_it(tmp_pat
     assert not without.wants_steps
     without.keep_ring(0)
     without.close()
+
+
+def no_room(*_: object) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_ends_a_recording_and_the_next_request_begins_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directories = CellDirectories("cell", tmp_path / "run", tmp_path)
+    events: list[EventMessage] = []
+    plan: Any = SimpleNamespace(
+        directories=directories, cameras=[], record="",
+        cell=SimpleNamespace(
+            cell=SimpleNamespace(name="cell"), recording=RecordingSection(ring_mib=0, reserve_mib=0)
+        ),
+    )  # fmt: skip
+    (tmp_path / "run").mkdir()
+    log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
+    notes = KeeperNotes(log)
+    flight = Recordings(plan, log, notes.tell)
+    begin = RecordingStart(Settings(250.0), fingerprint())  # type: ignore[arg-type]
+
+    def stream(first: int) -> None:
+        flight.take(RecordedCheckpoint(first, first, b"state"))
+        for k in range(first, first + 100):
+            flight.take(RecordedStep(k, os.urandom(10_000)))
+
+    flight.request()
+    flight.take(begin)
+    stream(1)
+    assert flight.running
+    ended = flight.path
+    with monkeypatch.context() as patch:
+        patch.setattr("stereoservo.recording.flight_recorder._OutputFile.write", no_room)
+        stream(101)
+    assert not flight.running
+    (note,) = notes.texts
+    assert ended in note
+    assert "No space left" in note
+    assert [event.kind for event in events] == ["recording", "recording_failed", "warning"]
+    stream(201)
+    assert not flight.running, "it ends with its last whole chunk"
+    flight.request()
+    flight.take(begin)
+    stream(301)
+    assert flight.running
+    assert flight.path != ended
+    assert notes.texts == ()
+    flight.close()
+
+
+def test_a_ring_that_is_not_written_is_a_note_until_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rings: list[SimpleNamespace] = []
+
+    def ring(*_: object) -> SimpleNamespace:
+        rings.append(SimpleNamespace(said=deque(), trouble="", take=lambda _: None, close=lambda: None))
+        return rings[-1]
+
+    monkeypatch.setattr(recordings, "RingThread", ring)
+    directories = CellDirectories("cell", tmp_path, tmp_path)
+    plan: Any = SimpleNamespace(
+        directories=directories, cameras=[], record="",
+        cell=SimpleNamespace(cell=SimpleNamespace(name="cell"), recording=RecordingSection()),
+    )  # fmt: skip
+    events: list[EventMessage] = []
+    log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
+    notes = KeeperNotes(log)
+    flight = Recordings(plan, log, notes.tell)
+    (one,) = rings
+    one.said.append(("warning", "the flight ring is not written: No space left"))
+    one.trouble = "No space left"
+    for _ in range(3):
+        flight.poll()
+    assert notes.texts == ("the flight ring is not written: No space left",)
+    one.trouble = ""
+    one.said.append(("ring_kept", "kept"))
+    flight.poll()
+    assert notes.texts == ()
+    assert [event.kind for event in events] == ["warning", "ring_kept"]

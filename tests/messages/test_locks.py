@@ -1,5 +1,6 @@
 """Locks: one holder, a clear word for the second, nothing left over by the dead."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -100,3 +101,42 @@ def test_a_device_has_one_lock_by_all_its_names(tmp_path: Path) -> None:
     assert hardware_lock_path(tmp_path, "canopen", {"channel": "/dev/../dev/null"}) == hardware_lock_path(
         tmp_path, "canopen", {"channel": "/dev/null"}
     )
+
+
+def no_room(*args: object) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("call", ["pwrite", "ftruncate"])
+def test_a_full_disk_does_not_refuse_a_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    path = tmp_path / "a.lock"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, no_room)
+        lock = FileLock(path, "it")
+        assert holder(path) is not None
+        with pytest.raises(AlreadyRunningError, match="it is already in use"):
+            FileLock(path, "it")
+        lock.release()
+    assert holder(path) is None
+
+
+def test_a_lock_file_on_a_read_only_disk_is_as_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.lock"
+    path.write_text("1\n")  # of a holder before, which nobody may be told to kill
+    opened = os.open
+
+    def read_only(name: Path, flags: int, mode: int = 0o777) -> int:
+        if flags & os.O_RDWR:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        return opened(name, flags, mode)
+
+    monkeypatch.setattr(os, "open", read_only)
+    with FileLock(path, "it"):
+        assert holder(path) == 0
+        with pytest.raises(AlreadyRunningError, match="another process"):
+            FileLock(path, "it")
+    assert holder(path) is None
+    with pytest.raises(FileNotFoundError):
+        FileLock(tmp_path / "none.lock", "it")

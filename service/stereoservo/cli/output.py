@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,8 +48,9 @@ def emit(result: Any, text: str, as_json: bool) -> None:
 
 
 def note(message: str) -> None:
-    """Print progress and remarks on stderr."""
-    print(message, file=sys.stderr, flush=True)
+    """Print progress and remarks on stderr; a full disk there loses them alone."""
+    with suppress(OSError):
+        print(message, file=sys.stderr, flush=True)
 
 
 def fail(error: BaseException, as_json: bool) -> None:

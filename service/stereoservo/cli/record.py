@@ -57,7 +57,7 @@ def record(
             while time.monotonic() < until:
                 time.sleep(min(0.5, max(0.0, until - time.monotonic())))
                 for event in watch.poll():
-                    if event.kind == "images_ended":
+                    if event.kind in ("images_ended", "recording_failed"):
                         note(event.message)
                     recorded = event.images or recorded
         except KeyboardInterrupt:

@@ -20,29 +20,49 @@ from stereoservo.messages.wire import EventMessage
 
 _HANDLED_LAYOUT = "HandledEvents.1"
 _HANDLED = struct.Struct("=qq")
+AGAIN_S = 1.0
+"""How often goals that could not be written are tried again."""
 BEGINS = frozenset({"goal_accepted", "goal_started", "calibration_progress"})
 ENDS = frozenset({*TERMINAL, "calibration_finished", "calibration_aborted", "check_finished"})
 
 
 class OpenGoalRecord:
-    """Goals accepted and not ended, by the events that are published; ``boot`` is the daemon's run."""
+    """Goals accepted and not ended, by the events that are published; ``boot`` is the daemon's run.
+
+    What a full disk has not taken is written once there is room: a goal that stayed in the file would end twice.
+    """
 
     def __init__(self, directories: CellDirectories, boot: str) -> None:
         self._directories = directories
         self._boot = boot
         self._goals = {goal.id: goal for goal in read_goals(directories)}
+        self._due_s: float | None = None
 
-    def observe(self, event: EventMessage) -> None:
-        """Take an event that was published."""
+    def observe(self, event: EventMessage, *, repeated: bool = False) -> None:
+        """Take an event that was published; ``repeated``: by a gateway before this one, which may not have had room."""
         if event.kind in BEGINS and event.id and event.id not in self._goals:
             calibration = event.kind.startswith("calibration")
             self._goals[event.id] = OpenGoal(event.id, self._boot, calibration)
         elif event.kind not in ENDS or self._goals.pop(event.id, None) is None:
             return
+        if repeated:
+            self._due_s = time.monotonic()
+        else:
+            self._store()
+
+    def poll(self) -> None:
+        """Write what is not written yet, each second."""
+        if self._due_s is not None and time.monotonic() >= self._due_s:
+            self._store()
+
+    def _store(self) -> None:
+        again, self._due_s = self._due_s is not None, None
         try:
             write_goals(self._directories, tuple(self._goals.values()))
         except OSError as error:  # a full disk: goals go on, and end, all the same
-            write_log("gateway", f"{self._directories.open_goals}: {error.strerror}")
+            self._due_s = time.monotonic() + AGAIN_S
+            if not again:
+                write_log("gateway", f"{self._directories.open_goals}: {error.strerror}")
 
     @property
     def any_of_this_run(self) -> bool:

@@ -202,8 +202,7 @@ class Gateway:
         self._publishers.event.put(payload)
 
     def _observe_event(self, message: EventMessage) -> None:
-        if not self._repeated:
-            self.goals.observe(message)
+        self.goals.observe(message, repeated=self._repeated)
 
     def _use_model(self, model: CellModel) -> None:
         """Use ``model``, made for moved cameras, now that the core has applied it."""
@@ -233,6 +232,7 @@ class Gateway:
         self._read_reports()
         self._take_steps()
         self._recordings.poll()
+        self.goals.poll()
         self._calibration.poll()
         self._relocalization.poll()
         self._announce()

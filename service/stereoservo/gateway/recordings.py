@@ -144,8 +144,8 @@ class Recordings:
 
     @property
     def running(self) -> bool:
-        """Whether a file is being written."""
-        return self._recorder is not None
+        """Whether a file is being written; one that a full disk has ended is not."""
+        return self._recorder is not None and not self._recorder.failure
 
     @property
     def wants_steps(self) -> bool:
@@ -162,10 +162,16 @@ class Recordings:
             self._ring.keep(t_ns)
 
     def poll(self) -> None:
-        """Report what the ring has to say; the state of image recordings."""
-        while self._ring is not None and self._ring.said:
-            kind, message = self._ring.said.popleft()
-            self._log.add(kind, message=message, origin="gateway")
+        """Report what the ring has to say, with a note while it is not written; the state of image recordings."""
+        if self._ring is not None:
+            while self._ring.said:
+                kind, message = self._ring.said.popleft()
+                if kind == "warning":
+                    self._tell("flight ring", message)
+                else:
+                    self._log.add(kind, message=message, origin="gateway")
+            if not self._ring.trouble:
+                self._tell("flight ring", "")
         self.images.poll()
 
     def close(self) -> None:
@@ -179,7 +185,7 @@ class Recordings:
         """Also record images: now, or with the recording that is about to begin. Raises CannotRecordError."""
         self.images.check()
         self._with_images = True
-        if self._recorder is not None and not self.images.running:
+        if self._recorder is not None and self.running and not self.images.running:
             self.images.begin(self._recorder.path)
 
     def take(self, item: StepMessage) -> None:

@@ -12,6 +12,7 @@ import re
 import socket
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -38,10 +39,13 @@ class AlreadyRunningError(Exception):
 
 
 class FileLock:
-    """An exclusive lock on ``path``, held until :meth:`release` or death. Raises AlreadyRunningError."""
+    """An exclusive lock on ``path``, held until :meth:`release` or death. Raises AlreadyRunningError.
+
+    A disk that is full or read-only does not take the number of its holder, which others then are not told.
+    """
 
     def __init__(self, path: Path, what: str) -> None:
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._fd = _opened(path)
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -49,13 +53,15 @@ class FileLock:
             os.close(self._fd)
             self._fd = -1
             raise AlreadyRunningError(what, pid, path) from error
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, b"%d\n" % os.getpid(), 0)
+        with suppress(OSError):
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, b"%d\n" % os.getpid(), 0)
 
     def release(self) -> None:
         """Release the lock. The file stays: unlinking it would race with the next holder. Idempotent."""
         if self._fd >= 0:
-            os.ftruncate(self._fd, 0)
+            with suppress(OSError):
+                os.ftruncate(self._fd, 0)
             os.close(self._fd)
             self._fd = -1
 
@@ -66,6 +72,16 @@ class FileLock:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.release()
+
+
+def _opened(path: Path) -> int:
+    """A lock file, which is made where it can be; a read-only one that is there is as good."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        if error.errno != errno.EROFS:
+            raise
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
 
 
 class ChannelLock(FileLock):
@@ -147,5 +163,19 @@ def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> P
 
 
 def _read_pid(fd: int) -> int:
+    """The holder, by its number in the lock file; 0 where there is none, or a full disk has kept an older one."""
     text = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
-    return int(text) if text.isdigit() else 0
+    return int(text) if text.isdigit() and _may_hold(int(text), fd) else 0
+
+
+def _may_hold(pid: int, fd: int) -> bool:
+    """Whether the kernel does not name other processes as those that lock the file."""
+    inode = f":{os.fstat(fd).st_ino}"
+    try:
+        lines = [line.split() for line in Path("/proc/locks").read_text(encoding="ascii").splitlines()]
+    except OSError:
+        return True
+    pids = {
+        words[4] for words in lines if len(words) > 5 and words[1] == "FLOCK" and words[5].endswith(inode)
+    }
+    return not pids or str(pid) in pids

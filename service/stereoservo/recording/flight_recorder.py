@@ -29,6 +29,7 @@ class _OutputFile:
     """File that takes each block as a whole or not at all, so that it ends with a whole record on a full disk."""
 
     def __init__(self, path: Path, durable: bool) -> None:
+        self._path = path
         self._file = FileIO(path, "wb")
         self._durable = durable
         self.size = 0
@@ -50,6 +51,12 @@ class _OutputFile:
     def tell(self) -> int:
         """Number of bytes written."""
         return self.size
+
+    def discard(self) -> None:
+        """Close and remove a file that has not begun."""
+        self._file.close()
+        with suppress(OSError):
+            self._path.unlink()
 
     def close(self) -> None:
         """Close, with what is durable on the disk. Idempotent. Raises OSError."""
@@ -89,7 +96,11 @@ class FlightRecorder:
         self._writer = Writer(
             self._stream, chunk_size=chunk, compression=CompressionType.LZ4, enable_data_crcs=True
         )
-        self._writer.start(profile=FORMAT, library="stereoservo")
+        try:
+            self._writer.start(profile=FORMAT, library="stereoservo")
+        except OSError:
+            self._stream.discard()
+            raise
         encoded = encode(settings)
         self._channels = {
             topic: self._writer.register_channel(topic=topic, message_encoding="msgpack", schema_id=0)

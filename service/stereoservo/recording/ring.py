@@ -47,8 +47,8 @@ class RingLimits(NamedTuple):
 class FlightRing:
     """The ring in a ``directory``: segments in ``ring/``, those of faults in ``kept/``.
 
-    Never raises on what the disk does: it is reported once, and tried again with later checkpoints. ``wall``: seconds
-    of the wall clock; ``free``: bytes left on the disk of a path.
+    Never raises on what the disk does: it is reported once, and tried again with later checkpoints; ``trouble`` has it
+    until a segment grows again. ``wall``: seconds of the wall clock; ``free``: bytes left on the disk of a path.
     """
 
     def __init__(
@@ -65,7 +65,8 @@ class FlightRing:
         self._segment: FlightRecorder | None = None
         self._begun_ns = 0
         self._keep_ns: int | None = None
-        self._trouble = ""
+        self._begun_size = 0
+        self.trouble = ""
 
     def take(self, message: StepMessage) -> None:
         """Write a message of the servo process; nothing is written before the first checkpoint of a stream."""
@@ -77,7 +78,8 @@ class FlightRing:
                 self._checkpoint(message)
             elif self._segment is not None:
                 self._write(message)
-                self._trouble = ""
+                if self._segment.size > self._begun_size:  # a chunk of it is on the disk
+                    self.trouble = ""
                 if self._segment.size > self._limits.bytes // SEGMENTS - CHUNK_BYTES:
                     self._end()
         except OSError as error:
@@ -126,7 +128,7 @@ class FlightRing:
         stamp = datetime.fromtimestamp(self._wall(), UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         path = self.segments / f"{stamp}.mcap"
         self._segment = FlightRecorder(path, self._start.settings, self._start.fingerprint, durable=False)
-        self._begun_ns = t_ns
+        self._begun_ns, self._begun_size = t_ns, self._segment.size
 
     def _end(self) -> None:
         segment, self._segment = self._segment, None
@@ -140,9 +142,9 @@ class FlightRing:
         if self._segment is not None:
             self._segment.abandon()
         self._segment = None
-        if trouble != self._trouble:
+        before, self.trouble = self.trouble, trouble
+        if trouble != before:
             self._report("warning", f"the flight ring in {self.segments} is not written: {trouble}")
-        self._trouble = trouble
 
     def _has_room(self) -> bool:
         place = self.segments
@@ -196,6 +198,11 @@ class RingThread:
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="flight-ring", daemon=True)
         self._thread.start()
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing is written; empty where it is."""
+        return self._ring.trouble
 
     def take(self, message: StepMessage) -> None:
         """Queue a message; after one that found the queue full, none before the next checkpoint."""

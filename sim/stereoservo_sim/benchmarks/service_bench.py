@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +26,7 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from stereoservo.client import Client, ClientError, SessionError
+from stereoservo.daemon.heartbeat import HeartbeatReader
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.kinematics.model import encode_model
 from stereoservo.messages.directories import CellDirectories, cell_directories
@@ -132,6 +133,8 @@ class ServiceBench:
 
     folder: Path
     lasting: ExitStack = field(default_factory=ExitStack)
+    mounts: ExitStack = field(default_factory=ExitStack)
+    """Unmounts what the state directory lies on, once the daemon has ended."""
     goals: list[str] = field(default_factory=list)
     """Of a trial; each must have one end."""
     port: int = field(default_factory=_free_port)
@@ -144,6 +147,7 @@ class ServiceBench:
 
     def __enter__(self) -> Self:
         text = shipped_cell_path(CELL).read_text(encoding="utf-8")
+        text += "\n[recording]\nreserve_mib = 0\n"  # small disks are filled to the last byte
         front, rest = text[: text.index("[[camera]]")], text[text.index("[servo]") :]
         text = front.replace('plant = "pybullet"', 'plant = "ideal"')
         rest = rest.replace('mode = "router"', f'mode = "router"\nendpoints = ["tcp/127.0.0.1:{self.port}"]')
@@ -154,16 +158,21 @@ class ServiceBench:
         self.directories = cell_directories(CELL)
         (self.folder / "bus").mkdir()
         self.emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=self.folder / "drives.log")
-        self.cell = move_to_channel(path, self.folder / "bus", self.emulator.wait_ready())
-        self.start()
+        with ExitStack() as failed:
+            failed.callback(self.emulator.stop)
+            self.cell = move_to_channel(path, self.folder / "bus", self.emulator.wait_ready())
+            failed.callback(self.end_daemon)
+            self.start()
+            failed.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.lasting.close()
-        self.end_daemon()
-        self.emulator.stop()
+        with self.mounts, self.lasting:
+            self.lasting.close()
+            self.end_daemon()
+            self.emulator.stop()
 
     def start(self) -> None:
         """Start a daemon; the one before must have ended. Raises DaemonError."""
@@ -211,8 +220,8 @@ class ServiceBench:
                 time.sleep(0.1)
 
     def forget_state(self) -> None:
-        """End the daemon, and remove the models and taught goals that a trial left."""
-        self.end_daemon()
+        """Remove the models and taught goals that a trial left, and the disk they lie on."""
+        self.mounts.close()
         for path in (*self.directories.models.glob("*"), *self.directories.state.glob("taught.json*")):
             path.unlink()
 
@@ -230,6 +239,18 @@ class ServiceBench:
         if self.daemon.process.poll() is None:
             found["supervisor"] = self.daemon.process.pid
         return found
+
+    def await_process(self, name: str) -> None:
+        """Wait until a process of the daemon, which may be being started again, lives and gives a sign of it.
+
+        Raises VoidTrialError.
+        """
+        until = time.monotonic() + READY_S
+        with closing(HeartbeatReader(self.directories.heartbeat_slot(name))) as reader:
+            while name not in self.processes() or (beat := reader.newest()) is None or beat.silent_s(0.0):
+                if time.monotonic() > until:
+                    raise VoidTrialError(f"there was no {name} process within {READY_S:g} s")
+                time.sleep(0.05)
 
     def truth(self) -> TrueJointHistory:
         """Where the emulated arm was; to be closed."""
@@ -375,29 +396,6 @@ def spoil_handled(directories: CellDirectories) -> None:
     slot = directories.runtime / "handled.slot"
     with slot.open("r+b") as file:
         file.write(b"\xff" * slot.stat().st_size)
-
-
-def full_disk(bench: ServiceBench) -> int:
-    """No file can be written any more: a folder is in the place of each, and a recording is asked for."""
-    t0_ns = time.monotonic_ns()
-    directories = bench.directories
-    for path in (directories.taught, directories.open_goals, directories.run_record, directories.recordings):
-        _put_aside(bench, path)
-    for path in (directories.taught, directories.open_goals, directories.run_record):
-        path.mkdir()
-        bench.lasting.callback(path.rmdir)
-    directories.recordings.write_text("no folder", encoding="ascii")
-    bench.lasting.callback(directories.recordings.unlink)
-    with Client(CELL) as client:
-        client.record()
-    return t0_ns
-
-
-def _put_aside(bench: ServiceBench, path: Path) -> None:
-    aside = path.with_name(f"{path.name}.aside")
-    if path.exists():
-        path.rename(aside)
-        bench.lasting.callback(aside.rename, path)
 
 
 def idle_sockets(bench: ServiceBench) -> int:

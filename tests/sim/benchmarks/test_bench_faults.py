@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.benchmarks.faults import bench, inputs, service, wall
-from stereoservo_sim.benchmarks.faults.page import reliability_page
+from stereoservo_sim.benchmarks.faults import bench, disks, inputs, service, wall
+from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 
@@ -103,12 +106,66 @@ def test_rows_and_tables(one_case, monkeypatch):
         assert word in text
 
 
+def test_a_sentence_that_differs_in_times_and_numbers_alone_is_printed_once():
+    silent = "the gateway has given no sign of life for {} s, since {}. One that hangs for 5 s is killed"
+    ended = "Its last run ended at {} {}: the supervisor (process {}) was killed (signal 9)"
+    note = (
+        "s/recordings/hil-can-{}.mcap: {} steps; it is set aside as model-000004.json.damaged-{}; of joint j1"
+    )
+    assert distinct_sentences(
+        [
+            silent.format("1.8", "18:49:47"),
+            silent.format("2.0", "18:50:21"),
+            "nothing is wrong",
+            ended.format("2026-11-23", "14:13:25", 4482),
+            ended.format("2026-11-24", "14:13:26", 51),
+            silent.format("11", "18:50:21"),
+            note.format("20261123T141550.371310Z", 250, 1),
+            note.format("20261123T141605.079062Z", 251, 2),
+            "nothing is wrong",
+        ]
+    ) == [
+        silent.format("N", "HH:MM:SS"),
+        "nothing is wrong",
+        ended.format("YYYY-MM-DD", "HH:MM:SS", "N"),
+        note.format("STAMP", "N", "N"),
+    ]
+
+
+def test_numbers_that_are_alike_and_sentences_that_are_others_stay():
+    said = ["killed by signal 9 after 3 s", "killed by signal 9 after 4 s", "ended by signal 9 after 3 s"]
+    assert distinct_sentences(said) == ["killed by signal 9 after N s", "ended by signal 9 after 3 s"]
+    assert distinct_sentences(["joint j1 is slow", "joint j2 is slow"]) == [
+        "joint j1 is slow",
+        "joint j2 is slow",
+    ]
+    assert distinct_sentences(["200 sockets, epoch 3"]) == ["200 sockets, epoch 3"]
+    assert distinct_sentences([]) == []
+
+
 def test_the_page_has_a_row_for_each_fault_of_the_service():
     text = Path(__file__).parents[3].joinpath("docs/reliability.md").read_text(encoding="utf-8")
     rows = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines() if line.startswith("| ")]
     assert [name for name in rows if name in {f.name for f in service.FAULTS}] == [
         fault.name for fault in service.FAULTS
     ]
+
+
+@pytest.mark.parametrize("disk", [disks.memory_disk, disks.image_disk])
+def test_where_nothing_may_be_mounted_the_trials_are_void_with_the_reason(tmp_path, monkeypatch, disk):
+    def refused(words, **_):
+        raise subprocess.CalledProcessError(32, words, stderr="must be superuser to use mount.\n")
+
+    monkeypatch.setattr(disks.subprocess, "run", refused)
+    with ExitStack() as mounts:
+        bench = SimpleNamespace(
+            folder=tmp_path, directories=SimpleNamespace(state=tmp_path / "s"), mounts=mounts, lasting=ExitStack(),
+            goals=[], end_daemon=lambda: None, forget_state=lambda: None,
+        )  # fmt: skip
+        row = service._row(bench, next(fault for fault in service.FAULTS if fault.disk is disk), 3)
+    assert (row["trials"], row["within"], row["rest_ms"]) == (0, 0, None)
+    assert len(row["void"]) == service.TRIES
+    assert all("must be superuser to use mount" in why for why in row["void"])
 
 
 def test_the_page_has_a_row_for_each_fault_of_the_inputs():

@@ -66,7 +66,7 @@ def _tell_row(row: dict[str, Any]) -> None:
     """One row of the service as it comes, on stderr."""
     print(
         f"{row['fault']}: rest {_summary(row['rest_ms'])} ms of {row['bound_ms']}, within {row['within']} of "
-        f"{row['trials']}, after {', '.join(row['after'])}",
+        f"{row['trials']}, after {', '.join(row['after'])}; a trial takes {_summary(row['trial_s'])} s",
         file=sys.stderr,
     )
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from typing import Any
 
@@ -22,8 +23,9 @@ max. They hold the ramp to rest. Machine: {machine}. Trials of the service in re
 
 A daemon with emulated drives moves to a joint goal, or is jogged, when the fault comes. *A second later*: what
 `stereoservo status` told then, the cell's state or the code of its error. *Ends*: terminal events of the goal, by this
-daemon or the next; one is right. *Later*: notes once the daemon is ready again. *Void*: trials in which the machine
-stalled; they count for nothing.
+daemon or the next; one is right. *Notes*: those of `status` then; *later*: once the daemon is ready again. What
+differs between trials stands as `N` (a number), `HH:MM:SS`, `YYYY-MM-DD` or `STAMP` (a time). *Void*: trials in which
+the machine stalled, or that cannot be made on it; they count for nothing.
 
 {service_table}
 
@@ -49,6 +51,13 @@ SERVICE_COLUMNS = (
 INPUT_COLUMNS = (
     "input", "fault", "goal by", "at rest", "bound", "within", "after", "told", "the goal", "ends", "works again",
 )  # fmt: skip
+PLACEHOLDERS = (
+    (re.compile(r"\b\d{8}T\d{6}(?:\.\d+)?Z?"), "STAMP"),
+    (re.compile(r"\b\d{4}-\d{2}-\d{2}\b"), "YYYY-MM-DD"),
+    (re.compile(r"\b\d{2}:\d{2}:\d{2}\b"), "HH:MM:SS"),
+)
+NUMBER = re.compile(r"(?<![A-Za-z\d.])\d+(?:\.\d+)?(?![A-Za-z\d])")
+"""Not one of a name (`j1`, `taught2`), nor of a unit or version behind it."""
 DRIVE_COLUMNS = ("protocol", "fault", "noticed", "at rest", "bound", "by", "latched", "within")
 
 
@@ -79,9 +88,28 @@ def _service_cells(row: dict[str, Any]) -> list[str]:
         ", ".join(row["after"]),
         f"{row['status_right']} of {row['trials']}",
         ends,
-        "<br>".join(row["status_says"]),
+        "<br>".join(distinct_sentences(row["status_says"])),
         str(len(row["void"])),
     ]
+
+
+def distinct_sentences(said: list[str]) -> list[str]:
+    """Each sentence once, in order. Times become placeholders; sentences that then differ in numbers alone become one,
+    with `N` for each number that differs.
+    """
+    alike: dict[str, list[str]] = {}
+    for sentence in said:
+        for pattern, word in PLACEHOLDERS:
+            sentence = pattern.sub(word, sentence)
+        alike.setdefault(NUMBER.sub("N", sentence), []).append(sentence)
+    return [_in_common(sentences) for sentences in alike.values()]
+
+
+def _in_common(sentences: list[str]) -> str:
+    """Sentences that differ in numbers alone as one, with `N` for each number that differs."""
+    numbers = [NUMBER.findall(sentence) for sentence in sentences]
+    common = iter([given[0] if len(set(given)) == 1 else "N" for given in zip(*numbers, strict=True)])
+    return NUMBER.sub(lambda _: next(common), sentences[0])
 
 
 def _input_cells(row: dict[str, Any]) -> list[str]:

@@ -24,6 +24,7 @@ import numpy as np
 from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_sim.benchmarks import service_bench
+from stereoservo_sim.benchmarks.faults import disks
 from stereoservo_sim.benchmarks.service_bench import (
     CELL,
     END,
@@ -63,6 +64,10 @@ STILL_NS = 50_000_000
 TRIES = 5
 STALL_S = 0.09
 """By which a thread that only sleeps comes late on a machine that stalls, short of what the drives bear."""
+FASTER = 0.2
+"""Share of its speed at which the arm is at its goal some seconds after the trial."""
+REACHED_S = 30.0
+"""After which a goal that goes on is reached."""
 TERMINAL = ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted")
 JOGS = """
 import sys, time
@@ -116,7 +121,9 @@ class ServiceFault:
     rest; None where the arm goes on; with ``may_go_on`` it rests by then or goes on. ``after``: what `status` may tell
     a second later, the lifecycle or the code of its error. ``client``: the program of a client in a process of its own,
     which moves the arm; else one of the bench does, at ``speed_scale``. ``note``: what a note in the status says once
-    the daemon is ready again, which then is ended, and its state forgotten.
+    the daemon is ready again; its state is forgotten then. ``disk``: what the state directory lies on while a daemon
+    runs. ``notes``: what those a second later say. ``reaches``: the goal goes on until it is reached, with the cause
+    there. ``check``: what is wrong once it is gone. ``trials_a_daemon``: after so many it is ended, 0 where it goes on.
     """
 
     name: str
@@ -127,6 +134,11 @@ class ServiceFault:
     act: Callable[[ServiceBench], int] | None = None
     client: str = ""
     note: str = ""
+    notes: tuple[str, ...] = ()
+    disk: Callable[[ServiceBench], None] | None = None
+    reaches: bool = False
+    check: Callable[[ServiceBench], str] = lambda bench: ""
+    trials_a_daemon: int = 0
     may_go_on: bool = False
     speed_scale: float = SPEED_SCALE
 
@@ -137,17 +149,22 @@ class ServiceFault:
 
 
 ACTIVE = ("active",)
+PAUSES = 3
+"""Trials in which a process ends, after which a new daemon costs no more time than the supervisor's next pauses, which
+grow to 10 s.
+"""
 ENDED = ("not_running", "servo_silent")
+NOT_RECORDED = ("flight ring", "left out")
 NO_GATEWAY = ("no_reply", "session")
 FAULTS = (
     ServiceFault("stop slot raised", STOP_MS, ACTIVE, act=service_bench.raise_stop_slot),
     ServiceFault("`stereoservo stop`", COMMAND_MS, ACTIVE, act=service_bench.stop_command),
     ServiceFault("servo killed", DRIVES_MS, ENDED, "servo"),
     ServiceFault("servo hung", DRIVES_MS, ("servo_silent",), "servo", signal.SIGSTOP),
-    ServiceFault("gateway killed", SILENCE_MS, NO_GATEWAY, "gateway"),
-    ServiceFault("gateway hung", SILENCE_MS, NO_GATEWAY, "gateway", signal.SIGSTOP),
-    ServiceFault("vision killed", None, ACTIVE, "vision-left"),
-    ServiceFault("vision hung", None, ACTIVE, "vision-left", signal.SIGSTOP),
+    ServiceFault("gateway killed", SILENCE_MS, NO_GATEWAY, "gateway", trials_a_daemon=PAUSES),
+    ServiceFault("gateway hung", SILENCE_MS, NO_GATEWAY, "gateway", signal.SIGSTOP, trials_a_daemon=PAUSES),
+    ServiceFault("vision killed", None, ACTIVE, "vision-left", trials_a_daemon=PAUSES),
+    ServiceFault("vision hung", None, ACTIVE, "vision-left", signal.SIGSTOP, trials_a_daemon=PAUSES),
     ServiceFault("supervisor killed", DRIVES_MS, ENDED, "supervisor"),
     ServiceFault("supervisor hung", None, ACTIVE, "supervisor", signal.SIGSTOP),
     ServiceFault("client killed while it jogs", JOG_LEASE_MS, ACTIVE, "client", client=JOGS),
@@ -162,17 +179,32 @@ FAULTS = (
     ),
     ServiceFault(
         "gateway killed, `taught.json` cut", SILENCE_MS, NO_GATEWAY,
-        act=service_bench.damaged(service_bench.spoil_taught), note="taught.json",
+        act=service_bench.damaged(service_bench.spoil_taught), note="taught.json", trials_a_daemon=PAUSES,
     ),
     ServiceFault(
         "gateway killed, newest model damaged", SILENCE_MS, NO_GATEWAY,
-        act=service_bench.damaged(service_bench.spoil_model), note="is used instead",
+        act=service_bench.damaged(service_bench.spoil_model), note="is used instead", trials_a_daemon=1,
     ),
     ServiceFault(
         "gateway killed, `handled.slot` damaged", SILENCE_MS, NO_GATEWAY,
-        act=service_bench.damaged(service_bench.spoil_handled), note="handled.slot",
+        act=service_bench.damaged(service_bench.spoil_handled), note="handled.slot", trials_a_daemon=PAUSES,
     ),
-    ServiceFault("disk full", None, ACTIVE, act=service_bench.full_disk, note="no recording"),
+    ServiceFault(
+        "disk full", None, ACTIVE, act=disks.full_disk, disk=disks.memory_disk, notes=NOT_RECORDED, reaches=True,
+        check=disks.records_again, speed_scale=FASTER,
+    ),
+    ServiceFault(
+        "`stereoservo stop`, disk full", COMMAND_MS, ACTIVE, disk=disks.memory_disk, notes=NOT_RECORDED,
+        act=during(disks.full_disk, service_bench.stop_command), check=disks.records_again,
+    ),
+    ServiceFault(
+        "file system read-only", None, ACTIVE, act=disks.read_only_disk, disk=disks.image_disk, notes=NOT_RECORDED,
+        reaches=True, check=disks.starts_again, trials_a_daemon=1, speed_scale=FASTER,
+    ),
+    ServiceFault(
+        "`stereoservo stop`, file system read-only", COMMAND_MS, ACTIVE, disk=disks.image_disk, notes=NOT_RECORDED,
+        act=during(disks.read_only_disk, service_bench.stop_command), check=disks.unexpected, trials_a_daemon=1,
+    ),
     ServiceFault("gateway without memory", SILENCE_MS, (*ACTIVE, *NO_GATEWAY), act=service_bench.memory_exhausted,
                  may_go_on=True),
     ServiceFault("200 silent TCP sockets", None, ACTIVE, act=service_bench.idle_sockets),
@@ -212,11 +244,19 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
     trials: list[dict[str, Any]] = []
     void: list[str] = []
     silent: list[str] = []
+    took_s: list[float] = []
+    tried, anew = 0, True
     while len(trials) + len(silent) < repetitions and len(void) < TRIES:
+        began_s = time.monotonic()
         try:
+            if fault.disk is not None and anew:
+                bench.end_daemon()
+                fault.disk(bench)
+                anew = False
             bench.ready()
-            with StallWatch() as watch:
-                trial = _trial(bench, fault)
+            if fault.process not in ("", "client"):
+                bench.await_process(fault.process)
+            trial = _trial(bench, fault)
         except VoidTrialError as error:
             void.append(str(error))
             continue
@@ -227,25 +267,36 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
         finally:
             bench.lasting.close()
             bench.goals.clear()
-            if fault.note:
+            tried += 1
+            if fault.trials_a_daemon and tried % fault.trials_a_daemon == 0:
+                bench.end_daemon()
+                anew = True
+            if fault.note or (fault.disk is not None and anew):
                 bench.forget_state()
-        if watch.longest_s > STALL_S:
-            void.append(f"the machine stalled for {watch.longest_s * 1e3:.0f} ms")
+            took_s.append(time.monotonic() - began_s)
+        if trial["stall_s"] > STALL_S:
+            void.append(f"the machine stalled for {trial['stall_s'] * 1e3:.0f} ms")
         else:
             trials.append(trial)
+    if fault.trials_a_daemon or fault.disk is not None:
+        bench.end_daemon()
+        bench.forget_state()
     rests = [trial["rest_ms"] for trial in trials if trial["rest_ms"] is not None]
     bound = None if fault.bound_ms is None else fault.bound_ms + RAMP_MS
     return {
         "fault": fault.name,
         "bound_ms": bound,
         "rest_ms": summary(rests) if rests else None,
-        "within": sum(_is_within(trial["rest_ms"], bound, fault.may_go_on) for trial in trials),
+        "within": sum(
+            _is_within(trial["rest_ms"], bound, fault.may_go_on) and not trial["wrong"] for trial in trials
+        ),
         "after": sorted({trial["after"] for trial in trials}),
         "status_right": sum(_status_is_right(trial, fault) for trial in trials),
         "status_says": sorted({*(trial["says"] for trial in trials), *silent}),
         "terminal_events": sorted({count for trial in trials for count in trial["terminal"]}),
         "trials": len(trials) + len(silent),
         "void": void,
+        "trial_s": summary(took_s),
     }
 
 
@@ -259,6 +310,7 @@ def _is_within(rest_ms: float | None, bound_ms: float | None, may_go_on: bool) -
 def _status_is_right(trial: dict[str, Any], fault: ServiceFault) -> bool:
     """Whether `status` a second later told what is so, with exit code 1 where that is an error, and later the note."""
     right = trial["after"] in fault.after and trial["code"] == (0 if trial["after"] == "active" else 1)
+    right = right and all(any(text in note for note in trial["now"]) for text in fault.notes)
     return right and (not fault.note or any(fault.note in note for note in trial["notes"]))
 
 
@@ -279,21 +331,23 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
             )
         if not fault.jogs:
             bench.goals.append(_sent_goal(client, child, fault.speed_scale))
-        _await_motion(history)
-        start = history.count
-        if fault.act is not None:
-            t0 = fault.act(bench)
-        else:
-            pid = child.pid if child is not None else bench.processes()[fault.process]
-            t0 = time.monotonic_ns()
-            send(pid, fault.signal)
-        _refuse_reached(told_live, "before the fault came")
-        time.sleep(max(0.0, ASKED_S - (time.monotonic_ns() - t0) * 1e-9))
-        code, told = bench.status()
-        time.sleep(max(0.0, WATCHED_S - (time.monotonic_ns() - t0) * 1e-9))
-        rest_ms = _rest_ms(history, start, t0)
+        with StallWatch() as watch:
+            _await_motion(history)
+            start = history.count
+            if fault.act is not None:
+                t0 = fault.act(bench)
+            else:
+                pid = child.pid if child is not None else bench.processes()[fault.process]
+                t0 = time.monotonic_ns()
+                send(pid, fault.signal)
+            _refuse_reached(told_live, "before the fault came")
+            time.sleep(max(0.0, ASKED_S - (time.monotonic_ns() - t0) * 1e-9))
+            code, told = bench.status()
+            time.sleep(max(0.0, WATCHED_S - (time.monotonic_ns() - t0) * 1e-9))
+            rest_ms = _rest_ms(history, start, t0)
         if fault.bound_ms is None:
             _refuse_reached(told_live, "while the arm was watched")
+        wrong = [_not_reached(told_live)] if fault.reaches else []
         bench.lasting.close()
     finally:
         history.close()
@@ -304,13 +358,24 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
         with suppress(ClientError):
             client.close()
     counts, notes = _afterwards(bench, fault, told_live)
+    wrong.append(fault.check(bench))
     says = str(told["error"]["message"]) if "error" in told else _reasons(told)
+    now = sorted(note.replace(f"{bench.folder}/", "") for note in told.get("notes", ()))
+    for title, more in (
+        ("Notes", now if fault.notes else []),
+        ("Later", list(notes) if fault.note else []),
+        ("Wrong", [text for text in wrong if text]),
+    ):
+        says += f". {title}: {'; '.join(more)}" if more else ""
     return {
         "rest_ms": rest_ms,
         "after": str(told["error"]["code"] if "error" in told else told["lifecycle"]),
         "code": code,
-        "says": f"{says}. Later: {'; '.join(notes)}" if fault.note else says,
+        "says": says,
+        "now": now,
         "notes": notes,
+        "wrong": any(wrong),
+        "stall_s": watch.longest_s,
         "terminal": counts or (-1,),
     }
 
@@ -319,6 +384,16 @@ def _refuse_reached(events: list[EventMessage], when: str) -> None:
     """Raise VoidTrialError where a goal was reached: the arm rests for that."""
     if any(event.kind == "goal_reached" for event in events):
         raise VoidTrialError(f"the goal was reached {when}")
+
+
+def _not_reached(events: list[EventMessage]) -> str:
+    """What is wrong with the goal's end, for which it waits; empty where it is reached."""
+    until = time.monotonic() + REACHED_S
+    while not (ends := [event.kind for event in events if event.kind in TERMINAL]):
+        if time.monotonic() > until:
+            return f"the goal was not reached {REACHED_S:g} s later"
+        time.sleep(0.02)
+    return "" if ends == ["goal_reached"] else f"the goal ended: {', '.join(ends)}"
 
 
 def _sent_goal(client: Client, child: subprocess.Popen[str] | None, speed_scale: float) -> str:
@@ -347,18 +422,17 @@ def _afterwards(
     """
     bench.ready()
 
-    def cancel(client: Client) -> None:
-        for goal in bench.goals:
-            with suppress(RefusedError):
-                client.cancel(goal)
+    def told(client: Client) -> tuple[tuple[EventMessage, ...], tuple[str, ...]]:
+        if fault.bound_ms is None or fault.may_go_on:
+            for goal in bench.goals:
+                with suppress(RefusedError):
+                    client.cancel(goal)
+        time.sleep(0.3)
+        return client.events(0).events, client.status().notes
 
-    if fault.bound_ms is None or fault.may_go_on:
-        bench.asked(cancel)
-    time.sleep(0.3)
-    events = bench.asked(lambda client: client.events(0).events)
-    told = [event for event in (*told_live, *events) if event.kind in TERMINAL]
-    ends = [{(event.boot, event.seq) for event in told if event.id == goal} for goal in bench.goals]
-    notes = bench.asked(lambda client: client.status().notes)
+    events, notes = bench.asked(told)
+    ended = [event for event in (*told_live, *events) if event.kind in TERMINAL]
+    ends = [{(event.boot, event.seq) for event in ended if event.id == goal} for goal in bench.goals]
     return tuple(map(len, ends)), tuple(note.replace(f"{bench.folder}/", "") for note in notes)
 
 
