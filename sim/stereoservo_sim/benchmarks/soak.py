@@ -39,6 +39,8 @@ LIMIT_S = 20.0
 """Of virtual time, for a goal."""
 RESTS_S = 1.5
 """Coasting, braking from full speed and the drives' time-out, generously."""
+LOOKS_S = 3.0
+"""In which a rest shows that pictures and joints agree again, after an encoder that had stuck."""
 MOVING = 1e-3
 """[rad/s] Of any joint, by the truth."""
 QUIET = 0.4
@@ -252,6 +254,17 @@ class _Soak:
             raise ExperimentError(
                 "not_active", f"after {name} the cell is {self.cell.status.lifecycle}: {reasons}"
             )
+        self._seen_again(name)
+
+    def _seen_again(self, name: str) -> None:
+        """Wait until the pictures agree with the joints: before, no goal by images is accepted."""
+        for _ in range(round(LOOKS_S / 0.1)):
+            assert self.cell.status is not None
+            doubts = [reason.hint for reason in self.cell.status.reasons if reason.code == "CAMERAS_OR_ARM"]
+            if not doubts:
+                return
+            self.cell.run_for(0.1)
+        raise ExperimentError("doubted", f"{LOOKS_S:g} s after {name} has passed: {doubts[0]}")
 
     def _figures(self, hours: float, seconds: float) -> dict[str, Any]:
         sizes = np.array(self.sizes[len(self.sizes) // 4 :])  # caches are warm after a quarter
