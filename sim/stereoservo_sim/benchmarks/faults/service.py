@@ -345,9 +345,9 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
             code, told = bench.status()
             time.sleep(max(0.0, WATCHED_S - (time.monotonic_ns() - t0) * 1e-9))
             rest_ms = _rest_ms(history, start, t0)
-        if fault.bound_ms is None:
-            _refuse_reached(told_live, "while the arm was watched")
-        wrong = [_not_reached(told_live)] if fault.reaches else []
+            if fault.bound_ms is None:
+                _refuse_reached(told_live, "while the arm was watched")
+            wrong = [_not_reached(told_live)] if fault.reaches else []
         bench.lasting.close()
     finally:
         history.close()
@@ -389,11 +389,11 @@ def _refuse_reached(events: list[EventMessage], when: str) -> None:
 def _not_reached(events: list[EventMessage]) -> str:
     """What is wrong with the goal's end, for which it waits; empty where it is reached."""
     until = time.monotonic() + REACHED_S
-    while not (ends := [event.kind for event in events if event.kind in TERMINAL]):
+    while not (ends := [event for event in events if event.kind in TERMINAL]):
         if time.monotonic() > until:
             return f"the goal was not reached {REACHED_S:g} s later"
         time.sleep(0.02)
-    return "" if ends == ["goal_reached"] else f"the goal ended: {', '.join(ends)}"
+    return "; ".join(f"{event.kind}: {event.message}" for event in ends if event.kind != "goal_reached")
 
 
 def _sent_goal(client: Client, child: subprocess.Popen[str] | None, speed_scale: float) -> str:
