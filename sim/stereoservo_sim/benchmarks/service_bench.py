@@ -246,11 +246,14 @@ class ServiceBench:
         Raises VoidTrialError.
         """
         until = time.monotonic() + READY_S
+        seen_ns = 0
         with closing(HeartbeatReader(self.directories.heartbeat_slot(name))) as reader:
-            while name not in self.processes() or (beat := reader.newest()) is None or beat.silent_s(0.0):
+            while not seen_ns or (beat := reader.newest()) is None or beat.t_ns < seen_ns:
                 if time.monotonic() > until:
                     raise VoidTrialError(f"there was no {name} process within {READY_S:g} s")
-                time.sleep(0.05)
+                if not seen_ns and name in self.processes():
+                    seen_ns = time.monotonic_ns()
+                time.sleep(0.01)
 
     def truth(self) -> TrueJointHistory:
         """Where the emulated arm was; to be closed."""

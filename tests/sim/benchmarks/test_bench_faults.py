@@ -204,6 +204,7 @@ def test_faults_of_the_service(names):
         assert set(row["after"]) <= set(fault.after), row
         assert row["status_right"] == 1, row
         assert fault.may_go_on or (row["rest_ms"] is None) == (fault.bound_ms is None), row
+        assert fault.bound_ms is not None or row["within"] == 1, row
         if not fault.jogs:
             assert row["terminal_events"] == [1], row
 

@@ -36,24 +36,26 @@ RING, RECORDING = "flight ring", "left out"
 
 def memory_disk(bench: ServiceBench) -> None:
     """The state directory lies on a file system in memory. Raises VoidTrialError where nothing may be mounted."""
-    _mount(bench, "-t", "tmpfs", "-o", f"size={DISK_MIB}m,mode=700", "stereoservo")
+    _mount(bench, bench.directories.state, "-t", "tmpfs", "-o", f"size={DISK_MIB}m,mode=700", "stereoservo")
 
 
 def image_disk(bench: ServiceBench) -> None:
     """It lies on an ext4 in a file, which, unlike one in memory, becomes read-only while files on it are open: as a
     disk with errors does. Raises VoidTrialError.
+
+    The file is in memory: what is written to a disk that the drives and slots of the trial lie on could hold them up.
     """
-    image = bench.folder / "disk.img"
-    image.unlink(missing_ok=True)
+    memory = bench.folder / "memory"
+    _mount(bench, memory, "-t", "tmpfs", "-o", f"size={2 * DISK_MIB}m,mode=700", "stereoservo")
+    image = memory / "disk.img"
     with image.open("wb") as file:
         file.truncate(DISK_MIB << 20)
     _called("mkfs.ext4", "-q", "-m", "0", str(image))
-    _mount(bench, "-o", "loop,errors=remount-ro", str(image))
+    _mount(bench, bench.directories.state, "-o", "loop,errors=remount-ro", str(image))
 
 
-def _mount(bench: ServiceBench, *arguments: str) -> None:
-    """Mount it in place of the state directory, until `ServiceBench.forget_state`."""
-    place = bench.directories.state
+def _mount(bench: ServiceBench, place: Path, *arguments: str) -> None:
+    """Mount at a place, until `ServiceBench.forget_state`."""
     place.mkdir(mode=0o700, parents=True, exist_ok=True)
     _called("mount", *arguments, str(place))
     bench.mounts.callback(_unmount, place)

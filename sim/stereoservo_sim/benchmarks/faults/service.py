@@ -162,9 +162,9 @@ FAULTS = (
     ServiceFault("servo killed", DRIVES_MS, ENDED, "servo"),
     ServiceFault("servo hung", DRIVES_MS, ("servo_silent",), "servo", signal.SIGSTOP),
     ServiceFault("gateway killed", SILENCE_MS, NO_GATEWAY, "gateway", trials_a_daemon=PAUSES),
-    ServiceFault("gateway hung", SILENCE_MS, NO_GATEWAY, "gateway", signal.SIGSTOP, trials_a_daemon=PAUSES),
+    ServiceFault("gateway hung", SILENCE_MS, NO_GATEWAY, "gateway", signal.SIGSTOP),
     ServiceFault("vision killed", None, ACTIVE, "vision-left", trials_a_daemon=PAUSES),
-    ServiceFault("vision hung", None, ACTIVE, "vision-left", signal.SIGSTOP, trials_a_daemon=PAUSES),
+    ServiceFault("vision hung", None, ACTIVE, "vision-left", signal.SIGSTOP),
     ServiceFault("supervisor killed", DRIVES_MS, ENDED, "supervisor"),
     ServiceFault("supervisor hung", None, ACTIVE, "supervisor", signal.SIGSTOP),
     ServiceFault("client killed while it jogs", JOG_LEASE_MS, ACTIVE, "client", client=JOGS),
@@ -345,9 +345,9 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
             code, told = bench.status()
             time.sleep(max(0.0, WATCHED_S - (time.monotonic_ns() - t0) * 1e-9))
             rest_ms = _rest_ms(history, start, t0)
-        if fault.bound_ms is None:
-            _refuse_reached(told_live, "while the arm was watched")
-        wrong = [_not_reached(told_live)] if fault.reaches else []
+            if fault.bound_ms is None:
+                _refuse_reached(told_live, "while the arm was watched")
+            wrong = [_not_reached(told_live)] if fault.reaches else []
         bench.lasting.close()
     finally:
         history.close()
@@ -389,11 +389,11 @@ def _refuse_reached(events: list[EventMessage], when: str) -> None:
 def _not_reached(events: list[EventMessage]) -> str:
     """What is wrong with the goal's end, for which it waits; empty where it is reached."""
     until = time.monotonic() + REACHED_S
-    while not (ends := [event.kind for event in events if event.kind in TERMINAL]):
+    while not (ends := [event for event in events if event.kind in TERMINAL]):
         if time.monotonic() > until:
             return f"the goal was not reached {REACHED_S:g} s later"
         time.sleep(0.02)
-    return "" if ends == ["goal_reached"] else f"the goal ended: {', '.join(ends)}"
+    return "; ".join(f"{event.kind}: {event.message}" for event in ends if event.kind != "goal_reached")
 
 
 def _sent_goal(client: Client, child: subprocess.Popen[str] | None, speed_scale: float) -> str:
