@@ -212,16 +212,14 @@ class SimulatedCamera:
         self._workpiece_pose = self._workpiece_at(t_shutter_ns)
         if not self._stands_still(t_shutter_ns):
             self._stand(t_shutter_ns)
+            since = (t_shutter_ns - self._activated_ns) * 1e-9
+            swing = float(np.sin(2.0 * np.pi * since / self._options.breathing_s))
+            self.focus = 1.0 + self._options.breathing * swing
         self._next = k + 1
         rng = np.random.default_rng((self._seed & 0xFFFFFFFF, zlib.crc32(self.name.encode()), k))
         if self._lost(t_shutter_ns, rng):
             return []
-        self.focus = 1.0 + self._options.breathing * float(
-            np.sin(2.0 * np.pi * (t_shutter_ns - self._activated_ns) * 1e-9 / self._options.breathing_s)
-        )
-        half_ns = round(0.5e9 * self._options.readout_s)
-        first, last = (self._arm_at(t_shutter_ns + late, now_ns) for late in (-half_ns, half_ns))
-        arm = ArmByRow(q if first is None else first, q, q if last is None else last, self.camera.height)
+        arm = self._by_row(q, t_shutter_ns, now_ns)
         return [self.deliver(k, t_shutter_ns + self._stamped_late_ns, now_ns, arm, rng)]  # type: ignore[return-value]
 
     def deactivate(self) -> None:
@@ -248,6 +246,15 @@ class SimulatedCamera:
         since = (t_shutter_ns - self._activated_ns) * 1e-9
         unlucky = bool(rng.random() < self._options.drop_rate)
         return unlucky or self.blackout or any(start <= since < end for start, end in self._options.dropouts)
+
+    def _by_row(self, q: FloatArray, t_shutter_ns: int, now_ns: int) -> ArmByRow:
+        """The arm as the rows see it, the middle one at ``q`` (n,)."""
+        first = last = q
+        half_ns = round(0.5e9 * self._options.readout_s)
+        if half_ns and not self._stands_still(t_shutter_ns):
+            first, last = (self._arm_at(t_shutter_ns + late, now_ns) for late in (-half_ns, half_ns))
+            self._frozen = q
+        return ArmByRow(q if first is None else first, q, q if last is None else last, self.camera.height)
 
     def _arm_at(self, t_ns: int, now_ns: int) -> FloatArray | None:
         """Joint positions at the shutter, or None while the arm's process has not reached that time."""

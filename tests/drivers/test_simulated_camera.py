@@ -130,6 +130,14 @@ def test_an_autofocus_that_breathes_swings_the_picture_about_its_centre(tmp_path
     assert min(factors) == pytest.approx(0.98, abs=1e-4)
 
 
+def test_a_picture_that_stands_still_does_not_breathe_and_is_that_of_one_time(tmp_path):
+    options = {"noise_px": 0.0, "latency_s": 0.03, "freeze_after_s": 0.3}
+    cell = Cell(tmp_path, [fake(**options, readout_s=0.03, breathing=0.02, breathing_s=1.7)])
+    (items,) = cell.run(1.0, velocity=[0.2, -0.1, 0.1, 0.3, 0.2, -0.5])
+    frozen = [item.pixels for item in items[-15:]]
+    assert all(np.array_equal(pixels, frozen[0]) for pixels in frozen)
+
+
 def test_noise_is_gaussian_with_the_declared_covariance(tmp_path):
     cell = Cell(tmp_path, [fake(noise_px=0.2, rate_hz=200.0)])
     (items,) = cell.run(2.0)

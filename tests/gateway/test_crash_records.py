@@ -151,14 +151,21 @@ class FullDisk:
         monkeypatch.setattr(crash_records, "time", SimpleNamespace(monotonic=lambda: self.now))
 
 
+def with_a_goal_on_a_full_disk(
+    directories: CellDirectories, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Gateway, FullDisk]:
+    """A gateway that wrote an accepted goal before its disk was full."""
+    begin_run(directories, "a", 7)
+    run_is_up(directories)
+    gateway = Gateway(directories, "a")
+    gateway.log.add("goal_accepted", id="g")
+    return gateway, FullDisk(monkeypatch)
+
+
 def test_a_goal_that_ended_on_a_full_disk_does_not_end_again(
     directories: CellDirectories, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    begin_run(directories, "a", 7)
-    run_is_up(directories)
-    first = Gateway(directories, "a")
-    first.log.add("goal_accepted", id="g")
-    disk = FullDisk(monkeypatch)
+    first, disk = with_a_goal_on_a_full_disk(directories, monkeypatch)
     first.log.add("goal_reached", id="g")
     for _ in range(50):
         disk.now += 0.1
@@ -176,11 +183,7 @@ def test_a_goal_that_ended_on_a_full_disk_does_not_end_again(
 def test_the_next_gateway_mends_what_a_full_disk_has_left(
     directories: CellDirectories, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin_run(directories, "a", 7)
-    run_is_up(directories)
-    first = Gateway(directories, "a")
-    first.log.add("goal_accepted", id="g")
-    disk = FullDisk(monkeypatch)
+    first, disk = with_a_goal_on_a_full_disk(directories, monkeypatch)
     events = [first.log.add("goal_started", id="g"), first.log.add("goal_reached", id="g")]
     events.append(first.log.add("goal_started", id="later"))
     disk.full = False
