@@ -354,3 +354,4 @@ def forget_travel(state: CoreState) -> None:
     state.missing_travel[:] = 0.0
     state.untold_travel[:] = 0.0
     state.last_positions = None
+    state.silent_from = None

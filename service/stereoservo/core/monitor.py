@@ -18,6 +18,7 @@ diagnosis needs two rounds of the last three.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -243,6 +244,13 @@ def _forget(contact: Contact, sample: JointState) -> None:
 
 MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
 LAG_S = 0.15  # a healthy drive lags by less than this at full speed
+SILENCE_S = 0.2  # of motion after which a reading has answered, whatever the drive's lag
+PLAY = {"revolute": 0.06, "prismatic": 0.005}  # [rad, m] sent before a healthy joint's reading answers
+ANSWERS = {
+    "revolute": 1e-3,
+    "prismatic": 1e-4,
+}  # [rad, m] by which a reading answers, where its step is no coarser
+FRICTION = {"revolute": 0.01, "prismatic": 0.001}  # [rad/s, m/s] below which a healthy joint may stick
 
 
 def detect_following_error(
@@ -251,10 +259,12 @@ def detect_following_error(
     """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
 
     ``state.command`` is still that of the last step. A joint's missing travel is its commanded minus its measured one,
-    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed. Without a new joint sample nothing is concluded:
-    stale samples are the safety stage's affair.
+    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed. What is sent to a joint whose reading does not
+    change at all is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new joint sample
+    nothing is concluded: stale samples are the safety stage's affair.
     """
     state.untold_travel = state.untold_travel + state.command * dt_s
+    _account_for_silence(state, settings, q, dt_s)
     if state.last_joints_ns == state.last_followed_ns:
         return None
     state.last_followed_ns = state.last_joints_ns
@@ -263,19 +273,63 @@ def detect_following_error(
     state.missing_travel = keep * (state.missing_travel + state.untold_travel - (q - last))
     state.untold_travel[:] = 0.0
     state.last_positions = q.copy()
+    return _not_following(state, settings) or _silent(state, settings)
+
+
+def _account_for_silence(state: CoreState, settings: CoreSettings, q: FloatArray, dt_s: float) -> None:
+    """Add up what each joint was sent, and for how long, since its reading changed; friction may hold the rest back."""
+    if state.silent_from is None:
+        state.silent_from, state.silent_travel, state.silent_s = q.copy(), np.zeros_like(q), np.zeros_like(q)
+    _, moved, friction = _by_kind(settings.joint_kinds)
+    if settings.resolution:
+        moved = np.maximum(moved, 1.5 * np.array(settings.resolution))  # one step to and fro is no motion
+    answered = np.abs(q - state.silent_from) > moved
+    felt = state.command - np.clip(state.command, -friction, friction)
+    state.silent_travel = np.where(answered, 0.0, state.silent_travel + felt * dt_s)
+    state.silent_s = np.where(answered, 0.0, state.silent_s + (felt != 0.0) * dt_s)
+    state.silent_from = np.where(answered, q, state.silent_from)
+
+
+def _not_following(state: CoreState, settings: CoreSettings) -> Reason | None:
     allowed = LAG_S * settings.limits.velocity_max
     joint = int((np.abs(state.missing_travel) / allowed).argmax())
     missing, limit = float(state.missing_travel[joint]), float(allowed[joint])
     if abs(missing) <= limit:
         return None
-    name = settings.joint_names[joint]
-    unit = "rad" if settings.joint_kinds[joint] == "revolute" else "m"
+    name, unit = settings.joint_names[joint], settings.joint_unit(joint)
     state.missing_travel[:] = 0.0
     return Reason(
         "JOINT_NOT_FOLLOWING", "fault", name, abs(missing), limit, unit,
         f"joint {name} lacks {missing:+.3f} {unit} of the travel it was sent (up to {limit:.3f} is lag): "
         "check its encoder, brake and drive; then reset and enable",
     )  # fmt: skip
+
+
+def _silent(state: CoreState, settings: CoreSettings) -> Reason | None:
+    share = np.abs(state.silent_travel) / _by_kind(settings.joint_kinds)[0] * (state.silent_s > SILENCE_S)
+    joint = int(share.argmax())
+    if share[joint] <= 1.0:
+        return None
+    name, unit = settings.joint_names[joint], settings.joint_unit(joint)
+    sent, since_s = float(state.silent_travel[joint]), float(state.silent_s[joint])
+    limit = PLAY[settings.joint_kinds[joint]]
+    state.silent_from = None
+    return Reason(
+        "JOINT_NOT_FOLLOWING", "fault", name, abs(sent), limit, unit,
+        f"the reading of joint {name} stood still for {since_s:.2f} s while it was sent {sent:+.3f} {unit} of travel "
+        f"(up to {limit:g} may be play): check its encoder, brake and drive; then reset and enable",
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _by_kind(kinds: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds; not to be written to."""
+    play, answers, friction = (
+        np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION)
+    )
+    for value in (play, answers, friction):
+        value.setflags(write=False)
+    return play, answers, friction
 
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:

@@ -130,6 +130,10 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
         """How near (n,) [rad or m] its target a joint has arrived, from its encoder's step; not to be written to."""
         return _arrival(self.resolution, len(self.joint_names))
 
+    def joint_unit(self, joint: int) -> str:
+        """Of a joint's positions."""
+        return "rad" if self.joint_kinds[joint] == "revolute" else "m"
+
     def arrival_origin(self, joint: int) -> str:
         """A joint's arrival tolerance and where it comes from, for people."""
         tolerance = float(self.arrival[joint])

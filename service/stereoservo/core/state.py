@@ -402,6 +402,12 @@ class CoreState(msgspec.Struct, eq=False):
     """By camera; None for those that stand for good."""
     adjusted: tuple[str, ...]
     """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
+    silent_from: FloatArray | None = None
+    """Readings (n,) when each last changed; see `core.monitor`."""
+    silent_travel: FloatArray = msgspec.field(default_factory=lambda: np.zeros(0))
+    """Sent since (n,), with its sign, less what friction may hold back [rad or m]."""
+    silent_s: FloatArray = msgspec.field(default_factory=lambda: np.zeros(0))
+    """For how long (n,) more than that was sent since."""
 
 
 def initial_state(settings: CoreSettings) -> CoreState:
@@ -502,19 +508,19 @@ def decode_state(data: bytes) -> CoreState:
     return state
 
 
-UNRECORDED = ("last_step_ns", "refused_joints", "refused_frames")
-"""Fields that a state of version 6 does not hold."""
+MOVED_IN_VERSION_7 = ("stop_reason",)
+"""Fields that a state of version 6 holds elsewhere."""
 
 
 def is_recorded(state: CoreState, data: bytes) -> bool:
-    """Whether ``data`` is this state bit for bit, in the fields that its version holds."""
-    encoded = encode_state(state)
-    if msgspec.msgpack.decode(data, type=_Versioned).version == STATE_VERSION:
-        # A field that was added since, with a default, is not in it.
-        return encoded == data or encoded == encode_state(decode_state(data))
-    now, recorded = msgspec.msgpack.decode(encoded), _from_version_6(data)
-    recorded |= {name: now[name] for name in UNRECORDED}
-    return encoded == msgspec.msgpack.encode({name: recorded[name] for name in now})
+    """Whether ``data`` is this state bit for bit, in the fields that were there when it was written."""
+    now = msgspec.msgpack.decode(encode_state(state))
+    recorded = msgspec.msgpack.decode(encode_state(decode_state(data)))
+    held = msgspec.msgpack.decode(data).keys() | MOVED_IN_VERSION_7
+    return bool(
+        msgspec.msgpack.encode([now[name] for name in now if name in held])
+        == msgspec.msgpack.encode([recorded[name] for name in now if name in held])
+    )
 
 
 def _from_version_6(data: bytes) -> dict[str, Any]:

@@ -145,7 +145,7 @@ def worst_contact(
         )
         return Reason("CONTACT_EFFORT", "hold", name, value, limit, unit, f"{hint}{way}effort")
     value, limit = float(following[joint]), float(following_limits[joint])
-    unit = "rad" if settings.joint_kinds[joint] == "revolute" else "m"
+    unit = settings.joint_unit(joint)
     hint = f"joint {name} is {value:.4g} {unit} from its set-point, {limit:.4g} is allowed: "
     return Reason("CONTACT_FOLLOWING", "hold", name, value, limit, unit, f"{hint}{way}following")
 

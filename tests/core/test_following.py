@@ -1,0 +1,115 @@
+"""The watch on joints that do not go where they are sent: drives and encoders as simple as they can be stated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stereoservo.core.monitor import PLAY, detect_following_error
+from stereoservo.core.state import initial_state
+from stereoservo.messages.goals import Enable, Jog
+from stereoservo.messages.reasons import Reason
+
+RATE_HZ = 250.0
+DT_S = 1.0 / RATE_HZ
+Encoder = Callable[[np.ndarray], np.ndarray]
+
+
+def watched(settings: Any, commands: np.ndarray, readings: np.ndarray) -> tuple[Reason | None, int]:
+    """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,), and in which step."""
+    state = initial_state(settings)
+    for k, (command, reading) in enumerate(zip(commands, readings, strict=True)):
+        q = np.zeros(len(settings.joint_names))
+        q[0] = reading
+        state.last_joints_ns = 1 + k
+        reason = detect_following_error(state, settings, q, DT_S)
+        if reason is not None:
+            return reason, k
+        state.command = np.zeros_like(q)
+        state.command[0] = command
+    return None, len(commands)
+
+
+def travelled(commands: np.ndarray) -> np.ndarray:
+    """Where an exact drive stands when it has just got each command (k,) [rad]."""
+    return np.concatenate([[0.0], np.cumsum(commands[:-1] * DT_S)])
+
+
+@pytest.mark.parametrize("speed", [0.015, 0.03, 0.1, 0.14, 0.16, 0.3, 1.0])
+def test_an_arm_whose_encoder_stands_still_goes_less_than_0_17_rad_at_any_speed(bench, speed):
+    commands = np.full(round(20.0 * RATE_HZ), speed)
+    reason, k = watched(bench.settings, commands, np.zeros(len(commands)))
+    assert reason is not None
+    assert (reason.code, reason.subject) == ("JOINT_NOT_FOLLOWING", bench.settings.joint_names[0])
+    assert "check its encoder, brake and drive" in reason.hint
+    slowed = speed / (speed - 0.01)  # what friction may hold back is not counted
+    bound = PLAY["revolute"] * slowed if speed < 0.3 else 0.17 * bench.settings.limits.velocity_max[0]
+    assert k * DT_S * speed <= bound + 0.2 * speed * (speed < 0.3)
+
+
+def delayed(commands: np.ndarray, delay_s: float) -> np.ndarray:
+    steps = round(delay_s * RATE_HZ)
+    return travelled(np.concatenate([np.zeros(steps), commands[: len(commands) - steps]]))
+
+
+def with_play(positions: np.ndarray, play: float) -> np.ndarray:
+    """Positions of a joint that its motor takes along where it stands ``play`` off to either side."""
+    joint = np.zeros(len(positions))
+    for k in range(1, len(positions)):
+        joint[k] = np.clip(joint[k - 1], positions[k] - play, positions[k] + play)
+    return joint
+
+
+def to_and_fro(speed: float, seconds: float) -> np.ndarray:
+    t = np.arange(round(60.0 * RATE_HZ)) * DT_S
+    return speed * np.where((t // seconds) % 2 == 0.0, 1.0, -1.0)
+
+
+def short_moves(speed: float, seconds: float) -> np.ndarray:
+    t = np.arange(round(60.0 * RATE_HZ)) * DT_S
+    return speed * (t % 1.0 < seconds) * np.where(t % 2.0 < 1.0, 1.0, -1.0)
+
+
+HEALTHY = {
+    "friction holds it at 10 mrad/s for a minute": lambda: (np.full(15000, 0.01), np.zeros(15000)),
+    "play of 3 degrees, to and fro": lambda: (c := to_and_fro(0.1, 2.0), with_play(travelled(c), 0.026)),
+    "an encoder of 12 bits, slow": lambda: (
+        c := to_and_fro(0.012, 5.0),
+        np.floor(travelled(c) / 1.5e-3) * 1.5e-3,
+    ),
+    "delay of 0.13 s, jerky": lambda: (c := short_moves(0.9, 0.1), delayed(c, 0.13)),
+    "a gain error of 5 per cent": lambda: (c := to_and_fro(1.0, 3.0), 0.95 * travelled(c)),
+    "moved in the dead band of an encoder": lambda: (c := short_moves(0.02, 0.02), np.zeros(len(c))),
+}
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_a_healthy_drive_is_not_blamed(bench, name):
+    commands, readings = HEALTHY[name]()
+    assert watched(bench.settings, commands, readings) == (None, len(commands))
+
+
+@pytest.mark.parametrize("noise", [0.0, 4e-4])
+def test_a_reading_that_only_flickers_stands_still(bench, noise):
+    rng = np.random.default_rng(5)
+    commands = np.full(5000, 0.05)
+    reason, k = watched(bench.settings, commands, rng.uniform(-noise, noise, len(commands)))
+    assert reason is not None
+    assert k * DT_S * 0.05 < 0.09
+
+
+def test_a_slow_jog_with_an_encoder_that_stands_still_ends_in_a_fault(bench: Any) -> None:
+    bench.run(0.1)
+    bench.step(Enable())
+    bench.run(0.3)
+    bench.frozen_joint = 2
+    start = bench.q.copy()
+    assert bench.reply(Jog({bench.settings.joint_names[2]: 0.05}, 60.0)).accepted
+    event = bench.until(lambda e: e.kind == "fault", 10.0)
+    assert (event.reasons[0].code, event.reasons[0].subject) == ("JOINT_NOT_FOLLOWING", "j3")
+    assert "stood still for" in event.reasons[0].hint
+    bench.run(0.5)
+    assert np.abs(bench.q - start).max() < 0.09
