@@ -19,7 +19,7 @@ Encoder = Callable[[np.ndarray], np.ndarray]
 
 
 def watched(settings: Any, commands: np.ndarray, readings: np.ndarray) -> tuple[Reason | None, int]:
-    """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,), and in which step."""
+    """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,), and when."""
     state = initial_state(settings)
     for k, (command, reading) in enumerate(zip(commands, readings, strict=True)):
         q = np.zeros(len(settings.joint_names))
