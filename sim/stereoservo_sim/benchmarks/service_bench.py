@@ -54,7 +54,7 @@ WATCH = {"heartbeat_timeout_ms": "100", "rpdo_deadline_ms": "0"}
 CAMERAS = '[[camera]]\nname = "{}"\ndriver = "fake"\nmount = "eye_to_hand"\n\n'
 LEAST_PRIORITY = 19
 """Of a second daemon: whether it is let in is tried, not what its start costs the first one's loops."""
-SOCKETS = 200
+SOCKETS = 1000
 PUTS = 20_000
 LITTLE_MEMORY = 64 << 20
 """Bytes of address space, less than the gateway has."""
@@ -218,6 +218,16 @@ class ServiceBench:
                 if time.monotonic() > until:
                     raise
                 time.sleep(0.1)
+
+    def asked_ready(self, ask: Callable[[Client], T]) -> T:
+        """The answer of a cell that is made ready first, and again where a stalled machine stopped it since."""
+
+        def operated(client: Client) -> T:
+            _operated(client)
+            return ask(client)
+
+        self.ready()
+        return self.asked(operated)
 
     def forget_state(self) -> None:
         """Remove the models and taught goals that a trial left, and the disk they lie on."""

@@ -98,13 +98,12 @@ def run_kills(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
 
 def _killed(bench: ServiceBench, rng: np.random.Generator) -> Trial:
     """A goal, and the end of a process while the arm moves."""
-    bench.ready()
 
     def begin(client: Client) -> None:
         end = -END if client.status().joints["j1"] > 0.0 else END
         client.goal({"j1": end}, speed_scale=SPEED_SCALE, lease_s=None)
 
-    bench.asked(begin)
+    bench.asked_ready(begin)
     begin_ns = time.monotonic_ns()
     time.sleep(float(rng.uniform(YOUNG_S + 0.3, 3.0)))
     processes = bench.processes()

@@ -238,7 +238,8 @@ class _Soak:
         blind = name == "cameras dark" and law == "joints"  # which no camera concerns
         if fastest > MOVING and not blind:
             raise ExperimentError(
-                "moves", f"{name}: the arm moves at {fastest:.3g} rad/s {RESTS_S:g} s after the fault, law {law}"
+                "moves",
+                f"{name}: the arm moves at {fastest:.3g} rad/s {RESTS_S:g} s after the fault, law {law}",
             )
         self.cell.joints.faults = type(self.cell.joints.faults)()  # type: ignore[attr-defined]
         for camera in self.cell.cameras:

@@ -207,13 +207,13 @@ FAULTS = (
     ),
     ServiceFault("gateway without memory", SILENCE_MS, (*ACTIVE, *NO_GATEWAY), act=service_bench.memory_exhausted,
                  may_go_on=True),
-    ServiceFault("200 silent TCP sockets", None, ACTIVE, act=service_bench.idle_sockets),
+    ServiceFault(f"{service_bench.SOCKETS} silent TCP sockets", None, ACTIVE, act=service_bench.idle_sockets),
     ServiceFault(
-        "`stereoservo stop`, 200 silent TCP sockets", COMMAND_MS, ACTIVE,
+        f"`stereoservo stop`, {service_bench.SOCKETS} silent TCP sockets", COMMAND_MS, ACTIVE,
         act=during(service_bench.idle_sockets, service_bench.stop_command),
     ),
     ServiceFault(
-        "stop by an open TCP session, 200 silent sockets", SESSION_MS, ACTIVE,
+        f"stop by an open TCP session, {service_bench.SOCKETS} silent sockets", SESSION_MS, ACTIVE,
         act=service_bench.stop_by_open_session,
     ),
     ServiceFault("20 000 refused messages", None, ACTIVE, act=service_bench.refused_puts),
