@@ -61,7 +61,8 @@ LITTLE_MEMORY = 64 << 20
 BEGINS_S = 0.4
 """From the first hostile socket or message to what is timed."""
 CONNECTS = """
-import socket, sys, time
+import os, socket, sys, time
+os.nice(19)
 def connected():
     one = socket.socket()
     one.setblocking(False)
@@ -83,7 +84,8 @@ while True:
             held[k] = connected()
     time.sleep(0.02)
 """
-"""Keeps TCP sockets open on which it says nothing; one that the listener gives up is opened again."""
+"""Keeps TCP sockets open on which it says nothing; one that the listener gives up is opened again. At least priority: a
+peer far away takes no time of this machine for its own program."""
 PUTS_REFUSED = """
 import sys, time
 from stereoservo.client import Client
