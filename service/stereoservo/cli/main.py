@@ -16,10 +16,20 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads 
 
 def invoke(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Failures are printed, as JSON with ``--json``."""
+    if arguments[:1] == ["stop"]:
+        _go_first()
     raised = raise_stop(arguments)
     from stereoservo.cli.dispatch import run  # typer and more, which a stop must not wait for
 
     return run(arguments, raised)
+
+
+def _go_first() -> None:
+    """Let a stop go before other work of this computer, where the account may (root, or ``nice`` in limits.conf)."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, -20)
+    except OSError:
+        return  # it goes with the others, as any command does
 
 
 def main() -> None:

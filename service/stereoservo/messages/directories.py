@@ -7,8 +7,8 @@ from __future__ import annotations
 import os
 import re
 import stat
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 RUNTIME_VARIABLE = "STEREOSERVO_RUNTIME_DIR"
 STATE_VARIABLE = "STEREOSERVO_STATE_DIR"
@@ -20,8 +20,7 @@ class DirectoryError(Exception):
     """A directory or path cannot be used; the message has its path, the cause and what to set."""
 
 
-@dataclass(frozen=True)
-class CellDirectories:
+class CellDirectories(NamedTuple):
     """Runtime and state directory of one cell."""
 
     cell: str
