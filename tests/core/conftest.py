@@ -226,6 +226,10 @@ class Bench:
     """What the encoders tell more than the joints stand at."""
     play: np.ndarray = field(default_factory=lambda: np.zeros(6))
     """By how much [rad], to either side, a motor with its encoder may stand off its joint before it takes it along."""
+    dead_speed: float = 0.0
+    """Of every motor [rad/s]: friction makes it slower by so much, and holds it below."""
+    resolution: float = 0.0
+    """Step of every encoder [rad]."""
     stamped_late_ns: int = 0
     """By which the stamps of pictures are later than their shutters."""
     joints_stamped_late_ns: int = 0
@@ -245,6 +249,8 @@ class Bench:
         if self.frozen_joint >= 0:
             self.encoder = self.q.copy() if self.encoder is None else self.encoder
             q_encoder[self.frozen_joint] = self.encoder[self.frozen_joint]
+        if self.resolution:
+            q_encoder = np.round(q_encoder / self.resolution) * self.resolution
         told = () if self.loads is None else self.loads(self)
         stamp_ns = self.now_ns + self.joints_stamped_late_ns
         joints = JointState(self.seq, stamp_ns, q_encoder, np.zeros(6), *told) if self.joints_on else None
@@ -269,7 +275,8 @@ class Bench:
             self._shutter()
         if outputs.command is not None:
             self.commands.append(outputs.command)
-            self._drive(outputs.command * period_ns * 1e-9)
+            held = np.clip(outputs.command, -self.dead_speed, self.dead_speed)
+            self._drive((outputs.command - held) * period_ns * 1e-9)
         return outputs
 
     def _drive(self, way: np.ndarray) -> None:

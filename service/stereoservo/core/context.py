@@ -31,7 +31,8 @@ class Derived:
     """Values that follow from the settings and the model in use: kept from step to step, but no part of the state.
 
     ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
-    ``frame_timeout_s``: age from which on a frame is refused. ``prior_every``: steps between priors. ``laws``: those
+    ``frame_timeout_s``: age from which on a frame is refused; ``features_fresh_s``: up to which features are fresh
+    enough not to coast. ``prior_every``: steps between priors. ``laws``: those
     that are installed, by name. ``load_limits``:
     collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
     """
@@ -39,6 +40,7 @@ class Derived:
     nominal_period_ns: int
     longest_gap_s: float
     frame_timeout_s: float
+    features_fresh_s: float
     prior_every: int
     laws: Mapping[str, Law]
     arrays: ModelArrays | None = None

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.friction import compensate_friction
 from stereoservo.core.goals.resolve import unplanned_report
 from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step
@@ -165,5 +166,8 @@ def move(context: StepContext) -> SourceOutput:
     state = context.state
     context.paused = paused(state)
     if context.paused or state.lifecycle != Lifecycle.ACTIVE:
+        state.friction = None
         return SourceOutput(np.zeros_like(context.q))
-    return MOTION_SOURCES[type(state.source)].step(state.source, context)
+    kind = MOTION_SOURCES[type(state.source)]
+    goal = kind.goal(state.source)
+    return compensate_friction(kind.step(state.source, context), goal, context)

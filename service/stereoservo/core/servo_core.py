@@ -50,16 +50,17 @@ class ServoCore:
         self.settings = settings
         self.state = initial_state(settings) if state is None else state
         model = self.state.model
-        self._limits = safety_limits(settings, features_fresh_s(settings))
         self._derived = Derived(
             nominal_period_ns=nominal_period_ns(settings),
             longest_gap_s=longest_gap_s(settings),
             frame_timeout_s=frame_timeout_s(settings),
+            features_fresh_s=features_fresh_s(settings),
             laws=LAWS.usable(),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
             arrays=None if model is None else model_arrays(model, settings),
             load_limits=load_limits(settings, model),
         )
+        self._limits = safety_limits(settings, self._derived.features_fresh_s)
 
     def step(self, inputs: StepInputs) -> StepOutputs:
         """One cycle: the seven stages, in their order."""

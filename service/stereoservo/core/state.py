@@ -345,6 +345,19 @@ Source = (
 )
 
 
+class FrictionCompensation(msgspec.Struct, eq=False):
+    """What is added to the velocities that a source wants, because of friction; see `core.friction`.
+
+    ``subject``: what the source works on. ``velocity`` (n,) [rad/s or m/s]. ``stood_at`` (n,): readings when each last
+    moved; ``sent`` (n,): commanded since [rad or m].
+    """
+
+    subject: str
+    velocity: FloatArray
+    stood_at: FloatArray
+    sent: FloatArray
+
+
 class CoreState(msgspec.Struct, eq=False):
     """All state of the core."""
 
@@ -408,6 +421,8 @@ class CoreState(msgspec.Struct, eq=False):
     """Sent since (n,), with its sign, less what friction may hold back [rad or m]."""
     silent_s: FloatArray = msgspec.field(default_factory=lambda: np.zeros(0))
     """For how long (n,) more than that was sent since."""
+    friction: FrictionCompensation | None = None
+    """None while nothing works on a goal."""
 
 
 def initial_state(settings: CoreSettings) -> CoreState:

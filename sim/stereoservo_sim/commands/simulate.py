@@ -97,11 +97,20 @@ def simulate(
             help="Of the arm rx90: gears and encoders as such joints have them; docs/simulation.md."
         ),
     ] = None,
+    law_only: Annotated[
+        bool,
+        typer.Option(
+            help="The law alone, without goal, monitors and safety stage; the arm free has no others."
+        ),
+    ] = False,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
     ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Run every task of a file in closed loop; the controller sees noisy pixels only, the judge the truth."""
+    """Run every task of a file in closed loop; the controller sees noisy pixels only, the judge the truth.
+
+    The arm rx90 is driven by the servo core, as in the daemon, the arm free by the law alone.
+    """
     # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     settings = LoopSettings(
@@ -117,6 +126,7 @@ def simulate(
         seed=seed,
         drop_camera=_drop(drop_camera),
         mechanics=_mechanics(mechanics, arm),
+        core=_by_core(arm, law_only, calibration, centre),
     )
     chosen = _chosen(read_tasks(tasks), limit, ids)
     with progress_bar() as progress:
@@ -136,6 +146,17 @@ def _mechanics(chosen: MechanicsChoice | None, arm: ArmOption) -> MechanicsPrese
     if arm is not ArmOption.RX90:
         raise SettingsError(f"--mechanics {chosen.value}: --arm {arm.value} has no joints; take --arm rx90")
     return chosen.value
+
+
+def _by_core(arm: ArmOption, law_only: bool, calibration: CalibrationOption, centre: str) -> bool:
+    """Whether the servo core drives the arm."""
+    if arm is ArmOption.FREE or law_only:
+        return False
+    if calibration is CalibrationOption.COARSE:
+        raise SettingsError("--calibration coarse: the servo core needs a model of the arm; take --law-only")
+    if centre != "middle":
+        raise SettingsError(f"--centre {centre}: the servo core takes the middle; take --law-only")
+    return True
 
 
 def _centre(text: str) -> str:

@@ -24,6 +24,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, mechanics_of, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, Knowledge, TaskCalibration, known_at_start
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
+from stereoservo_sim.tasks.core_controller import CoreController
 from stereoservo_sim.tasks.ground_truth import (
     PlateView,
     error_px,
@@ -61,7 +62,8 @@ class LoopSettings:
     ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws that could correct
     their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
     ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
-    of the markers or the number of one. ``mechanics``: of the serial arm; None: it is perfect.
+    of the markers or the number of one. ``mechanics``: of the serial arm; None: it is perfect. ``core``: the servo
+    core drives it, which needs a serial arm and its model; else the law alone.
     """
 
     law: str = DEFAULT_LAW
@@ -78,6 +80,7 @@ class LoopSettings:
     first_order: bool = False
     joint_speed: float | None = None
     mechanics: MechanicsPreset | None = None
+    core: bool = False
 
 
 class TaskResult(msgspec.Struct, frozen=True):
@@ -137,7 +140,15 @@ def run_task(
     else:
         arm = SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
         reach = replace(reach, start=arm.joints)
-    controller = Controller(known_at_start(calibration, task, reach), task, settings, arm.limits)
+    controller: Controller | CoreController
+    if settings.core:
+        assert calibration.model is not None
+        controller = CoreController(
+            calibration.model, task, arm, law=settings.law, points=settings.points, gain=settings.gain,
+            rate_hz=settings.rate_hz, noise_px=settings.noise_px, time_limit_s=TIME_LIMIT_S,
+        )  # fmt: skip
+    else:
+        controller = Controller(known_at_start(calibration, task, reach), task, settings, arm.limits)
     rng = np.random.default_rng([settings.seed, task.id])
     return _run(task, arm, controller, settings, rng)
 
@@ -205,9 +216,17 @@ class Controller:
         fastest = float(np.abs(step.velocity).max())
         return np.asarray(step.velocity * (self._joint_speed / max(fastest, self._joint_speed)))
 
-    def moved(self, velocity: FloatArray) -> None:
-        """Update by the arm's readings after a step at ``velocity``."""
+    def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
+        """Move the arm for a step from a frame; why it cannot be, or ''. Raises NoPathError."""
+        velocity = self.step(pixels, seen, arm.joints)
+        if not np.isfinite(velocity).all():
+            return "NO_COMMAND"
+        ahead = arm.joints + velocity * self._dt_s
+        if (ahead < arm.limits[:, 0]).any() or (ahead > arm.limits[:, 1]).any():
+            return "JOINT_LIMIT"
+        arm.move(velocity, self._dt_s)
         self.estimate.moved(self._operators, velocity * self._dt_s)
+        return ""
 
     def _start(self, points: FloatArray) -> Task:
         knowledge = self._knowledge
@@ -279,7 +298,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
 def _run(
     task: AlignmentTask,
     arm: TaskArm,
-    controller: Controller,
+    controller: Controller | CoreController,
     settings: LoopSettings,
     rng: np.random.Generator,
 ) -> tuple[TaskResult, Trace]:
@@ -309,22 +328,15 @@ def _run(
         if k == limit or _settled(errors, k, window):
             break
         frame = truth.pixels + rng.normal(0.0, 1.0, truth.pixels.shape) * settings.noise_px
-        seen = _seen(truth, settings, k * dt_s)
         try:
-            velocity = controller.step(frame, seen, arm.joints)
+            reason = controller.advance(frame, _seen(truth, settings, k * dt_s), arm)
         except NoPathError as error:
             reason, refused = "REFUSED", error.reason
+        if refused:
             break
         task_errors[k] = controller.task_error
-        if not np.isfinite(velocity).all():
-            reason = "NO_COMMAND"
+        if reason:
             break
-        ahead = arm.joints + velocity * dt_s
-        if (ahead < arm.limits[:, 0]).any() or (ahead > arm.limits[:, 1]).any():
-            reason = "JOINT_LIMIT"
-            break
-        arm.move(velocity, dt_s)
-        controller.moved(velocity)
     trace = Trace(
         poses[:steps], errors[:steps], facing[:steps], joints[:steps], task_errors[: max(steps - 1, 0)]
     )

@@ -2,7 +2,8 @@
 
 From the drive to the image an angle passes three places, all in joint units [rad or m]:
 
-* motor: the drive's set-point, late by ``delay_s`` and ``lag_s``, less the ``dead_band`` of Coulomb friction;
+* motor: the drive's set-point, late by ``delay_s`` and ``lag_s``, less what Coulomb friction takes: ``dead_speed`` of a
+  drive that follows velocities, ``dead_band`` of one that follows positions;
 * link: motor + ripple + play + sag + coupling. The images show the link;
 * reading: what the encoder reports, of the motor or of the link (``encoder_side``), with ``zero_drift``, in steps
   of ``encoder_step``. An encoder on the motor sees none of the errors of the gear.
@@ -45,6 +46,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     it pulls to, below it the link stays where the motor pushed it, on the flank behind the motion.
     ``sag``: deflection under the largest gravity torque. ``coupling``: share of the previous joint's motor angle that
     turns this joint too. ``dead_band``: whole width by which the set-point may move before friction yields.
+    ``dead_speed``: by which the motor is slower than its set-point, and below which it stands.
     ``zero_drift`` [rad/h]: of the encoder's zero. ``lag_s``: time constant of the drive's loop; ``delay_s``: dead
     time of its commands.
     """
@@ -59,6 +61,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     sag: NonNegative = 0.0
     coupling: float = 0.0
     dead_band: NonNegative = 0.0
+    dead_speed: NonNegative = 0.0
     zero_drift: float = 0.0
     lag_s: NonNegative = 0.0
     delay_s: NonNegative = 0.0
@@ -275,6 +278,8 @@ class Transmission:
             self.motor = self.motor + (link - self.link)
         self._settle()
         self._lagged = self.motor.copy()
+        self._dead_speed = column(mechanics, "dead_speed")
+        self._set, self._held_back = self.motor.copy(), np.zeros_like(self.motor)
         self._delay = _Delay(column(mechanics, "delay_s"), self.motor)
         self._resting = True
 
@@ -303,7 +308,7 @@ class Transmission:
     def follow(self, set_positions: FloatArray, h: float) -> None:
         """Advance by ``h`` [s] towards set-points (n,)."""
         self._t += h
-        arrived = self._delay.after(set_positions, h)
+        arrived = self._delay.after(self._driven(set_positions, h), h)
         share = np.where(self._lag > 0.0, -np.expm1(-h / np.maximum(self._lag, 1e-12)), 1.0)
         step = arrived - self._lagged
         # An exponential never ends: what is left of it within a nanometre is done at once.
@@ -320,7 +325,16 @@ class Transmission:
         self._play = np.where(pressed, held + fall, held)
         self._sagged = self._sagged + np.clip(self._sag * load - self._sagged, -most, most)
         self.link = motor + self._geared() + self._play + self._sagged
-        self._resting = bool((self._lagged == set_positions).all() and (self.link == before).all())
+        settled = (self._lagged == set_positions - self._held_back).all()
+        self._resting = bool(settled and (self.link == before).all())
+
+    def _driven(self, set_positions: FloatArray, h: float) -> FloatArray:
+        """Set-points (n,) less all that friction has kept back of their motion."""
+        step = set_positions - self._set
+        self._set = set_positions.copy()
+        most = self._dead_speed * h
+        self._held_back = self._held_back + np.clip(step, -most, most)
+        return set_positions - self._held_back
 
     def rest(self, h: float) -> bool:
         """Let ``h`` [s] pass where nothing moves or is about to; whether that is so."""

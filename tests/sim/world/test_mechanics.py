@@ -129,6 +129,21 @@ def test_friction_holds_the_motor_within_its_dead_band():
     assert np.ptp(held) == 0.0
 
 
+def test_friction_takes_its_speed_from_a_drive_that_follows_velocities():
+    joint = one(dead_speed=0.01)
+    for k in range(1, 1001):
+        joint.follow(np.array([0.008 * k * 1e-3]), 1e-3)
+    assert joint.motor[0] == 0.0
+    for k in range(1, 1001):
+        joint.follow(np.array([0.008 + 0.05 * k * 1e-3]), 1e-3)
+    assert np.isclose(joint.motor[0], 0.04)
+    for k in range(1, 1001):
+        joint.follow(np.array([0.058 - 0.03 * k * 1e-3]), 1e-3)
+    assert np.isclose(joint.motor[0], 0.02)
+    joint.follow(np.array([0.028]), 1e-3)
+    assert joint.rest(1e-3)
+
+
 def test_a_drive_is_late_by_its_delay_and_its_time_constant():
     joint = one(delay_s=0.05, lag_s=0.02)
     speed = 0.4

@@ -1,0 +1,95 @@
+"""Drives whose friction holds them against small velocities: goals are reached all the same, and nothing hunts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.core.friction import MOST
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.messages.goals import FeatureTarget, JointTarget
+
+STEP = 2.0 * np.pi / 4096.0
+WAY = 0.4 * np.array([0.18, -0.15, 0.2, 0.3, -0.25, 0.35])
+
+
+def true_error(bench: Any, q: np.ndarray) -> float:
+    """Farthest a marker is [px], without noise, from where it is with the joints at ``q``."""
+    return float(np.abs(bench.truth.pixels(bench.q) - bench.truth.pixels(q)).max())
+
+
+def with_settings(bench: Any, **changed: Any) -> None:
+    bench.settings = msgspec.structs.replace(bench.settings, **changed)
+    bench.core = ServoCore(bench.settings)
+    bench.ready()
+
+
+@pytest.mark.parametrize("law", ["stereo", "image", "cartesian3"])
+@pytest.mark.parametrize("dead_speed", [0.002, 0.005, 0.01])
+def test_a_goal_by_images_is_reached_against_friction(bench: Any, law: str, dead_speed: float) -> None:
+    bench.ready()
+    bench.dead_speed, bench.noise_px = dead_speed, 0.02
+    target = bench.q + WAY
+    assert bench.reply(bench.goal(FeatureTarget(bench.features(target)), law=law)).accepted
+    assert bench.ended().kind == "goal_reached"
+    bench.run(0.3)
+    assert true_error(bench, target) < 2.0 * bench.settings.tolerance_px
+
+
+def test_a_joint_goal_is_reached_against_friction(bench: Any) -> None:
+    bench.ready()
+    bench.dead_speed = 0.01
+    target = bench.q + 0.2
+    joints = dict(zip(bench.settings.joint_names, target.tolist(), strict=True))
+    assert bench.reply(bench.goal(JointTarget(joints))).accepted
+    assert bench.ended().kind == "goal_reached"
+    assert np.abs(bench.q - target).max() < 2.0 * bench.settings.arrival.max()
+
+
+@pytest.mark.parametrize("resolution", [0.0, 1e-5, STEP])
+def test_a_drive_without_friction_is_not_pushed(bench: Any, resolution: float) -> None:
+    with_settings(bench, resolution=(resolution,) * 6)
+    bench.resolution, bench.noise_px = resolution, 0.05
+    assert bench.reply(bench.goal(FeatureTarget(bench.features(bench.q + WAY)))).accepted
+    most = 0.0
+    while not any(event.kind == "goal_reached" for event in bench.events):
+        bench.step()
+        friction = bench.core.state.friction
+        most = max(most, 0.0 if friction is None else float(np.abs(friction.velocity).max()))
+    assert most <= 0.1 * MOST["revolute"]
+
+
+@pytest.mark.parametrize("resolution", [0.0, STEP])
+def test_nothing_hunts_while_a_goal_is_held_against_friction(bench: Any, resolution: float) -> None:
+    with_settings(bench, resolution=(resolution,) * 6, hold_frames=1000)
+    bench.resolution, bench.dead_speed, bench.noise_px = resolution, 0.01, 0.05
+    target = bench.q + WAY
+    assert bench.reply(
+        bench.goal(FeatureTarget(bench.features(target)), law="stereo", time_limit_s=60.0)
+    ).accepted
+    bench.run(8.0)
+    stood = []
+    for _ in range(6):
+        bench.run(0.5)
+        stood.append(bench.q.copy())
+    assert bench.core.state.friction is not None
+    assert np.ptp(stood, axis=0).max() < 3e-4
+    assert true_error(bench, target) < bench.settings.tolerance_px
+
+
+def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> None:
+    with_settings(bench, watch_following=False)
+    bench.frozen_joint, bench.dead_speed = 2, 1.0  # nothing moves, whatever is sent
+    assert bench.reply(
+        bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)
+    ).accepted
+    bench.run(3.0)
+    most = MOST["revolute"]
+    assert 0.9 * most < np.abs(bench.core.state.friction.velocity).max() <= most
+    bench.ended()
+    bench.run(0.1)
+    assert bench.core.state.friction is None
+    assert np.abs(bench.core.state.command).max() == 0.0
