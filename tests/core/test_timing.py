@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from stereoservo.core.ingest import remember_joints
-from stereoservo.core.latency import MODEL_SIGMA_PX, fold_timing, offset_s
 from stereoservo.core.monitor_state import CameraTiming
-from stereoservo.core.prediction import motion_at
-from stereoservo.core.report import advice
+from stereoservo.core.prediction import MODEL_SIGMA_PX, fold_timing, motion_at
+from stereoservo.core.report import advice, offset_s
 from stereoservo.core.state import HISTORY, JointHistory
 from stereoservo.ports.devices import JointState
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.latency import timing_sigma_s
 from stereoservo.core.model_arrays import model_arrays, require_fitting
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds
@@ -154,16 +153,13 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
     estimate = state.cameras[camera]
     estimate.last_seq = observation.seq
     estimate.last_visible = int(observation.ids.size)
-    timing = state.watching.sightings[camera].timing
-    shutter_ns = observation.t_shutter_ns + timing.late_ns
-    at_shutter = joints_at(state.history, shutter_ns)
+    at_shutter = joints_at(state.history, observation.t_shutter_ns)
     if arrays is None or at_shutter is None:
         return
     prediction = predict(arrays, at_shutter)
-    motion = motion_at(state.history, shutter_ns)
+    motion = motion_at(state.history, observation.t_shutter_ns)
     speed = state.velocities if motion is None else motion
-    ideal = ideal_observation(arrays, camera, observation)
-    sights = frame_sights(arrays, camera, ideal, prediction, speed, timing_sigma_s(timing))
+    sights = frame_sights(arrays, camera, ideal_observation(arrays, camera, observation), prediction, speed)
     if motion is not None:  # where the arm was is known, and not only expected
         if state.mobile[camera] is not None:
             sights = moving_camera.see(

@@ -27,7 +27,6 @@ from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.latency import MODEL_SIGMA_PX
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import (
     LATE_S,
@@ -47,6 +46,7 @@ from stereoservo.core.monitors.fault_isolation import (
 )
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
+    MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
     TRUSTED_FRAMES,
     camera_chi2,

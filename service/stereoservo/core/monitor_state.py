@@ -50,20 +50,11 @@ class ModelDiagnosis(msgspec.Struct, frozen=True):
 
 
 class CameraTiming(msgspec.Struct, eq=False):
-    """What moving markers have said of one camera's stamps.
-
-    Weighted sums over frames, of velocities ``v``, their directions ``n`` and innovations ``i``: ``product`` of v and
-    i, ``square`` of v, ``lag`` of n and i, ``speed`` of v and n, ``frames`` of n. ``late_ns``: by how much later than
-    stamped its shutters have been taken to open, which the sums are counted from.
-    """
+    """Sums over frames of one camera: ``product`` of velocities and innovations, ``square`` of velocities, weighted."""
 
     product: float = 0.0
     square: float = 0.0
     seen_ns: int = 0
-    lag: float = 0.0
-    speed: float = 0.0
-    frames: float = 0.0
-    late_ns: int = 0
 
 
 class CameraMonitor(msgspec.Struct, eq=False):

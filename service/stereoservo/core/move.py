@@ -3,19 +3,23 @@ calibration motion, …), and the table of all motion sources.
 
 A motion source is a kind of state (`core.state.Source`) with what the stages must know of it, a `MotionSource`, found
 by the type of the state in `MOTION_SOURCES`. To add one: a state of its own, a step, and a line in the table.
+
+What friction takes of the velocity of a source that works on a goal is added to it. For each joint it is estimated from
+small commands and the travel that they have brought: an integral action for a joint that stands, and none for one that
+follows. Play and sag wind nothing up, since the encoder of a motor that turns through its play does move.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.friction import compensate_friction
 from stereoservo.core.goals.resolve import unplanned_report
 from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step
@@ -36,6 +40,7 @@ from stereoservo.core.state import (
     CalibrationMotion,
     CheckMotion,
     CoreState,
+    FrictionCompensation,
     Holding,
     IncidenceGoal,
     Jogging,
@@ -46,6 +51,7 @@ from stereoservo.core.state import (
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
+from stereoservo.numerics.arrays import FloatArray
 
 
 def _rest(source: Source, context: StepContext) -> SourceOutput:
@@ -171,3 +177,87 @@ def move(context: StepContext) -> SourceOutput:
     kind = MOTION_SOURCES[type(state.source)]
     goal = kind.goal(state.source)
     return compensate_friction(kind.step(state.source, context), goal, context)
+
+
+# -- friction ---------------------------------------------------------------------------------------------------
+
+RISE_S = 0.25
+"""Time constant of the estimate; a joint that stands is sent its source's velocity once more in this time."""
+LAG_S = 0.06
+"""Of a healthy drive: its travel is compared over longer."""
+MOST = {"revolute": 0.015, "prismatic": 0.0015}
+"""[rad/s, m/s] Half as much again as the friction of a healthy joint; see `monitor.FRICTION`."""
+SMALL = 2.0
+"""Times ``MOST``, up to which a wanted velocity is small."""
+LEAST_TRAVEL = {"revolute": 2e-4, "prismatic": 2e-5}
+"""[rad, m] over which travel is compared, beside what lags, where encoders are fine."""
+LEAST_STEPS = 5.0
+"""Steps of the encoder likewise."""
+
+
+@lru_cache(maxsize=8)
+def _bounds(kinds: tuple[str, ...], resolution: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared."""
+    most, travel = (np.array([value[kind] for kind in kinds]) for value in (MOST, LEAST_TRAVEL))
+    if resolution:
+        travel = np.maximum(travel, LEAST_STEPS * np.array(resolution))
+    most.setflags(write=False)
+    travel.setflags(write=False)
+    return most, travel
+
+
+def compensate_friction(output: SourceOutput, subject: str, context: StepContext) -> SourceOutput:
+    """The output of the source that works on ``subject``, with what friction takes from each joint on top.
+
+    It begins anew with another subject, is zero for a joint that is not to move, and rests while the features that the
+    source needs are not fresh, and without a new joint sample.
+    """
+    state, settings = context.state, context.settings
+    if not subject:
+        state.friction = None
+        return output
+    known = state.friction
+    if known is None or known.subject != subject:
+        nothing = np.zeros_like(context.q)
+        known = state.friction = FrictionCompensation(
+            subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
+        )
+    known.sent = known.sent + state.command * context.dt_s
+    known.sent_s = known.sent_s + context.dt_s
+    wanted = output.velocity
+    if context.ingested.joints is not None and _fresh(output, context):
+        _estimate(known, wanted, context.q, _bounds(settings.joint_kinds, settings.resolution), context.dt_s)
+    if not known.velocity.any():
+        return output
+    return replace(output, velocity=np.where(wanted == 0.0, 0.0, wanted + known.velocity))
+
+
+def _estimate(
+    known: FrictionCompensation,
+    wanted: FloatArray,
+    q: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    dt_s: float,
+) -> None:
+    """Compare the travel that was sent, once it is enough, with what came of it; begin again where it reverses."""
+    most, travel = bounds
+    sent, seconds = known.sent, known.sent_s
+    valid = (np.abs(wanted) < SMALL * most) & (wanted * sent >= 0.0)
+    enough = valid & (np.abs(sent) > travel + LAG_S * np.abs(sent) / seconds)
+    share = np.where(enough, (q - known.stood_at) / np.where(enough, sent, 1.0), 1.0)
+    lost = np.clip(1.0 - share, 0.0, 1.0) * sent / seconds
+    velocity = known.velocity + np.where(
+        enough, np.minimum(seconds / RISE_S, 1.0) * (lost - known.velocity), 0.0
+    )
+    velocity = np.where(wanted * velocity < 0.0, velocity * (1.0 - min(dt_s / RISE_S, 1.0)), velocity)
+    known.velocity = np.clip(velocity, -most, most)
+    again = enough | ~valid
+    known.sent, known.sent_s = np.where(again, 0.0, sent), np.where(again, 0.0, seconds)
+    known.stood_at = np.where(again, q, known.stood_at)
+
+
+def _fresh(output: SourceOutput, context: StepContext) -> bool:
+    if not output.needs_features:
+        return True
+    newest_ns = max([estimate.accepted_ns for estimate in context.state.cameras], default=0)
+    return (context.now_ns - newest_ns) * 1e-9 <= context.derived.features_fresh_s

@@ -19,9 +19,8 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law import Scene
-from stereoservo.core.latency import MODEL_SIGMA_PX, TIMING_SIGMA_S, fold_timing
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
-from stereoservo.core.monitor_state import CameraMonitor, ModelMonitor
+from stereoservo.core.monitor_state import CameraMonitor, CameraTiming, ModelMonitor
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import HISTORY, CameraEstimate, JointHistory, ServoGoal
 from stereoservo.kinematics.kernels import (
@@ -38,6 +37,8 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 from stereoservo.ports.devices import CameraObservation
 
+MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
+TIMING_SIGMA_S = 0.003  # uncertainty of a shutter stamp against the joint stamps
 FIRST_SIGHT_SIGMA_PX = 6.0  # before a marker's innovation is known
 CORRECTION_DAMPING = 1e-4  # relative to the largest diagonal of the normal matrix
 LARGE_CORRECTION = 3e-3
@@ -198,18 +199,17 @@ def frame_sights(
     observation: CameraObservation,
     prediction: Prediction,
     speed: FloatArray,
-    timing_s: float = TIMING_SIGMA_S,
 ) -> FrameResiduals:
     """Innovations of an observation in ideal pixels against the ``prediction`` at its shutter.
 
-    ``speed`` (n,): of the joints then; ``timing_s``: deviation of its stamp.
+    ``speed`` (n,): of the joints then.
     """
     rows = np.array([arrays.rows.get(i, -1) for i in observation.ids.tolist()], dtype=np.int64)
     standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
     innovation, spread, seen, velocity = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
         np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
-        np.concatenate((prediction.jacobian[camera], standing)), speed, timing_s,
+        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
     )  # fmt: skip
     noise, known = np.ones(seen.size), rows >= 0
     noise[rows[known]] = 0.5 * (observation.covariances[known, 0, 0] + observation.covariances[known, 1, 1])
@@ -249,6 +249,45 @@ def used_rows(watching: ModelMonitor, sighting: CameraMonitor) -> FloatArray:
     used = sighting.seen.copy()
     used[: len(watching.masked)] *= 1.0 - watching.masked
     return used
+
+
+FORGETTING_S = 30.0
+"""Time constant, in seconds of seen motion, with which old frames are forgotten."""
+MOVING_PX_S = 20.0
+"""Mean pixel speed below which a frame says nothing of time."""
+
+
+def fold_timing(
+    timing: CameraTiming, innovations: FloatArray, velocities: FloatArray, variances: FloatArray, t_ns: int
+) -> None:
+    """Take in a frame: ``innovations`` [px] and ``velocities`` [px/s] (k, 2), ``variances`` (k,) [px²] a coordinate.
+
+    The markers of a frame share what the model is off by: they count as one sight, not as k.
+    """
+    k = variances.shape[0]
+    speed, product, square = _timing_sums(innovations, velocities, variances)
+    if k == 0 or speed < MOVING_PX_S * k:
+        return
+    elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns else 0.0
+    keep = math.exp(-elapsed_s / FORGETTING_S)
+    timing.product = keep * timing.product + product / k
+    timing.square = keep * timing.square + square / k
+    timing.seen_ns = t_ns
+
+
+@kernel
+def _timing_sums(
+    innovations: FloatArray, velocities: FloatArray, variances: FloatArray
+) -> tuple[float, float, float]:
+    """Sums over a frame's markers: pixel speeds, and of the weighted fit of innovations to velocities."""
+    speed, product, square = 0.0, 0.0, 0.0
+    for i in range(variances.shape[0]):
+        vu, vv = velocities[i, 0], velocities[i, 1]
+        speed += math.sqrt(vu * vu + vv * vv)
+        weight = 1.0 / (variances[i] + MODEL_SIGMA_PX * MODEL_SIGMA_PX)
+        product += weight * (vu * innovations[i, 0] + vv * innovations[i, 1])
+        square += weight * (vu * vu + vv * vv)
+    return speed, product, square
 
 
 @kernel

@@ -15,18 +15,13 @@ from stereoservo.core.cycle import Event, Status, StepOutputs
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
-from stereoservo.core.latency import KNOWN_S, TIMING_SIGMA_S, offset_s
 from stereoservo.core.limit import SafetyResult
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import CameraTiming, ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
-from stereoservo.core.prediction import (
-    FIRST_SIGHT_SIGMA_PX,
-    Prediction,
-    propagate_covariance,
-)
+from stereoservo.core.prediction import FIRST_SIGHT_SIGMA_PX, TIMING_SIGMA_S, Prediction, propagate_covariance
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CameraEstimate, Contact, CoreState
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
@@ -204,21 +199,28 @@ def health_status(state: CoreState, settings: CoreSettings, reanchoring: str) ->
     )
 
 
+KNOWN_S = 0.002
+"""Standard deviation at which the offset is told."""
 WRONG_S = 0.004
 """Offset that is worth a word: at 100 px/s it moves a marker by 0.4 px."""
 
 
+def offset_s(timing: CameraTiming) -> tuple[float, float]:
+    """How much later than stated the shutter opens [s], and its standard deviation; (0, inf) before any motion."""
+    if timing.square <= 0.0:
+        return 0.0, math.inf
+    return timing.product / timing.square, 1.0 / math.sqrt(timing.square)
+
+
 def advice(timing: CameraTiming) -> str:
     """What is to be said of it to people; empty where the stamps are right, or nothing is known yet."""
-    more, deviation = offset_s(timing)
-    late = 1e-9 * timing.late_ns + more
+    late, deviation = offset_s(timing)
     if deviation > KNOWN_S or abs(late) < max(WRONG_S, 4.0 * deviation):
         return ""
     way = "less" if late > 0 else "more"
     return (
         f"its shutter opens {1e3 * abs(late):.1f} ms {'later' if late > 0 else 'earlier'} than stated "
-        f"(± {1e3 * deviation:.1f}), which is taken into account: {1e3 * abs(late):.0f} ms {way} latency_s would be "
-        "right"
+        f"(± {1e3 * deviation:.1f}): {1e3 * abs(late):.0f} ms {way} latency_s would be right"
     )
 
 

@@ -346,16 +346,17 @@ Source = (
 
 
 class FrictionCompensation(msgspec.Struct, eq=False):
-    """What is added to the velocities that a source wants, because of friction; see `core.friction`.
+    """What is added to the velocities that a source wants, because of friction; see `core.move`.
 
-    ``subject``: what the source works on. ``velocity`` (n,) [rad/s or m/s]. ``stood_at`` (n,): readings when each last
-    moved; ``sent`` (n,): commanded since [rad or m].
+    ``subject``: what the source works on. ``velocity`` (n,) [rad/s or m/s]. ``stood_at`` (n,): readings from which
+    travel is compared; ``sent`` (n,): commanded since [rad or m], ``sent_s`` (n,): in what time.
     """
 
     subject: str
     velocity: FloatArray
     stood_at: FloatArray
     sent: FloatArray
+    sent_s: FloatArray
 
 
 class CoreState(msgspec.Struct, eq=False):

@@ -28,14 +28,12 @@ FEWEST_LEFT = 4
 def start_model_monitor(
     state: CoreState, arrays: ModelArrays, settings: CoreSettings, masked: tuple[int, ...] = ()
 ) -> None:
-    """Watch over a new model. ``masked``: ids of markers that stay unused. The cameras' latencies stay."""
+    """Watch over a new model. ``masked``: ids of markers that stay unused."""
     m = len(arrays.marker_ids)
     watching = nothing_sighted(len(settings.cameras), len(arrays.rows), len(settings.joint_names), m)
     for marker in masked:
         if marker in arrays.index:
             watching.masked[arrays.index[marker]] = 1.0
-    for sighting, before in zip(watching.sightings, state.watching.sightings, strict=True):
-        sighting.timing = before.timing
     state.watching = watching
 
 

@@ -19,10 +19,9 @@ import numpy as np
 
 from stereoservo.calibration.change.change_detection import ChangeDiagnosis, IsolatedChange, diagnose
 from stereoservo.calibration.change.hypothesis_test import Thresholds, alarm_thresholds
-from stereoservo.core.latency import MODEL_SIGMA_PX
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis, ModelMonitor, VerdictKind
-from stereoservo.core.prediction import chain_at, gate_threshold, improbable, used_rows
+from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, gate_threshold, improbable, used_rows
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
 from stereoservo.numerics.arrays import FloatArray

@@ -17,7 +17,6 @@ import numpy as np
 
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
 from stereoservo.core.context import Emit, RefusalError, StepContext
-from stereoservo.core.latency import MODEL_SIGMA_PX
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.monitor_state import MOVED, STALE_PERIODS, MobileCamera, ModelDiagnosis, standing_camera
 from stereoservo.core.monitors.camera_relocalization import AT_REST, begin, carry_all, unknown_cameras
@@ -41,6 +40,7 @@ from stereoservo.core.monitors.moving_camera_fit import (
 )
 from stereoservo.core.move import goal_of
 from stereoservo.core.prediction import (
+    MODEL_SIGMA_PX,
     FrameResiduals,
     Prediction,
     chain_at,
