@@ -78,7 +78,7 @@ def test_nothing_hunts_while_a_goal_is_held_against_friction(bench: Any, resolut
     assert bench.core.state.friction is not None
     assert np.ptp(stood, axis=0).max() < 3e-4
     one_step = max(true_error(bench, bench.q + resolution * joint) for joint in np.eye(6))
-    assert true_error(bench, target) < bench.settings.tolerance_px + one_step
+    assert true_error(bench, target) < 2.0 * bench.settings.tolerance_px + one_step
 
 
 def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> None:
