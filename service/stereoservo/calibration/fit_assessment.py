@@ -118,6 +118,7 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
         return Acceptance("usable", "usable: the model carries no statistics", ("no statistics",))
     _residuals(model, report, reasons, advice)
     _left_out(model, report, reasons, advice)
+    _likely_joint_errors(report, reasons, advice)
     _identified(model, report, depth_spread, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
     summary = f"residual {statistics.rms_px:.3g} px rms" + (
@@ -183,7 +184,19 @@ def _joint_errors(report: CalibrationReport) -> str:
         both = float(np.linalg.norm([joint.repeatable, joint.random, joint.posture]))
         told = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
         parts.append(f"joint {joint.name} {told} ({joint.pixels:.2g} px)")
-    return f"Joint readings have errors, as standard deviations: {'; '.join(parts)}"
+    have = "may have" if report.exact_joints_chance else "have"
+    return f"Joint readings {have} errors, as standard deviations: {'; '.join(parts)}"
+
+
+def _likely_joint_errors(report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:
+    if report.exact_joints_chance:
+        reasons.append(
+            "joint readings are likely to have errors, which the trials do not prove (exact ones show as much in "
+            f"{report.exact_joints_chance:.1g} of the fits at most); stated deviations contain them"
+        )
+        advice.append(
+            "more stops (calibration.stops) or frames at each (calibration.frames) tell whether the joints have errors"
+        )
 
 
 def _left_out(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:
