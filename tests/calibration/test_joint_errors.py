@@ -177,6 +177,9 @@ def test_a_scale_that_gears_may_imitate_is_told_as_either():
     assert abs(float(factor) - 1.03) < 4.5 * float(deviation) < 0.02
     assert "its drive's scale may be wrong, or it gives way under its load" in told
     assert result.model.joint_accuracy.posture.argmax() == 2
+    said = assess_fit(result.model, result.report)
+    assert said.grade == "usable"
+    assert said.reasons[0].startswith("joint j3 is off by an amount that changes with the posture")
     assert result.model.statistics.chi2_ok
 
 
