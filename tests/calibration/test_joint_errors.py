@@ -12,7 +12,11 @@ from stereoservo.calibration.change.model_check import check_model_holds
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.joint_errors.joint_noise import expected_squares, joint_columns
-from stereoservo.calibration.joint_errors.variance_components import estimate_components, readings
+from stereoservo.calibration.joint_errors.variance_components import (
+    estimate_components,
+    readings,
+    reduced_rows,
+)
 from stereoservo.calibration.rig_model import JointNoise, residuals
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
@@ -173,6 +177,9 @@ def test_a_scale_that_gears_may_imitate_is_told_as_either():
     assert abs(float(factor) - 1.03) < 4.5 * float(deviation) < 0.02
     assert "its drive's scale may be wrong, or it gives way under its load" in told
     assert result.model.joint_accuracy.posture.argmax() == 2
+    said = assess_fit(result.model, result.report)
+    assert said.grade == "usable"
+    assert said.reasons[0].startswith("joint j3 is off by an amount that changes with the posture")
     assert result.model.statistics.chi2_ok
 
 
@@ -223,7 +230,8 @@ def test_components_are_those_of_the_joints(linearised):
         order = (data.camera, data.stop, data.marker)
 
         here = solve(linearised.rig, replace(data, pixels=trials.pixels[order]), "metric", max_evaluations=1)
-        found = estimate_components(here, readings(trials.positions - cell.home), scales=False)
+        rows = reduced_rows(here, readings(trials.positions - cell.home))
+        found = estimate_components(rows, scales=False)
         assert found.significant
         assert found.pixels == pytest.approx(1.0, abs=0.1)
         # Of the first joint, which moves the markers most; of the last ones the two kinds are hardly told apart.

@@ -15,6 +15,7 @@ import numpy as np
 from stereoservo.calibration.joint_errors.joint_noise import (
     StopEquations,
     StopFactor,
+    exact_fit_factor,
     orthogonal_factor,
     stop_equations,
 )
@@ -30,6 +31,7 @@ from stereoservo.calibration.normal_equations import (
 from stereoservo.calibration.rig_model import (
     Charts,
     JointErrors,
+    JointNoise,
     Measurements,
     RigModel,
     full_charts,
@@ -57,6 +59,7 @@ class Solution:
 
     ``cost``: sum of squared weighted residuals, those of lens priors and errors of joints included; ``residuals``
     (2 k,) of the pixels alone. ``data`` includes the estimated errors of the joints, where these have noise.
+    ``stated_factor``: of the parameters' covariance, where it is not that of the rows.
     """
 
     rig: RigModel
@@ -69,6 +72,7 @@ class Solution:
     rows: int
     converged: bool
     evaluations: int
+    stated_factor: StopFactor | None = None
 
     @cached_property
     def lens_factor(self) -> ArrowFactor | StopFactor:
@@ -79,7 +83,9 @@ class Solution:
 
     @cached_property
     def factor(self) -> ArrowFactor | StopFactor:
-        """Orthogonal factor of the Jacobian by the parameters."""
+        """Orthogonal factor of the Jacobian by the parameters, or the one stated."""
+        if self.stated_factor is not None:
+            return self.stated_factor
         fixed = len(self.rig.lenses) if self.lenses == "none" else 0
         return self.lens_factor.without(self.charts.start(2) + np.arange(fixed))
 
@@ -95,6 +101,15 @@ class Solution:
         """Lengths (p,) of the Jacobian's columns; 1 where a column is zero."""
         sizes = np.linalg.norm(self.triangle, axis=0)
         return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def with_joint_errors_stated(solution: Solution, noise: JointNoise) -> Solution:
+    """The solution, of exact joint readings, with the covariance that its parameters have where the readings have this
+    ``noise``.
+    """
+    data = solution.data.with_joint_noise(noise)
+    factor = exact_fit_factor(solution.rig, solution.charts, data, solution.triangle)
+    return replace(solution, stated_factor=factor)
 
 
 def jacobian(rig: RigModel, charts: Charts, x: FloatArray, data: Measurements) -> FloatArray:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import Solution
+from stereoservo.calibration.bundle_adjustment import Solution, with_joint_errors_stated
 from stereoservo.calibration.bundle_statistics import (
     GroupRms,
     chi2_within,
@@ -22,7 +22,7 @@ from stereoservo.calibration.bundle_statistics import (
     residual_expectations,
     variance_factor,
 )
-from stereoservo.calibration.joint_errors.variance_components import VarianceComponents
+from stereoservo.calibration.joint_errors.variance_components import VarianceComponents, readings
 from stereoservo.calibration.lens_significance import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.trial_data import TrialData
@@ -114,7 +114,9 @@ class CalibrationReport(msgspec.Struct, frozen=True):
     bundle, which the stratum's is nested in. ``lens``: the lens model and its test.
     ``untested``: what the model takes as stated because the trials do not determine it. ``joints``: errors of the joint
     readings; empty where the data show none. Chi-square, residuals and deviations are then those of a model with both
-    noises, residuals what is left of the pixels beside the joints' errors.
+    noises, residuals what is left of the pixels beside the joints' errors. ``exact_joints_chance``: above 0 where the
+    errors are likely only, the probability, at most, with which exact readings show as much; deviations contain them,
+    chi-square and residuals are those of a model with exact readings.
     """
 
     stratum: Stratum
@@ -135,6 +137,7 @@ class CalibrationReport(msgspec.Struct, frozen=True):
     lens: LensReport
     untested: tuple[str, ...] = ()
     joints: tuple[JointErrorReport, ...] = ()
+    exact_joints_chance: float = 0.0
 
 
 class CalibrationFit(msgspec.Struct, frozen=True, eq=False):
@@ -159,9 +162,10 @@ def build_fit(
     projective: tuple[float, int],
     markers_left_out: tuple[int, ...],
     components: VarianceComponents | None = None,
+    exact_joints_chance: float = 0.0,
 ) -> CalibrationFit:
     """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame; ``components``: of its
-    joint noise.
+    joint noise, or where readings are exact with some chance of the noise that is stated beside them.
     """
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
@@ -170,7 +174,11 @@ def build_fit(
     variances = prediction_variances(solution, every.offsets)
     own = variances[data.camera, data.stop, data.marker]
     if components is not None:
-        own = data.sigmas**2 * (2.0 - residual_expectations(solution))
+        if solution.data.joint_noise is None:
+            solution = with_joint_errors_stated(solution, components.noise(readings(every.offsets)))
+            variances = prediction_variances(solution, every.offsets)
+        else:
+            own = data.sigmas**2 * (2.0 - residual_expectations(solution))
         by_joint = joint_variances(solution, every.offsets)
         there = _accuracy(components).deviations(every.offsets - every.corrections)
         by_error = (by_joint * there[None, :, None] ** 2).sum(axis=3)
@@ -216,6 +224,7 @@ def build_fit(
         notes=notes,
         lens=LensReport(solution.lenses, tested.chi2, tested.freedom, tested.limit),
         joints=() if components is None else _joint_errors(trials, components, by_joint),
+        exact_joints_chance=exact_joints_chance,
     )
     return CalibrationFit(model, report)
 

@@ -27,6 +27,8 @@ SHORT_DEG, SHORT_M = 5.0, 0.02
 """Trial motions so small that a poor deviation is put down to them."""
 NOTABLE_SHARE = 0.1
 """Errors of a joint's readings over the largest, in the images, that are reported."""
+SEEN = 2.0
+"""Errors of a joint's readings over their own deviation from which they are named."""
 NOTABLE_DEVIATION_PX = 0.5
 """Deviation of predicted pixels that is reported."""
 NOTABLE_DEPTH_DEVIATION = 0.05
@@ -118,6 +120,7 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
         return Acceptance("usable", "usable: the model carries no statistics", ("no statistics",))
     _residuals(model, report, reasons, advice)
     _left_out(model, report, reasons, advice)
+    _errors_of_readings(report, reasons, advice)
     _identified(model, report, depth_spread, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
     summary = f"residual {statistics.rms_px:.3g} px rms" + (
@@ -178,12 +181,31 @@ def _joint_errors(report: CalibrationReport) -> str:
                 ("random", joint.random, joint.random_std),
                 ("by posture", joint.posture, joint.posture_std),
             )
-            if value > 2.0 * deviation
+            if value > SEEN * deviation
         ]
         both = float(np.linalg.norm([joint.repeatable, joint.random, joint.posture]))
         told = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
         parts.append(f"joint {joint.name} {told} ({joint.pixels:.2g} px)")
-    return f"Joint readings have errors, as standard deviations: {'; '.join(parts)}"
+    have = "may have" if report.exact_joints_chance else "have"
+    return f"Joint readings {have} errors, as standard deviations: {'; '.join(parts)}"
+
+
+def _errors_of_readings(report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:
+    if report.exact_joints_chance:
+        reasons.append(
+            "joint readings are likely to have errors, which the trials do not prove (exact ones show as much in "
+            f"{report.exact_joints_chance:.1g} of the fits at most); stated deviations contain them"
+        )
+        advice.append(
+            "more stops (calibration.stops) or frames at each (calibration.frames) tell whether the joints have errors"
+        )
+        return
+    giving = [joint.name for joint in report.joints if joint.posture > SEEN * joint.posture_std]
+    if giving:
+        reasons.append(
+            f"joint {', '.join(giving)} is off by an amount that changes with the posture: how much where several "
+            "joints stand apart from the base, the trials show in part only"
+        )
 
 
 def _left_out(model: CellModel, report: CalibrationReport, reasons: list[str], advice: list[str]) -> None:

@@ -15,10 +15,7 @@ import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_inliers import projective_bundle, refine_to_convergence
-from stereoservo.calibration.bundle_statistics import (
-    chi2_within,
-    degrees_of_freedom,
-)
+from stereoservo.calibration.bundle_statistics import chi2_within, degrees_of_freedom
 from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
 from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
@@ -34,10 +31,13 @@ from stereoservo.calibration.diagnosis.joint_errors import (
 from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
+from stereoservo.calibration.joint_errors.score_tests import likely_errors
 from stereoservo.calibration.joint_errors.variance_components import (
+    ReducedRows,
     VarianceComponents,
     estimate_components,
     readings,
+    reduced_rows,
 )
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
@@ -348,7 +348,7 @@ def _fit(
         if joint_errors == "none" or error.code not in OF_JOINT_ERRORS:
             raise
         start, inexact = _inexact_start(trials, report_progress, options, priors, bend, error), True
-    components, doubtful = None, False
+    components, doubtful, chance = None, False, 0.0
     found = _components_at_start(start) if joint_errors == "beside scales" else None
     if inexact and found is None:
         raise _JointErrorsError
@@ -359,11 +359,14 @@ def _fit(
     else:
         bundles = _bundles(start, report_progress, options)
         if joint_errors != "none":
+            rows = _reduced_rows(start, bundles.final)
             refined = _refined_by_joint_errors(
-                start, bundles, options, beside_scales=joint_errors == "beside scales"
+                start, bundles, options, rows, beside_scales=joint_errors == "beside scales"
             )
             if refined is not None:
                 start, bundles, components, doubtful = refined
+            elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
+                components, chance = likely_errors(rows)
     report_progress("report", 0.95)
     result = build_fit(
         start.trials,
@@ -379,9 +382,10 @@ def _fit(
         projective=(bundles.projective.cost, degrees_of_freedom(bundles.projective)),
         markers_left_out=start.markers_left_out,
         components=components,
+        exact_joints_chance=chance,
     )
     report_progress("done", 1.0)
-    return _Fitted(result, components is not None, doubtful)
+    return _Fitted(result, components is not None and not chance, doubtful)
 
 
 def _inexact_start(
@@ -463,6 +467,10 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     return _Bundles(solution, raised, final, inliers)
 
 
+def _reduced_rows(start: _Start, solution: Solution) -> ReducedRows:
+    return reduced_rows(solution, readings(start.trials.positions - start.zero))
+
+
 def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Measurements:
     """The inliers, with the errors of the joints as in ``solution``."""
     return every.corrected(solution.data.joint_errors).select(inliers)
@@ -478,7 +486,7 @@ def _components_at_start(start: _Start) -> VarianceComponents | None:
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     near = squares <= WILD * max(1.0, float(np.median(squares)))
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
-    found = estimate_components(free, readings(start.trials.positions - start.zero), scales=True)
+    found = estimate_components(_reduced_rows(start, free), scales=True)
     return found if found is not None and found.significant else None
 
 
@@ -495,7 +503,8 @@ def _bundles_with_joint_errors(
     try:
         noisy = start.with_joint_noise(found.noise(at))
         first = _bundles(noisy, report_progress, options)
-        better = _refined_by_joint_errors(noisy, first, options, found)
+        rows = _reduced_rows(noisy, first.final)
+        better = _refined_by_joint_errors(noisy, first, options, rows, found)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
         raise _JointErrorsError from error
     if better is None:
@@ -507,24 +516,25 @@ def _refined_by_joint_errors(
     start: _Start,
     bundles: _Bundles,
     options: FitOptions,
+    rows: ReducedRows,
     near: VarianceComponents | None = None,
     *,
     beside_scales: bool = True,
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool] | None:
-    """The final bundle whitened by the variance components that it shows, until these stay the same, and whether
-    they look like one event; None where errors of the joints do not explain it. Raises ScalesError.
+    """The final bundle, of these ``rows``, whitened by the variance components that it shows, until these stay the
+    same, and whether they look like one event; None where errors of the joints do not explain it. Raises ScalesError.
     """
     at = readings(start.trials.positions - start.zero)
     final, inliers = bundles.final, bundles.inliers
     beside = near
     if beside_scales:
-        beside = estimate_components(final, at, scales=True, near=near)
+        beside = estimate_components(rows, scales=True, near=near)
         if beside is None or not beside.significant:
             return None
         factors = wrong_scales(start.trials, beside)
         if (factors != 1.0).any():
             raise ScalesError(factors, beside)
-    components = estimate_components(final, at, scales=False, near=beside)
+    components = estimate_components(rows, scales=False, near=beside)
     for _ in range(2):
         if components is None:
             return None
@@ -533,7 +543,7 @@ def _refined_by_joint_errors(
             final.rig, noisy.every, final.stratum, options, final.lenses, inliers=inliers
         )
         before = components
-        components = estimate_components(final, at, scales=False, near=before)
+        components = estimate_components(reduced_rows(final, at), scales=False, near=before)
         if components is not None and components.like(before):
             components = before
             break

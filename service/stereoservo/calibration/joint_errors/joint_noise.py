@@ -307,6 +307,31 @@ def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> Float
     return out
 
 
+def exact_fit_factor(rig: RigModel, charts: Charts, data: Measurements, triangle: FloatArray) -> StopFactor:
+    """Factor whose inverse square is the covariance of parameters that were fitted to ``data``, which has joint noise,
+    as if its readings were exact; ``triangle`` (p, p): root of the normal matrix of that fit.
+    """
+    noise, (ordered, _) = data.joint_noise, by_stop(data)
+    assert noise is not None
+    p = charts.size
+    sizes = np.linalg.norm(triangle, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    own, common = np.zeros((p, p)), np.zeros((p, noise.common))
+    for one in stop_rows(rig, charts, ordered):
+        slopes = (one.rows[:, :-1] / sizes).T @ one.joints
+        moved = slopes * noise.own[one.stop]
+        own += moved @ moved.T
+        common += slopes @ noise.common_factors(one.stop)
+    unit = triangle / sizes
+    # With A = R⁻ᵀ Jᵀ Z the covariance is R⁻¹ (I + A Aᵀ) R⁻ᵀ.
+    half = np.linalg.solve(unit.T, own + common @ common.T)
+    inner = np.eye(p) + np.linalg.solve(unit.T, half.T)
+    root = np.linalg.cholesky(0.5 * (inner + inner.T))
+    whole = np.eye(p + 1)
+    whole[:-1, :-1] = np.linalg.solve(root, triangle)
+    return StopFactor(whole, 0)
+
+
 def _column_root(triangle: FloatArray) -> FloatArray:
     """``R⁻¹`` of a factor (p, p), by way of unit columns."""
     sizes = np.linalg.norm(triangle, axis=0)

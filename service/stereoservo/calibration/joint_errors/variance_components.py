@@ -164,12 +164,14 @@ def noise_of_accuracy(accuracy: JointAccuracy, at: Readings) -> JointNoise:
     return joint_noise_of(accuracy.random, accuracy.repeatable, accuracy.posture, at)
 
 
-class _Reduced(NamedTuple):
-    """Rows that carry the components: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales`` (N, r), ``Z`` (N, e) of
-    the joints' errors with the ``component`` (e,) of each; ``squares`` of the ``freedom`` rows left, which only pixels
+class ReducedRows(NamedTuple):
+    """Rows that carry the components of ``joints`` joints: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales``
+    (N, r), ``Z`` (N, e) of the joints' errors with the ``component`` (e,) of each, counted by joint, first the random
+    ones, then the repeatable, then those by posture; ``squares`` of the ``freedom`` rows left, which only pixels
     scatter.
     """
 
+    joints: int
     y: FloatArray
     X: FloatArray
     scales: FloatArray
@@ -179,8 +181,10 @@ class _Reduced(NamedTuple):
     freedom: int
 
 
-def _reduced(solution: Solution, at_stops: Readings) -> _Reduced:
-    """The bundle's linearised rows, reflected so that each stop has one row for each of its joints' errors."""
+def reduced_rows(solution: Solution, at_stops: Readings) -> ReducedRows:
+    """Linearised rows of a bundle whose stops have the readings ``at_stops``, its present joint noise set aside,
+    reflected so that each stop has one row for each of its joints' errors.
+    """
     rig, charts = solution.rig, solution.charts
     data, _ = by_stop(solution.data)
     used = np.unique(data.stop)
@@ -226,7 +230,8 @@ def _reduced(solution: Solution, at_stops: Readings) -> _Reduced:
     _, values, vectors = np.linalg.svd(X / np.where(size > 0.0, size, 1.0), full_matrices=False)
     known = values > RANK_TOLERANCE * values[0]
     X = (X / np.where(size > 0.0, size, 1.0)) @ (vectors[known].T / values[known])
-    return _Reduced(
+    return ReducedRows(
+        n,
         whole[:, -1],
         X,
         whole[:, p:-1],
@@ -240,7 +245,7 @@ def _reduced(solution: Solution, at_stops: Readings) -> _Reduced:
 class _Likelihood:
     """Restricted likelihood of a reduced problem at variances (1 + 3 n,): pixels, random, repeatable, posture."""
 
-    def __init__(self, reduced: _Reduced, X: FloatArray, variances: FloatArray) -> None:
+    def __init__(self, reduced: ReducedRows, X: FloatArray, variances: FloatArray) -> None:
         self.reduced, self.variances = reduced, variances
         weights = variances[1 + reduced.component]
         used = weights > 0.0
@@ -281,7 +286,7 @@ class _Likelihood:
         return 0.5 * (up - down), information, np.where(down > 0.0, factors, 1.0)
 
 
-def _maximised(reduced: _Reduced, X: FloatArray, start: FloatArray) -> tuple[_Likelihood, FloatArray]:
+def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[_Likelihood, FloatArray]:
     """The likelihood at its maximum over variances that are not negative, and the information there."""
     here = _Likelihood(reduced, X, start)
     for _ in range(ROUNDS):
@@ -310,26 +315,43 @@ def _maximised(reduced: _Reduced, X: FloatArray, start: FloatArray) -> tuple[_Li
     return here, here.score()[1]
 
 
-def estimate_components(
-    solution: Solution, at: Readings, *, scales: bool, near: VarianceComponents | None = None
-) -> VarianceComponents | None:
-    """Variance components of a bundle, its present joint noise set aside, whose stops have the readings ``at``.
-    ``near``: an earlier estimate to start from.
-
-    ``scales``: with scale factors of the revolute joints among the parameters, which errors proportional to the
-    reading are then not taken for. None where nothing in the residuals points to joints.
+class ExactReadings(NamedTuple):
+    """Reduced rows under exact joint readings: ``basis`` (N, p) of the parameters, unit and orthogonal, what is
+    ``left`` (N,) beside them, and the variance of ``pixels`` over the stated one.
     """
-    reduced = _reduced(solution, at)
-    n = len(solution.rig.kinds)
-    X = np.hstack([reduced.X, _unit(reduced.scales)]) if scales else reduced.X
+
+    basis: FloatArray
+    left: FloatArray
+    pixels: float
+
+
+def exact_readings(reduced: ReducedRows, X: FloatArray) -> ExactReadings | None:
+    """The rows beside parameters ``X`` (N, p) alone; None where these leave no freedom."""
     freedom = len(reduced.y) - X.shape[1] + reduced.freedom
     if freedom <= 0 or len(reduced.y) <= X.shape[1]:
         return None
-    left = reduced.y - (basis := np.linalg.qr(X)[0]) @ (basis.T @ reduced.y)
-    pixels = max((float(left @ left) + reduced.squares) / freedom, 1e-12)
+    basis = np.linalg.qr(X)[0]
+    left = reduced.y - basis @ (basis.T @ reduced.y)
+    return ExactReadings(basis, left, max((float(left @ left) + reduced.squares) / freedom, 1e-12))
+
+
+def estimate_components(
+    reduced: ReducedRows, *, scales: bool, near: VarianceComponents | None = None, screened: bool = True
+) -> VarianceComponents | None:
+    """Variance components of a bundle by its `reduced_rows`. ``near``: an earlier estimate to start from.
+
+    ``scales``: with scale factors of the revolute joints among the parameters, which errors proportional to the
+    reading are then not taken for. None where nothing in the residuals points to joints, unless not ``screened``.
+    """
+    n = reduced.joints
+    X = np.hstack([reduced.X, _unit(reduced.scales)]) if scales else reduced.X
+    exact = exact_readings(reduced, X)
+    if exact is None:
+        return None
+    pixels = exact.pixels
     none = _Likelihood(reduced, X, np.append(pixels, np.zeros(3 * n)))
     score, information, _ = none.score()
-    if not (score[1:] > SCREEN * np.sqrt(np.maximum(np.diag(information)[1:], 0.0))).any():
+    if screened and not (score[1:] > SCREEN * np.sqrt(np.maximum(np.diag(information)[1:], 0.0))).any():
         return None
     there = np.diag(information)[1:] > 0.0
     guess = np.zeros(3 * n)
@@ -364,14 +386,14 @@ def _unit(columns: FloatArray) -> FloatArray:
     return np.asarray(columns / np.where(sizes > 0.0, sizes, 1.0))
 
 
-def _mean_square(reduced: _Reduced, component: int) -> float:
+def _mean_square(reduced: ReducedRows, component: int) -> float:
     """Mean squared length of a component's columns: what a unit of its variance adds to a row, over its rows."""
     return float((reduced.Z[:, reduced.component == component] ** 2).sum()) / int(
         (reduced.component == component).sum()
     )
 
 
-def _scale_estimates(best: _Likelihood, reduced: _Reduced) -> tuple[FloatArray, FloatArray]:
+def _scale_estimates(best: _Likelihood, reduced: ReducedRows) -> tuple[FloatArray, FloatArray]:
     """Logarithms (r,) of the scale factors by generalised least squares, and their deviations."""
     rows = np.hstack([reduced.X, reduced.scales, reduced.y[:, None]])
     white = solve_triangular(best.root, rows, lower=True)
