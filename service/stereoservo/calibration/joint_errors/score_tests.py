@@ -105,6 +105,6 @@ def weighted_chi2_tail(value: float, weights: FloatArray) -> float:
     if abs(z) * np.sqrt(curvature) < 1e-4:
         # At the mean the tail's formula is 0 over 0; its limit has the skewness.
         third = float((8.0 * w**3).sum())
-        return 0.5 - third / (6.0 * float(np.sqrt(2.0 * np.pi)) * curvature**1.5)
+        return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
     root = np.sign(z) * np.sqrt(2.0 * (z * q - cumulant))
     return float(norm.sf(root + np.log(z * np.sqrt(curvature) / root) / root))
