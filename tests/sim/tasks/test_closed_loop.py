@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,11 +11,15 @@ from rich.console import Console
 
 from stereoservo.cli.main import invoke
 from stereoservo_sim.commands.simulate import _show
+from stereoservo_sim.tasks.arms import SerialArm
 from stereoservo_sim.tasks.calibrations import calibrate
 from stereoservo_sim.tasks.campaign import default_jobs, run_campaign, summary
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, run_task
+from stereoservo_sim.tasks.core_controller import CoreController
 from stereoservo_sim.tasks.ground_truth import line_deviations, sight
 from stereoservo_sim.tasks.hard_tasks import shipped_tasks_path
+from stereoservo_sim.tasks.planned_path import NoPathError
+from stereoservo_sim.tasks.setting import SUCCESS_PX
 from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks, tasks_text
 
 SETTINGS = LoopSettings()
@@ -165,6 +170,43 @@ def test_summary_of_nothing_judged():
     assert told["line_deviation_mm"] is None
 
 
+@pytest.fixture(scope="session")
+def rx90():
+    return calibrate("rx90", "exact", 0.1, 0)
+
+
+def test_the_servo_core_solves_what_the_law_alone_solves(public_kind, rx90):
+    easy = sorted(public_kind, key=lambda task: task.angle_deg)[10:14]
+    alone = results_of(easy, rx90, arm="rx90", law="stereo")
+    by_core = results_of(easy, rx90, arm="rx90", law="stereo", core=True)
+    assert [result.success for result in by_core] == [result.success for result in alone]
+    reached = [result for result in by_core if result.success]
+    assert reached
+    assert max(result.final_error_px for result in reached) < SUCCESS_PX
+    assert max(result.rest_mrad_s for result in reached) == 0.0  # a goal that is reached is at rest
+
+
+def look(controller, pixels, arm, frames):
+    for _ in range(frames):
+        assert controller.advance(pixels, np.ones((2, 4)), arm) == ""
+
+
+def test_the_servo_core_refuses_what_is_out_of_its_limits(public_kind, rx90):
+    """A goal whose images show nothing of the plate."""
+    task = public_kind[0]
+    goal = task.goal.copy()
+    goal[0, 3] += 3.0
+    controller = CoreController(
+        rx90.model, dataclasses.replace(task, goal=goal), SerialArm(rx90.cell, rx90.cell.home), law="cartesian3",
+        points="predicted", gain=0.5, rate_hz=25.0, noise_px=0.1, time_limit_s=10.0,
+    )  # fmt: skip
+    arm = SerialArm(rx90.cell, rx90.cell.home)
+    pixels = sight(arm.pose).pixels
+    with pytest.raises(NoPathError):
+        look(controller, pixels, arm, frames=50)
+    assert np.array_equal(arm.joints, rx90.cell.home)
+
+
 def simulate(capsys, *arguments):
     code = invoke(["simulate", *arguments])
     out, err = capsys.readouterr()
@@ -208,6 +250,8 @@ def test_command_prints_one_object(tmp_path, capsys, public_kind):
         (["{hard}", "--centre", "7"], "--centre"),
         (["{hard}", "--law", "magic"], "magic"),
         (["{hard}", "--jobs", "-1"], "jobs"),
+        (["{hard}", "--arm", "rx90", "--calibration", "coarse"], "needs a model of the arm; take --law-only"),
+        (["{hard}", "--arm", "rx90", "--centre", "0"], "takes the middle; take --law-only"),
     ],
 )
 def test_errors_leave_with_a_code_and_one_object(capsys, arguments, words):
