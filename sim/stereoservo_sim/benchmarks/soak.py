@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.core.cycle import StepInputs, StepOutputs
+from stereoservo.core.monitor import FRICTION
 from stereoservo.daemon.lockstep import LockstepCell, LockstepTimeoutError
 from stereoservo.messages.cell_file import CellFile, check_cell
 from stereoservo.messages.goals import Enable, FeatureTarget, Goal, JointTarget, Reset, Resume, RunGoal
@@ -43,6 +44,10 @@ LOOKS_S = 3.0
 """In which a rest shows that pictures and joints agree again, after an encoder that had stuck."""
 MOVING = 1e-3
 """[rad/s] Of any joint, by the truth."""
+CREEP = FRICTION["revolute"] + MOVING
+"""[rad/s] That is not counted against an encoder which stands still: friction may hold a healthy joint so long."""
+STUCK_TRAVEL = 0.17 + 0.5 / 4.0 + 0.06
+"""[rad] Of an arm whose encoders stand still: until found at 1 rad/s, braking at 4 rad/s², the drives' time-out."""
 QUIET = 0.4
 """Share of goals without a fault."""
 TRUTH_SAMPLES = 4096
@@ -247,6 +252,26 @@ class _Soak:
         self.cell.links.gateway_alive = True  # type: ignore[attr-defined]
         self.cell.run_for(0.2)
         self._operated(name)
+
+    def _true_motion(self) -> tuple[FloatArray, float]:
+        """Where the joints are (n,) [rad], and the speed of the fastest [rad/s]."""
+        newest = self.truth.newest()
+        assert newest is not None
+        return newest[1], float(np.abs(newest[2]).max())
+
+    def _creeps(self, before: FloatArray, law: str) -> None:
+        """A slow command to an encoder that stands still is found by travel, not by time. Raises ExperimentError."""
+        for _ in range(round(LIMIT_S / 0.5)):
+            at, fastest = self._true_motion()
+            travel = float(np.abs(at - before).max())
+            if travel > STUCK_TRAVEL:
+                raise ExperimentError("moves", f"encoder stuck: the arm has gone {travel:.3f} rad, law {law}")
+            if fastest <= CREEP:
+                return
+            self.cell.run_for(0.5)
+        raise ExperimentError(
+            "moves", f"encoder stuck: the arm moves at {fastest:.3g} rad/s for ever, law {law}"
+        )
 
     def _operated(self, name: str) -> None:
         assert self.cell.status is not None
