@@ -54,7 +54,7 @@ WATCH = {"heartbeat_timeout_ms": "100", "rpdo_deadline_ms": "0"}
 CAMERAS = '[[camera]]\nname = "{}"\ndriver = "fake"\nmount = "eye_to_hand"\n\n'
 LEAST_PRIORITY = 19
 """Of a second daemon: whether it is let in is tried, not what its start costs the first one's loops."""
-SOCKETS = 1000
+SOCKETS = 200
 PUTS = 20_000
 LITTLE_MEMORY = 64 << 20
 """Bytes of address space, less than the gateway has."""
