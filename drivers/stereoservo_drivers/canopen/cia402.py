@@ -1,9 +1,8 @@
-"""CiA 402 codec for the cyclic master: SYNC, process data, heartbeats and emergencies of velocity-controlled
-drives.
+"""CiA 402 codec for the cyclic master: SYNC, process data, heartbeats and emergencies of servo drives.
 
-RPDO1: control word (0x6040) and target velocity (0x60FF), type 255, so that a stop needs no SYNC. TPDO1: status word
-(0x6041) and position (0x6064); TPDO2, TPDO3: the further feedback; all with every SYNC. COB-IDs of the predefined
-connection set (CiA 301).
+RPDO1: control word (0x6040) and set-point, a velocity (0x60FF) or a position (0x607A, 0x60C1), type 255, so that a stop
+needs no SYNC. TPDO1: status word (0x6041) and position (0x6064); TPDO2, TPDO3: the further feedback; all with every
+SYNC. COB-IDs of the predefined connection set (CiA 301).
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.cia402_words import (
     ENABLE_STEPS,
     FAULTY,
+    FOLLOWS_BIT,
     INTERNAL_LIMIT_BIT,
     POWER_OFF,
     WARNING_BIT,
@@ -31,8 +31,9 @@ from stereoservo_drivers.canopen.cia402_words import (
     nmt_words,
 )
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_drivers.canopen.units import JointScale, Unwrapper
+from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions, CommandMode
+from stereoservo_drivers.canopen.units import JointScale, Unwrapper, wrap_int32
+from stereoservo_drivers.position_output import PositionOutput
 
 SYNC_ID = 0x080
 EMCY_ID = 0x080
@@ -44,14 +45,23 @@ FEEDBACK_OBJECTS: dict[str, tuple[int, str]] = {
     "velocity": (0x606C0020, "i"),
     "effort": (0x60770010, "h"),
     "following_error": (0x60F40020, "i"),
+    "switches": (0x60FD0020, "I"),
 }
 """Feedback -> (mapping entry: index, sub-index, bits; struct format)."""
 
 STATUS_AND_POSITION = (0x60410010, 0x60640020)
-COMMAND = (0x60400010, 0x60FF0020)
 _COMMAND = struct.Struct("<Hi")
 _STATUS_AND_POSITION = struct.Struct("<Hi")
 _ENABLE_OPERATION = int(ControlWord.ENABLE_OPERATION)
+INTERPOLATE = 0x0010
+"""Bit of the control word that makes a drive in interpolated position mode follow its set-points."""
+BIT_S = 0.1
+"""A bit of the status word that says why a drive does not follow must last so long: limits act while it accelerates."""
+FOLLOWED_SHARE = 0.5
+"""Of the commanded travel: a joint that goes further while its drive reports a limit does not stand at one."""
+LEAST_TRAVEL = 8.0
+"""[counts] Commanded, before a joint's travel is compared with it."""
+ENABLING = frozenset(ENABLE_STEPS.values())
 _PDO_BYTES = 8
 _CODES_KEPT = 4
 _PERMILLE = 1e-3
@@ -82,6 +92,7 @@ class DriveAxis:
 
     ``enabled``, ``faulty``: by ``state``. ``heard_poll``: number of the poll before its last heartbeat.
     ``limit_side``: 1 or -1 where the drive's internal limit is known to lie on that side of the joint, else 0.
+    ``switches``: 0x60FD, where it is sent. ``mode``, ``guarded``: as configured.
     """
 
     def __init__(self, index: int, joint: CanJoint) -> None:
@@ -101,11 +112,60 @@ class DriveAxis:
         self.heard_poll = 0
         self.limit_side = 0
         self.commanded = 0.0
+        self.switches: int | None = None
+        self.mode: CommandMode = "csv"
+        self.guarded = False
+        self._limited_s, self._limited_from, self._asked = 0.0, 0.0, 0.0
+        self._followed, self._ignored_s = False, 0.0
 
     @property
     def at_limit(self) -> bool:
         """Whether the drive limits the motion by itself (bit 11 of the status word)."""
         return bool((self.status_word or 0) & INTERNAL_LIMIT_BIT)
+
+    @property
+    def by_position(self) -> bool:
+        """Whether its set-points are positions."""
+        return self.mode in POSITION_MODES
+
+    @property
+    def switch_side(self) -> int:
+        """Side of the joint (1, -1) whose limit switch is active; 0: none, both, or not known."""
+        switches = self.switches or 0
+        return self.joint.direction * ((switches >> 1 & 1) - (switches & 1))
+
+    def stands_at_limit(self, position: float, period_s: float) -> bool:
+        """Whether the drive has limited its motion long enough, and the joint has not gone as it was commanded.
+
+        Call it once a cycle while commanding. Limits of current, ramp and velocity are reported by the same bit, in
+        which a healthy drive may be while it accelerates.
+        """
+        if not (self.at_limit and self.enabled) or self.commanded * self._asked < 0.0:
+            self._limited_s = self._asked = 0.0
+            return False
+        if self._limited_s == 0.0:
+            self._limited_from = position
+        self._limited_s += period_s
+        self._asked += self.commanded * period_s
+        asked = abs(self._asked)
+        if self._limited_s < BIT_S or asked <= LEAST_TRAVEL * self.scale.resolution:
+            return False
+        moved = (position - self._limited_from) * math.copysign(1.0, self._asked)
+        self._limited_s = self._asked = 0.0
+        return moved < FOLLOWED_SHARE * asked
+
+    def ignores_set_points(self, period_s: float) -> bool:
+        """Whether the drive, which has followed its set-points since it was enabled, says for long that it does not.
+
+        Call it once a cycle while commanding. Bit 12 is another one in profile velocity.
+        """
+        follows = bool((self.status_word or 0) & FOLLOWS_BIT)
+        if not self.enabled or self.mode == "pv":
+            self._followed, self._ignored_s = False, 0.0
+            return False
+        self._followed |= follows
+        self._ignored_s = 0.0 if follows or not self._followed else self._ignored_s + period_s
+        return self._ignored_s >= BIT_S
 
     def take_status(self, status_word: int) -> None:
         """Store the newest status word."""
@@ -149,13 +209,6 @@ class Cia402Codec:
 
     def __init__(self, options: CanOptions) -> None:
         self.axes = tuple(DriveAxis(index, joint) for index, joint in enumerate(options.joint))
-        count = len(self.axes)
-        self.feedback = Feedback(
-            positions=np.full(count, np.nan),
-            velocities=np.full(count, np.nan),
-            efforts=np.full(count, np.nan) if "effort" in options.feedback else None,
-            following_errors=np.full(count, np.nan) if "following_error" in options.feedback else None,
-        )
         self._ignored = frozenset(options.emcy_ignore)
         self._heartbeat_polls = math.ceil(options.heartbeat_timeout_ms * 1e-3 * options.rate_hz)
         self._heartbeat_timeout_ms = options.heartbeat_timeout_ms
@@ -165,23 +218,45 @@ class Cia402Codec:
         self._events: list[AxisFault] = []
         self._sync = [CanFrame(SYNC_ID)]
         self._heartbeat = [CanFrame(HEARTBEAT_ID + options.master_id, bytes([NmtState.OPERATIONAL]))]
-        self._idle = [self._rpdo(axis, ControlWord.DISABLE_VOLTAGE) for axis in self.axes]
-        self._quick_stop = [self._rpdo(axis, ControlWord.QUICK_STOP) for axis in self.axes]
         self._at_rest = {
-            word: [self._rpdo(axis, word) for axis in self.axes]
-            for word in {*ENABLE_STEPS.values(), ControlWord.DISABLE_VOLTAGE}
+            word: [CanFrame(axis.command_id, _COMMAND.pack(word, 0)) for axis in self.axes]
+            for word in {*ENABLE_STEPS.values(), ControlWord.DISABLE_VOLTAGE, ControlWord.QUICK_STOP}
         }
+        self._period_s = 1.0 / options.rate_hz
+        joints = options.joint
+        self._low = np.array([joint.position_min for joint in joints])
+        self._high = np.array([joint.position_max for joint in joints])
+        self._output = PositionOutput(
+            np.array([joint.lead for joint in joints]),
+            np.array([joint.largest_load_offset for joint in joints]),
+            np.array([joint.max_velocity for joint in joints]),
+            self._period_s,
+        )
+        self.arrange(options.feedback)
+
+    def arrange(self, feedback: tuple[str, ...]) -> None:
+        """Expect ``feedback`` beside status words and positions, from all drives."""
+        count = len(self.axes)
+        self.feedback = Feedback(
+            positions=np.full(count, np.nan),
+            velocities=np.full(count, np.nan),
+            efforts=np.full(count, np.nan) if "effort" in feedback else None,
+            following_errors=np.full(count, np.nan) if "following_error" in feedback else None,
+        )
         self._takers: dict[int, Callable[[bytes], int]] = {}
         bits: list[tuple[int, str]] = []
         for axis in self.axes:
-            self._register(axis, tpdo_feedback(options.feedback), bits)
+            self._register(axis, tpdo_feedback(feedback), bits)
         self.expected = (1 << len(bits)) - 1
         self.bit_axis = tuple(index for index, _ in bits)
         self.bit_name = tuple(name for _, name in bits)
 
-    @staticmethod
-    def _rpdo(axis: DriveAxis, word: ControlWord) -> CanFrame:
-        return CanFrame(axis.command_id, _COMMAND.pack(word, 0))
+    def configured(self, axis: DriveAxis, mode: CommandMode, guarded: bool) -> None:
+        """Take over how a drive was configured."""
+        axis.mode = mode
+        axis.guarded = guarded
+        guarded = [CanFrame(HEARTBEAT_ID + a.node_id, remote=True, length=1) for a in self.axes if a.guarded]
+        self._heartbeat = [self._heartbeat[0], *guarded]
 
     # -- receiving ------------------------------------------------------------------------------------------
 
@@ -207,7 +282,7 @@ class Cia402Codec:
                 return self._wrong_length(axis, "TPDO1", len(data), size)
             word, counts = unpack(data)
             if word != axis.status_word:
-                self._take_status(axis, word)
+                axis.take_status(word)
             positions[k] = position(unwrapped(counts))
             return bit
 
@@ -222,15 +297,19 @@ class Cia402Codec:
             "velocity": (feedback.velocities, scale.velocity),
             "effort": (feedback.efforts, lambda permille: permille * axis.effort_unit),
             "following_error": (feedback.following_errors, scale.difference),
+            "switches": (None, float),
         }
-        targets = [(array, convert) for array, convert in (kinds[what] for what in pdo) if array is not None]
+        targets = [kinds[what] for what in pdo]
         unpack, size = layout.unpack, layout.size
 
         def take(data: bytes) -> int:
             if len(data) != size:
                 return self._wrong_length(axis, f"TPDO{number}", len(data), size)
             for raw, (array, convert) in zip(unpack(data), targets, strict=True):
-                array[k] = convert(raw)
+                if array is None:
+                    axis.switches = raw
+                else:
+                    array[k] = convert(raw)
             return bit
 
         return take
@@ -254,19 +333,6 @@ class Cia402Codec:
             "the drive's PDO mapping was changed, or another node has its id: reset configures it anew",
         )
         return NOT_CYCLIC
-
-    def _take_status(self, axis: DriveAxis, word: int) -> None:
-        limited_before = axis.at_limit
-        axis.take_status(word)
-        if axis.at_limit and not limited_before and axis.state is DriveState.OPERATION_ENABLED:
-            axis.limit_side = int(np.sign(axis.commanded))
-            self._event(
-                axis,
-                "limit_switch",
-                "internal limit active: a limit switch, or the drive's own position, velocity or current limit",
-                word,
-                "see the limit switches (0x60FD); reset, enable and move the joint inward",
-            )
 
     def _take_emergency(self, axis: DriveAxis, data: bytes) -> int:
         if len(data) < 2:  # no error code, and not the error reset that zeros would be
@@ -319,6 +385,9 @@ class Cia402Codec:
         """Faults since the last call: drives in fault, switched off unrequested, silent, or commanded against a
         limit.
         """
+        if self._commanding:
+            for axis in self.axes:
+                self._check_following(axis)
         events, self._events = self._events, []
         for axis in self.axes:
             if (
@@ -328,6 +397,32 @@ class Cia402Codec:
             ):
                 events += self._levels(axis)
         return tuple(events)
+
+    def _check_following(self, axis: DriveAxis) -> None:
+        """Note an event where a drive holds its joint back, or ignores what it is told."""
+        position = float(self.feedback.positions[axis.index])
+        at_switch = axis.commanded * axis.switch_side > 0.0
+        if axis.limit_side == 0 and (axis.stands_at_limit(position, self._period_s) or at_switch):
+            axis.limit_side = int(np.sign(axis.commanded))
+            if at_switch:
+                message, what = "limit switch active (0x60FD)", "reset, enable and move the joint inward"
+            elif axis.switches is None:
+                message = "internal limit active and the joint stands: a limit switch, or the drive's own position, "
+                message += "velocity or current limit"
+                what = "see the limit switches (0x60FD); reset, enable and move the joint inward"
+            else:
+                message = "internal limit active and the joint stands, with no limit switch active: the drive's own "
+                message += "position, velocity or current limit"
+                what = "is the joint blocked or overloaded? Compare the drive's limits with the cell file"
+            self._event(axis, "limit_switch", message, axis.status_word or 0, what)
+        if axis.ignores_set_points(self._period_s):
+            self._event(
+                axis,
+                "target_ignored",
+                f"enabled, but ignores its set-points for {BIT_S * 1e3:.0f} ms (bit 12 of the status word)",
+                axis.status_word or 0,
+                "does an input or another tool hold it (halt, local mode)? See the drive's manual; then reset",
+            )
 
     def _levels(self, axis: DriveAxis) -> list[AxisFault]:
         who, found = f"node {axis.node_id}", []
@@ -376,10 +471,21 @@ class Cia402Codec:
         """The master's heartbeat, operational."""
         return self._heartbeat
 
-    def _stand(self) -> None:
+    def _stand(self, words: list[ControlWord]) -> list[CanFrame]:
+        """Frames of axes that are commanded nowhere; those that are enabled keep the position that they were led to."""
         self._commanding = False
-        for axis in self.axes:
+        held = np.array(
+            [axis.enabled and word in ENABLING for axis, word in zip(self.axes, words, strict=True)]
+        )
+        orders = self._output.follow(self.feedback.positions, held)
+        frames = []
+        for axis, word in zip(self.axes, words, strict=True):
             axis.commanded = 0.0
+            if axis.by_position:
+                frames.append(self._position(axis, word, float(orders[axis.index])))
+            else:
+                frames.append(self._at_rest[word][axis.index])
+        return frames
 
     def idle(self) -> list[CanFrame]:
         """Frames: disable voltage, target zero.
@@ -387,39 +493,46 @@ class Cia402Codec:
         0x00 and not 0x06 (shutdown): it leads from every state to switch on disabled, from which only the whole
         enable sequence leads to power. No fault is reset by it. A moving axis would coast: stop it first.
         """
-        self._stand()
-        return self._idle
+        return self._stand([ControlWord.DISABLE_VOLTAGE] * len(self.axes))
 
     def enable(self) -> list[CanFrame]:
         """Frames: for every axis the next transition towards enabled from its newest status word."""
-        self._stand()
-        return [
-            self._at_rest[ENABLE_STEPS.get(axis.state, ControlWord.DISABLE_VOLTAGE)][axis.index]
-            for axis in self.axes
-        ]
+        return self._stand([ENABLE_STEPS.get(axis.state, ControlWord.DISABLE_VOLTAGE) for axis in self.axes])
 
     def command(self, velocities: FloatArray) -> list[CanFrame]:
-        """Frames: enable operation (halt bit clear) with target velocities (n,) [rad/s or m/s]."""
+        """Frames: enable operation (halt bit clear) with set-points for velocities (n,) [rad/s or m/s]."""
         self._commanding = True
-        return [
-            self._velocity(axis, velocity)
-            for axis, velocity in zip(self.axes, velocities.tolist(), strict=True)
-        ]
+        positions = self.feedback.positions
+        led = any(axis.by_position for axis in self.axes)
+        orders = self._output.step(velocities, positions, self._low, self._high) if led else velocities
+        frames = []
+        for axis, velocity, order in zip(self.axes, velocities.tolist(), orders.tolist(), strict=True):
+            axis.commanded = velocity
+            if axis.by_position:
+                frames.append(self._position(axis, ControlWord.ENABLE_OPERATION, order, axis.mode == "ip"))
+            else:
+                target = axis.scale.velocity_units(velocity)
+                frames.append(CanFrame(axis.command_id, _COMMAND.pack(_ENABLE_OPERATION, target)))
+        return frames
 
     @staticmethod
-    def _velocity(axis: DriveAxis, velocity: float) -> CanFrame:
-        axis.commanded = velocity
-        units = axis.scale.velocity_units(velocity)
-        return CanFrame(axis.command_id, _COMMAND.pack(_ENABLE_OPERATION, units))
+    def _position(axis: DriveAxis, word: ControlWord, order: float, interpolate: bool = False) -> CanFrame:
+        """Frame with a position as set-point; without a known one the drive is not to be enabled."""
+        if math.isnan(order):
+            return CanFrame(axis.command_id, _COMMAND.pack(min(word, ControlWord.QUICK_STOP), 0))
+        counts = wrap_int32(axis.scale.counts(order))
+        return CanFrame(axis.command_id, _COMMAND.pack(word | INTERPOLATE * interpolate, counts))
 
     def quick_stop(self) -> list[CanFrame]:
         """Frames: quick stop, target zero, in place of the stored cyclic control word."""
-        self._stand()
-        return self._quick_stop
+        return self._stand([ControlWord.QUICK_STOP] * len(self.axes))
 
     def sendable(self, velocities: FloatArray) -> FloatArray:
-        """Velocities rounded to the drives' units, within 32 bits."""
+        """Velocities rounded to the drives' units, within 32 bits; as they are where positions are ordered."""
         pairs = zip(self.axes, velocities.tolist(), strict=True)
         return np.array(
-            [axis.scale.velocity(axis.scale.velocity_units(velocity)) for axis, velocity in pairs]
+            [
+                velocity if axis.by_position else axis.scale.velocity(axis.scale.velocity_units(velocity))
+                for axis, velocity in pairs
+            ]
         )

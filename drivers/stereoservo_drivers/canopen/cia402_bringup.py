@@ -16,16 +16,24 @@ from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
-    HEARTBEAT_CONSUMER,
+    ABORT_OPTION,
     MODES,
     PDO_OFF,
+    Capabilities,
+    Setup,
     Write,
+    capabilities,
+    common_feedback,
+    compose,
     eds_path,
     identifier_writes,
     load_eds,
     parameter_writes,
     pdo_writes,
+    period_writes,
     unused_pdos,
+    unwatch_writes,
+    watch_writes,
 )
 from stereoservo_drivers.canopen.cia402_presence import (
     Identity,
@@ -44,7 +52,8 @@ from stereoservo_drivers.canopen.cia402_words import (
     error_words,
     is_communication_error,
 )
-from stereoservo_drivers.canopen.options import CanOptions
+from stereoservo_drivers.canopen.option_checks import check_load
+from stereoservo_drivers.canopen.options import CanOptions, CommandMode
 
 if TYPE_CHECKING:
     import canopen
@@ -65,11 +74,15 @@ STANDS_SHARE = 0.01
 
 
 class Cia402Bringup:
-    """Bring-up of the drives of one bus. ``identities``: by node id, once connected."""
+    """Bring-up of the drives of one bus. ``identities``, ``setups``: by node id, once connected; ``feedback``: what all
+    drives send beside status word and position.
+    """
 
     def __init__(self, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> None:
         self.codec = codec
         self.identities: dict[int, Identity] = {}
+        self.setups: dict[int, Setup] = {}
+        self.feedback: tuple[str, ...] = options.feedback
         self._options = options
         self._eds = eds_path(options, cell_dir)
         self._dictionary: canopen.ObjectDictionary | None = None
@@ -80,8 +93,9 @@ class Cia402Bringup:
         """Check and configure every drive, power off, process data on.
 
         A drive in fault stays in fault: the codec reports it. Raises DriverError: ``node_missing``,
-        ``duplicate_node``, ``not_a_drive``, ``identity``, ``wrong_eds``, ``eds``, ``mode``, ``option``, ``sdo_abort``,
-        ``sdo_timeout``, ``read_back``, ``not_off``, ``not_operational``, ``second_master``, ``rebooted``.
+        ``duplicate_node``, ``not_a_drive``, ``identity``, ``wrong_eds``, ``eds``, ``mode``, ``no_watch``,
+        ``option``, ``sdo_abort``, ``sdo_timeout``, ``read_back``, ``not_off``, ``not_operational``,
+        ``second_master``, ``rebooted``.
         """
         self.codec.ignore()
         with self._drives(link) as drives:
@@ -131,10 +145,13 @@ class Cia402Bringup:
                 try:
                     if _state(drive) is DriveState.OPERATION_ENABLED:
                         self._power_off(link, drive)
-                    if self._options.abort_option == 1:  # leaving operational would make a fault of it
-                        drive.write(0x6007, 0, 0)
+                    setup = self.setups.get(drive.node_id)
+                    known = setup is not None and setup.capabilities.has(ABORT_OPTION)
+                    if known and self._options.abort_option == 1:
+                        drive.write(*ABORT_OPTION, 0)  # leaving operational would make a fault of it
                     drive.nmt("PRE-OPERATIONAL")
-                    drive.write(*HEARTBEAT_CONSUMER, 0)
+                    for write in unwatch_writes(setup) if setup is not None else []:
+                        drive.write(write.index, write.subindex, write.value)
                 except DriverError as error:
                     failed.append(error)
                     if error.code == "connection_lost":
@@ -168,10 +185,17 @@ class Cia402Bringup:
             status_word = drive.read_if_there(0x6041)
             if status_word is not None and drive_state(status_word) is DriveState.OPERATION_ENABLED:
                 drive.write(0x6040, 0, ControlWord.QUICK_STOP)
+        found: list[Capabilities] = []
         for drive in drives:
-            self.identities[drive.node_id] = identify(drive, self._options, self._eds)
+            self.identities[drive.node_id] = identify(drive, self._eds)
             self._power_off(link, drive)
-            self._configure(link, drive)
+            found.append(capabilities(drive))
+            self.setups[drive.node_id] = compose(drive, self._options, found[-1])
+        check_load(self._options, sum("guarding" in setup.watches for setup in self.setups.values()))
+        self.feedback = common_feedback(self._options, found)
+        self.codec.arrange(self.feedback)
+        for drive in drives:
+            self._configure(link, drive, self.setups[drive.node_id])
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
         """Bring a drive that was left enabled to rest and switch it off. A fault stays as it is."""
@@ -189,20 +213,37 @@ class Cia402Bringup:
                 node_id=drive.node_id,
             )
 
-    def _configure(self, link: Link, drive: RemoteDrive) -> None:
+    def _configure(self, link: Link, drive: RemoteDrive, setup: Setup) -> None:
         """Write the whole configuration, then read it back. Raises DriverError (``read_back``)."""
         options, joint = self._options, drive.axis.joint
-        parameters = parameter_writes(options, joint, drive.dictionary)
-        pdos = pdo_writes(options, drive.node_id)
+        parameters = [write for write in parameter_writes(options, joint, setup) if not _fixed(drive, write)]
         identifiers = [write for write in identifier_writes(drive.node_id) if self._differs(drive, write)]
-        off = [write for index in unused_pdos(options, drive.dictionary) for write in self._off(drive, index)]
-        for write in (*identifiers, *off, *parameters, *pdos):
+        unused = unused_pdos(self.feedback, drive.dictionary)
+        off = [write for index in unused for write in self._off(drive, index)]
+        # Without guarding from before: a life time that runs out now would make a fault.
+        first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
+        for write in (*first, *identifiers, *off, *parameters):
             drive.write(write.index, write.subindex, write.value, write.option)
-        for write in {write.key: write for write in (*identifiers, *off, *parameters, *pdos)}.values():
+        mode = self._choose_mode(link, drive, setup)
+        period = period_writes(options, joint, setup, mode)
+        pdos = pdo_writes(options, drive.node_id, setup, mode, self.feedback)
+        for write in (*period, *pdos):
+            drive.write(write.index, write.subindex, write.value, write.option)
+        for write in {
+            write.key: write for write in (*identifiers, *off, *parameters, *period, *pdos)
+        }.values():
             self._compare(drive, write)
-        mode = MODES[options.mode]
-        if not until(link, lambda: drive.read(0x6061) == mode, STATE_S):
-            self._compare(drive, Write(0x6061, 0, mode))
+        self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
+
+    def _choose_mode(self, link: Link, drive: RemoteDrive, setup: Setup) -> CommandMode:
+        """Set the best mode that the drive takes. Raises DriverError (``read_back``) where it takes none."""
+        for mode in setup.modes:
+            number = MODES[mode]
+            drive.write(0x6060, 0, number, "mode")
+            if until(link, lambda number=number: drive.read(0x6061) == number, STATE_S):  # type: ignore[misc]
+                return mode
+        self._compare(drive, Write(0x6061, 0, MODES[setup.modes[-1]], option="mode"))
+        return setup.modes[-1]
 
     @staticmethod
     def _differs(drive: RemoteDrive, write: Write) -> bool:
@@ -232,11 +273,13 @@ class Cia402Bringup:
             )
 
     def _start(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Activate the drives' monitoring of this master's heartbeat, go operational, check that all report so."""
-        value = self._options.master_id << 16 | self._options.heartbeat_timeout_ms
+        """Activate the drives' watches of this master, go operational, check that all report so."""
         for drive in drives:
-            drive.write(*HEARTBEAT_CONSUMER, value)
-            self._compare(drive, Write(*HEARTBEAT_CONSUMER, value))
+            writes = watch_writes(self._options, self.setups[drive.node_id])
+            for write in writes:
+                drive.write(write.index, write.subindex, write.value, write.option)
+            for write in writes:
+                self._compare(drive, write)
             _read_initial_state(drive)
         with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
             for drive in drives:
@@ -308,6 +351,12 @@ class Cia402Bringup:
             error_code=code,
             state=drive.axis.state.value,
         )
+
+
+def _fixed(drive: RemoteDrive, write: Write) -> bool:
+    """Whether a value that no option asks for cannot be set, by the EDS: the drive's own stays."""
+    variable = drive.variable(write.index, write.subindex)
+    return not write.option and variable is not None and not variable.writable
 
 
 def _state(drive: RemoteDrive) -> DriveState:

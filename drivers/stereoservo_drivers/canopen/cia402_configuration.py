@@ -1,20 +1,192 @@
-"""Configuration of a CiA 402 drive as a list of object writes, from the cell file's options."""
+"""What a CiA 402 drive has, by its own answers, the safest configuration that this allows, and its object writes.
+
+Mandatory in CiA 301 and CiA 402 is little: what a drive does when its master falls silent, its quick stop's reaction
+and the very modes are optional. An EDS may be wrong or of another firmware, so the drive is asked.
+"""
 
 from __future__ import annotations
 
 import configparser
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.canopen.cia402 import COMMAND, EMCY_ID, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CommandMode
 from stereoservo_drivers.canopen.units import JointScale
 
 if TYPE_CHECKING:
     import canopen
+
+    from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+
+Watch = Literal["heartbeat", "guarding", "deadline"]
+
+MODES: dict[CommandMode, int] = {"csv": 9, "pv": 3, "csp": 8, "ip": 7}
+"""Mode of operation -> its number in 0x6060, the one preferred first."""
+TARGETS: dict[CommandMode, tuple[int, int]] = {
+    "csv": (0x60FF, 0),
+    "pv": (0x60FF, 0),
+    "csp": (0x607A, 0),
+    "ip": (0x60C1, 1),
+}
+"""Object of the set-point of each mode."""
+FEEDBACK_INDEX = {"velocity": 0x606C, "effort": 0x6077, "following_error": 0x60F4, "switches": 0x60FD}
+HEARTBEAT_CONSUMER = (0x1016, 1)
+GUARD_TIME, LIFE_FACTOR = (0x100C, 0), (0x100D, 0)
+DEADLINE = (0x1400, 5)
+ABORT_OPTION, QUICK_STOP_OPTION, QUICK_STOP_RAMP = (0x6007, 0), (0x605A, 0), (0x6085, 0)
+FAULT_REACTION = (0x605E, 0)
+SPEEDS = ((0x607F, 0), (0x6080, 0))
+RAMPS = ((0x6083, 0), (0x6084, 0))
+INTERPOLATION_TIME, INTERPOLATION_EXPONENT = (0x60C2, 1), (0x60C2, 2)
+
+PROBED = (
+    HEARTBEAT_CONSUMER, GUARD_TIME, LIFE_FACTOR, DEADLINE, ABORT_OPTION, QUICK_STOP_OPTION, QUICK_STOP_RAMP,
+    FAULT_REACTION, *SPEEDS, *RAMPS, INTERPOLATION_TIME, INTERPOLATION_EXPONENT,
+    *dict.fromkeys(TARGETS.values()), *((index, 0) for index in FEEDBACK_INDEX.values()),
+)  # fmt: skip
+
+LOSSES = {
+    ABORT_OPTION: "0x6007 is not there: what the drive does when it misses this computer is its maker's choice",
+    QUICK_STOP_OPTION: "0x605A is not there: whether a quick stop ends with the power off is its maker's choice",
+    QUICK_STOP_RAMP: "0x6085 is not there: how hard a quick stop brakes is its maker's choice",
+}
+"""What is lost with an object that a drive lacks, for people; of the objects by which it stops."""
+NO_WATCH = (
+    "the drive watches nothing of this computer: it has no consumer heartbeat (0x1016:1), no node guarding (0x100C, "
+    "0x100D) and no deadline of commands (0x1400:5, or rpdo_deadline_ms is 0)"
+)
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What one drive has. ``values``: of the probed objects that are there; ``modes``: bits of 0x6502, None where
+    it does not tell.
+    """
+
+    modes: int | None
+    values: dict[tuple[int, int], int]
+
+    def has(self, key: tuple[int, int]) -> bool:
+        """Whether the drive has an object."""
+        return key in self.values
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Configuration of one drive. ``modes``: to try, the best first. ``losses``: what its stops lack, as text."""
+
+    capabilities: Capabilities
+    modes: tuple[CommandMode, ...]
+    watches: tuple[Watch, ...]
+    losses: tuple[str, ...] = field(default=())
+
+    def safety(self) -> str:
+        """Its watches of this computer, and what is lost, as one line."""
+        words = {
+            "heartbeat": "this computer's heartbeat (0x1016)",
+            "guarding": "node guarding (0x100C)",
+            "deadline": "the deadline of commands (0x1400:5)",
+        }
+        watched = ", ".join(words[watch] for watch in self.watches) or "nothing"
+        return "; ".join((f"watches {watched}", *self.losses))
+
+
+def capabilities(drive: RemoteDrive) -> Capabilities:
+    """Ask a drive what it has. Raises DriverError (``sdo_timeout``)."""
+    found = {key: drive.read_if_there(*key) for key in PROBED}
+    return Capabilities(
+        drive.read_if_there(0x6502), {key: value for key, value in found.items() if value is not None}
+    )
+
+
+def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup:
+    """The safest configuration of a drive. Raises DriverError (``mode``, ``no_watch``)."""
+    joint = drive.axis.joint
+    losses = [text for key, text in LOSSES.items() if not has.has(key)]
+    reaction = drive.variable(*FAULT_REACTION)
+    if reaction is not None and not reaction.writable and has.values.get(FAULT_REACTION) == 0:
+        losses.append("0x605E is fixed at 0: at a fault of its own it lets its axis run out")
+    watches = _watches(options, has)
+    if not watches:
+        if "watch" not in joint.accept_missing:
+            raise DriverError(
+                "no_watch",
+                f"{drive.name}: {NO_WATCH}. If this computer dies, it goes on with the last command that it got. Cut "
+                'its power by a safety relay, and say that you know: accept_missing = ["watch"] of this joint',
+                node_id=drive.node_id,
+                joint=joint.name,
+            )
+        losses.insert(0, f"{NO_WATCH}, as accept_missing acknowledges")
+    return Setup(has, _modes(drive, options, has), watches, tuple(losses))
+
+
+def _watches(options: CanOptions, has: Capabilities) -> tuple[Watch, ...]:
+    """The drive's own watches of this computer, of which heartbeat and guarding exclude each other (CiA 301)."""
+    watches: list[Watch] = []
+    if has.has(HEARTBEAT_CONSUMER):
+        watches.append("heartbeat")
+    elif has.has(GUARD_TIME) and has.has(LIFE_FACTOR):
+        watches.append("guarding")
+    if has.has(DEADLINE) and options.rpdo_deadline_ms:
+        watches.append("deadline")
+    return tuple(watches)
+
+
+def _modes(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> tuple[CommandMode, ...]:
+    there = tuple(mode for mode in MODES if usable(mode, has))
+    if options.mode == "auto":
+        asked = there
+    else:
+        asked = tuple(mode for mode in there if mode == options.mode)
+    if asked:
+        return asked
+    told = "none" if has.modes is None else f"0x{has.modes:08X}"
+    number = "" if options.mode == "auto" else f" {MODES[options.mode]} ({options.mode})"
+    able = ", ".join(there) or "none of csv, pv, csp and ip: this drive cannot be used"
+    raise DriverError(
+        "mode",
+        f"{drive.name}: the drive has no mode{number}, 0x6502 is {told}; set mode to {able}",
+        node_id=drive.node_id,
+        modes=has.modes,
+    )
+
+
+def usable(mode: CommandMode, has: Capabilities) -> bool:
+    """Whether a drive has a mode, by 0x6502 where it tells, and the object of its set-point."""
+    stated = has.modes is None or bool(has.modes >> (MODES[mode] - 1) & 1)
+    return stated and has.has(TARGETS[mode])
+
+
+def common_feedback(options: CanOptions, drives: list[Capabilities]) -> tuple[str, ...]:
+    """Of the feedback asked for, what every drive has."""
+    return tuple(
+        what for what in options.feedback if all(has.has((FEEDBACK_INDEX[what], 0)) for has in drives)
+    )
+
+
+def interpolation_time(rate_hz: float) -> tuple[int, int]:
+    """Period of a cycle as 0x60C2 takes it: (value of 8 bits, exponent of ten [s]), the closest there is."""
+    period_s = 1.0 / rate_hz
+    candidates = [
+        (round(period_s * 10.0**-exponent), exponent)
+        for exponent in range(-3, -7, -1)
+        if 1 <= round(period_s * 10.0**-exponent) <= 255
+    ]
+    return min(candidates, key=lambda pair: abs(pair[0] * 10.0 ** pair[1] - period_s))
+
+
+def lead_words(joint: CanJoint) -> str:
+    """How far a drive led by positions goes by itself, as text."""
+    unit = "rad" if joint.kind == "revolute" else "m"
+    farthest = joint.lead + joint.largest_load_offset
+    return f"led by positions: without orders it goes at most {farthest:.3g} {unit} further"
+
+
+# -- writes ----------------------------------------------------------------------------------------------------
 
 SHIPPED_EDS = Path(__file__).with_name("drive402.eds")
 
@@ -24,10 +196,9 @@ _COB_ID_MASK = 0xBFFFFFFF
 _WHOLE = 0xFFFFFFFF
 ON_EVERY_SYNC = 1
 AT_ONCE = 255
-MODES = {"csv": 9, "pv": 3}
 FAULT_REACTION_QUICK_STOP = 2
 
-HEARTBEAT_CONSUMER = (0x1016, 1)
+CONTROL_WORD = 0x60400010
 RPDO_COMMUNICATION, RPDO_MAPPING = 0x1400, 0x1600
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 PDO_RANGE = 0x200
@@ -80,35 +251,67 @@ def identifier_writes(node_id: int) -> list[Write]:
     ]
 
 
-def parameter_writes(
-    options: CanOptions, joint: CanJoint, dictionary: canopen.ObjectDictionary
-) -> list[Write]:
-    """Writes of everything but PDOs and the monitoring of this master's heartbeat (0x1016), which is activated
-    last.
+def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list[Write]:
+    """Writes of everything but mode, PDOs and the drive's watch of this computer, which is activated last.
 
-    What the joint's ``sdo`` names takes the place of the driver's own value. 0x605E, 0x607F, 0x6080, 0x6083 and 0x6084
-    only where the EDS has them.
+    Only objects that the drive has. What the joint's ``sdo`` names takes the place of the driver's own value.
     """
     scale = JointScale.of(joint)
     limit = scale.rate_units(joint.max_velocity)
     acceleration = scale.rate_units(joint.max_acceleration)
-    always = [
-        Write(0x1017, 0, options.heartbeat_ms, option="heartbeat_ms"),
-        Write(0x6007, 0, options.abort_option, option="abort_option"),
-        Write(0x605A, 0, options.quick_stop_option, option="quick_stop_option"),
-        Write(0x6060, 0, MODES[options.mode], option="mode"),
-        Write(0x6085, 0, scale.rate_units(joint.quick_stop_deceleration), option="quick_stop_deceleration"),
-    ]
-    where_there = [
-        Write(0x605E, 0, FAULT_REACTION_QUICK_STOP),
-        Write(0x607F, 0, limit, option="max_velocity"),
-        Write(0x6080, 0, limit, option="max_velocity"),
-        Write(0x6083, 0, acceleration, option="max_acceleration"),
-        Write(0x6084, 0, acceleration, option="max_acceleration"),
+    guarded = "guarding" in setup.watches
+    writes = [
+        Write(0x1017, 0, 0 if guarded else options.heartbeat_ms, option="heartbeat_ms"),
+        Write(*ABORT_OPTION, options.abort_option, option="abort_option"),
+        Write(*QUICK_STOP_OPTION, options.quick_stop_option, option="quick_stop_option"),
+        Write(
+            *QUICK_STOP_RAMP,
+            scale.rate_units(joint.quick_stop_deceleration),
+            option="quick_stop_deceleration",
+        ),
+        Write(*FAULT_REACTION, FAULT_REACTION_QUICK_STOP),
+        *(Write(*key, limit, option="max_velocity") for key in SPEEDS),
+        *(Write(*key, acceleration, option="max_acceleration") for key in RAMPS),
     ]
     own = [Write(*parse_object(name, joint.name), value, option="sdo") for name, value in joint.sdo.items()]
-    there = [write for write in where_there if dictionary.get_variable(*write.key) is not None]
-    return list({write.key: write for write in (*always, *there, *own)}.values())
+    there = [write for write in writes if write.key == (0x1017, 0) or setup.capabilities.has(write.key)]
+    return list({write.key: write for write in (*there, *own)}.values())
+
+
+def period_writes(options: CanOptions, joint: CanJoint, setup: Setup, mode: CommandMode) -> list[Write]:
+    """Writes of the period of set-points in the modes that interpolate, where the drive can be told."""
+    told = {parse_object(name, joint.name) for name in joint.sdo}
+    if mode == "pv" or not setup.capabilities.has(INTERPOLATION_TIME) or INTERPOLATION_TIME in told:
+        return []
+    value, exponent = interpolation_time(options.rate_hz)
+    held = setup.capabilities.values.get(INTERPOLATION_EXPONENT, exponent)
+    if held == exponent:
+        return [Write(*INTERPOLATION_TIME, value, option="rate_hz")]
+    return [
+        Write(*INTERPOLATION_EXPONENT, exponent, option="rate_hz"),
+        Write(*INTERPOLATION_TIME, value, option="rate_hz"),
+    ]
+
+
+def watch_writes(options: CanOptions, setup: Setup) -> list[Write]:
+    """Writes that activate the drive's watch of this computer."""
+    if "heartbeat" in setup.watches:
+        value = options.master_id << 16 | options.heartbeat_timeout_ms
+        return [Write(*HEARTBEAT_CONSUMER, value, option="heartbeat_timeout_ms")]
+    if "guarding" in setup.watches:
+        factor = max(2, round(options.heartbeat_timeout_ms / options.heartbeat_ms))
+        return [
+            Write(*GUARD_TIME, options.heartbeat_ms, option="heartbeat_ms"),
+            Write(*LIFE_FACTOR, min(factor, 255), option="heartbeat_timeout_ms"),
+        ]
+    return []
+
+
+def unwatch_writes(setup: Setup) -> list[Write]:
+    """Writes that end the drive's watch of this computer."""
+    if "heartbeat" in setup.watches:
+        return [Write(*HEARTBEAT_CONSUMER, 0)]
+    return [Write(*LIFE_FACTOR, 0), Write(*GUARD_TIME, 0)] if "guarding" in setup.watches else []
 
 
 def _pdo_writes(
@@ -125,24 +328,28 @@ def _pdo_writes(
     writes += [Write(mapped, place + 1, entry, option="feedback") for place, entry in enumerate(mapping)]
     writes += [Write(mapped, 0, len(mapping)), Write(communication, 2, transmission)]
     if deadline_ms:
-        option = "rpdo_deadline_ms (0 where the drive has no such deadline)"
-        writes.append(Write(communication, 5, deadline_ms, option=option))
+        writes.append(Write(communication, DEADLINE[1], deadline_ms, option="rpdo_deadline_ms"))
     return [*writes, Write(communication, 1, cob_id, _COB_ID_MASK)]
 
 
-def pdo_writes(options: CanOptions, node_id: int) -> list[Write]:
+def pdo_writes(
+    options: CanOptions, node_id: int, setup: Setup, mode: CommandMode, feedback: tuple[str, ...]
+) -> list[Write]:
     """Writes of the mapping of RPDO1 and the TPDOs in use, in order."""
     rpdo = (RPDO_COMMUNICATION, RPDO_MAPPING)
     tpdo = (TPDO_COMMUNICATION, TPDO_MAPPING)
-    writes = _pdo_writes(0, rpdo, RPDO_IDS[0] + node_id, COMMAND, AT_ONCE, options.rpdo_deadline_ms)
-    for number, mapping in enumerate(tpdo_mappings(options.feedback)):
+    index, subindex = TARGETS[mode]
+    command = (CONTROL_WORD, index << 16 | subindex << 8 | 32)
+    deadline_ms = options.rpdo_deadline_ms if "deadline" in setup.watches else 0
+    writes = _pdo_writes(0, rpdo, RPDO_IDS[0] + node_id, command, AT_ONCE, deadline_ms)
+    for number, mapping in enumerate(tpdo_mappings(feedback)):
         writes += _pdo_writes(number, tpdo, TPDO_IDS[number] + node_id, mapping, ON_EVERY_SYNC, 0)
     return writes
 
 
-def unused_pdos(options: CanOptions, dictionary: canopen.ObjectDictionary) -> list[int]:
-    """Writes that disable all other PDOs of the EDS: a drive may have them on by default."""
-    used = len(tpdo_mappings(options.feedback))
+def unused_pdos(feedback: tuple[str, ...], dictionary: canopen.ObjectDictionary) -> list[int]:
+    """Communication objects of all other PDOs of the EDS: a drive may have them on by default."""
+    used = len(tpdo_mappings(feedback))
     rpdos = range(RPDO_COMMUNICATION + 1, RPDO_COMMUNICATION + PDO_RANGE)
     tpdos = range(TPDO_COMMUNICATION + used, TPDO_COMMUNICATION + PDO_RANGE)
     return [index for index in dictionary if index in rpdos or index in tpdos]

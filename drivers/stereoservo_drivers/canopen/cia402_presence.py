@@ -12,7 +12,7 @@ from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
-from stereoservo_drivers.canopen.cia402_configuration import MODES, SHIPPED_EDS
+from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.options import CanOptions
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ PATIENCE_S = 0.5
 ALONE_S = 0.05
 """Whoever runs these drives sends them commands within this time."""
 BOOT_UP = b"\0"
+ABORT = b"\x80"
 CIA_402 = 402
 ALL_NODES = range(1, 128)
 IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
@@ -33,12 +34,12 @@ IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity object 0x1018 of a drive."""
+    """Identity object 0x1018 of a drive; None for what it lacks: only the vendor is mandatory (CiA 301)."""
 
-    vendor_id: int
-    product_code: int
-    revision: int
-    serial_number: int
+    vendor_id: int | None
+    product_code: int | None
+    revision: int | None
+    serial_number: int | None
 
 
 def alone(link: Link, drives: list[RemoteDrive]) -> None:
@@ -114,7 +115,8 @@ def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
         count = len(answers[drive.node_id])
         if count > 1:
             serials = ", ".join(
-                f"{int.from_bytes(frame.data[4:8], 'little')}" for frame in answers[drive.node_id]
+                "unknown" if frame.data[:1] == ABORT else f"{int.from_bytes(frame.data[4:8], 'little')}"
+                for frame in answers[drive.node_id]
             )
             raise DriverError(
                 "duplicate_node",
@@ -149,10 +151,8 @@ def _missing(
     )
 
 
-def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
-    """Check the drive's type and identity. Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``,
-    ``mode``).
-    """
+def identify(drive: RemoteDrive, eds: Path) -> Identity:
+    """Check the drive's type and identity. Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``)."""
     device_type = drive.read(0x1000)
     if device_type & 0xFFFF != CIA_402:
         raise DriverError(
@@ -162,32 +162,25 @@ def identify(drive: RemoteDrive, options: CanOptions, eds: Path) -> Identity:
             node_id=drive.node_id,
             device_type=device_type,
         )
-    identity = Identity(*(drive.read(0x1018, subindex) for subindex in (1, 2, 3, 4)))
+    identity = Identity(*(drive.read_if_there(0x1018, subindex) for subindex in (1, 2, 3, 4)))
     for key in IDENTITY:
         expected, found = getattr(drive.axis.joint, key), getattr(identity, key)
         if expected is not None and expected != found:
             raise DriverError(
                 "identity",
-                f"{drive.name}: {key} is {found} (0x{found:X}), the cell file says {expected} (0x{expected:X}); was "
-                "the drive exchanged, or are node ids swapped?",
+                f"{drive.name}: {key} is {_number(found)}, the cell file says {_number(expected)}; was the drive "
+                "exchanged, or are node ids swapped?",
                 node_id=drive.node_id,
                 key=key,
                 found=found,
                 wanted=expected,
             )
     _check_eds(drive, identity, eds)
-    mode = MODES[options.mode]
-    modes = drive.read(0x6502)
-    if not modes >> (mode - 1) & 1:
-        able = ", ".join(name for name, number in MODES.items() if modes >> (number - 1) & 1)
-        raise DriverError(
-            "mode",
-            f"{drive.name}: the drive has no mode {mode} ({options.mode}), 0x6502 is 0x{modes:08X}; set "
-            f"mode to {able or 'none of csv and pv: this drive cannot be used'}",
-            node_id=drive.node_id,
-            modes=modes,
-        )
     return identity
+
+
+def _number(value: int | None) -> str:
+    return "not told by the drive" if value is None else f"{value} (0x{value:X})"
 
 
 def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
@@ -199,7 +192,7 @@ def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
         ("vendor", of.vendor_number, identity.vendor_id),
         ("product", of.product_number, identity.product_code),
     ):
-        if in_eds and in_eds != found:
+        if in_eds and found is not None and in_eds != found:
             raise DriverError(
                 "wrong_eds",
                 f"{drive.name}: {eds.name} is for {key} 0x{in_eds:X} ({of.vendor_name} {of.product_name}), "

@@ -38,6 +38,17 @@ LOOK_S = 0.0002
 
 ABSENT = (ABORT_NO_OBJECT, ABORT_NO_SUBINDEX)
 
+SIZES: dict[tuple[int, int], tuple[int, bool]] = {
+    (0x100C, 0): (2, False), (0x100D, 0): (1, False), (0x1016, 1): (4, False), (0x1017, 0): (2, False),
+    (0x1400, 5): (2, False), (0x6007, 0): (2, True), (0x603F, 0): (2, False), (0x605A, 0): (2, True),
+    (0x605E, 0): (2, True), (0x6060, 0): (1, True), (0x6061, 0): (1, True), (0x6064, 0): (4, True),
+    (0x606C, 0): (4, True), (0x6077, 0): (2, True), (0x607A, 0): (4, True), (0x607F, 0): (4, False),
+    (0x6080, 0): (4, False), (0x6083, 0): (4, False), (0x6084, 0): (4, False), (0x6085, 0): (4, False),
+    (0x60C1, 1): (4, True), (0x60C2, 1): (1, False), (0x60C2, 2): (1, True), (0x60F4, 0): (4, True),
+    (0x60FD, 0): (4, False), (0x60FF, 0): (4, True), (0x6502, 0): (4, False),
+}  # fmt: skip
+"""Bytes and sign of standard objects (CiA 301, CiA 402-2), for drives whose EDS leaves out what they have."""
+
 
 class LinkNetwork(canopen.Network):
     """The ``canopen`` package's network, which sends by a link. It does not receive."""
@@ -125,16 +136,18 @@ class RemoteDrive:
             data = ReadableStream(self._client, index, subindex).read()
         except (SdoAbortedError, SdoCommunicationError) as error:
             raise self._failed("reading", index, subindex, None, error) from error
+        size, signed = self._layout(index, subindex) or (len(data), False)
+        return int.from_bytes(data[:size], "little", signed=signed)
+
+    def _layout(self, index: int, subindex: int) -> tuple[int, bool] | None:
+        """Bytes of an object and whether it is signed, by the EDS or the standard; None where neither knows it."""
         variable = self.variable(index, subindex)
-        signed = variable is not None and variable.data_type in SIGNED_TYPES
         if variable is not None and variable.fixed_size:
-            data = data[: len(variable) // 8]
-        return int.from_bytes(data, "little", signed=signed)
+            return len(variable) // 8, variable.data_type in SIGNED_TYPES
+        return SIZES.get((index, subindex))
 
     def read_if_there(self, index: int, subindex: int = 0) -> int | None:
-        """Value as by ``read``; None where EDS or drive lack the object."""
-        if self.variable(index, subindex) is None:
-            return None
+        """Value as by ``read``; None where the drive lacks the object, whatever its EDS says."""
         try:
             return self.read(index, subindex)
         except DriverError as error:
@@ -143,24 +156,25 @@ class RemoteDrive:
             raise
 
     def write(self, index: int, subindex: int, value: int, option: str = "") -> None:
-        """Write an object of the EDS. ``option``: the cell file's, for errors.
+        """Write an object of the EDS or the standard. ``option``: the cell file's, for errors.
 
         Raises:
-            DriverError: ``wrong_eds`` (not in the EDS), ``option`` (outside the EDS's range), ``sdo_abort``,
+            DriverError: ``wrong_eds`` (unknown to both), ``option`` (outside the EDS's range), ``sdo_abort``,
                 ``sdo_timeout``.
         """
-        variable = self.variable(index, subindex)
-        if variable is None:
+        variable, layout = self.variable(index, subindex), self._layout(index, subindex)
+        if layout is None:
             raise DriverError(
                 "wrong_eds",
                 f"{self.name}: the EDS has no object 0x{index:04X}:{subindex}{_from(option)}; give the drive's own EDS",
                 **self._data(index, subindex, value),
             )
-        size, signed = len(variable) // 8, variable.data_type in SIGNED_TYPES
+        size, signed = layout
         low = -(1 << 8 * size - 1) if signed else 0
         high = (1 << 8 * size - signed) - 1
-        low = max(low, variable.min) if variable.min is not None else low
-        high = min(high, variable.max) if variable.max is not None else high
+        if variable is not None:
+            low = max(low, variable.min) if variable.min is not None else low
+            high = min(high, variable.max) if variable.max is not None else high
         if not low <= value <= high:
             raise DriverError(
                 "option",

@@ -54,6 +54,8 @@ POWER_OFF = frozenset(
 
 WARNING_BIT = 0x0080
 INTERNAL_LIMIT_BIT = 0x0800
+FOLLOWS_BIT = 0x1000
+"""Of the cyclic and interpolated modes: the drive follows its set-points."""
 
 
 def drive_state(status_word: int) -> DriveState:

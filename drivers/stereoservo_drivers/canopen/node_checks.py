@@ -8,11 +8,18 @@ from pathlib import Path
 from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo_drivers.canopen.bringup import Link
 from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
-from stereoservo_drivers.canopen.cia402_configuration import MODES, eds_path, load_eds
+from stereoservo_drivers.canopen.cia402_configuration import (
+    MODES,
+    capabilities,
+    compose,
+    eds_path,
+    lead_words,
+    load_eds,
+)
 from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions
 
 MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "homing", 7: "interpolated position",
               8: "cyclic position", 9: "cyclic velocity", 10: "cyclic torque"}  # fmt: skip
@@ -129,19 +136,20 @@ def _past_errors(drive: RemoteDrive) -> list[int]:
 
 
 def _modes(drive: RemoteDrive, options: CanOptions) -> ExaminationFinding:
+    """Modes, watches and what is lost, as the drive would be configured; raises DriverError as that does."""
     name = f"{drive.axis.name} modes"
     supported = drive.read_if_there(0x6502)
-    expected = MODES[options.mode]
     if supported is None:
-        return ExaminationFinding(
-            name, None, f"0x6502 is not there: whether it has mode {expected} shows when it is configured"
-        )
-    modes = [mode for mode in range(1, 33) if supported >> (mode - 1) & 1]
-    message = ", ".join(f"{mode} {MODE_NAMES.get(mode, '')}".strip() for mode in modes)
-    if expected in modes:
-        return ExaminationFinding(name, True, message)
-    other = [mode for mode, number in MODES.items() if number in modes]
-    remedy = f'mode = "{other[0]}"' if other else "this drive has no velocity mode that this driver knows"
-    return ExaminationFinding(
-        name, False, f"mode {expected} ({options.mode}) is not among {message or 'none'}", remedy
-    )
+        message = "0x6502 is not there"
+    else:
+        modes = [mode for mode in range(1, 33) if supported >> (mode - 1) & 1]
+        message = ", ".join(f"{mode} {MODE_NAMES.get(mode, '')}".strip() for mode in modes) or "none"
+    try:
+        setup = compose(drive, options, capabilities(drive))
+    except DriverError as error:
+        return ExaminationFinding(name, False, f"{message}; {error}")
+    chosen = setup.modes[0]
+    message += f"; used: {MODES[chosen]} ({chosen}); {setup.safety()}"
+    if chosen in POSITION_MODES:
+        message += f"; {lead_words(drive.axis.joint)}"
+    return ExaminationFinding(name, None if setup.losses else True, message)

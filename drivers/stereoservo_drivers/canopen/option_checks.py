@@ -58,12 +58,17 @@ def check_options(options: CanOptions) -> None:
     if 0 < options.rpdo_deadline_ms < 2000.0 / options.rate_hz:
         valid = f"0 (no such timer) or at least {math.ceil(2000.0 / options.rate_hz)}, two cycles at rate_hz"
         raise _refusal("rpdo_deadline_ms", options.rpdo_deadline_ms, valid)
-    why = refusal(bus_load(options), options.max_bus_load)
+    check_load(options)
+
+
+def check_load(options: CanOptions, guarded: int = 0) -> None:
+    """Check the bus's load, with so many drives ``guarded`` by remote frames. Raises DriverError (``option``)."""
+    load = bus_load(options, guarded)
+    why = refusal(load, options.max_bus_load)
     if why is not None:
         raise DriverError(
-            "option", f"driver 'canopen': {why}", option="rate_hz", value=options.rate_hz,
-            load=bus_load(options).share,
-        )  # fmt: skip
+            "option", f"driver 'canopen': {why}", option="rate_hz", value=options.rate_hz, load=load.share
+        )
 
 
 def _check_bus(options: CanOptions) -> None:
@@ -78,8 +83,8 @@ def _check_bus(options: CanOptions) -> None:
             raise _refusal("emcy_ignore", f"{code:#x}", "codes of 16 bits, 0x1 to 0xffff, e.g. 0x4210")
 
 
-def bus_load(options: CanOptions) -> BusLoad:
-    """Worst-case load of the cycle and of the heartbeats beside it."""
+def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:
+    """Worst-case load of the cycle and of the heartbeats beside it, with so many drives ``guarded``."""
     n = len(options.joint)
     if options.protocol == "odrive":
         asked_in_turn = (2 if "effort" in options.feedback else 1) * min(SHARE, n)
@@ -90,8 +95,9 @@ def bus_load(options: CanOptions) -> BusLoad:
         struct.calcsize("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
         for pdo in tpdo_feedback(options.feedback)
     ]
-    heartbeats = (1, (n + 1) * 1000.0 / options.heartbeat_ms)
-    return cycle_load([0, *[6, 6, *further] * n], options.rate_hz, options.bitrate, [heartbeats])
+    per_second = 1000.0 / options.heartbeat_ms
+    beside = [(1, (n + 1) * per_second), (0, guarded * per_second)]
+    return cycle_load([0, *[6, 6, *further] * n], options.rate_hz, options.bitrate, beside)
 
 
 def _check_unique(options: CanOptions, option: str, of: Callable[[CanJoint], Any]) -> None:

@@ -12,7 +12,14 @@ from stereoservo.ports.devices import JointSpec
 
 Positive = Annotated[float, Meta(gt=0)]
 NodeId = Annotated[int, Meta(ge=1, le=126)]
-Feedback = Literal["velocity", "effort", "following_error"]
+Feedback = Literal["velocity", "effort", "following_error", "switches"]
+CommandMode = Literal["csv", "pv", "csp", "ip"]
+Missing = Literal["watch"]
+POSITION_MODES = ("csp", "ip")
+LEAD_S = 0.1
+"""Time at the largest velocity that an ordered position may be ahead, where the cell file says nothing."""
+LOAD_OFFSET = {"revolute": 0.06, "prismatic": 0.005}
+"""[rad, m] By which a drive may stand off its ordered position under load, where the cell file says nothing."""
 
 
 class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -24,7 +31,9 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     machine's limits. ``rated_torque`` [N m or N at the joint] of 1000 permille; without it, efforts are shares of it.
     ``current_limit`` [A]: protocol ``odrive`` only; where given, it and ``max_velocity`` become the drive's limits.
     ``vendor_id``, ``product_code``, ``revision``, ``serial_number``: checked against the drive's identity where given.
-    ``sdo``: further writes ``"index:subindex" = value``, verified by reading back.
+    ``sdo``: further writes ``"index:subindex" = value``, verified by reading back. ``accept_missing``: names what the
+    drive may lack though the arm is less safe without it. Of position modes: ``position_lead`` [rad or m], how far an
+    order may be ahead of the joint; ``load_offset_max``, how far the drive may stand off its order under load.
     """
 
     name: str
@@ -48,6 +57,19 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     revision: int | None = None
     serial_number: int | None = None
     sdo: dict[str, int] = {}
+    accept_missing: tuple[Missing, ...] = ()
+    position_lead: Positive | None = None
+    load_offset_max: Annotated[float, Meta(ge=0)] | None = None
+
+    @property
+    def lead(self) -> float:
+        """How far an ordered position may be ahead of the joint [rad or m]."""
+        return self.position_lead or LEAD_S * self.max_velocity
+
+    @property
+    def largest_load_offset(self) -> float:
+        """How far the drive may stand off its ordered position under load [rad or m]."""
+        return LOAD_OFFSET[self.kind] if self.load_offset_max is None else self.load_offset_max
 
     def spec(self) -> JointSpec:
         """The joint in the form of the joint driver port."""
@@ -68,7 +90,9 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     ``interface``, ``channel``, ``bitrate``, ``interface_options``: as python-can takes them; ``stereoservo_slcan`` is
     the fast serial-line CAN of this package. ``feedback``: what the drives send beside status word and position.
-    ``rpdo_deadline_ms``: 0 where the drives have none. ``emcy_ignore``: emergency codes that do not trip.
+    ``mode``: cyclic or profile velocity, cyclic or interpolated position; ``auto`` takes for each drive the first of
+    them that it has. ``rpdo_deadline_ms``: where the drives have such a timer; 0 leaves it off. ``emcy_ignore``:
+    emergency codes that do not trip.
     ``command_timeout_s``: without a command for so long the joints are brought to rest (they stay enabled);
     ``loop_timeout_ms``: without any call for so long, while enabled, the driver latches a fault.
     """
@@ -85,7 +109,7 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     heartbeat_timeout_ms: Annotated[int, Meta(ge=10, le=5000)] = 100
     rpdo_deadline_ms: Annotated[int, Meta(ge=0, le=5000)] = 20
     max_missed_cycles: Annotated[int, Meta(ge=1, le=50)] = 3
-    mode: Literal["csv", "pv"] = "csv"
+    mode: Literal["auto", "csv", "pv", "csp", "ip"] = "auto"
     quick_stop_option: Literal[1, 2, 3, 4, 5, 6, 7, 8] = 2
     abort_option: Literal[1, 2, 3] = 3
     emcy_ignore: tuple[int, ...] = ()

@@ -19,6 +19,11 @@ def clamp_int32(value: float) -> int:
     return round(min(max(value, INT32_MIN), INT32_MAX))  # NaN goes on to here, and round refuses it
 
 
+def wrap_int32(counts: int) -> int:
+    """``counts`` as a signed 32-bit counter shows them."""
+    return (counts - INT32_MIN & UINT32_MAX) + INT32_MIN
+
+
 @dataclass(frozen=True)
 class JointScale:
     """Scales of one joint: ``counts = counts_per_unit * (q + offset)``; ``velocity units = velocity_units_per_unit

@@ -372,6 +372,16 @@ def test_silent_heartbeats_count_in_polls(enabled: Cia402Codec) -> None:
     assert codes(enabled) == []
 
 
+def limited(codec: Cia402Codec, node: int, position: int, velocities: list[float]) -> list[tuple[str, int]]:
+    """Faults within 120 ms in which the drive of ``node`` reports a limit at ``position`` [counts]."""
+    found = []
+    for _ in range(30):
+        codec.receive(tpdo1(node, ENABLED | 0x0800, position))
+        codec.command(np.array(velocities))
+        found += codes(codec)
+    return found
+
+
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("outward", [0.2, -0.2])
 def test_a_limit_stops_all_and_lets_the_joint_go_inward_only(direction: int, outward: float) -> None:
@@ -381,8 +391,7 @@ def test_a_limit_stops_all_and_lets_the_joint_go_inward_only(direction: int, out
         codec.receive(tpdo1(node, ENABLED))
     codec.command(np.array([0.0, outward]))
     assert codes(codec) == []
-    codec.receive(tpdo1(2, ENABLED | 0x0800))
-    assert codes(codec)[0] == ("limit_switch", 1)
+    assert limited(codec, 2, 0, [0.0, outward])[0] == ("limit_switch", 1)
     codec.quick_stop()
     assert codes(codec) == []
     codec.command(np.array([0.3, -outward]))
@@ -393,10 +402,28 @@ def test_a_limit_stops_all_and_lets_the_joint_go_inward_only(direction: int, out
     assert codes(codec) == []
 
 
+@pytest.mark.parametrize(("switches", "hint"), [(0b10, "limit switch active"), (0, "no limit switch active")])
+def test_limit_switches_that_are_sent_tell_a_switch_at_once_from_a_limit_of_the_drive(
+    switches: int, hint: str
+) -> None:
+    codec = codec_of(feedback=("velocity", "switches"))
+    codec.watch()
+    for node in (1, 2):
+        codec.receive(tpdo1(node, ENABLED))
+        codec.receive(CanFrame(0x280 + node, struct.pack("<iI", 0, 0)))
+    frame = CanFrame(0x282, struct.pack("<iI", 0, switches))
+    found: list[str] = []
+    for cycle in range(30):
+        codec.receive(tpdo1(2, ENABLED | 0x0800))
+        codec.receive(frame)
+        codec.command(np.array([0.0, 0.2]))
+        found += [fault.message for fault in codec.faults() if fault.code == "limit_switch"]
+        assert bool(found) == (switches != 0) or cycle > 20
+    assert hint in found[0]
+
+
 def test_the_side_of_a_limit_is_forgotten_with_it(enabled: Cia402Codec) -> None:
-    enabled.command(np.array([0.2, 0.0]))
-    enabled.receive(tpdo1(1, ENABLED | 0x0800))
-    assert codes(enabled)[0] == ("limit_switch", 0)
+    assert limited(enabled, 1, 0, [0.2, 0.0])[0] == ("limit_switch", 0)
     enabled.idle()
     enabled.receive(tpdo1(1, DISABLED))
     enabled.receive(tpdo1(1, DISABLED | 0x0800))  # by hand, onto whatever side

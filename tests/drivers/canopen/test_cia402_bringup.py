@@ -145,11 +145,13 @@ Make = Callable[..., Bench]
 
 @pytest.fixture
 def make_bench(tmp_path: Path) -> Make:
-    """``make_bench(options, on_bus=options of what is really there)``."""
+    """``make_bench(options, on_bus=options of what is really there, eds=of the emulated drives)``."""
 
-    def make(options: CanOptions | None = None, on_bus: CanOptions | None = None) -> Bench:
+    def make(
+        options: CanOptions | None = None, on_bus: CanOptions | None = None, eds: Path = SHIPPED_EDS
+    ) -> Bench:
         options = options or make_options()
-        settings = DrivesSettings(plant="ideal", bit_time=True, brake_ms=5.0, eds=str(SHIPPED_EDS))
+        settings = DrivesSettings(plant="ideal", bit_time=True, brake_ms=5.0, eds=str(eds))
         emulator = make_bus_emulator(on_bus or options, settings, t_ns=0)
         emulator.run_until(10_000_000)
         return Bench(options, emulator, tmp_path)
@@ -330,12 +332,61 @@ def test_an_eds_of_another_drive_is_refused(make_bench: Make, tmp_path: Path) ->
     assert "0x53455256" in message
 
 
-def test_an_eds_without_what_is_needed_is_refused(make_bench: Make, tmp_path: Path) -> None:
+def test_what_an_eds_leaves_out_and_the_drive_has_is_configured(make_bench: Make, tmp_path: Path) -> None:
     text = SHIPPED_EDS.read_text().replace("[6085]", "[2085]").replace("=0x6085", "=0x2085")
     (tmp_path / "poor.eds").write_text(text)
-    message = make_bench(make_options(eds="poor.eds")).refused("wrong_eds")
-    assert "0x6085:0" in message
-    assert "quick_stop_deceleration" in message
+    bench = make_bench(make_options(eds="poor.eds"))
+    bench.connect()
+    scale = bench.codec.axes[0].scale
+    assert bench.object(1, 0x6085) == scale.rate_units(bench.options.joint[0].quick_stop_deceleration)
+
+
+GUARDED = """
+[100C]
+ParameterName=Guard time
+ObjectType=0x7
+DataType=0x0006
+AccessType=rw
+DefaultValue=0
+[100D]
+ParameterName=Life time factor
+ObjectType=0x7
+DataType=0x0005
+AccessType=rw
+DefaultValue=0
+"""
+
+
+def test_drives_without_consumer_heartbeat_are_guarded_and_stop_when_the_guarding_ends(
+    make_bench: Make, tmp_path: Path
+) -> None:
+    path = tmp_path / "guarded.eds"
+    path.write_text(SHIPPED_EDS.read_text().replace("1016", "2016") + GUARDED)
+    bench = make_bench(make_options(rpdo_deadline_ms=0), eds=path)
+    bench.connect()
+    assert [bench.bringup.setups[node].watches for node in (1, 2, 3)] == [("guarding",)] * 3
+    bench.run()
+    bench.cycle(1.0, 0.3, 0.3, 0.3)
+    assert bench.master.fault is None
+    bench.host.cycling = False
+    lost_ns = bench.emulator.t_ns
+    bench.host.run_until(lost_ns + 600_000_000)
+    rests = [event.t_ns for event in bench.emulator.events if event.kind == "rest" and event.t_ns > lost_ns]
+    assert len(rests) == 3
+    assert max(rests) - lost_ns <= 100_000_000 + 20_000_000 + 0.3 / 10.0 * 1e9 + 1_000_000
+    bench.host.cycling = True
+    bench.reset()
+    bench.run()
+    bench.host.end_cycle()
+    bench.bringup.release(bench.host)
+    bench.host.run_until(bench.host.t_ns + 500_000_000)
+    assert bench.node(1).faults == []
+
+
+def test_an_object_that_neither_eds_nor_standard_know_is_refused(make_bench: Make) -> None:
+    message = make_bench(make_options(make_joint(1, sdo={"0x2345:1": 5}))).refused("wrong_eds")
+    assert "0x2345:1" in message
+    assert "option sdo" in message
 
 
 @pytest.mark.filterwarnings("ignore:The 'warn' method:DeprecationWarning")  # canopen's
@@ -354,7 +405,8 @@ def test_an_eds_that_is_not_there_is_refused_before_anything_is_connected(make_b
     make_bench(make_options(eds="drive402.eds")).connect()
 
 
-def test_a_drive_without_the_mode_is_refused(bench: Bench) -> None:
+def test_a_drive_without_the_mode_is_refused(make_bench: Make) -> None:
+    bench = make_bench(make_options(mode="csv"))
     bench.node(1).dictionary.set(0x6502, 0, 1 << 2)
     message = bench.refused("mode")
     assert "mode 9 (csv)" in message

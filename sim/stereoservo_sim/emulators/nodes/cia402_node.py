@@ -15,7 +15,12 @@ from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSet
 from stereoservo_sim.emulators.nodes.pdo import DEADLINE, ProcessData
 from stereoservo_sim.emulators.nodes.sdo_server import SdoServer
 from stereoservo_sim.emulators.nodes.state_machine import Cia402State, PowerMachine
-from stereoservo_sim.emulators.nodes.supervision import HeartbeatConsumer, HeartbeatProducer, SyncWatch
+from stereoservo_sim.emulators.nodes.supervision import (
+    HeartbeatConsumer,
+    HeartbeatProducer,
+    LifeGuard,
+    SyncWatch,
+)
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 
 COMMUNICATION, HEARTBEAT_LOST, SYNC_LOST, PASSIVE = 0x8100, 0x8130, 0x8700, 0x8120
@@ -69,6 +74,7 @@ class Cia402Node:
         self._sdo = SdoServer(self.dictionary)
         self._pdo = ProcessData(self.dictionary, self._pdo_error)
         self._consumer = HeartbeatConsumer(self.dictionary)
+        self._guard = LifeGuard(self.dictionary)
         self._producer = HeartbeatProducer(self.dictionary)
         self._sync = SyncWatch(self.dictionary, settings.sync_timeout_factor)
         self._objects = DriveObjects(self.dictionary, self.machine, self.motion, identity, settings)
@@ -95,6 +101,7 @@ class Cia402Node:
         self._pdo.enter_operational(False)
         self._pdo.reload()
         self._consumer.reset()
+        self._guard.reset()
         self._sync.reset()
 
     def _boot(self) -> None:
@@ -137,6 +144,7 @@ class Cia402Node:
             self._go(Nmt.RESETTING)
             self._sdo.reset()
             self._consumer.reset()
+            self._guard.reset()
         else:
             self.power_up(self._t_ns)
 
@@ -274,6 +282,12 @@ class Cia402Node:
         return takes_effect
 
     def _receive_heartbeat(self, frame: CanFrame) -> bool:
+        if frame.remote and frame.id == 0x700 + self.node_id:
+            answer = self._guard.asked(self.nmt, self._t_ns)
+            if answer is not None:
+                self._out.append(CanFrame(id=frame.id, data=answer))
+                self._recovered(HEARTBEAT_LOST)
+            return True
         if frame.remote or len(frame.data) != 1 or frame.data[0] == 0:
             return False  # a boot-up frame is no heartbeat
         if not self._consumer.heard(frame.id - 0x700, self._t_ns):
@@ -298,6 +312,8 @@ class Cia402Node:
             self.power_up(t_ns)
         self._answer(self._sdo.advance(t_ns))
         for _ in self._consumer.lost(t_ns):
+            self._heartbeat_lost()
+        if self._guard.lost(t_ns):
             self._heartbeat_lost()
         if self._sync.lost(t_ns):
             self._fault(SYNC_LOST)
@@ -339,7 +355,7 @@ class Cia402Node:
         emergencies = NEVER_NS if self.nmt is Nmt.STOPPED else self.emergencies.due_ns()
         return min(
             motion, emergencies, self._sdo.due_ns(), self._pdo.due_ns(), self._consumer.due_ns(),
-            self._producer.due_ns(), self._sync.due_ns(),
+            self._guard.due_ns(), self._producer.due_ns(), self._sync.due_ns(),
         )  # fmt: skip
 
     def outgoing(self) -> list[CanFrame]:

@@ -6,6 +6,8 @@ from stereoservo_sim.emulators.nodes.dictionary import Abort, Dictionary, SdoErr
 from stereoservo_sim.emulators.nodes.node import NEVER_NS
 
 CONSUMER, PRODUCER, SYNC_ID, SYNC_PERIOD = 0x1016, 0x1017, 0x1005, 0x1006
+GUARD_TIME, LIFE_FACTOR = 0x100C, 0x100D
+TOGGLE = 0x80
 
 
 class HeartbeatConsumer:
@@ -53,6 +55,45 @@ class HeartbeatConsumer:
     def due_ns(self) -> int:
         """Time at which the next heartbeat is overdue."""
         return min(self._deadlines.values(), default=NEVER_NS)
+
+
+class LifeGuard:
+    """Node guarding (CiA 301, 7.2.8.2.1): answers remote frames, and monitors that they come within 0x100C times 0x100D
+    from the first one on. A node that produces heartbeats does not.
+    """
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._toggle = 0
+        self._deadline_ns = NEVER_NS
+        for index in (GUARD_TIME, LIFE_FACTOR):
+            dictionary.changed(index, lambda sub, value: self.reset())
+
+    def reset(self) -> None:
+        """Wait for a first remote frame again."""
+        self._toggle = 0
+        self._deadline_ns = NEVER_NS
+
+    def asked(self, state: int, t_ns: int) -> bytes | None:
+        """Answer to a remote frame: the NMT state with a toggling bit; None where heartbeats are produced."""
+        if self._dictionary.get(PRODUCER):
+            return None
+        life_ms = self._dictionary.get(GUARD_TIME) * self._dictionary.get(LIFE_FACTOR)
+        self._deadline_ns = t_ns + life_ms * 1_000_000 if life_ms else NEVER_NS
+        answer = bytes([state | self._toggle])
+        self._toggle ^= TOGGLE
+        return answer
+
+    def lost(self, t_ns: int) -> bool:
+        """Whether the next remote frame is overdue; reported once."""
+        if t_ns < self._deadline_ns:
+            return False
+        self._deadline_ns = NEVER_NS
+        return True
+
+    def due_ns(self) -> int:
+        """Time at which the next remote frame is overdue."""
+        return self._deadline_ns
 
 
 class HeartbeatProducer:

@@ -1,0 +1,195 @@
+"""Drives with their makers' own dictionaries, played by the `canopen` package: every one comes up with the options'
+defaults, moves as commanded, and stops by its own watch where the cable is cut.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoservo.ports.devices import DriverError
+from stereoservo_drivers.canopen.cia402 import Cia402Codec
+from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
+from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
+from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+
+from .maker_drive import MakerBus, MakerDrive
+
+COUNTS, GEAR = 4096, 10.0
+COUNTS_PER_RAD = COUNTS * GEAR / (2 * math.pi)
+SPEED, TRAVEL = 0.4, 0.2
+
+MAKERS = {
+    "epos2": (1, 3, 6, 7),
+    "epos4": (1, 3, 6, 8, 9, 10),
+    "erb415": (1, 3, 6, 8),
+    "everest_xcr": (1, 3, 6, 7, 8, 9, 10),
+    "eyou": (1, 3, 4, 7, 8, 9, 10),
+    "schunk_lwa4p": (1, 2, 7),
+    "technosoft": (1, 3, 6, 7),
+}
+"""File -> modes of operation that its drive has, where the file does not tell."""
+
+
+def eds(name: str) -> Path:
+    """A maker's file, which is not part of the project."""
+    root = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[4] / "shared" / "data"))
+    path = root / "eds" / f"{name}.eds"
+    if not path.is_file():
+        pytest.skip(f"no {path}; $STEREOSERVO_DATA names the folder of the makers' EDS files")
+    return path
+
+
+def joint(**changes: object) -> CanJoint:
+    values: dict[str, object] = {
+        "name": "elbow", "node_id": 5, "counts_per_rev": COUNTS, "gear_ratio": GEAR, "max_velocity": 1.0,
+        "max_acceleration": 4.0, "quick_stop_deceleration": 10.0, "position_min": -3.0, "position_max": 3.0,
+    }  # fmt: skip
+    return CanJoint(**(values | changes))  # type: ignore[arg-type]
+
+
+class Bench:
+    """One drive of a maker and a master that meets it for the first time."""
+
+    def __init__(
+        self, path: Path, modes: tuple[int, ...], *, lacking: tuple[int, ...] = (), axis: CanJoint | None = None,
+        **options: object,
+    ) -> None:  # fmt: skip
+        values = {(0x1000, 0): 0x00020192, (0x6502, 0): sum(1 << mode - 1 for mode in modes), (0x6060, 0): 0}
+        self.drive = MakerDrive(5, path, values, lacking)
+        of = self.drive.node.object_dictionary.device_information
+        for sub, number in ((1, of.vendor_number), (2, of.product_number)):
+            if number:
+                self.drive.put(0x1018, sub, number)
+        named = {} if path == SHIPPED_EDS else {"eds": str(path)}
+        self.options = CanOptions(
+            interface="virtual", channel="x", joint=(axis or joint(),), **named, **options  # type: ignore[arg-type]
+        )  # fmt: skip
+        self.codec = Cia402Codec(self.options)
+        self.master = Master(self.codec, MasterSettings.of(self.options))
+        self.bringup = Cia402Bringup(self.options, self.codec, path.parent)
+        self.bus = MakerBus([self.drive], self.master)
+
+    def run(self) -> None:
+        self.bringup.connect(self.bus)
+        self.bus.begin_cycle()
+        self.go(0.05)
+        self.master.request_enable(self.bus.t_ns)
+        self.go(0.2)
+        assert self.master.mode is Mode.RUNNING, self.master.fault
+
+    def go(self, seconds: float, velocity: float = 0.0) -> None:
+        self.bus.velocities = np.array([velocity])
+        self.bus.wait(seconds)
+
+    @property
+    def position(self) -> float:
+        return self.drive.counts / COUNTS_PER_RAD
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_makers_drive_comes_up_with_default_options_and_moves_as_commanded(name):
+    bench = Bench(eds(name), MAKERS[name])
+    bench.run()
+    start = bench.position
+    bench.go(TRAVEL / SPEED, SPEED)
+    bench.go(0.5)
+    assert bench.master.fault is None
+    assert bench.position - start == pytest.approx(TRAVEL, rel=0.01)
+    sample = bench.master.sample()
+    assert sample is not None
+    assert sample.positions[0] == pytest.approx(bench.position, abs=2 / COUNTS_PER_RAD)
+    told = bench.bringup.setups[5]
+    assert (told.losses == ()) == (name in ("epos4", "technosoft"))
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_cut_cable_stops_a_makers_drive_by_its_own_watch(name):
+    bench = Bench(eds(name), MAKERS[name])
+    bench.run()
+    bench.go(0.3, SPEED)
+    bench.bus.cut = True
+    cut, before = bench.bus.t_ns, bench.position
+    while abs(bench.drive.speed) > 1.0 and bench.bus.t_ns - cut < 10**9:
+        bench.bus.wait(0.001)
+    watches = bench.bringup.setups[5].watches
+    assert watches
+    if bench.codec.axes[0].mode in ("csv", "pv"):
+        assert bench.drive.reason in watches
+        assert (bench.bus.t_ns - cut) * 1e-9 < 0.15
+    else:
+        assert (
+            abs(bench.position - before)
+            <= bench.options.joint[0].lead + bench.options.joint[0].largest_load_offset
+        )
+
+
+def test_a_drive_without_any_watch_is_refused_until_the_cell_file_says_that_it_is_known():
+    lacking = (0x1016, 0x100C, 0x100D)
+    deaf = {"lacking": lacking, "rpdo_deadline_ms": 0}
+    with pytest.raises(DriverError, match=r"accept_missing = \[\"watch\"\]") as refusal:
+        Bench(SHIPPED_EDS, (3, 9), **deaf).run()
+    assert refusal.value.code == "no_watch"
+    bench = Bench(SHIPPED_EDS, (3, 9), **deaf, axis=joint(accept_missing=("watch",)))
+    bench.run()
+    assert "acknowledges" in bench.bringup.setups[5].losses[0]
+
+
+@pytest.mark.parametrize(
+    ("missing", "told"), [(0x6007, "0x6007"), (0x605A, "0x605A"), (0x6085, "0x6085"), (0x6077, "")]
+)
+def test_what_cia_402_leaves_optional_may_be_missing_and_is_told(missing, told):
+    bench = Bench(SHIPPED_EDS, (3, 9), lacking=(missing,))
+    bench.run()
+    assert told in bench.bringup.setups[5].safety()
+    assert bench.master.fault is None
+    sample = bench.master.sample()
+    assert sample is not None
+    assert (sample.efforts is None) == (missing == 0x6077)
+
+
+@pytest.mark.parametrize(
+    ("asked", "modes", "used"),
+    [("auto", (3, 9), 9), ("auto", (3, 8), 3), ("auto", (8,), 8), ("pv", (3, 9), 3), ("csp", (8, 9), 8)],
+)
+def test_the_first_mode_that_a_drive_has_is_used(asked, modes, used):
+    bench = Bench(SHIPPED_EDS, modes, mode=asked)
+    bench.run()
+    assert bench.drive.get(0x6060) == used
+
+
+def test_limits_that_act_while_it_accelerates_are_no_fault_but_a_joint_that_stands_is():
+    bench = Bench(SHIPPED_EDS, (9,))
+    bench.run()
+    bench.drive.word = 0x800
+    bench.go(1.0, SPEED)
+    assert bench.master.fault is None
+    bench.drive.blocked = True
+    bench.go(0.5, SPEED)
+    assert bench.master.fault is not None
+    assert bench.master.fault.code == "limit_switch"
+    assert "the joint stands" in bench.master.fault.message
+
+
+def test_a_drive_that_says_that_it_ignores_its_set_points_is_a_fault_of_that_name():
+    bench = Bench(SHIPPED_EDS, (9,))
+    bench.run()
+    bench.go(0.1, SPEED)
+    bench.drive.word = 0x1000
+    bench.go(0.08, SPEED)
+    assert bench.master.fault is None
+    bench.go(0.05, SPEED)
+    assert bench.master.fault is not None
+    assert bench.master.fault.code == "target_ignored"
+
+
+@pytest.mark.parametrize(("rate_hz", "value", "exponent"), [(250.0, 4, -3), (1000.0, 1, -3), (400.0, 25, -4)])
+def test_the_interpolation_period_follows_the_rate(rate_hz, value, exponent):
+    bench = Bench(SHIPPED_EDS, (9,), rate_hz=rate_hz)
+    bench.run()
+    assert (bench.drive.get(0x60C2, 1), bench.drive.get(0x60C2, 2)) == (value, exponent)

@@ -1,0 +1,84 @@
+"""Drives that take positions only, led by velocities: they go as far as commanded, whatever their load, and no further
+than the lead once orders end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereoservo_drivers.position_output import PositionOutput
+
+PERIOD, LAG = 0.004, 0.03
+LIMITS = np.array([-3.0]), np.array([3.0])
+
+
+class Servo:
+    """A joint behind a stiff position loop: a lag, a load that holds it off its order, and play that it must cross."""
+
+    def __init__(self, output: PositionOutput, sag: float = 0.0) -> None:
+        self.output, self.sag = output, sag
+        self.position = 0.0
+        self.order = float(output.follow(np.zeros(1), np.zeros(1, dtype=bool))[0])
+
+    def run(self, seconds: float, velocity: float | None = 0.0) -> None:
+        """Commanded, or with no orders any more."""
+        for _ in range(round(seconds / PERIOD)):
+            if velocity is not None:
+                order = self.output.step(np.array([velocity]), np.array([self.position]), *LIMITS)
+                self.order = float(order[0])
+            self.position += (self.order - self.sag - self.position) * PERIOD / LAG
+
+
+def output(lead: float = 0.1, largest_offset: float = 0.06) -> PositionOutput:
+    return PositionOutput(np.array([lead]), np.array([largest_offset]), np.array([1.0]), PERIOD)
+
+
+@pytest.mark.parametrize("sag", [0.0, np.radians(2.5), -np.radians(2.5)])
+@pytest.mark.parametrize("lead", [0.03, 0.1])
+@pytest.mark.parametrize("velocity", [0.02, -0.4])
+def test_a_joint_goes_as_far_as_commanded_under_load(sag, lead, velocity):
+    servo = Servo(output(lead), sag)
+    servo.run(3.0)
+    start = servo.position
+    servo.run(0.2 / abs(velocity), velocity)
+    servo.run(2.0)
+    assert servo.position - start == pytest.approx(np.copysign(0.2, velocity), abs=0.002)
+    rest = servo.position
+    servo.run(20.0)
+    assert servo.position == pytest.approx(rest, abs=1e-4)
+
+
+@pytest.mark.parametrize("sag", [0.0, np.radians(2.5)])
+def test_without_orders_a_joint_goes_no_further_than_its_lead(sag):
+    servo = Servo(output(0.03), sag)
+    servo.run(3.0)
+    servo.run(0.5, 0.4)
+    at = servo.position
+    servo.run(2.0, None)
+    assert abs(servo.position - at) <= 0.03 + 1e-6
+
+
+def test_a_joint_that_is_blocked_is_pressed_no_harder_than_lead_and_offset_allow():
+    servo = output(0.03, 0.06)
+    servo.follow(np.zeros(1), np.zeros(1, dtype=bool))
+    for _ in range(5000):
+        order = servo.step(np.array([0.4]), np.zeros(1), *LIMITS)
+    assert float(order[0]) == pytest.approx(0.09)
+
+
+def test_orders_end_at_a_limit_and_lead_back_from_beyond_it():
+    servo = Servo(output())
+    low, high = np.array([-3.0]), np.array([0.1])
+    for _ in range(500):
+        servo.order = float(servo.output.step(np.array([0.4]), np.array([servo.position]), low, high)[0])
+        servo.position += (servo.order - servo.position) * PERIOD / LAG
+    assert servo.position == pytest.approx(0.1, abs=1e-3)
+    assert float(servo.output.step(np.array([-0.4]), np.array([0.3]), low, high)[0]) < 0.3
+
+
+def test_an_enabled_joint_keeps_its_order_and_a_free_one_stands_where_it_is():
+    servo = output()
+    servo.follow(np.array([0.5]), np.array([False]))
+    assert float(servo.follow(np.array([0.4]), np.array([True]))[0]) == 0.5
+    assert float(servo.follow(np.array([0.4]), np.array([False]))[0]) == 0.4
