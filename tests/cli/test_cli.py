@@ -1,6 +1,7 @@
 """The command line's contract: one JSON object, errors as JSON, exit codes, broken plug-ins."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -153,7 +154,9 @@ def test_a_missing_cell_file_and_a_cell_that_does_not_run(tmp_path: Path, run: R
     assert code == 1
     assert result["error"]["code"] == "not_running"
     assert "no daemon runs for cell 'nowhere'; running: none" in result["error"]["message"]
+    priority = os.getpriority(os.PRIO_PROCESS, 0)
     assert run("stop", "nowhere")[0] == 1
+    assert os.getpriority(os.PRIO_PROCESS, 0) == priority  # only a process that is a stop goes before others
     assert run("ls") == (0, {"cells": []}, "")
 
 

@@ -16,8 +16,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads 
 
 def invoke(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Failures are printed, as JSON with ``--json``."""
-    if arguments[:1] == ["stop"]:
-        _go_first()
     raised = raise_stop(arguments)
     from stereoservo.cli.dispatch import run  # typer and more, which a stop must not wait for
 
@@ -25,7 +23,9 @@ def invoke(arguments: list[str]) -> int:
 
 
 def _go_first() -> None:
-    """Let a stop go before other work of this computer, where the account may (root, or ``nice`` in limits.conf)."""
+    """Let this process, a stop, go before other work of the computer, where the account may (root, or ``nice`` in
+    limits.conf).
+    """
     try:
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     except OSError:
@@ -36,6 +36,8 @@ def main() -> None:
     """Entry point of the command line."""
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     interruption.install()
+    if sys.argv[1:2] == ["stop"]:
+        _go_first()
     sys.exit(invoke(sys.argv[1:]))
 
 
