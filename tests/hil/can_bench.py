@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -72,6 +73,7 @@ class CanBench:
 
         ``joints``: another ``[joints]`` section instead of the CAN bus.
         """
+        shutil.rmtree(folder, ignore_errors=True)  # of a fixture that failed, and is tried again
         for made in (folder, folder / "bus", folder / "streams"):
             made.mkdir()
         path = folder / "cell.toml"

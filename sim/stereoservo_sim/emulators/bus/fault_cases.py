@@ -58,6 +58,7 @@ EITHER_PROTOCOL = (
     ),
     FaultCase(
         name="limit switch active before motion",
+        options={"feedback": ("velocity", "switches")},
         orders=("limit 3 +",),
         towards=3,
         stage="standing",
@@ -179,10 +180,19 @@ CIA402_CASES = (
     ),
     FaultCase(
         name="limit switch",
+        options={"feedback": ("velocity", "switches")},
         orders=("limit 3 +",),
         towards=3,
         codes=("limit_switch", "emergency"),
         bound_ms=40,
+        afterwards=("limit 3 off",),
+    ),
+    FaultCase(
+        name="limit switch, switches not sent",
+        orders=("limit 3 +",),
+        towards=3,
+        codes=("limit_switch", "emergency"),
+        bound_ms=140,
         afterwards=("limit 3 off",),
     ),
     FaultCase(
