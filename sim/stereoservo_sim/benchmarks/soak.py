@@ -215,7 +215,11 @@ class _Soak:
         )
         reply = self.cell.submit(RunGoal(goal))
         if not reply.accepted:
-            raise ExperimentError("refused", f"a goal of law {law} was refused: {reply.message}")
+            causes = "; ".join(f"{reason.code} {reason.hint}" for reason in self.cell.core.state.fault)
+            raise ExperimentError(
+                "refused",
+                f"{passed_s:.1f} s: a goal of law {law} was refused after {self.last_fault!r}: {reply.message} {causes}",
+            )
         if self.rng.random() > QUIET:
             self.cell.run_for(float(self.rng.uniform(0.0, 1.0)))
             self._struck(law)
