@@ -50,6 +50,7 @@ def fly(
     following: np.ndarray | None = None,
     command: float = 0.3,
     gap_ns: int = 0,
+    step_ns: int = STEP_NS,
 ) -> list[tuple[int, Any]]:
     """Feed samples (t, n) to the watch while every joint is commanded to move, the first after a gap; the reasons."""
     limits = collision.collision_thresholds(settings, None)
@@ -58,7 +59,7 @@ def fly(
     for k in range(count):
         state.command = np.full(N, command)
         sample = JointState(
-            k, state.contact.seen_ns + STEP_NS + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
+            k, state.contact.seen_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
         )  # fmt: skip
         reason = monitor.detect_collision(state, settings, limits, sample)
@@ -167,6 +168,23 @@ def test_drives_that_tell_nothing_are_not_watched(settings: CoreSettings) -> Non
     assert fly(state, settings, following=lags) == []
 
 
+@pytest.mark.parametrize("rate_hz", [100, 1000])
+@pytest.mark.parametrize(("command", "constant_s"), [(0.0, monitor.REST_S), (0.3, monitor.MEAN_S)])
+def test_the_expected_effort_follows_with_its_time_constant_at_any_rate(
+    settings: CoreSettings, command: float, constant_s: float, rate_hz: int
+) -> None:
+    """What is left of a step after twice the time constant: a lag stepped implicitly is slower than exp(-2), by less
+    than exp(dt / T): n ln(1 + dt / T) > n (dt / T - (dt / T)^2 / 2) with n = 2 T / dt.
+    """
+    state = enabled(settings)
+    load = 5.0 * np.eye(N)[1]
+    flown = {"command": command, "step_ns": 1_000_000_000 // rate_hz}
+    fly(state, settings, np.zeros((20, N)), **flown)
+    assert fly(state, settings, np.tile(load, (round(2.0 * constant_s * rate_hz), 1)), **flown) == []
+    left = 1.0 - state.contact.mean_efforts[1] / load[1]
+    assert np.exp(-2.0) < left < np.exp(-2.0 + 1.0 / (constant_s * rate_hz))
+
+
 # -- what is ------------------------------------------------------------------------------------------------
 
 
@@ -201,6 +219,32 @@ def test_after_a_contact_its_load_may_go_and_may_not_grow(settings: CoreSettings
     relieved = pressed + (GRAVITY - pressed) * np.linspace(0.0, 1.0, 20)[:, None]
     assert fly(state, settings, np.concatenate([relieved, np.tile(GRAVITY, (500, 1))])) == []
     assert len(fly(harder, settings, np.tile(pressed + 15.0 * np.eye(N)[1], (5, 1)))) == 1
+
+
+def test_what_comes_while_the_arm_brakes_belongs_to_the_contact(settings: CoreSettings) -> None:
+    state = enabled(settings)
+    fly(state, settings, np.tile(GRAVITY, (50, 1)))
+    pressed, braked = GRAVITY + 40.0 * np.eye(N)[1], GRAVITY + 80.0 * np.eye(N)[1]
+    assert len(fly(state, settings, np.tile(pressed, (5, 1)))) == 1
+    state.stopped = True
+    assert fly(state, settings, np.tile(braked, (5, 1))) == []
+    assert fly(state, settings, np.tile(pressed, (500, 1)), command=0.0) == []
+    state.stopped = False
+    harder = decode_state(encode_state(state))
+    assert fly(state, settings, np.tile(braked, (50, 1))) == []
+    assert len(fly(harder, settings, np.tile(braked + 15.0 * np.eye(N)[1], (5, 1)))) == 1
+
+
+def test_what_a_contact_brought_is_a_contact_again_once_the_drives_were_off(settings: CoreSettings) -> None:
+    state = enabled(settings)
+    pressed = GRAVITY + 40.0 * np.eye(N)[1]
+    fly(state, settings, np.tile(GRAVITY, (50, 1)))
+    assert len(fly(state, settings, np.tile(pressed, (5, 1)))) == 1
+    state.lifecycle = Lifecycle.INACTIVE
+    fly(state, settings, np.tile(GRAVITY, (20, 1)), command=0.0)
+    state.lifecycle = Lifecycle.ACTIVE
+    assert fly(state, settings, np.tile(GRAVITY, (20, 1))) == []
+    assert len(fly(state, settings, np.tile(pressed, (5, 1)))) == 1
 
 
 def test_a_following_error_that_stays_after_the_time_to_leave_is_a_contact_again(
@@ -281,6 +325,34 @@ def test_switched_off_means_off(bench: Any) -> None:
     off = msgspec.structs.replace(stated(effort={1: 10.0}), enabled=False)
     assert collision.collision_thresholds(with_contact(bench.settings, off), LOADS) is None
     assert collision.collision_thresholds(with_contact(bench.settings, None), LOADS) is None
+
+
+@pytest.mark.parametrize("speed", [0.1, 3.0])
+def test_efforts_are_learnt_where_one_joint_moves_alone(bench: Any, speed: float) -> None:
+    """Alone: the others' speeds are at most ``ALONE`` of the fastest's."""
+    for share, learnt in ((0.8, 2.0), (1.2, 0.0)):
+        contact = initial_state(bench.settings).contact
+        contact.effort_excess = np.full_like(contact.effort_excess, -2.0)
+        speeds = speed * np.array([0.0, share * collision.ALONE, 0.0, 1.0, 0.0, 0.0])
+        collision.learn_loads("trials", contact, speeds, GRAVITY, np.zeros(N))
+        assert contact.loads is not None
+        np.testing.assert_array_equal(contact.loads.efforts, learnt * np.tile(np.eye(N)[3], (N, 1)))
+        np.testing.assert_array_equal(contact.loads.velocities, speeds)
+        np.testing.assert_array_equal(contact.loads.largest_efforts, np.abs(GRAVITY))
+
+
+@pytest.mark.parametrize(("former", "now"), [("1", "2"), ("2", "1")])
+def test_loads_of_other_trials_are_not_these_trials_loads(bench: Any, former: str, now: str) -> None:
+    contact = initial_state(bench.settings).contact
+    contact.efforts = GRAVITY
+    collision.learn_loads(former, contact, np.full(N, 0.9), 10.0 * GRAVITY, np.zeros(N))
+    assert collision.learnt_loads(former, contact) is not None
+    assert collision.learnt_loads(now, contact) is None
+    collision.learn_loads(now, contact, np.full(N, 0.5), GRAVITY, np.zeros(N))
+    loads = collision.learnt_loads(now, contact)
+    assert loads is not None
+    assert loads.velocities == pytest.approx(0.5)
+    assert loads.largest_efforts == pytest.approx(np.abs(GRAVITY))
 
 
 # -- in the core --------------------------------------------------------------------------------------------

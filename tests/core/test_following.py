@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.monitor import PLAY, detect_following_error
+from stereoservo.core.monitor import PLAY, SILENCE_S, detect_following_error
 from stereoservo.core.state import initial_state
 from stereoservo.messages.goals import Enable, Jog
 from stereoservo.messages.reasons import Reason
@@ -18,13 +19,17 @@ DT_S = 1.0 / RATE_HZ
 Encoder = Callable[[np.ndarray], np.ndarray]
 
 
-def watched(settings: Any, commands: np.ndarray, readings: np.ndarray) -> tuple[Reason | None, int]:
-    """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,), and when."""
+def watched(
+    settings: Any, commands: np.ndarray, readings: np.ndarray, every: int = 1
+) -> tuple[Reason | None, int]:
+    """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,) in every so many
+    steps, and when.
+    """
     state = initial_state(settings)
-    for k, (command, reading) in enumerate(zip(commands, readings, strict=True)):
+    for k, command in enumerate(commands):
         q = np.zeros(len(settings.joint_names))
-        q[0] = reading
-        state.last_joints_ns = 1 + k
+        q[0] = readings[k - k % every]
+        state.last_joints_ns = 1 + k - k % every
         reason = detect_following_error(state, settings, q, DT_S)
         if reason is not None:
             return reason, k
@@ -92,6 +97,13 @@ def test_a_healthy_drive_is_not_blamed(bench, name):
     assert watched(bench.settings, commands, readings) == (None, len(commands))
 
 
+@pytest.mark.parametrize("every", [1, 4])
+def test_a_gain_error_is_forgotten_however_often_the_drive_tells(bench, every):
+    """10 per cent at 1 rad/s for a second leave 0.1 rad missing, for ever as well; 0.15 are a fault."""
+    commands = np.full(round(12.0 * RATE_HZ), 1.0)
+    assert watched(bench.settings, commands, 0.9 * travelled(commands), every) == (None, len(commands))
+
+
 @pytest.mark.parametrize("noise", [0.0, 4e-4])
 def test_a_reading_that_only_flickers_stands_still(bench, noise):
     rng = np.random.default_rng(5)
@@ -99,6 +111,50 @@ def test_a_reading_that_only_flickers_stands_still(bench, noise):
     reason, k = watched(bench.settings, commands, rng.uniform(-noise, noise, len(commands)))
     assert reason is not None
     assert k * DT_S * 0.05 < 0.09
+
+
+def on_a_rail(settings: Any) -> Any:
+    return msgspec.structs.replace(settings, joint_kinds=("prismatic", *settings.joint_kinds[1:]))
+
+
+@pytest.mark.parametrize("speed", [0.0015, 0.005, 0.1])
+def test_a_rail_whose_encoder_stands_still_goes_a_few_millimetres_at_low_speed(bench, speed):
+    commands = np.full(round(12.0 * RATE_HZ), speed)
+    reason, k = watched(on_a_rail(bench.settings), commands, np.zeros(len(commands)))
+    assert reason is not None
+    assert (reason.code, reason.threshold, reason.unit) == ("JOINT_NOT_FOLLOWING", PLAY["prismatic"], "m")
+    assert k * DT_S * (speed - 0.001) <= PLAY["prismatic"] + speed * SILENCE_S
+
+
+def test_a_healthy_rail_is_not_blamed(bench):
+    settings = on_a_rail(bench.settings)
+    commands = np.full(round(8.0 * RATE_HZ), 0.001)  # friction holds it
+    assert watched(settings, commands, np.zeros(len(commands))) == (None, len(commands))
+    commands *= 5.0
+    steps_of_a_millimetre = np.floor(travelled(commands) / 1e-3) * 1e-3
+    assert watched(settings, commands, steps_of_a_millimetre) == (None, len(commands))
+
+
+def test_without_new_samples_nothing_is_concluded(bench):
+    state, q = initial_state(bench.settings), np.zeros(6)
+    state.last_joints_ns = 1
+    for _ in range(100):  # 0.4 s at 1 rad/s
+        assert detect_following_error(state, bench.settings, q, DT_S) is None
+        state.command = np.eye(6)[0]
+    q[0] = 99 * DT_S
+    state.last_joints_ns = 2
+    state.command = np.zeros(6)
+    assert detect_following_error(state, bench.settings, q, DT_S) is None
+    assert np.abs(state.missing_travel).max() < 1e-9
+
+
+def test_what_was_missing_before_a_long_gap_is_forgotten(bench):
+    state, q = initial_state(bench.settings), np.zeros(6)
+    state.missing_travel[0] = 0.14
+    for k, dt_s in enumerate((DT_S, 3.0)):
+        state.last_joints_ns = 1 + k
+        assert detect_following_error(state, bench.settings, q, dt_s) is None
+    assert not state.missing_travel.any()
 
 
 def test_a_slow_jog_with_an_encoder_that_stands_still_ends_in_a_fault(bench: Any) -> None:

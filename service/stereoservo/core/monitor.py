@@ -265,11 +265,12 @@ def detect_following_error(
     """
     state.untold_travel = state.untold_travel + state.command * dt_s
     _account_for_silence(state, settings, q, dt_s)
+    keep = max(0.0, 1.0 - dt_s / MEMORY_S)
     if state.last_joints_ns == state.last_followed_ns:
+        state.missing_travel = keep * state.missing_travel
         return None
     state.last_followed_ns = state.last_joints_ns
     last = q if state.last_positions is None else state.last_positions
-    keep = max(0.0, 1.0 - dt_s / MEMORY_S)
     state.missing_travel = keep * (state.missing_travel + state.untold_travel - (q - last))
     state.untold_travel[:] = 0.0
     state.last_positions = q.copy()

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from stereoservo.core.cycle import StepInputs, StepOutputs
+from stereoservo.core.cycle import Event, StepInputs, StepOutputs
 from stereoservo.core.monitor import FRICTION
 from stereoservo.daemon.lockstep import LockstepCell, LockstepTimeoutError
 from stereoservo.messages.cell_file import CellFile, check_cell
@@ -99,7 +99,7 @@ FAULTS: dict[str, Act] = {
 def run_soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``repetitions`` times two virtual minutes of goals and faults; memory, descriptors, events and residuals.
 
-    Raises ExperimentError where a goal has no end or two, or the cell cannot be operated again.
+    Raises ExperimentError where an event is lost, a goal has no end or two, or the cell cannot be operated again.
     """
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory(prefix="sssoak") as name:
@@ -160,12 +160,19 @@ class _Soak:
         self.last_fault = ""
         self.residuals: list[tuple[float, float]] = []
         self.sizes: list[tuple[float, float, float]] = []
+        self.events = 0
         cell.on_step = self._count
+        cell.on_event.append(self._told)
 
     def _count(self, _inputs: StepInputs, outputs: StepOutputs) -> None:
         self.steps += 1
         if outputs.command is not None:
             self.fastest = max(self.fastest, float((np.abs(outputs.command) / self.velocity_max).max()))
+
+    def _told(self, event: Event) -> None:
+        self.events += 1
+        if event.seq != self.events:
+            raise ExperimentError("lost", f"events {self.events} to {event.seq - 1} were lost")
 
     def run(self, seconds: float, progress: ProgressCall) -> dict[str, Any]:
         """The figures, after so much virtual time."""
@@ -208,7 +215,11 @@ class _Soak:
         )
         reply = self.cell.submit(RunGoal(goal))
         if not reply.accepted:
-            raise ExperimentError("refused", f"a goal of law {law} was refused: {reply.message}")
+            causes = "; ".join(f"{reason.code} {reason.hint}" for reason in self.cell.core.state.fault)
+            raise ExperimentError(
+                "refused",
+                f"{passed_s:.1f} s: a goal of law {law} was refused after {self.last_fault!r}: {reply.message} {causes}",
+            )
         if self.rng.random() > QUIET:
             self.cell.run_for(float(self.rng.uniform(0.0, 1.0)))
             self._struck(law)
@@ -313,6 +324,7 @@ class _Soak:
             "goals": sum(self.outcomes.values()),
             "outcomes": dict(self.outcomes),
             "faults": dict(self.faults),
+            "events": self.events,
             "fastest_of_limit": self.fastest,
             "memory_mb": float(sizes[-1, 1]),
             "memory_slope_mb_per_virtual_hour": float(np.polyfit(sizes[:, 0], sizes[:, 1], 1)[0]),

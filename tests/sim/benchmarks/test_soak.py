@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from stereoservo.core.cycle import Event
+from stereoservo.daemon.lockstep import MemoryLinks
 from stereoservo_sim.benchmarks import soak
 
 
@@ -15,6 +17,7 @@ def test_goals_and_faults_for_hours(goals: int, minutes: float, monkeypatch: pyt
     assert figures["goals"] == sum(figures["outcomes"].values()) > 0
     assert set(figures["outcomes"]) <= {"goal_reached", "goal_aborted"}
     assert sum(figures["faults"].values()) > 0
+    assert figures["events"] > figures["goals"]
     assert figures["fastest_of_limit"] <= 1.0 + 1e-9
     assert figures["descriptors"][0] == figures["descriptors"][1]
     if minutes > 1.0:
@@ -28,3 +31,14 @@ def test_a_goal_that_ends_twice_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(soak, "QUIET", 1.1)
     with pytest.raises(soak.ExperimentError, match=r"ended 2 times: goal_started, goal_reached"):
         soak.run_soak(1, 1, lambda stage, done, total: None)
+
+
+def test_an_event_that_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    published = MemoryLinks.publish_events
+
+    def publish(links: MemoryLinks, events: tuple[Event, ...]) -> None:
+        published(links, tuple(event for event in events if event.seq != 2))
+
+    monkeypatch.setattr(MemoryLinks, "publish_events", publish)
+    with pytest.raises(soak.ExperimentError, match="events 2 to 2 were lost"):
+        soak.run_soak(1, 3, lambda stage, done, total: None)
