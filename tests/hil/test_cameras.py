@@ -96,7 +96,6 @@ def told(client: Client, first: int, kind: str) -> list[str]:
         pytest.param("corrupt all 10", marks=pytest.mark.slow),
         pytest.param("black left for 2s", marks=pytest.mark.slow),
         pytest.param("white all for 2s", marks=pytest.mark.slow),
-        pytest.param("flip all for 1s", marks=pytest.mark.slow),
         pytest.param("exposure all 0.5 for 5s", marks=pytest.mark.slow),
         pytest.param("lamp on for 5s", marks=pytest.mark.slow),
         pytest.param("loss all 20% for 5s", marks=pytest.mark.slow),
@@ -109,6 +108,20 @@ def test_what_passes_does_not_change_the_outcome(bench: CanBench, client: Client
     result = handle.reached(90.0)
     assert result.error_px is not None
     assert result.error_px <= 0.5
+
+
+@pytest.mark.slow
+def test_mirrored_pictures_end_a_goal_and_right_ones_make_the_model_good_again(
+    bench: CanBench, client: Client
+) -> None:
+    handle = under_way(client)
+    order(bench, "flip all for 1s")
+    result = handle.wait(90.0)
+    assert result.outcome == "aborted"
+    assert "images" in result.why
+    eventually("the arm rests", lambda: at_rest(client))
+    eventually("the model is good again", lambda: client.status().model == "valid", 60.0)
+    assert client.goal("park", tolerance_px=0.5, hold_frames=3).reached(90.0).error_px is not None
 
 
 def test_both_cameras_dark_for_good_stop_the_arm_with_the_reason_and_light_lets_it_go_on(
