@@ -89,7 +89,7 @@ NARROWEST = 0.8
 """The same where one all but touches: enough to tell a face by, hardly to measure with."""
 CROWDED, PRESSED = 0.02, 0.1
 """Standard deviations [px] that the light of a neighbour adds then."""
-ROOM = 6
+ROOM = 7
 """Pixels around a component's bounding box in its patch: a skirt and what gives background and noise."""
 MARGIN = 4
 """Pixels needed between a dot's half-contrast outline and the border of the image."""
@@ -286,6 +286,18 @@ def _window(skirt, out):
 
 
 @kernel
+def _around(skirt, out):
+    """First and last column and row of what gives background and noise about the centre in ``out``."""
+    reach = _reach(out[QXX], out[QXY], out[QYY], skirt) + RING
+    half_u, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
+    half_u, half_v = half_u + reach, half_v + reach
+    return (
+        int(np.floor(out[U] - half_u)), int(np.floor(out[V] - half_v)), int(np.floor(out[U] + half_u)) + 1,
+        int(np.floor(out[V] + half_v)) + 1,
+    )  # fmt: skip
+
+
+@kernel
 def _beset(labels, box, label, near, out):
     return crowded(labels, box, label, near, _reach(out[QXX], out[QXY], out[QYY], near), out)
 
@@ -353,16 +365,9 @@ def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out):
         skirt, beside = _free_skirt(scratch.labels, box, found.label, out)
         if skirt == 0.0:
             return SHAPE, none, nowhere
-    window = _window(skirt, out)
-    left, top, right, bottom = (
-        window.left - RING,
-        window.top - RING,
-        window.right + RING,
-        window.bottom + RING,
-    )
+    around = left, top, right, bottom = _around(skirt, out)
     wide = left < patch.left or right > patch.right or top < patch.top or bottom > patch.bottom
     if wide or mixed:
-        around = left, top, right, bottom
         if patch_size(around) > PATCH:
             return SHAPE, none, nowhere
         patch = fill_patch(image, dark, background, around, scratch.patch)
@@ -458,8 +463,7 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, scratch
     level, xs, ys = planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]
     weights, (bump, bump2, odd_x, odd_y, odd_3x, odd_3y) = _weight_sums(level, xs, ys, ellipse)
     _sensitivities(j, weights, dot.contrast, out)
-    a, b = lanes(patch, max(window.top - RING, patch.top), min(window.bottom + RING, patch.bottom))
-    surface = surroundings(planes, a, b, ellipse, 4.0 * 1.4826 * dot.noise + 2.0)
+    surface = surroundings(patch, planes, _around(dot.skirt, out), ellipse, 4.0 * 1.4826 * dot.noise + 2.0)
     out[NOISE] = surface.variance
     inside(patch, planes, ellipse, dot.contrast, out)
     w, ww = weights[0], weights[4]

@@ -97,9 +97,10 @@ def _fit_surface(sums):
 
 
 @reassociating_kernel
-def _ring_moments(level, valid, xs, ys, ellipse, limit, surface, sums):
-    """Sums over the VALID pixels outside an ellipse's skirt within ``limit`` of a ``surface``: 1, level, x, y, x², xy,
-    y², x level, y level, level², tail, tail x, tail y, tail², tail level; into ``sums`` (15,).
+def _ring_moments(level, valid, xs, ys, ellipse, box, limit, surface, sums):
+    """Sums over the VALID pixels of a ``box`` (its middle and half size in x, then in y) outside an ellipse's skirt
+    within ``limit`` of a ``surface``: 1, level, x, y, x², xy, y², x level, y level, level², tail, tail x, tail y,
+    tail², tail level; into ``sums`` (15,).
     """
     q11, q12, q22, cx, cy, skirt = ellipse
     width, inner = F(4.0) * skirt * skirt, skirt * skirt
@@ -117,8 +118,8 @@ def _ring_moments(level, valid, xs, ys, ellipse, limit, surface, sums):
         tail = max(F(1.0) - (F(0.25) * e / g2 - inner) * fall, F(0.0))
         tail = tail * tail * tail
         away = abs(i - base - slope_x * x - slope_y * y - slope_t * tail)
-        one = one if e >= width * g2 else F(0.0)
-        one = one if away <= limit else F(0.0)
+        one = one if e >= width * g2 and abs(xs[k] - box[0]) <= box[1] else F(0.0)
+        one = one if away <= limit and abs(ys[k] - box[2]) <= box[3] else F(0.0)
         mx, my, mt, mi = one * x, one * y, one * tail, one * i
         count += one
         si += mi
@@ -141,18 +142,24 @@ def _ring_moments(level, valid, xs, ys, ellipse, limit, surface, sums):
 
 
 @kernel
-def surroundings(planes, a, b, ellipse, limit):
-    """The surface about a dot's ``ellipse`` in the pixels ``a`` to ``b`` of a patch, of variance [levels²] -1 where
-    there is too little to see.
+def surroundings(patch, planes, box, ellipse, limit):
+    """The surface about a dot's ``ellipse`` in a ``box`` of a patch, of variance [levels²] -1 where there is too
+    little to see.
 
     Pixels off by more than ``limit``, then by more than three standard deviations (a neighbour's skirt, the plate's
     edge) do not count.
     """
+    left, top, right, bottom = box
+    a, b = lanes(patch, max(top, patch.top), min(bottom, patch.bottom))
+    middle = (
+        F(0.5 * (left + right) - patch.left), F(0.5 * (right - left)), F(0.5 * (top + bottom) - patch.top),
+        F(0.5 * (bottom - top)),
+    )  # fmt: skip
     level, valid, xs, ys = planes[LEVEL, a:b], planes[VALID, a:b], planes[X, a:b], planes[Y, a:b]
     fit, sums = Surface(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.empty(15)
     for _ in range(2):
         surface = F(fit.level), F(fit.slope_x), F(fit.slope_y), F(fit.slope_t)
-        _ring_moments(level, valid, xs, ys, ellipse, F(limit), surface, sums)
+        _ring_moments(level, valid, xs, ys, ellipse, middle, F(limit), surface, sums)
         fit = _fit_surface(sums)
         if fit.variance < 0.0:
             return NO_SURFACE

@@ -5,6 +5,7 @@ import pytest
 
 from stereoservo.ports.devices import DriverError, Prior
 from stereoservo.ports.dot_plates import DEFAULT_BODY
+from stereoservo_drivers.detectors.dots import _Seen
 
 from .rendering import Scene, circle, digitise
 from .scenes import IDS, as_frame, make_detector, normalised, random_shot, rms
@@ -296,11 +297,12 @@ def test_the_prior_gate_is_a_probability(detector):
         make_detector(gate_probability=0.8, min_dots=1),
         make_detector(gate_probability=0.9, min_dots=1),
     )
-    prior = shot.prior((2.0, 0.0), sigma=1.0)
-    assert detector._track(shot.frame.image, shot.prior((2.0, 0.0), sigma=0.2), 0.0)[1].all()
-    assert not loose._track(shot.frame.image, shot.prior((2.0, 0.0), sigma=0.2), 0.0)[1].any()
-    assert loose._track(shot.frame.image, prior, 0.0)[1].all()
-    assert not tight._track(shot.frame.image, prior, 0.0)[1].any()
+    prior, sure = shot.prior((2.0, 0.0), sigma=1.0), shot.prior((2.0, 0.0), sigma=0.2)
+    seen = _Seen.of(14)
+    assert detector._track(shot.frame.image, sure, 0.0, seen) == 14
+    assert loose._track(shot.frame.image, sure, 0.0, seen) == 0
+    assert loose._track(shot.frame.image, prior, 0.0, seen) == 14
+    assert tight._track(shot.frame.image, prior, 0.0, seen) == 0
     # what is refused is looked for anew, in the picture
     assert tight.detect(shot.frame, prior).ids.tolist() == IDS.tolist()
 
