@@ -7,15 +7,44 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import Prior
-from stereoservo_drivers.detectors.centroids import measure_windows
-from stereoservo_drivers.detectors.components import AREA, FIELDS, LOPSIDED, MAX_WINDOW, OK
+from stereoservo_drivers.detectors.centroids import measure
+from stereoservo_drivers.detectors.components import (
+    AREA_PX,
+    BEYOND,
+    BOTTOM,
+    FIELDS,
+    FIRST,
+    LEFT,
+    LOPSIDED,
+    MAX_WINDOW,
+    OK,
+    RIGHT,
+    ROW,
+    SUM_U,
+    SUM_V,
+    TOP,
+    Scratch,
+    join_runs,
+)
 from stereoservo_drivers.detectors.face_fit import whole
-from stereoservo_drivers.detectors.face_options import Pattern
-from stereoservo_drivers.detectors.patterns import find_face
+from stereoservo_drivers.detectors.kernel_types import (
+    BOOL,
+    BYTE,
+    FLOAT,
+    IMAGE,
+    INT,
+    INT32,
+    SINGLE,
+    WORD,
+    compile_for,
+    given,
+    written,
+)
+from stereoservo_drivers.detectors.patterns import find_faces
 
 SHRINK_FROM = 240
 """Least side of an image [px] that is searched, not measured, at half its size: a third of the time, half
@@ -28,33 +57,115 @@ MIN_FILL = 0.3
 MAX_ASPECT = 6.0
 
 
-def noise_level(image: npt.NDArray[np.uint8]) -> float:
+@kernel
+def noise_level(image):
     """Standard deviation of the noise [grey levels] of an image (h, w), from differences of neighbours on
     some thirty rows.
     """
-    rows = image[:: max(1, image.shape[0] // 30)].astype(np.int16)
-    differences = np.abs(rows[:, 1:] - rows[:, :-1])
+    counts = np.zeros(256, np.int64)
+    rows, columns = image.shape
+    for v in range(0, rows, max(1, rows // 30)):
+        row = image[v]
+        for u in range(columns - 1):
+            counts[abs(np.int64(row[u + 1]) - np.int64(row[u]))] += 1
     # the median of |difference| in whole levels, interpolated within its level
-    counts = np.bincount(differences.ravel(), minlength=2)
-    cumulated = np.cumsum(counts)
-    half = 0.5 * cumulated[-1]
-    level = int(np.searchsorted(cumulated, half))
-    below = cumulated[level - 1] if level else 0
-    width = 0.5 if level == 0 else 1.0
-    start = 0.0 if level == 0 else level - 0.5
+    half = 0.5 * counts.sum()
+    level = below = 0
+    while below + counts[level] < half:
+        below += counts[level]
+        level += 1
+    width, start = (0.5, 0.0) if level == 0 else (1.0, level - 0.5)
     median = start + width * (half - below) / counts[level]
-    return float(median / (0.6745 * np.sqrt(2.0)))
+    return median / (0.6745 * np.sqrt(2.0))
+
+
+@kernel
+def _mask_runs(mask, words, columns, runs):
+    """Runs (n, 4) of an image's pixels (n,) that are not 0; their number. ``words``: the same pixels, eight in each."""
+    count = 0
+    within = False
+    for start in range(0, mask.size, 8):
+        if not within and start // 8 < words.size and words[start // 8] == 0:
+            continue
+        v, u = start // columns, start % columns
+        for k in range(start, min(start + 8, mask.size)):
+            bright = mask[k] != 0
+            if within and (u == 0 or not bright):
+                runs[count, BEYOND] = u if u > 0 else columns
+                count += 1
+                within = False
+            if bright and not within:
+                runs[count, ROW], runs[count, FIRST] = v, u
+                within = True
+            u += 1
+            if u == columns:
+                v, u = v + 1, 0
+    if within:
+        runs[count, BEYOND] = columns
+        count += 1
+    return count
+
+
+@kernel
+def _spots(image, dark, mask, words, columns, shrink, min_contrast, lopsided, most, labels, runs, patch):
+    """Measurements (m, FIELDS) of the whole spots among the components of a mask, at most ``most``, the roundest first.
+
+    ``mask`` (n,) of ``columns``, ``shrink`` times smaller than ``image``; ``words`` as :func:`_mask_runs` takes them.
+    """
+    scratch = Scratch(labels, runs, patch)
+    own = np.empty((mask.size // 2 + mask.size // columns + 1, 4), np.int32)
+    totals = join_runs(own, _mask_runs(mask, words, columns, own), np.int64(1))
+    found = np.empty((totals.shape[0], FIELDS))
+    count = 0
+    for c in range(totals.shape[0]):
+        total = totals[c]
+        left, top, area = total[LEFT], total[TOP], total[AREA_PX]
+        width, height = total[RIGHT] + 1 - left, total[BOTTOM] + 1 - top
+        longer, shorter = max(width, height), min(width, height)
+        if area < 6 // shrink**2 + 1 or shrink * longer > MAX_WINDOW - 2 * GROW:
+            continue
+        if longer > MAX_ASPECT * shorter or area < MIN_FILL * width * height:
+            continue
+        status = measure(
+            image, dark, shrink * left - GROW, shrink * top - GROW, shrink * (left + width) + GROW,
+            shrink * (top + height) + GROW, shrink * (total[SUM_U] / area) + 0.5 * (shrink - 1),
+            shrink * (total[SUM_V] / area) + 0.5 * (shrink - 1), min_contrast, np.int64(5), scratch, found[count],
+        )  # fmt: skip
+        if status == OK and whole(found[count], lopsided):
+            count += 1
+    return _roundest(found[:count], most)
+
+
+@kernel
+def _roundest(found, most):
+    """The first ``most`` rows of ``found`` (m, FIELDS) by their LOPSIDED, without those that are another one again."""
+    n = found.shape[0]
+    order = np.empty(n, np.int64)
+    for i in range(n):
+        k = i
+        while k > 0 and found[order[k - 1], LOPSIDED] > found[i, LOPSIDED]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+    spots = np.empty((min(n, most), FIELDS))
+    count = 0
+    for i in range(min(n, 2 * most)):
+        spot = found[order[i]]
+        # one spot may be measured from two components
+        twin = count == most
+        for k in range(i):
+            other = found[order[k]]
+            twin = twin or (spot[0] - other[0]) ** 2 + (spot[1] - other[1]) ** 2 < 4.0
+        if not twin:
+            for j in range(FIELDS):
+                spots[count, j] = spot[j]
+            count += 1
+    return spots[:count]
 
 
 def find_spots(
-    image: npt.NDArray[np.uint8],
-    dark: bool,
-    min_contrast: int,
-    lopsided: float,
-    most: int,
-    labels: npt.NDArray[np.int32],
-    stack: npt.NDArray[np.int32],
-) -> npt.NDArray[np.float64]:
+    image: ImageArray, dark: bool, min_contrast: int, lopsided: float, most: int, scratch: Scratch
+) -> FloatArray:
     """Measurements (m, FIELDS) of the whole, elliptical spots of an image (h, w), at most ``most`` of them.
 
     A pixel is bright when it exceeds the mean of its surroundings (a tenth of the image's width, so that
@@ -68,30 +179,21 @@ def find_spots(
     side = max(31 // shrink, bright.shape[1] // 10) | 1
     offset = max(0.4 * min_contrast, 4.0 * noise_level(bright))
     mean = cv2.blur(bright, (side, side), borderType=cv2.BORDER_REPLICATE)
-    mask = cv2.compare(bright, cv2.add(mean, offset), cv2.CMP_GT)
-    # labels of 16 bits take less than half the time; no more components than a quarter of the pixels
-    labelled = cv2.CV_16U if mask.size <= 4 * 65535 else cv2.CV_32S
-    _, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=labelled)
-    left, top, width, height, area = stats[1:].T
-    longer, shorter = np.maximum(width, height), np.minimum(width, height)
-    keep = (
-        (area >= 6 // shrink**2 + 1)
-        & (shrink * longer <= MAX_WINDOW - 2 * GROW)
-        & (longer <= MAX_ASPECT * shorter)
-        & (area >= MIN_FILL * width * height)
+    mask = cv2.compare(bright, cv2.add(mean, offset), cv2.CMP_GT).ravel()
+    words = mask[: mask.size // 8 * 8].view(np.uint64)
+    spots: FloatArray = _spots(
+        image, dark, mask, words, bright.shape[1], shrink, min_contrast, lopsided, most, *scratch
     )
-    left, top, right, bottom = (shrink * x[keep] for x in (left, top, left + width, top + height))
-    windows = np.column_stack([left - GROW, top - GROW, right + GROW, bottom + GROW]).astype(np.int64)
-    near = shrink * centres[1:][keep] + 0.5 * (shrink - 1)
-    spots, status = np.zeros((len(windows), FIELDS)), np.zeros(len(windows), np.int64)
-    least = np.full(len(windows), 5, np.int64)
-    measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, spots, status)
-    spots = np.array([spot for spot in spots[status == OK] if whole(spot, lopsided)]).reshape(-1, FIELDS)
-    spots = spots[np.argsort(spots[:, LOPSIDED], kind="stable")][: 2 * most]
-    # one spot may be measured from two components
-    distances = np.hypot(*(spots[:, None, :2] - spots[None, :, :2]).transpose(2, 0, 1))
-    twins = np.triu(distances < 2.0, 1).any(axis=0)
-    return spots[~twins][:most]
+    return spots
+
+
+def compile_kernels() -> None:
+    """Compile what the detector calls, or load it from the cache."""
+    compile_for(noise_level, IMAGE)
+    compile_for(
+        _spots, IMAGE, BOOL, given(BYTE, 1), given(WORD, 1), INT, INT, INT, FLOAT, INT, written(INT32, 2),
+        written(INT32, 2), written(SINGLE, 2),
+    )  # fmt: skip
 
 
 Region = tuple[int, int, int, int]
@@ -121,7 +223,7 @@ class Expectation:
     pixels: FloatArray
     covariances: FloatArray
 
-    def squared_distance(self, places: FloatArray, found: npt.NDArray[np.bool_]) -> float:
+    def squared_distance(self, places: FloatArray, found: BoolArray) -> float:
         """Mean squared Mahalanobis distance of the dots ``found`` (7,) at ``places`` (7, 2); infinite without any."""
         common = found[self.rows]
         if not common.any():
@@ -172,49 +274,35 @@ def crop(image: ImageArray, region: Region) -> ImageArray:
     return np.ascontiguousarray(image[v0:v1, u0:u1])
 
 
-def copies_of(pattern: Pattern, spots: FloatArray, least: int, tolerance: float) -> list[IntArray]:
-    """All occurrences of a face among ``spots`` (m, FIELDS): rows of the spots (7,), -1 for missing dots."""
-    left = np.arange(len(spots))
-    found: list[IntArray] = []
-    while len(left) >= least and len(found) < MOST_COPIES:
-        centres = np.ascontiguousarray(spots[left, :2])
-        areas = np.ascontiguousarray(spots[left, AREA])
-        owner = np.full(len(pattern.ids), -1, np.int64)
-        for bases in (slice(0, 1), slice(1, None)):
-            # the first basis is the corners, the others stand in where one is hidden
-            if find_face(
-                pattern.positions, pattern.radius, centres, areas, pattern.bases[bases],
-                pattern.inverses[bases], least, REACH_PX, tolerance, owner,
-            ):  # fmt: skip
-                break
-        if (owner < 0).all():
-            break
-        found.append(np.where(owner >= 0, left[owner], -1))
-        left = np.setdiff1d(left, found[-1])
-    return found
+def copies_of(
+    positions: FloatArray,
+    radii: FloatArray,
+    bases: IntArray,
+    inverses: FloatArray,
+    sought: BoolArray,
+    spots: FloatArray,
+    least: int,
+    tolerance: float,
+) -> list[IntArray]:
+    """All occurrences (k, 7) of each face that is ``sought`` (f,) among ``spots`` (m, FIELDS): rows of the spots, -1
+    for missing dots.
+    """
+    owners, counts = np.empty((len(radii), MOST_COPIES, 7), np.int64), np.empty(len(radii), np.int64)
+    gates = np.array([least, REACH_PX, tolerance])
+    find_faces(positions, radii, bases, inverses, sought, spots, gates, owners, counts)
+    return [found[:count] for found, count in zip(owners, counts.tolist(), strict=True)]
 
 
-def choose(copies: Sequence[IntArray], spots: FloatArray, expected: Expectation | None) -> IntArray | None:
+def choose(copies: IntArray, spots: FloatArray, expected: Expectation | None) -> IntArray | None:
     """Of several occurrences of a face the expected one; None where there is none, or it is ambiguous.
 
     A single one is taken wherever it is: a prior does not decide against the picture.
     """
     if len(copies) < 2:
-        return copies[0] if copies else None
+        return copies[0] if len(copies) else None
     if expected is None:
         return None
     distances = np.array([expected.squared_distance(spots[owner, :2], owner >= 0) for owner in copies])
     first, second = np.argsort(distances)[:2]
     clear = distances[first] <= NEAR and distances[second] > distances[first] + FARTHER
-    return copies[first] if clear else None
-
-
-def without_conflicts(owners: IntArray) -> IntArray:
-    """Faces (f, 7) without those that share a spot: the one with more dots stays; of equals, none."""
-    kept = owners.copy()
-    for f, owner in enumerate(owners):
-        mine = owner[owner >= 0]
-        for g, other in enumerate(owners):
-            if f != g and np.isin(mine, other).any() and (other >= 0).sum() >= len(mine):
-                kept[f] = -1
-    return kept
+    return copies[int(first)] if clear else None

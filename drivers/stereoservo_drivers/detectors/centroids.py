@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.numerics.compilation import inlined_kernel, kernel
+from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo_drivers.detectors.components import (
     AREA,
     BACKGROUND,
@@ -42,8 +42,10 @@ from stereoservo_drivers.detectors.components import (
     EXX,
     EXY,
     EYY,
+    FAR,
     FLUX,
     FLUX_NOISE,
+    LEVEL,
     LIT,
     LOPSIDED,
     LOPSIDED_NOISE,
@@ -51,32 +53,31 @@ from stereoservo_drivers.detectors.components import (
     NO_COMPONENT,
     NO_CONTRAST,
     NOISE,
+    NOTHING,
     OK,
+    PATCH,
     PULL,
     QXX,
     QXY,
     QYY,
     SHAPE,
+    F,
+    Patch,
     U,
     V,
-    aperture_of,
+    X,
+    Y,
+    blank_others,
     crowded,
     extremes,
+    fill_patch,
     half_sizes,
+    lanes,
     nearest_component,
+    patch_size,
     ring_level,
 )
-from stereoservo_drivers.detectors.kernel_types import (
-    BOOL,
-    FLOAT,
-    IMAGE,
-    INT,
-    INT32,
-    compile_for,
-    given,
-    written,
-)
-from stereoservo_drivers.detectors.levels import UNEVEN_INSIDE, inside, surroundings
+from stereoservo_drivers.detectors.levels import RING, UNEVEN_INSIDE, inside, surroundings
 
 SKIRT = 2.2
 """Distance to the ellipse, to first order, up to which a pixel outside counts [px] (in truth up to 2.8 at 4
@@ -88,42 +89,44 @@ NARROWEST = 0.8
 """The same where one all but touches: enough to tell a face by, hardly to measure with."""
 CROWDED, PRESSED = 0.02, 0.1
 """Standard deviations [px] that the light of a neighbour adds then."""
+ROOM = 7
+"""Pixels around a component's bounding box in its patch: a skirt and what gives background and noise."""
 MARGIN = 4
 """Pixels needed between a dot's half-contrast outline and the border of the image."""
 
 
+@reassociating_kernel
+def _soft_moments(level, xs, ys, cx, cy, half, scale):
+    """Moments 1, x, y, x², xy, y² about (cx, cy) of the levels, times ``scale`` less a half and cut off at 0 and 1, no
+    farther than ``half`` in x.
+    """
+    s = su = sv = suu = suv = svv = F(0.0)
+    for k in range(level.size):
+        x, y = xs[k] - cx, ys[k] - cy
+        w = min(max(level[k] * scale - F(0.5), F(0.0)), F(1.0))
+        w = w if abs(x) <= half else F(0.0)
+        s += w
+        su += w * x
+        sv += w * y
+        suu += w * x * x
+        suv += w * x * y
+        svv += w * y * y
+    return s, su, sv, suu, suv, svv
+
+
 @kernel
-def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
-    """Soft area, centre and ellipse matrix into ``out``. False where no ellipse can be had."""
-    u0, v0, u1, v1 = box
-    lo_u, hi_u = int(found[3]) - 2, int(found[4]) + 2
-    lo_v, hi_v = int(found[5]) - 2, int(found[6]) + 2
-    ou = found[1] / found[0]
-    ov = found[2] / found[0]
-    s = su = sv = suu = suv = svv = 0.0
-    for v in range(lo_v, hi_v + 1):
-        row = image[v, lo_u : hi_u + 1]
-        for k in range(row.size):
-            u = lo_u + k
-            if u0 <= u < u1 and v0 <= v < v1:
-                other = labels[v - v0, u - u0]
-                if other not in (0, label):
-                    continue
-            level = int(row[k])
-            if dark:
-                level = 255 - level
-            w = (level - background) / (0.5 * contrast) - 0.5
-            if w <= 0.0:
-                continue
-            w = min(w, 1.0)
-            x = u - ou
-            y = v - ov
-            s += w
-            su += w * x
-            sv += w * y
-            suu += w * x * x
-            suv += w * x * y
-            svv += w * y * y
+def _ellipse(component, patch, planes, contrast, out):
+    """Soft area, centre and ellipse matrix of what is within 2 px of a component's bounding box into ``out``. False
+    where no ellipse can be had.
+    """
+    a, b = lanes(patch, component.top - 2, component.bottom + 2)
+    # about the middle of the box: sums of small numbers
+    mid_u, mid_v = 0.5 * (component.left + component.right), 0.5 * (component.top + component.bottom)
+    half = 0.5 * (component.right - component.left) + 2.0
+    s, su, sv, suu, suv, svv = _soft_moments(
+        planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b], F(mid_u - patch.left), F(mid_v - patch.top), F(half),
+        F(2.0 / contrast),
+    )  # fmt: skip
     if s < 3.0:
         return False
     mu = su / s
@@ -140,8 +143,8 @@ def _ellipse(image, dark, box, labels, label, found, background, contrast, out):
     if scale > 2.0 or scale < 0.5:
         return False
     f = 1.0 / (4.0 * det * scale)
-    out[U] = ou + mu
-    out[V] = ov + mv
+    out[U] = mid_u + mu
+    out[V] = mid_v + mv
     out[AREA] = s
     out[QXX] = f * myy
     out[QXY] = -f * mxy
@@ -172,154 +175,126 @@ its squared weight; W I; W; W²; W I ddᵀ; W² I ddᵀ; W ddᵀ."""
 SUMS = 27
 
 
-class RowMoments(NamedTuple):
-    """Sums along a row of what is weighted, and of it times x and x²."""
-
-    all: float
-    x: float
-    xx: float
-
-
-class Rim(NamedTuple):
-    """Sums over the skirt's slope: its part of J, and of the edge's band ``RIM`` to ``RIM2`` of the window's sums."""
-
-    jxx: float
-    jxy: float
-    jyx: float
-    jyy: float
-    weight: float
-    x: float
-    y: float
-    x3: float
-    y3: float
-    square: float
-
-
-@inlined_kernel
-def _row_sums(row, first, y, aperture, edge, rim):
-    """Sums along one ``row`` of the window, at x = ``first``, ``first`` + 1, ... and ``y`` [px] from the centre.
-
-    Returns ``rim`` with this row added, and moments of W I, W² I, W and W². The band and all but W I and W I x only
-    where ``edge``.
-    """
-    q11, q12, q22, skirt, sign, zero = aperture
-    width = 4.0 * skirt * skirt
-    j00, j01, j10, j11, bumps, odd_x, odd_y, odd_3x, odd_3y, bumps2 = rim
-    light = light_x = light_xx = bright = bright_x = bright_xx = 0.0
-    all_w = all_wx = all_wxx = all_w2 = all_w2x = all_w2xx = 0.0
-    for k in range(row.size):
-        x = k + first
+@reassociating_kernel
+def _centre_sums(level, xs, ys, ellipse):
+    """Sums over the pixels of a window: W I, W I x, W I y, and the skirt's part of J (4)."""
+    q11, q12, q22, cx, cy, skirt = ellipse
+    width = F(4.0) * skirt * skirt
+    twice = F(2.0) * skirt * skirt
+    light = light_x = light_y = j00 = j01 = j10 = j11 = F(0.0)
+    for k in range(level.size):
+        x, y = xs[k] - cx, ys[k] - cy
         gx = q11 * x + q12 * y
         gy = q12 * x + q22 * y
-        e = x * gx + y * gy - 1.0
-        g2 = gx * gx + gy * gy
-        band = width * g2
-        square = e * e
-        if e > 0.0 and square >= band:
-            continue
-        level = sign * row[k] + zero
-        weight = 1.0
-        if square < band:
-            # W = (1 - (delta / skirt)²)², delta = e / 2|Qd|
-            over = 1.0 / band
-            rest = 1.0 - square * over
-            bump = rest * rest
-            if e > 0.0:
-                weight = bump
-                f = 8.0 * e * rest * over
-                g = 2.0 * skirt * skirt * f * e * over
-                dx = (f * gx - g * (q11 * gx + q12 * gy)) * level
-                dy = (f * gy - g * (q12 * gx + q22 * gy)) * level
-                j00 += x * dx
-                j01 += x * dy
-                j10 += y * dx
-                j11 += y * dy
-            if edge:
-                r = 1.0 / np.sqrt(g2)
-                nx = gx * r
-                ny = gy * r
-                part = bump * level
-                bumps += bump
-                bumps2 += bump * bump
-                odd_x += part * nx
-                odd_y += part * ny
-                odd_3x += part * (4.0 * nx * nx - 3.0) * nx
-                odd_3y += part * (3.0 - 4.0 * ny * ny) * ny
-        lit = weight * level
+        e = x * gx + y * gy - F(1.0)
+        # W = (1 - (delta / skirt)²)², delta = e / 2|Qd|
+        over = F(1.0) / (width * (gx * gx + gy * gy) + NOTHING)
+        rest = max(F(1.0) - e * e * over, F(0.0))
+        weight = rest * rest if e > F(0.0) else F(1.0)
+        f = F(8.0) * e * rest * over if e > F(0.0) else F(0.0)
+        g = twice * f * e * over
+        lit = weight * level[k]
+        dx = (f * gx - g * (q11 * gx + q12 * gy)) * level[k]
+        dy = (f * gy - g * (q12 * gx + q22 * gy)) * level[k]
         light += lit
         light_x += x * lit
-        if edge:
-            light_xx += x * x * lit
-            here = weight * lit
-            bright += here
-            bright_x += x * here
-            bright_xx += x * x * here
-            all_w += weight
-            all_wx += x * weight
-            all_wxx += x * x * weight
-            here = weight * weight
-            all_w2 += here
-            all_w2x += x * here
-            all_w2xx += x * x * here
+        light_y += y * lit
+        j00 += x * dx
+        j01 += x * dy
+        j10 += y * dx
+        j11 += y * dy
+    return light, light_x, light_y, j00, j01, j10, j11
+
+
+@reassociating_kernel
+def _weight_sums(level, xs, ys, ellipse):
+    """Further sums over the pixels of a window: W and W² with their second moments, second moments of W I and W² I
+    (14); of the band about the dot's edge its weight and squared weight, first and third harmonic of its level (6).
+    """
+    q11, q12, q22, cx, cy, skirt = ellipse
+    narrow = F(0.25) / (skirt * skirt)
+    w = wxx = wxy = wyy = ww = wwxx = wwxy = wwyy = F(0.0)
+    lxx = lxy = lyy = wlxx = wlxy = wlyy = F(0.0)
+    bumps = squares = odd_x = odd_y = odd_3x = odd_3y = F(0.0)
+    for k in range(level.size):
+        x, y = xs[k] - cx, ys[k] - cy
+        gx = q11 * x + q12 * y
+        gy = q12 * x + q22 * y
+        e = x * gx + y * gy - F(1.0)
+        r = F(1.0) / np.sqrt(gx * gx + gy * gy + NOTHING)
+        rest = max(F(1.0) - narrow * e * e * r * r, F(0.0))
+        bump = rest * rest
+        weight = bump if e > F(0.0) else F(1.0)
+        square, lit = weight * weight, weight * level[k]
+        xx, xy, yy = x * x, x * y, y * y
+        w += weight
+        wxx += weight * xx
+        wxy += weight * xy
+        wyy += weight * yy
+        ww += square
+        wwxx += square * xx
+        wwxy += square * xy
+        wwyy += square * yy
+        lxx += lit * xx
+        lxy += lit * xy
+        lyy += lit * yy
+        lit *= weight
+        wlxx += lit * xx
+        wlxy += lit * xy
+        wlyy += lit * yy
+        nx = gx * r
+        ny = gy * r
+        part = bump * level[k]
+        bumps += bump
+        squares += bump * bump
+        odd_x += part * nx
+        odd_y += part * ny
+        odd_3x += part * (F(4.0) * nx * nx - F(3.0)) * nx
+        odd_3y += part * (F(3.0) - F(4.0) * ny * ny) * ny
     return (
-        Rim(j00, j01, j10, j11, bumps, odd_x, odd_y, odd_3x, odd_3y, bumps2),
-        RowMoments(light, light_x, light_xx),
-        RowMoments(bright, bright_x, bright_xx),
-        RowMoments(all_w, all_wx, all_wxx),
-        RowMoments(all_w2, all_w2x, all_w2xx),
+        (w, wxx, wxy, wyy, ww, wwxx, wwxy, wwyy, lxx, lxy, lyy, wlxx, wlxy, wlyy),
+        (bumps, squares, odd_x, odd_y, odd_3x, odd_3y),
     )
-
-
-@inlined_kernel
-def _add_row(sums, xx, row, y):
-    """Second moments of a row's ``row`` at ``y`` into ``sums`` from ``xx`` on."""
-    sums[xx] += row.xx
-    sums[xx + 1] += y * row.x
-    sums[xx + 2] += y * y * row.all
 
 
 @kernel
-def _window_sums(image, dark, background, skirt, out, sums, edge):
-    """Sums over the window about the centre in ``out`` into ``sums`` (SUMS,): S, J, W I; where ``edge``, all of them.
+def single_ellipse(patch, skirt, out):
+    """The ellipse in ``out``, its centre in the patch's pixels, and the skirt, in single precision."""
+    return F(out[QXX]), F(out[QXY]), F(out[QYY]), F(out[U] - patch.left), F(out[V] - patch.top), F(skirt)
 
-    False where the window leaves the image.
-    """
+
+class Window(NamedTuple):
+    """First and last column and row [px] of what counts about a centre."""
+
+    left: int
+    right: int
+    top: int
+    bottom: int
+
+
+@kernel
+def _window(skirt, out):
+    """The window about the centre in ``out``."""
     q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    cu, cv = out[U], out[V]
     reach = _reach(q11, q12, q22, skirt)
     half_u, half_v = half_sizes(q11, q12, q22)
     half_u, half_v = half_u + reach, half_v + reach
-    lo_u, hi_u = int(np.ceil(cu - half_u)), int(np.floor(cu + half_u))
-    lo_v, hi_v = int(np.ceil(cv - half_v)), int(np.floor(cv + half_v))
-    rows, columns = image.shape
-    if lo_u < 0 or lo_v < 0 or hi_u >= columns or hi_v >= rows:
-        return False
-    sums[:] = 0.0
-    rim = Rim(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    aperture = aperture_of(dark, background, skirt, out)
-    for v in range(lo_v, hi_v + 1):
-        y = v - cv
-        row = image[v, lo_u : hi_u + 1]
-        rim, light, light2, weight, weight2 = _row_sums(row, lo_u - cu, y, aperture, edge, rim)
-        sums[SX] += light.x
-        sums[SY] += y * light.all
-        sums[LIGHT] += light.all
-        if edge:
-            sums[W] += weight.all
-            sums[WW] += weight2.all
-            _add_row(sums, LIGHTXX, light, y)
-            _add_row(sums, WLIGHTXX, light2, y)
-            _add_row(sums, WXX, weight, y)
-            _add_row(sums, WWXX, weight2, y)
-    sums[JXX], sums[JXY], sums[JYX], sums[JYY] = (
-        rim.jxx - sums[LIGHT],
-        rim.jxy,
-        rim.jyx,
-        rim.jyy - sums[LIGHT],
-    )
-    sums[RIM], sums[RIM_X], sums[RIM_Y], sums[RIM_3X] = rim.weight, rim.x, rim.y, rim.x3
-    sums[RIM_3Y], sums[RIM2] = rim.y3, rim.square
-    return True
+    return Window(
+        int(np.ceil(out[U] - half_u)), int(np.floor(out[U] + half_u)),
+        int(np.ceil(out[V] - half_v)), int(np.floor(out[V] + half_v)),
+    )  # fmt: skip
+
+
+@kernel
+def _around(skirt, out):
+    """First and last column and row of what gives background and noise about the centre in ``out``."""
+    reach = _reach(out[QXX], out[QXY], out[QYY], skirt) + RING
+    half_u, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
+    half_u, half_v = half_u + reach, half_v + reach
+    return (
+        int(np.floor(out[U] - half_u)), int(np.floor(out[V] - half_v)), int(np.floor(out[U] + half_u)) + 1,
+        int(np.floor(out[V] + half_v)) + 1,
+    )  # fmt: skip
 
 
 @kernel
@@ -340,65 +315,94 @@ def _free_skirt(labels, box, label, out):
 
 
 class Dot(NamedTuple):
-    """A dot's ``background`` level, ``contrast`` to it, and ``skirt`` [px]; what a neighbour adds, ``beside`` [px]."""
+    """A dot's ``background`` level, the median distance from it (``noise``), ``contrast`` to it, and ``skirt`` [px];
+    what a neighbour adds, ``beside`` [px].
+    """
 
     background: float
+    noise: float
     contrast: float
     skirt: float
     beside: float
 
 
 @kernel
-def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, labels, stack, out):
-    """Status and the dot nearest to (pu, pv); its ellipse and its centre to first order into ``out``."""
+def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out):
+    """Status, the dot nearest to (pu, pv) and the patch about it; its ellipse and its centre to first order into
+    ``out``.
+    """
     rows, columns = image.shape
-    none = Dot(0.0, 0.0, 0.0, 0.0)
+    none, nowhere = Dot(0.0, 0.0, 0.0, 0.0, 0.0), Patch(0, 0, 0, 0, 8)
     brightest = np.empty(box[3] - box[1], np.int64)
     low, high = extremes(image, dark, box, brightest)
     if high - low < min_contrast:
-        return NO_CONTRAST, none
+        return NO_CONTRAST, none, nowhere
     threshold = 255 - (low + high) // 2 if dark else (low + high + 1) // 2
-    found = np.zeros(10)
-    label = nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, labels, stack, found)
-    if label == 0:
-        return NO_COMPONENT, none
-    u_min, u_max, v_min, v_max = int(found[3]), int(found[4]), int(found[5]), int(found[6])
-    if u_min < MARGIN or v_min < MARGIN or u_max >= columns - MARGIN or v_max >= rows - MARGIN:
-        return BORDER, none
-    background = ring_level(image, dark, u_min, u_max, v_min, v_max)
+    found = nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, scratch)
+    if found.label == 0:
+        return NO_COMPONENT, none, nowhere
+    if (
+        min(found.left, found.top) < MARGIN
+        or found.right >= columns - MARGIN
+        or found.bottom >= rows - MARGIN
+    ):
+        return BORDER, none, nowhere
+    background, noise = ring_level(image, dark, found.left, found.right, found.top, found.bottom)
     contrast = float(255 - low if dark else high) - background
-    if found[8] >= 4:
-        contrast = found[7] / found[8] - background
+    if found.inner >= 4:
+        contrast = found.level_sum / found.inner - background
     if contrast < min_contrast:
-        return NO_CONTRAST, none
-    if not _ellipse(image, dark, box, labels, label, found, background, contrast, out):
-        return SHAPE, none
+        return NO_CONTRAST, none, nowhere
+    around = found.left - ROOM, found.top - ROOM, found.right + ROOM, found.bottom + ROOM
+    patch = fill_patch(image, dark, background, around, scratch.patch)
+    mixed = found.gap <= 3
+    if mixed:
+        blank_others(box, found.label, patch, scratch)
+    if not _ellipse(found, patch, scratch.patch, contrast, out):
+        return SHAPE, none, nowhere
     skirt, beside = SKIRT, 0.0
-    if found[9] > 1.0:
-        skirt, beside = _free_skirt(labels, box, label, out)
-    return (OK if skirt > 0.0 else SHAPE), Dot(background, contrast, skirt, beside)
+    if found.gap < FAR:
+        skirt, beside = _free_skirt(scratch.labels, box, found.label, out)
+        if skirt == 0.0:
+            return SHAPE, none, nowhere
+    around = left, top, right, bottom = _around(skirt, out)
+    wide = left < patch.left or right > patch.right or top < patch.top or bottom > patch.bottom
+    if wide or mixed:
+        if patch_size(around) > PATCH:
+            return SHAPE, none, nowhere
+        patch = fill_patch(image, dark, background, around, scratch.patch)
+    return OK, Dot(background, noise, contrast, skirt, beside), patch
 
 
 @kernel
-def _refine_centre(image, dark, dot, out, sums):
-    """Newton's method for the zero of S from the centre in ``out``: a status. ``sums`` of the last step."""
+def _refine_centre(image, dot, patch, planes, out):
+    """Newton's method for the zero of S from the centre in ``out``: a status, W I and J (4) of the last step."""
     start_u, start_v = out[U], out[V]
+    rows, columns = image.shape
+    light = jxx = jxy = jyx = jyy = 0.0
     # From a start within some hundredths of a pixel the second step is of the order of 1e-4 px.
     for step in range(4):
-        if not _window_sums(image, dark, dot.background, dot.skirt, out, sums, step > 0):
-            return BORDER
-        det = sums[JXX] * sums[JYY] - sums[JXY] * sums[JYX]
-        if det <= 0.0 or sums[JXX] + sums[JYY] >= 0.0:
-            return DIVERGED
-        du = -(sums[JYY] * sums[SX] - sums[JXY] * sums[SY]) / det
-        dv = -(sums[JXX] * sums[SY] - sums[JYX] * sums[SX]) / det
+        window = _window(dot.skirt, out)
+        if window.left < 0 or window.top < 0 or window.right >= columns or window.bottom >= rows:
+            return BORDER, light, (jxx, jxy, jyx, jyy)
+        a, b = lanes(patch, window.top, window.bottom)
+        light, sx, sy, jxx, jxy, jyx, jyy = _centre_sums(
+            planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b], single_ellipse(patch, dot.skirt, out)
+        )
+        jxx -= light
+        jyy -= light
+        det = jxx * jyy - jxy * jyx
+        if det <= 0.0 or jxx + jyy >= 0.0:
+            return DIVERGED, light, (jxx, jxy, jyx, jyy)
+        du = -(jyy * sx - jxy * sy) / det
+        dv = -(jxx * sy - jyx * sx) / det
         out[U] += du
         out[V] += dv
         if (out[U] - start_u) ** 2 + (out[V] - start_v) ** 2 > 1.0:
-            return DIVERGED
+            return DIVERGED, light, (jxx, jxy, jyx, jyy)
         if step > 0 and du * du + dv * dv < 1e-6:
             break
-    return OK
+    return OK, light, (jxx, jxy, jyx, jyy)
 
 
 @kernel
@@ -412,30 +416,29 @@ def _congruence(a, b, c, d, n11, n12, n22):
 
 
 @kernel
-def _sensitivities(sums, contrast, out):
+def _sensitivities(j, weights, contrast, out):
     """Into ``out``: the centre's covariance at unit noise, its shifts by slopes of the light and of the background."""
-    det = sums[JXX] * sums[JYY] - sums[JXY] * sums[JYX]
-    a, b, c, d = sums[JYY] / det, -sums[JXY] / det, -sums[JYX] / det, sums[JXX] / det
-    out[CXX], out[CXY], out[CYY] = _congruence(a, b, c, d, sums[WWXX], sums[WWXY], sums[WWYY])
+    _, wxx, wxy, wyy, _, wwxx, wwxy, wwyy, lxx, lxy, lyy, wlxx, wlxy, wlyy = weights
+    det = j[0] * j[3] - j[1] * j[2]
+    a, b, c, d = j[3] / det, -j[1] / det, -j[2] / det, j[0] / det
+    out[CXX], out[CXY], out[CYY] = _congruence(a, b, c, d, wwxx, wwxy, wwyy)
     out[CONTRAST] = contrast
     f = 1.0 / contrast
-    out[BXX], out[BXY], out[BYY] = _congruence(
-        a, b, c, d, f * sums[WLIGHTXX], f * sums[WLIGHTXY], f * sums[WLIGHTYY]
-    )
+    out[BXX], out[BXY], out[BYY] = _congruence(a, b, c, d, f * wlxx, f * wlxy, f * wlyy)
     for k in range(2):
         # the shift is -J⁻¹ sum T dI, and T = d W
         p, r = (a, b) if k == 0 else (c, d)
-        out[LIT + 2 * k] = -(p * sums[LIGHTXX] + r * sums[LIGHTXY])
-        out[LIT + 2 * k + 1] = -(p * sums[LIGHTXY] + r * sums[LIGHTYY])
-        out[DARK + 2 * k] = -(p * sums[WXX] + r * sums[WXY])
-        out[DARK + 2 * k + 1] = -(p * sums[WXY] + r * sums[WYY])
+        out[LIT + 2 * k] = -(p * lxx + r * lxy)
+        out[LIT + 2 * k + 1] = -(p * lxy + r * lyy)
+        out[DARK + 2 * k] = -(p * wxx + r * wxy)
+        out[DARK + 2 * k + 1] = -(p * wxy + r * wyy)
         # inside the dot T = d is one of the terms that the slope is fitted with
         out[PULL + 2 * k] = -f * p
         out[PULL + 2 * k + 1] = -f * r
 
 
 @kernel
-def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels, stack, out):
+def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, scratch, out):
     """Measure the dot nearest to (pu, pv) in the window [u0, u1) x [v0, v1) of ``image`` (h, w) uint8.
 
     ``dark``: dots darker than their background. ``out`` (FIELDS,) is written; returns a status, ``OK`` or
@@ -447,33 +450,38 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, labels,
     if u1 - u0 < 7 or v1 - v0 < 7 or u1 - u0 > MAX_WINDOW or v1 - v0 > MAX_WINDOW:
         return BORDER
     box = (u0, v0, u1, v1)
-    status, dot = _find_dot(image, dark, box, pu, pv, min_contrast, min_area, labels, stack, out)
+    status, dot, patch = _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out)
     if status != OK:
         return status
-    sums = np.zeros(SUMS)
-    status = _refine_centre(image, dark, dot, out, sums)
+    planes = scratch.patch
+    status, light, j = _refine_centre(image, dot, patch, planes, out)
     if status != OK:
         return status
-    _sensitivities(sums, dot.contrast, out)
-    plane = np.zeros(2)
-    reach = _reach(out[QXX], out[QXY], out[QYY], dot.skirt)
-    out[NOISE] = surroundings(image, dark, dot.background, dot.skirt, reach, out, plane)
-    inside(image, dark, dot.background, dot.contrast, out)
-    out[BACKGROUND] = dot.background + plane[0]
-    out[FLUX] = sums[LIGHT] - plane[0] * sums[W]
-    out[FLUX_NOISE] = np.sqrt(sums[WW] + sums[W] ** 2 / max(plane[1], 1.0))
+    ellipse = single_ellipse(patch, dot.skirt, out)
+    window = _window(dot.skirt, out)
+    a, b = lanes(patch, window.top, window.bottom)
+    level, xs, ys = planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]
+    weights, (bump, bump2, odd_x, odd_y, odd_3x, odd_3y) = _weight_sums(level, xs, ys, ellipse)
+    _sensitivities(j, weights, dot.contrast, out)
+    surface = surroundings(patch, planes, _around(dot.skirt, out), ellipse, 4.0 * 1.4826 * dot.noise + 2.0)
+    out[NOISE] = surface.variance
+    inside(patch, planes, ellipse, dot.contrast, out)
+    w, ww = weights[0], weights[4]
+    out[BACKGROUND] = dot.background + surface.plane_level
+    out[FLUX] = light - surface.plane_level * w
+    out[FLUX_NOISE] = np.sqrt(ww + w**2 / max(surface.count, 1.0))
     even = dot.beside * dot.beside
     out[EXX], out[EXY], out[EYY] = even, 0.0, even
-    if sums[RIM] <= 0.0:
+    if bump <= 0.0:
         return SHAPE
-    odd = sums[RIM_X] ** 2 + sums[RIM_Y] ** 2 + sums[RIM_3X] ** 2 + sums[RIM_3Y] ** 2
-    out[LOPSIDED] = 2.0 * np.sqrt(odd) / (sums[RIM] * dot.contrast)
-    out[LOPSIDED_NOISE] = 2.0 * np.sqrt(2.0 * sums[RIM2]) / (sums[RIM] * dot.contrast)
+    odd = odd_x**2 + odd_y**2 + odd_3x**2 + odd_3y**2
+    out[LOPSIDED] = 2.0 * np.sqrt(odd) / (bump * dot.contrast)
+    out[LOPSIDED_NOISE] = 2.0 * np.sqrt(2.0 * bump2) / (bump * dot.contrast)
     return OK
 
 
 @kernel
-def measure_windows(image, dark, windows, near, min_contrast, least, labels, stack, out, status):
+def measure_windows(image, dark, windows, near, min_contrast, least, scratch, out, status):
     """:func:`measure` in windows (k, 4) about points (k, 2) [px], components of ``least`` (k,) pixels or
     more.
 
@@ -482,7 +490,7 @@ def measure_windows(image, dark, windows, near, min_contrast, least, labels, sta
     for k in range(windows.shape[0]):
         u0, v0, u1, v1 = windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3]
         status[k] = measure(
-            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, least[k], labels, stack, out[k]
+            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, least[k], scratch, out[k]
         )
 
 
@@ -496,25 +504,31 @@ SATURATED_PX = 0.005
 
 
 @kernel
-def variances(dots, column, unevenness, out):
-    """Noise variance of each dot (k,) [levels²] from what its ``column`` of ``dots`` says, -1 where that is nothing.
+def variances(seen, contrasts, unevenness, out):
+    """Noise variance of each dot (k,) [levels²] from what is ``seen`` (k,), -1 where that is nothing.
 
-    ``unevenness``: part of the contrast that is no noise. One picture has one noise: each dot gets the median over all
-    of them, which is steadier (a dot's own: 15 %), unless its own is more than twice that.
+    ``unevenness``: part of the ``contrasts`` (k,) that is no noise. One picture has one noise: each dot gets the
+    median over all of them, which is steadier (a dot's own: 15 %), unless its own is more than twice that.
     """
-    n = dots.shape[0]
+    n = seen.size
     known = np.empty(n)
     count = 0
     for i in range(n):
-        out[i] = dots[i, column]
+        out[i] = seen[i]
         if out[i] >= 0.0:
-            out[i] = max(out[i] - (unevenness * dots[i, CONTRAST]) ** 2, 0.0)
+            out[i] = max(out[i] - (unevenness * contrasts[i]) ** 2, 0.0)
             known[count] = out[i]
             count += 1
     if count == 0:
         out[:] = 1.0 + QUANTISATION
         return
-    known = np.sort(known[:count])
+    for i in range(1, count):
+        # insertion sort: NumPy's takes a second to compile
+        value, k = known[i], i
+        while k > 0 and known[k - 1] > value:
+            known[k] = known[k - 1]
+            k -= 1
+        known[k] = value
     common = max(0.5 * (known[(count - 1) // 2] + known[count // 2]), QUANTISATION)
     for i in range(n):
         if out[i] <= 2.0 * common:
@@ -530,8 +544,8 @@ def covariances(dots, floor, out):
     """
     n = dots.shape[0]
     darks, brights = np.empty(n), np.empty(n)
-    variances(dots, NOISE, 0.0, darks)
-    variances(dots, BRIGHT, UNEVEN_INSIDE, brights)
+    variances(dots[:, NOISE], dots[:, CONTRAST], 0.0, darks)
+    variances(dots[:, BRIGHT], dots[:, CONTRAST], UNEVEN_INSIDE, brights)
     seen = False
     for i in range(n):
         seen = seen or dots[i, BRIGHT] >= 0.0
@@ -550,12 +564,3 @@ def covariances(dots, floor, out):
         out[i, 0, 1] = dark * dot[CXY] + light * dot[BXY] + dot[EXY]
         out[i, 1, 0] = out[i, 0, 1]
         out[i, 1, 1] = dark * dot[CYY] + light * dot[BYY] + dot[EYY] + even
-
-
-def compile_kernels() -> None:
-    """Compile what the detector calls, or load it from the cache."""
-    compile_for(covariances, given(FLOAT, 2), FLOAT, written(FLOAT, 3))
-    compile_for(
-        measure_windows, IMAGE, BOOL, given(INT, 2), given(FLOAT, 2), INT, given(INT, 1), written(INT32, 2),
-        written(INT32, 1), written(FLOAT, 2), written(INT, 1),
-    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Connected components of a window, and the level around one. Numba kernels; no state."""
+"""Connected components of a window, the level around one, and its pixels as a patch. Numba kernels; no state."""
 
 from __future__ import annotations
 
@@ -9,24 +9,41 @@ import numpy.typing as npt
 
 from stereoservo.numerics.compilation import kernel
 
+F = np.float32
+NOTHING = F(1e-12)
+"""Keeps quotients finite in the centre of an ellipse."""
 MAX_WINDOW = 160
 """Largest side of a window [px]."""
+ROW, FIRST, BEYOND, COMPONENT = range(4)
+"""Columns of a run: its row, its first pixel, the first beyond, the number of its component."""
+AREA_PX, SUM_U, SUM_V, LEFT, RIGHT, TOP, BOTTOM = range(7)
+"""Columns of a component's totals; the last row and column are its own."""
+LEVEL, VALID, X, Y = range(4)
+"""Planes of a patch: level above the background, 1 where that is a pixel of the image, column, row."""
+LANES = 32
+"""Pixels of a patch are so many at a time: what the loops over them leave over is padding."""
+FAR = 10
+"""Pixels between the bounding boxes of components from which one does not matter to a dot in the other: twice what
+must be free about it, and what its ellipse may exceed its box by."""
+PATCH = (MAX_WINDOW + 96) ** 2
+"""Pixels of the largest patch, padding included."""
 
 
-def scratch() -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Label image and stack for :func:`measure`, to be reused between calls of one thread."""
-    return np.zeros((MAX_WINDOW, MAX_WINDOW), np.int32), np.zeros(MAX_WINDOW * MAX_WINDOW, np.int32)
+class Scratch(NamedTuple):
+    """Memory of :func:`~stereoservo_drivers.detectors.centroids.measure`, reused between calls of one thread."""
+
+    labels: npt.NDArray[np.int32]
+    runs: npt.NDArray[np.int32]
+    patch: npt.NDArray[np.float32]
 
 
-@kernel
-def median_level(histogram, count):
-    half = (count + 1) // 2
-    total = 0
-    for level in range(256):
-        total += histogram[level]
-        if total >= half:
-            return float(level)
-    return 255.0
+def scratch() -> Scratch:
+    """New memory for measuring."""
+    return Scratch(
+        np.zeros((MAX_WINDOW, MAX_WINDOW), np.int32),
+        np.zeros((MAX_WINDOW * (MAX_WINDOW // 2 + 1), 4), np.int32),
+        np.zeros((4, PATCH), np.float32),
+    )
 
 
 @kernel
@@ -50,90 +67,157 @@ def extremes(image, dark, box, brightest):
 
 
 @kernel
-def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, labels, stack, found):
-    """Label the bright components of a window; the label of the one nearest to (pu, pv), 0 if there is none.
+def join_runs(runs, count, reach):
+    """Number the components of ``count`` runs (n, 4) in the order of their rows; their totals (components, 7).
 
-    ``brightest`` level of each row (rows,). ``found``: count, sum u, sum v, u_min, u_max, v_min, v_max, level sum of
-    its inner pixels, their count; last, the number of all components. Those that touch the window's rim are something
-    larger than a dot and are not looked for.
+    Runs of neighbouring rows are of one component where they overlap, or, at a ``reach`` of 1, touch by a corner.
+    """
+    components = count
+    above = 0
+    for k in range(count):
+        row, first, beyond = runs[k, ROW], runs[k, FIRST] - reach, runs[k, BEYOND] + reach
+        runs[k, COMPONENT] = root = k
+        while above < k and (
+            runs[above, ROW] < row - 1 or (runs[above, ROW] == row - 1 and runs[above, BEYOND] <= first)
+        ):
+            above += 1
+        i = above
+        while i < k and runs[i, ROW] == row - 1 and runs[i, FIRST] < beyond:
+            other = i
+            while runs[other, COMPONENT] != other:
+                other = runs[other, COMPONENT]
+            if other != root:
+                components -= 1
+                runs[max(root, other), COMPONENT] = root = min(root, other)
+            i += 1
+    totals = np.zeros((components, 7), np.int64)
+    components = 0
+    for k in range(count):
+        row, first, beyond = runs[k, ROW], runs[k, FIRST], runs[k, BEYOND]
+        if runs[k, COMPONENT] == k:
+            mine = components
+            components += 1
+            total = totals[mine]
+            total[LEFT], total[RIGHT], total[TOP] = first, beyond - 1, row
+        else:
+            # an earlier run, which has its number already
+            mine = runs[runs[k, COMPONENT], COMPONENT]
+            total = totals[mine]
+        runs[k, COMPONENT] = mine
+        n = beyond - first
+        total[AREA_PX] += n
+        total[SUM_U] += n * (first + beyond - 1) // 2
+        total[SUM_V] += n * row
+        total[LEFT] = min(total[LEFT], first)
+        total[RIGHT] = max(total[RIGHT], beyond - 1)
+        total[BOTTOM] = row
+    return totals
+
+
+@kernel
+def _bright_runs(image, dark, box, brightest, threshold, runs):
+    """Runs (n, 4) of pixels at the threshold or above in a window; their number."""
+    u0, v0, u1, v1 = box
+    flip = 255 if dark else 0
+    count = 0
+    for v in range(v0, v1):
+        if brightest[v - v0] < threshold:
+            continue
+        row = image[v, u0:u1]
+        within = False
+        for k in range(row.size):
+            bright = (np.int64(row[k]) ^ flip) >= threshold
+            if bright != within:
+                within = bright
+                if bright:
+                    runs[count, ROW] = v
+                    runs[count, FIRST] = k + u0
+                else:
+                    runs[count, BEYOND] = k + u0
+                    count += 1
+        if within:
+            runs[count, BEYOND] = u1
+            count += 1
+    return count
+
+
+class Component(NamedTuple):
+    """A component of a window: its ``label`` (0: none), the ``gap`` [px] to the next one's bounding box, its own, and
+    sum of levels and number of its inner pixels.
+    """
+
+    label: int
+    gap: int
+    left: int
+    right: int
+    top: int
+    bottom: int
+    level_sum: int
+    inner: int
+
+
+@kernel
+def _gap(totals, which):
+    """Pixels between the bounding box of a component and the nearest other one's; FAR where there is none nearer."""
+    own = totals[which]
+    gap = FAR
+    for c in range(totals.shape[0]):
+        if c != which:
+            other = totals[c]
+            along = max(other[LEFT] - own[RIGHT], own[LEFT] - other[RIGHT])
+            gap = min(gap, max(along, other[TOP] - own[BOTTOM], own[TOP] - other[BOTTOM]))
+    return gap
+
+
+@kernel
+def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, scratch):
+    """The bright component of ``min_area`` pixels or more nearest to (pu, pv).
+
+    ``brightest`` level of each row (rows,). Those that touch the window's rim are something larger than a dot and are
+    not looked for. Labels are written where another one is near.
     """
     u0, v0, u1, v1 = box
-    labels[: v1 - v0, : u1 - u0] = 0
-    best = 0
-    best_distance = 1e30
-    label = 0
-    for sv in range(v0, v1):
-        if brightest[sv - v0] < threshold:
+    labels, runs, _ = scratch
+    count = _bright_runs(image, dark, box, brightest, threshold, runs)
+    totals = join_runs(runs, count, np.int64(0))
+    best, nearest = -1, 1e30
+    for c in range(totals.shape[0]):
+        total = totals[c]
+        if total[AREA_PX] < min_area or total[LEFT] == u0 or total[TOP] == v0:
             continue
-        row, marks = image[sv, u0:u1], labels[sv - v0]
-        for su in range(row.size):
-            level = int(row[su])
-            if dark:
-                level = 255 - level
-            if level < threshold or marks[su] != 0:
-                continue
-            label += 1
-            marks[su] = label
-            stack[0] = (sv - v0) * MAX_WINDOW + su
-            top = 1
-            count = 0
-            sum_u = sum_v = 0
-            u_min, u_max, v_min, v_max = su + u0, su + u0, sv, sv
-            inner_sum = inner = 0
-            while top > 0:
-                top -= 1
-                v = stack[top] // MAX_WINDOW + v0
-                u = stack[top] % MAX_WINDOW + u0
-                count += 1
-                sum_u += u
-                sum_v += v
-                u_min = min(u_min, u)
-                u_max = max(u_max, u)
-                v_min = min(v_min, v)
-                v_max = max(v_max, v)
-                neighbours = 0
-                for k in range(4):
-                    nu = u + (1 if k == 0 else -1 if k == 1 else 0)
-                    nv = v + (1 if k == 2 else -1 if k == 3 else 0)
-                    if nu < u0 or nu >= u1 or nv < v0 or nv >= v1:
-                        continue
-                    other = int(image[nv, nu])
-                    if dark:
-                        other = 255 - other
-                    if other < threshold:
-                        continue
-                    neighbours += 1
-                    if labels[nv - v0, nu - u0] == 0:
-                        labels[nv - v0, nu - u0] = label
-                        stack[top] = (nv - v0) * MAX_WINDOW + (nu - u0)
-                        top += 1
-                if neighbours == 4:
-                    here = int(image[v, u])
-                    inner_sum += 255 - here if dark else here
+        if total[RIGHT] == u1 - 1 or total[BOTTOM] == v1 - 1:
+            continue
+        du, dv = total[SUM_U] / total[AREA_PX] - pu, total[SUM_V] / total[AREA_PX] - pv
+        if du * du + dv * dv < nearest:
+            nearest = du * du + dv * dv
+            best = c
+    if best < 0:
+        return Component(0, FAR, 0, 0, 0, 0, 0, 0)
+    gap = _gap(totals, best)
+    if gap < FAR:
+        labels[: v1 - v0, : u1 - u0] = 0
+    flip = 255 if dark else 0
+    level_sum = inner = 0
+    for k in range(count):
+        row, first, beyond, mine = runs[k, ROW], runs[k, FIRST], runs[k, BEYOND], runs[k, COMPONENT]
+        if gap < FAR:
+            for u in range(first, beyond):
+                labels[row - v0, u - u0] = mine + 1
+        if mine == best:
+            for u in range(first + 1, beyond - 1):
+                over, under = np.int64(image[row - 1, u]) ^ flip, np.int64(image[row + 1, u]) ^ flip
+                if over >= threshold and under >= threshold:
+                    level_sum += np.int64(image[row, u]) ^ flip
                     inner += 1
-            if count < min_area or u_min == u0 or v_min == v0 or u_max == u1 - 1 or v_max == v1 - 1:
-                continue
-            du = sum_u / count - pu
-            dv = sum_v / count - pv
-            if du * du + dv * dv < best_distance:
-                best_distance = du * du + dv * dv
-                best = label
-                found[0] = count
-                found[1] = sum_u
-                found[2] = sum_v
-                found[3] = u_min
-                found[4] = u_max
-                found[5] = v_min
-                found[6] = v_max
-                found[7] = inner_sum
-                found[8] = inner
-    found[9] = label
-    return best
+    total = totals[best]
+    return Component(best + 1, gap, total[LEFT], total[RIGHT], total[TOP], total[BOTTOM], level_sum, inner)
 
 
 @kernel
 def ring_level(image, dark, u_min, u_max, v_min, v_max):
-    """Median level of the rectangular ring 3 to 4 px outside a bounding box (all inside the image)."""
+    """Median level of the rectangular ring 3 to 4 px outside a bounding box (all inside the image), and the median
+    distance from it.
+    """
     histogram = np.zeros(256, np.int32)
     count = 0
     for grow in (3, 4):
@@ -147,7 +231,17 @@ def ring_level(image, dark, u_min, u_max, v_min, v_max):
                 level = int(image[v, u])
                 histogram[255 - level if dark else level] += 1
                 count += 1
-    return median_level(histogram, count)
+    half = (count + 1) // 2
+    total = middle = 0
+    while total + histogram[middle] < half:
+        total += histogram[middle]
+        middle += 1
+    total, away = histogram[middle], 0
+    while total < half:
+        away += 1
+        total += histogram[middle - away] if middle >= away else 0
+        total += histogram[middle + away] if middle + away <= 255 else 0
+    return float(middle), float(away)
 
 
 @kernel
@@ -157,24 +251,75 @@ def half_sizes(q11, q12, q22):
     return np.sqrt(q22 / det), np.sqrt(q11 / det)
 
 
-class Aperture(NamedTuple):
-    """An ellipse dᵀQd = 1 with a ``skirt`` [px], and what makes levels of an image ones above the background:
-    ``sign`` times level plus ``zero``.
-    """
+@kernel
+def patch_size(box):
+    """Pixels of the planes that a rectangle takes, with its padding."""
+    return ((box[2] - box[0]) // 8 * 8 + 8) * (box[3] - box[1] + 1) + 2 * LANES
 
-    q11: float
-    q12: float
-    q22: float
-    skirt: float
-    sign: float
-    zero: float
+
+class Patch(NamedTuple):
+    """Where the pixels of a patch come from: first and last columns and rows [px]; its ``width``, a multiple of 8."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    width: int
 
 
 @kernel
-def aperture_of(dark, background, skirt, out):
-    """The aperture about a dot's ellipse in ``out``."""
-    sign, zero = (-1.0, 255.0 - background) if dark else (1.0, -background)
-    return Aperture(out[QXX], out[QXY], out[QYY], skirt, sign, zero)
+def fill_patch(image, dark, background, box, planes):
+    """The pixels of a rectangle, its last row and column included, into ``planes`` (4, n), row by row.
+
+    What is outside of the image or pads a row has the level 0 and is not VALID; what pads the end is far away.
+    """
+    u0, v0, u1, v1 = box
+    rows, columns = image.shape
+    width = (u1 - u0) // 8 * 8 + 8
+    sign, zero = np.float32(1.0), np.float32(-background)
+    if dark:
+        sign, zero = np.float32(-1.0), np.float32(255.0 - background)
+    n = (v1 - v0 + 1) * width
+    padded = (n + LANES - 1) // LANES * LANES + LANES
+    planes[LEVEL, :padded] = 0.0
+    planes[VALID, :padded] = 0.0
+    planes[X, n:padded] = 1e3
+    planes[Y, n:padded] = 1e3
+    first, beyond = max(u0, 0), min(u1 + 1, columns)
+    for v in range(v0, v1 + 1):
+        start = (v - v0) * width
+        x, y = planes[X, start : start + width], planes[Y, start : start + width]
+        for k in range(width):
+            x[k] = k
+            y[k] = v - v0
+        if v < 0 or v >= rows:
+            continue
+        row = image[v, first:beyond]
+        start += first - u0
+        level, valid = planes[LEVEL, start : start + row.size], planes[VALID, start : start + row.size]
+        for k in range(row.size):
+            level[k] = sign * np.float32(row[k]) + zero
+            valid[k] = 1.0
+    return Patch(u0, v0, u1, v1, width)
+
+
+@kernel
+def blank_others(box, label, patch, scratch):
+    """Give the pixels of other components than ``label`` in a window the background's level in their patch."""
+    labels, _, planes = scratch
+    u0, v0, u1, v1 = box
+    for v in range(max(patch.top, v0), min(patch.bottom + 1, v1)):
+        for u in range(max(patch.left, u0), min(patch.right + 1, u1)):
+            if labels[v - v0, u - u0] not in (0, label):
+                planes[LEVEL, (v - patch.top) * patch.width + u - patch.left] = 0.0
+
+
+@kernel
+def lanes(patch, first, last):
+    """First and end in the planes of the rows ``first`` to ``last`` [px] of a patch, a multiple of LANES apart."""
+    start = (first - patch.top) * patch.width
+    n = (last - first + 1) * patch.width
+    return start, start + (n + LANES - 1) // LANES * LANES
 
 
 @kernel

@@ -5,14 +5,14 @@ priors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import (
     CameraObservation,
@@ -22,7 +22,7 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
-from stereoservo_drivers.detectors import acquisition, centroids, face_fit, patterns
+from stereoservo_drivers.detectors import acquisition, centroids, patterns
 from stereoservo_drivers.detectors.acquisition import Expectation, find_spots
 from stereoservo_drivers.detectors.centroids import measure_windows
 from stereoservo_drivers.detectors.components import (
@@ -34,6 +34,7 @@ from stereoservo_drivers.detectors.components import (
     FIELDS,
     NOISE,
     OK,
+    Scratch,
     scratch,
 )
 from stereoservo_drivers.detectors.face_fit import (
@@ -48,7 +49,17 @@ from stereoservo_drivers.detectors.face_fit import (
 from stereoservo_drivers.detectors.face_options import FaceOptions, Positive, patterns_of
 from stereoservo_drivers.detectors.frame_images import sized_image
 from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle
-from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile_for, given, written
+from stereoservo_drivers.detectors.kernel_types import (
+    BOOL,
+    FLOAT,
+    IMAGE,
+    INT,
+    INT32,
+    SINGLE,
+    compile_for,
+    given,
+    written,
+)
 
 SAME_SPOT_PX = 2.0
 """A spot this near to a dot that was tracked is that dot."""
@@ -96,6 +107,24 @@ _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
 """Measurements (faces, 7, FIELDS) and which of them are accepted (faces, 7)."""
 
 
+class _Seen(NamedTuple):
+    """What an observation is made of: arrays of its own, of which the first rows are filled."""
+
+    ids: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
+
+    @classmethod
+    def of(cls, most: int) -> _Seen:
+        return cls(np.empty(most, np.int64), np.empty((most, 2)), np.empty((most, 2, 2)))
+
+    def observation(self, frame: Frame, count: int) -> CameraObservation:
+        return CameraObservation(
+            frame.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, self.ids[:count],
+            self.pixels[:count], self.covariances[:count],
+        )  # fmt: skip
+
+
 class DotDetector:
     """Detects dots of self-identifying faces: ids, centres and calibrated covariances. One thread at a time.
 
@@ -122,36 +151,44 @@ class DotDetector:
         self.camera = context.camera
         self._patterns = patterns_of(self.options.faces, self.options.beside)
         self._dark = self.options.polarity == "dark"
-        self._labels, self._stack = scratch()
-        centroids.compile_kernels()
+        self._scratch = scratch()
         patterns.compile_kernels()
-        face_fit.compile_kernels()
+        acquisition.compile_kernels()
         _compile_kernels()
         self._size = self.options.image_size
         self._every_id = np.array([pattern.ids for pattern in self._patterns])
         self._order = np.argsort(self._every_id.ravel())
         self._positions = np.array([pattern.positions for pattern in self._patterns])
         self._radii = np.array([pattern.radius for pattern in self._patterns])
-        self._ids = tuple(sorted(self._every_id.ravel().tolist()))
-        self._place = {marker: k for k, marker in enumerate(self._every_id.ravel().tolist())}
+        self._bases = np.array([pattern.bases for pattern in self._patterns])
+        self._inverses = np.array([pattern.inverses for pattern in self._patterns])
+        self._dots = np.zeros((self._every_id.size, FIELDS))
+        self._used = np.zeros(self._every_id.size, np.bool_)
+        self._gate = np.inf
+        if self.options.gate_probability:
+            self._gate = -2.0 * np.log1p(-self.options.gate_probability)
 
     def describe(self) -> DetectorDescription:
         """The marker ids of all faces."""
-        return DetectorDescription("dots", self._ids, self.options.floor_px)
+        ids = tuple(self._every_id.ravel()[self._order].tolist())
+        return DetectorDescription("dots", ids, self.options.floor_px)
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """Dots of ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
         image = sized_image(frame, self.camera, self._size)
         self._size = (image.shape[1], image.shape[0])
+        seen = _Seen.of(self._used.size)
         if prior is not None and self._fresh(frame, prior):
-            found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9)
-            if found[1].sum() >= self.options.min_dots:
-                return self._observation(frame, self._with_others(image, found, prior))
-        return self._observation(frame, self._search(frame, image, prior))
+            found = self._track(image, prior, (frame.t_shutter_ns - prior.t_ns) * 1e-9, seen)
+            if found >= self.options.min_dots and not self.options.beside:
+                return seen.observation(frame, found)
+            if found >= self.options.min_dots:
+                return self._observation(frame, self._with_others(image, prior), seen)
+        return self._observation(frame, self._search(frame, image, prior), seen)
 
     def _search(self, frame: Frame, image: ImageArray, prior: Prior | None) -> _Found:
         """Search for all faces: near the prior, of any age; in the whole image if that is not enough."""
-        every = range(len(self._patterns))
+        every = np.ones(len(self._patterns), np.bool_)
         if prior is None or not len(prior.ids):
             return self._acquire(image, every, [None] * len(every))
         limit_s = self.options.max_prior_age_s
@@ -167,107 +204,80 @@ class DotDetector:
         age_s = abs(frame.t_shutter_ns - prior.t_ns) * 1e-9
         return len(prior.ids) > 0 and age_s <= self.options.max_prior_age_s
 
-    def _track(self, image: ImageArray, prior: Prior, dt_s: float) -> _Found:
+    def _track(self, image: ImageArray, prior: Prior, dt_s: float, seen: _Seen) -> int:
+        """Measure and judge the dots of a prior, into ``seen`` and for :meth:`_with_others`; the number accepted."""
         options = self.options
-        faces, n = self._every_id.shape
-        m = faces * n
-        predicted, present = np.zeros((m, 2)), np.zeros(m, np.bool_)
-        shapes, windows, least = np.zeros((m, SHAPE)), np.zeros((m, 4), np.int64), np.zeros(m, np.int64)
-        dots, used, status = np.zeros((m, FIELDS)), np.zeros(m, np.bool_), np.zeros(m, np.int64)
-        uncertain = np.ascontiguousarray(prior.covariances, np.float64)
-        ids = np.ascontiguousarray(prior.ids, np.int64)
-        expect(
-            self._every_id, self._positions, self._radii, ids, np.ascontiguousarray(prior.pixels, np.float64),
-            np.ascontiguousarray(prior.velocities, np.float64), uncertain, dt_s, predicted, present, shapes,
-            windows, least,
+        found: int = track(
+            image, self._dark, self._every_id, self._positions, self._radii, self._order,
+            np.ascontiguousarray(prior.ids, np.int64), np.ascontiguousarray(prior.pixels, np.float64),
+            np.ascontiguousarray(prior.velocities, np.float64),
+            np.ascontiguousarray(prior.covariances, np.float64), dt_s, options.min_contrast, self._gate,
+            options.lopsided, options.consistency_px, options.floor_px, *self._scratch, self._dots, self._used,
+            seen.ids, seen.pixels, seen.covariances,
         )  # fmt: skip
-        measure_windows(
-            image, self._dark, windows, predicted, options.min_contrast, least, self._labels, self._stack,
-            dots, status
-        )  # fmt: skip
-        covariance, limit = np.zeros((m, 3)), np.inf
-        if options.gate_probability:
-            limit = -2.0 * np.log1p(-options.gate_probability)
-            for k, marker in enumerate(ids.tolist()):
-                if marker in self._place:
-                    covariance[self._place[marker]] = uncertain[k].ravel()[[0, 1, 3]]
-        judge(
-            self._positions, self._radii, predicted, present, shapes, status, covariance, limit, options.lopsided,
-            options.consistency_px, dots, used,
-        )  # fmt: skip
-        return dots.reshape(faces, n, FIELDS), used.reshape(faces, n)
+        return found
 
-    def _with_others(self, image: ImageArray, tracked: _Found, prior: Prior) -> _Found:
+    def _with_others(self, image: ImageArray, prior: Prior) -> _Found:
         """Tracked dots together with faces outside of the body, which the prior does not contain, found by search."""
-        if not self.options.beside:
-            return tracked
+        shape = self._every_id.shape
+        dots, used = self._dots.reshape(*shape, FIELDS), self._used.reshape(shape)
         unknown = ~np.isin(self._every_id, prior.ids).any(axis=1)
         unknown[: len(self._patterns) - len(self.options.beside)] = False
         if not unknown.any():
-            return tracked
-        dots, used = tracked
-        missing_faces = np.flatnonzero(unknown).tolist()
-        found, seen = self._acquire(image, missing_faces, [None] * len(unknown), taken=dots[used, :2])
-        return np.where(unknown[:, None, None], found, dots), np.where(unknown[:, None], seen, used)
+            return dots, used
+        found, right = self._acquire(image, unknown, [None] * len(unknown), taken=dots[used, :2])
+        return np.where(unknown[:, None, None], found, dots), np.where(unknown[:, None], right, used)
 
     def _acquire(
         self,
         image: ImageArray,
-        faces: Sequence[int],
+        sought: BoolArray,
         expected: Sequence[Expectation | None],
         origin: npt.NDArray[np.int64] | None = None,
         taken: FloatArray | None = None,
     ) -> _Found:
-        """Find the ``faces`` (indices) among all spots of an image except those ``taken`` (k, 2) [px].
+        """Find the faces that are ``sought`` (f,) among all spots of an image except those ``taken`` (k, 2) [px].
 
         ``expected`` of all faces chooses among copies. ``origin`` (2,): the image's offset in a larger one.
         """
         options = self.options
-        least, tolerance = options.acquire_dots, options.consistency_px
         spots = find_spots(
-            image,
-            self._dark,
-            options.min_contrast,
-            options.lopsided,
-            options.max_spots,
-            self._labels,
-            self._stack,
+            image, self._dark, options.min_contrast, options.lopsided, options.max_spots, self._scratch
         )
         if origin is not None:
             spots[:, :2] += origin
         if taken is not None and len(taken) and len(spots):
             away = np.hypot(*(spots[:, None, :2] - taken[None]).transpose(2, 0, 1)).min(axis=1)
-            spots = spots[away > SAME_SPOT_PX]
+            spots = np.ascontiguousarray(spots[away > SAME_SPOT_PX])
+        copies = acquisition.copies_of(
+            self._positions, self._radii, self._bases, self._inverses, sought, spots, options.acquire_dots,
+            options.consistency_px,
+        )  # fmt: skip
         owners = np.full(self._every_id.shape, -1, np.int64)
-        for f in faces:
-            copies = acquisition.copies_of(self._patterns[f], spots, least, tolerance)
-            owner = acquisition.choose(copies, spots, expected[f])
+        for f, found in enumerate(copies):
+            owner = acquisition.choose(found, spots, expected[f])
             if owner is not None:
                 owners[f] = owner
-        owners = acquisition.without_conflicts(owners)
-        used = owners >= 0
-        dots = np.zeros((*used.shape, FIELDS))
-        dots[used] = spots[owners[used]]
-        for f, pattern in enumerate(self._patterns):
-            if used[f].any():
-                settle_face(pattern.positions, pattern.radius, dots[f], used[f], tolerance, least)
+        dots, used = np.zeros((*owners.shape, FIELDS)), np.zeros(owners.shape, np.bool_)
+        settle_faces(
+            self._positions,
+            self._radii,
+            spots,
+            owners,
+            options.consistency_px,
+            options.acquire_dots,
+            dots,
+            used,
+        )
         return dots, used
 
-    def _observation(self, frame: Frame, found: _Found) -> CameraObservation:
+    def _observation(self, frame: Frame, found: _Found, seen: _Seen) -> CameraObservation:
         dots, used = found
-        rows = self._order[used.ravel()[self._order]]
-        ids, chosen = self._every_id.ravel()[rows], dots.reshape(-1, FIELDS)[rows]
-        covariance = np.empty((len(ids), 2, 2))
-        centroids.covariances(chosen, self.options.floor_px, covariance)
-        return CameraObservation(
-            camera=frame.camera,
-            seq=frame.seq,
-            t_shutter_ns=frame.t_shutter_ns,
-            t_received_ns=frame.t_received_ns,
-            ids=ids,
-            pixels=np.ascontiguousarray(chosen[:, :2]),
-            covariances=covariance,
-        )
+        count = report(
+            self._every_id, self._order, dots.reshape(-1, FIELDS), used.ravel(), self.options.floor_px, seen.ids,
+            seen.pixels, seen.covariances,
+        )  # fmt: skip
+        return seen.observation(frame, count)
 
 
 MIN_HALF_WINDOW = 14
@@ -279,20 +289,20 @@ SHAPE_MARGIN = 6
 @kernel
 def expect(
     every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s,
-    predicted, present, shapes, windows, least,
+    predicted, present, spread, shapes, windows, least,
 ):  # fmt: skip
     """Windows for the dots of a prior of ``ids`` (k,), ``pixels``, ``velocities`` (k, 2), ``covariances``
     (k, 2, 2).
 
     ``every_id`` (f, n), ``patterns`` (f, n, 2), ``radii`` (f,) are the faces. Writes ``predicted`` (m, 2)
-    [px] at ``dt_s`` [s] after the prior, ``present`` (m,), ``shapes`` (m, SHAPE), ``windows`` (m, 4),
-    ``least`` (m,) pixels of a dot. Faces that the prior shows from behind, too thin, too uncertain or by
-    fewer than four dots stay empty. Returns the number of windows.
+    [px] at ``dt_s`` [s] after the prior, ``present`` (m,), ``spread`` (m, 3) its covariance xx, xy, yy [px²],
+    ``shapes`` (m, SHAPE), ``windows`` (m, 4), ``least`` (m,) pixels of a dot. Faces that the prior shows from behind,
+    too thin, too uncertain or by fewer than four dots stay empty. Returns the number of windows.
     """
     faces, n = every_id.shape
     count = 0
     H = np.zeros((3, 3))
-    spread = np.zeros(n)
+    reaches = np.zeros(n)
     for f in range(faces):
         mine = present[f * n : (f + 1) * n]
         places = predicted[f * n : (f + 1) * n]
@@ -303,13 +313,15 @@ def expect(
                 du, dv = velocities[k, 0] * dt_s, velocities[k, 1] * dt_s
                 u, v = pixels[k, 0] + du, pixels[k, 1] + dv
                 xx, xy, yy = covariances[k, 0, 0], covariances[k, 0, 1], covariances[k, 1, 1]
+                row = spread[f * n + i]
+                row[0], row[1], row[2] = xx, xy, yy
                 largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
                 reach = 3.0 * np.sqrt(max(largest, 0.0)) + 0.25 * (abs(du) + abs(dv))
                 # comparisons fail for NaN
                 if abs(u) < 1e6 and abs(v) < 1e6 and reach < MAX_HALF_WINDOW:
                     places[i, 0] = u
                     places[i, 1] = v
-                    spread[i] = reach
+                    reaches[i] = reach
                     mine[i] = True
         good = fit_homography(patterns[f], places, mine, H)
         for i in range(n):
@@ -319,13 +331,13 @@ def expect(
             if (
                 good
                 and mine[i]
-                and (shape[6] < THINNEST or shape[5] + spread[i] + SHAPE_MARGIN > MAX_HALF_WINDOW)
+                and (shape[6] < THINNEST or shape[5] + reaches[i] + SHAPE_MARGIN > MAX_HALF_WINDOW)
             ):
                 good = False
         for i in range(n):
             if good and mine[i]:
                 shape = shapes[f * n + i]
-                half = max(int(np.ceil(shape[5] + spread[i])) + SHAPE_MARGIN, MIN_HALF_WINDOW)
+                half = max(int(np.ceil(shape[5] + reaches[i])) + SHAPE_MARGIN, MIN_HALF_WINDOW)
                 u, v = int(np.floor(places[i, 0] + 0.5)), int(np.floor(places[i, 1] + 0.5))
                 window = windows[f * n + i]
                 window[0], window[1], window[2], window[3] = u - half, v - half, u + half + 1, v + half + 1
@@ -404,7 +416,9 @@ def judge(
                 if present[k] and other < own:
                     used[i] = False
             count += 1 if used[i] else 0
-        count = settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, 4) if count >= 4 else 0
+        count = (
+            settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, np.int64(4)) if count >= 4 else 0
+        )
         if count == 0 or (
             count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine, FEW_TOLERANCE)
         ):
@@ -414,14 +428,94 @@ def judge(
     return total
 
 
+@kernel
+def report(every_id, order, dots, used, floor, ids, pixels, covariances):
+    """What is ``used`` (m,) of ``dots`` (m, FIELDS) as an observation, by ascending id, into the first rows of the last
+    three arguments; their number. ``order`` (m,) sorts the ids of all faces (f, n); ``floor`` [px].
+    """
+    n = every_id.shape[1]
+    chosen = np.empty((used.size, FIELDS))
+    count = 0
+    for k in order:
+        if used[k]:
+            ids[count] = every_id[k // n, k % n]
+            pixels[count, 0], pixels[count, 1] = dots[k, 0], dots[k, 1]
+            for j in range(FIELDS):
+                chosen[count, j] = dots[k, j]
+            count += 1
+    centroids.covariances(chosen[:count], floor, covariances)
+    return count
+
+
+@kernel
+def track(
+    image, dark, every_id, patterns, radii, order, ids, pixels, velocities, covariances, dt_s, min_contrast, limit,
+    lopsided, tolerance, floor, labels, runs, patch, dots, used, seen_ids, seen_pixels, seen_covariances,
+):  # fmt: skip
+    """From an image and a prior to an observation: :func:`expect`, the measurement in windows, :func:`judge`,
+    :func:`report`. Returns the number of dots; ``dots`` (m, FIELDS) and ``used`` (m,) are written, too.
+    """
+    m = used.size
+    predicted, spread, shapes = np.zeros((m, 2)), np.zeros((m, 3)), np.zeros((m, SHAPE))
+    windows, least, status = np.zeros((m, 4), np.int64), np.zeros(m, np.int64), np.zeros(m, np.int64)
+    present = np.zeros(m, np.bool_)
+    used[:] = False
+    expect(
+        every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s, predicted, present, spread, shapes,
+        windows, least,
+    )  # fmt: skip
+    measure_windows(
+        image, dark, windows, predicted, min_contrast, least, Scratch(labels, runs, patch), dots, status
+    )  # fmt: skip
+    judge(
+        patterns, radii, predicted, present, shapes, status, spread, limit, lopsided, tolerance, dots, used
+    )  # fmt: skip
+    return report(every_id, order, dots, used, floor, seen_ids, seen_pixels, seen_covariances)
+
+
+@kernel
+def settle_faces(patterns, radii, spots, owners, tolerance, least, dots, used):
+    """Check the faces (f, n) that acquisition found: ``owners`` are rows of ``spots``, -1 for missing dots.
+
+    Of faces that share a spot the one with more dots stays; of equals, none. Writes ``dots`` (f, n, FIELDS) and
+    ``used`` (f, n), of zeros.
+    """
+    faces, n = owners.shape
+    for f in range(faces):
+        mine = count = 0
+        keep = True
+        for i in range(n):
+            mine += 1 if owners[f, i] >= 0 else 0
+        for g in range(faces):
+            others = shared = 0
+            for i in range(n):
+                others += 1 if owners[g, i] >= 0 else 0
+                for k in range(n):
+                    shared += 1 if owners[g, i] >= 0 and owners[g, i] == owners[f, k] else 0
+            keep = keep and (g == f or shared == 0 or others < mine)
+        for i in range(n):
+            if keep and owners[f, i] >= 0:
+                used[f, i] = True
+                count += 1
+                for j in range(FIELDS):
+                    dots[f, i, j] = spots[owners[f, i], j]
+        if count > 0:
+            settle_face(patterns[f], radii[f], dots[f], used[f], tolerance, least)
+
+
 def _compile_kernels() -> None:
     """Compile the kernels of tracking, or load them from the cache."""
+    seen = written(INT, 1), written(FLOAT, 2), written(FLOAT, 3)
+    # before `track`, which calls it with the same types
     compile_for(
-        expect, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(FLOAT, 2), given(FLOAT, 2),
-        given(FLOAT, 3), FLOAT, written(FLOAT, 2), written(BOOL, 1), written(FLOAT, 2), written(INT, 2),
-        written(INT, 1),
+        report, given(INT, 2), given(INT, 1), written(FLOAT, 2), written(BOOL, 1), FLOAT, *seen
     )  # fmt: skip
     compile_for(
-        judge, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(BOOL, 1), given(FLOAT, 2), given(INT, 1),
-        given(FLOAT, 2), FLOAT, FLOAT, FLOAT, written(FLOAT, 2), written(BOOL, 1),
+        track, IMAGE, BOOL, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(INT, 1),
+        given(FLOAT, 2), given(FLOAT, 2), given(FLOAT, 3), FLOAT, INT, FLOAT, FLOAT, FLOAT, FLOAT,
+        written(INT32, 2), written(INT32, 2), written(SINGLE, 2), written(FLOAT, 2), written(BOOL, 1), *seen,
+    )  # fmt: skip
+    compile_for(
+        settle_faces, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(INT, 2), FLOAT, INT,
+        written(FLOAT, 3), written(BOOL, 2),
     )  # fmt: skip

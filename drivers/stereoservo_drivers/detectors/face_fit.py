@@ -28,7 +28,6 @@ from stereoservo_drivers.detectors.homographies import (
     outlier_dot,
     reject_outliers,
 )
-from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile_for, given, written
 from stereoservo_drivers.detectors.levels import UNEVEN_INSIDE
 from stereoservo_drivers.detectors.lighting import flat_field
 
@@ -191,11 +190,3 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
     for i in range(n):
         count += 1 if used[i] else 0
     return count
-
-
-def compile_kernels() -> None:
-    """Compile what the detector calls, or load it from the cache."""
-    compile_for(
-        settle_face, given(FLOAT, 2), FLOAT, written(FLOAT, 2), written(BOOL, 1), FLOAT, INT
-    )  # fmt: skip
-    compile_for(whole, given(FLOAT, 1), FLOAT)

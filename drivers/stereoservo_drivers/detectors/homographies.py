@@ -7,96 +7,147 @@ mirrored pattern has not.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from stereoservo.numerics.compilation import kernel
 
 ODD_NOISE, ODD_REST = 25.0, 70.0
+SINGULAR = 1e-11
+"""Pivot below which normal equations say nothing."""
 
 
 @kernel
-def _solve(A, b):
-    """Gaussian elimination with partial pivoting, in place; the solution is in ``b``. False if singular."""
-    n = b.size
-    for i in range(n):
-        pivot = i
-        for k in range(i + 1, n):
-            if abs(A[k, i]) > abs(A[pivot, i]):
-                pivot = k
-        if abs(A[pivot, i]) < 1e-11:
-            return False
-        if pivot != i:
-            for j in range(n):
-                A[i, j], A[pivot, j] = A[pivot, j], A[i, j]
-            b[i], b[pivot] = b[pivot], b[i]
-        for k in range(i + 1, n):
-            f = A[k, i] / A[i, i]
-            if f != 0.0:
-                for j in range(i, n):
-                    A[k, j] -= f * A[i, j]
-                b[k] -= f * b[i]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            b[i] -= A[i, j] * b[j]
-        b[i] /= A[i, i]
-    return True
-
-
-@kernel
-def _lower_root(A):
+def lower_root(A):
     """Cholesky factor L of a symmetric A = L Lᵀ, in place in its lower triangle. False if A is singular."""
     n = A.shape[0]
     for j in range(n):
+        scale = 0.0
         for i in range(j, n):
             total = A[i, j]
             for k in range(j):
                 total -= A[i, k] * A[j, k]
             if i == j:
-                if total < 1e-11:
+                if total < SINGULAR:
                     return False
                 A[j, j] = np.sqrt(total)
+                scale = 1.0 / A[j, j]
             else:
-                A[i, j] = total / A[j, j]
+                A[i, j] = total * scale
     return True
 
 
-@kernel
-def _normal_matrix(pattern, pixels, used, frame, h, A, b):
-    """Normal equations of the linear residuals at depths of ``h`` (8,); ``frame`` (3,) = centroid and scale of the
-    pixels.
+class Normal(NamedTuple):
+    """Normal equations of a homography's linear residuals, [[B, 0, C], [0, B, D], [Cᵀ, Dᵀ, E]] h = (a, b, c), reduced
+    by B = L Lᵀ: ``root`` L (6, by rows), ``kx`` L⁻¹C and ``ky`` L⁻¹D (6, by rows), ``ux`` L⁻¹a, ``uy`` L⁻¹b (3),
+    Schur's complement ``s`` (3) of E and its right-hand side ``g`` (2). ``solvable``: all positive definite.
     """
-    A[:] = 0.0
-    b[:] = 0.0
-    row = np.zeros(8)
+
+    solvable: bool
+    root: tuple[float, float, float, float, float, float]
+    kx: tuple[float, float, float, float, float, float]
+    ky: tuple[float, float, float, float, float, float]
+    ux: tuple[float, float, float]
+    uy: tuple[float, float, float]
+    s: tuple[float, float, float]
+    g: tuple[float, float]
+
+
+@kernel
+def _forward(root, a, b, c):
+    """L⁻¹ times a column."""
+    x = a / root[0]
+    y = (b - root[1] * x) / root[2]
+    return x, y, (c - root[3] * x - root[4] * y) / root[5]
+
+
+@kernel
+def _backward(root, a, b, c):
+    """L⁻ᵀ times a column."""
+    z = c / root[5]
+    y = (b - root[4] * z) / root[2]
+    return (a - root[1] * y - root[3] * z) / root[0], y, z
+
+
+@kernel
+def _normal(pattern, pixels, used, frame, h):
+    """The normal equations at depths of ``h`` (8,); ``frame`` (3,) = centroid and scale of the pixels."""
+    zero2, zero3, zero6 = (0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    none = Normal(False, zero6, zero6, zero6, zero3, zero3, zero3, zero2)
+    n = nx = ny = nxx = nxy = nyy = 0.0
+    u = ux = uy = uxx = uxy = uyy = 0.0
+    v = vx = vy = vxx = vxy = vyy = 0.0
+    rx = ry = rxx = rxy = ryy = 0.0
     for i in range(used.size):
         if not used[i]:
             continue
-        depth = h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0
+        x, y = pattern[i, 0], pattern[i, 1]
+        depth = h[6] * x + h[7] * y + 1.0
         if depth < 1e-3:
-            return False
-        for axis in range(2):
-            target = (pixels[i, axis] - frame[axis]) / frame[2]
-            _row(pattern[i], axis, target, depth, row)
-            for j in range(8):
-                if row[j] != 0.0:
-                    for k in range(8):
-                        A[j, k] += row[j] * row[k]
-                    b[j] += row[j] * target / depth
-    return True
+            return none
+        tu, tv = (pixels[i, 0] - frame[0]) / frame[2], (pixels[i, 1] - frame[1]) / frame[2]
+        w = 1.0 / (depth * depth)
+        wx, wy = w * x, w * y
+        wxx, wxy, wyy = wx * x, wx * y, wy * y
+        n, nx, ny, nxx, nxy, nyy = n + w, nx + wx, ny + wy, nxx + wxx, nxy + wxy, nyy + wyy
+        u, ux, uy = u + tu * w, ux + tu * wx, uy + tu * wy
+        uxx, uxy, uyy = uxx + tu * wxx, uxy + tu * wxy, uyy + tu * wyy
+        v, vx, vy = v + tv * w, vx + tv * wx, vy + tv * wy
+        vxx, vxy, vyy = vxx + tv * wxx, vxy + tv * wxy, vyy + tv * wyy
+        r = tu * tu + tv * tv
+        rx, ry = rx + r * wx, ry + r * wy
+        rxx, rxy, ryy = rxx + r * wxx, rxy + r * wxy, ryy + r * wyy
+    if nxx < SINGULAR:
+        return none
+    l00 = np.sqrt(nxx)
+    l10, l20 = nxy / l00, nx / l00
+    d1 = nyy - l10 * l10
+    if d1 < SINGULAR:
+        return none
+    l11 = np.sqrt(d1)
+    l21 = (ny - l20 * l10) / l11
+    d2 = n - l20 * l20 - l21 * l21
+    if d2 < SINGULAR:
+        return none
+    root = (l00, l10, l11, l20, l21, np.sqrt(d2))
+    a0, b0, c0 = _forward(root, -uxx, -uxy, -ux)
+    a1, b1, c1 = _forward(root, -uxy, -uyy, -uy)
+    d0, e0, f0 = _forward(root, -vxx, -vxy, -vx)
+    d1, e1, f1 = _forward(root, -vxy, -vyy, -vy)
+    p, q = _forward(root, ux, uy, u), _forward(root, vx, vy, v)
+    s00 = rxx - a0 * a0 - b0 * b0 - c0 * c0 - d0 * d0 - e0 * e0 - f0 * f0
+    s01 = rxy - a0 * a1 - b0 * b1 - c0 * c1 - d0 * d1 - e0 * e1 - f0 * f1
+    s11 = ryy - a1 * a1 - b1 * b1 - c1 * c1 - d1 * d1 - e1 * e1 - f1 * f1
+    if s00 < SINGULAR or s11 - s01 * s01 / s00 < SINGULAR:
+        return none
+    g0 = -rx - a0 * p[0] - b0 * p[1] - c0 * p[2] - d0 * q[0] - e0 * q[1] - f0 * q[2]
+    g1 = -ry - a1 * p[0] - b1 * p[1] - c1 * p[2] - d1 * q[0] - e1 * q[1] - f1 * q[2]
+    return Normal(
+        True, root, (a0, a1, b0, b1, c0, c1), (d0, d1, e0, e1, f0, f1), p, q, (s00, s01, s11), (g0, g1)
+    )  # fmt: skip
 
 
 @kernel
-def _row(point, axis, target, depth, row):
-    row[:] = 0.0
-    row[3 * axis] = point[0] / depth
-    row[3 * axis + 1] = point[1] / depth
-    row[3 * axis + 2] = 1.0 / depth
-    row[6] = -target * point[0] / depth
-    row[7] = -target * point[1] / depth
+def _solution(normal, h):
+    """Solve the normal equations into ``h`` (8,)."""
+    s, kx, ky, ux, uy = normal.s, normal.kx, normal.ky, normal.ux, normal.uy
+    det = s[0] * s[2] - s[1] * s[1]
+    g0 = (s[2] * normal.g[0] - s[1] * normal.g[1]) / det
+    g1 = (s[0] * normal.g[1] - s[1] * normal.g[0]) / det
+    h[0], h[1], h[2] = _backward(
+        normal.root, ux[0] - kx[0] * g0 - kx[1] * g1, ux[1] - kx[2] * g0 - kx[3] * g1,
+        ux[2] - kx[4] * g0 - kx[5] * g1,
+    )  # fmt: skip
+    h[3], h[4], h[5] = _backward(
+        normal.root, uy[0] - ky[0] * g0 - ky[1] * g1, uy[1] - ky[2] * g0 - ky[3] * g1,
+        uy[2] - ky[4] * g0 - ky[5] * g1,
+    )  # fmt: skip
+    h[6], h[7] = g0, g1
 
 
 @kernel
-def _fit(pattern, pixels, used, frame, h, A, b):
+def _fit(pattern, pixels, used, frame, h):
     """Homography in normalised pixels into ``h`` (8,). False where it is undetermined or depths are not
     positive.
     """
@@ -119,10 +170,10 @@ def _fit(pattern, pixels, used, frame, h, A, b):
         return False
     h[:] = 0.0
     for _ in range(1 if n == 4 else 3):
-        if not _normal_matrix(pattern, pixels, used, frame, h, A, b) or not _solve(A, b):
+        normal = _normal(pattern, pixels, used, frame, h)
+        if not normal.solvable:
             return False
-        for j in range(8):
-            h[j] = b[j]
+        _solution(normal, h)
     nearest = 1.0
     for i in range(used.size):
         nearest = min(nearest, h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0)
@@ -149,11 +200,8 @@ def fit_homography(pattern, pixels, used, H):
     residuals to first order. False where fewer than four rows are used, they are degenerate or depths are
     not positive.
     """
-    frame = np.zeros(3)
-    h = np.zeros(8)
-    A = np.zeros((8, 8))
-    b = np.zeros(8)
-    if not _fit(pattern, pixels, used, frame, h, A, b):
+    frame, h = np.zeros(3), np.zeros(8)
+    if not _fit(pattern, pixels, used, frame, h):
         return False
     _in_pixels(frame, h, H)
     return True
@@ -212,7 +260,7 @@ def misfits(pattern, pixels, used, H, out):
 
 
 @kernel
-def _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
+def _leave_one_out(pattern, pixels, used, frame, h, out):
     """Leave-one-out residual of each dot: ``out`` (n, 3) = its distance from the homography of the others [px], the
     smallest root of I - L, its squared studentised residual [px²].
 
@@ -220,42 +268,40 @@ def _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
     a single bad dot, so that e alone may hide most of its error. Rows of 0 where the others say nothing of a dot (five
     dots, three of them collinear). False where the fit is degenerate.
     """
-    if not _normal_matrix(pattern, pixels, used, frame, h, A, b):
-        return False
+    normal = _normal(pattern, pixels, used, frame, h)
     out[:] = 0.0
-    if not _lower_root(A):
+    if not normal.solvable:
         return False
-    rows = np.zeros((2, 8))
-    e = np.zeros(2)
+    kx, ky = normal.kx, normal.ky
+    s00, s01, s11 = normal.s
+    whole = s00 * s11 - s01 * s01
     for i in range(used.size):
         if not used[i]:
             continue
-        depth = h[6] * pattern[i, 0] + h[7] * pattern[i, 1] + 1.0
-        for axis in range(2):
-            target = (pixels[i, axis] - frame[axis]) / frame[2]
-            _row(pattern[i], axis, target, depth, rows[axis])
-            e[axis] = target / depth
-            for j in range(8):
-                e[axis] -= rows[axis, j] * h[j]
-            # L⁻¹ row, the square of which is the leverage
-            for j in range(8):
-                for k in range(j):
-                    rows[axis, j] -= A[j, k] * rows[axis, k]
-                rows[axis, j] /= A[j, j]
-        m11, m12, m22 = 1.0, 0.0, 1.0
-        for j in range(8):
-            m11 -= rows[0, j] * rows[0, j]
-            m12 -= rows[0, j] * rows[1, j]
-            m22 -= rows[1, j] * rows[1, j]
+        x, y = pattern[i, 0], pattern[i, 1]
+        depth = h[6] * x + h[7] * y + 1.0
+        tu, tv = (pixels[i, 0] - frame[0]) / frame[2], (pixels[i, 1] - frame[1]) / frame[2]
+        eu = tu - (h[0] * x + h[1] * y + h[2]) / depth
+        ev = tv - (h[3] * x + h[4] * y + h[5]) / depth
+        # the leverage of the two rows, by the same reduction
+        p, q, r = _forward(normal.root, x / depth, y / depth, 1.0 / depth)
+        u0 = -tu * x / depth - kx[0] * p - kx[2] * q - kx[4] * r
+        u1 = -tu * y / depth - kx[1] * p - kx[3] * q - kx[5] * r
+        v0 = -tv * x / depth - ky[0] * p - ky[2] * q - ky[4] * r
+        v1 = -tv * y / depth - ky[1] * p - ky[3] * q - ky[5] * r
+        own = 1.0 - p * p - q * q - r * r
+        m11 = own - (s11 * u0 * u0 - 2.0 * s01 * u0 * u1 + s00 * u1 * u1) / whole
+        m12 = -(s11 * u0 * v0 - s01 * (u0 * v1 + u1 * v0) + s00 * u1 * v1) / whole
+        m22 = own - (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / whole
         det = m11 * m22 - m12 * m12
         least = 0.5 * (m11 + m22) - np.sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12)
         if least < 1e-6 or det <= 0.0:
             continue
-        a = frame[2] * (m22 * e[0] - m12 * e[1]) / det
-        c = frame[2] * (m11 * e[1] - m12 * e[0]) / det
+        a = frame[2] * (m22 * eu - m12 * ev) / det
+        c = frame[2] * (m11 * ev - m12 * eu) / det
         out[i, 0] = np.sqrt(a * a + c * c)
         out[i, 1] = least
-        out[i, 2] = (a * e[0] + c * e[1]) * frame[2]
+        out[i, 2] = (a * eu + c * ev) * frame[2]
     return True
 
 
@@ -266,16 +312,13 @@ def outlier_dot(pattern, pixels, used, sigma, out):
     ``sigma`` [px] of a dot; ``out`` (n, 3) as :func:`_left_out` writes it. Beyond ODD_NOISE variances of noise and
     ODD_REST of what the others misfit beyond noise (F of 2 and 4 degrees of freedom, 0.9998).
     """
-    frame = np.zeros(3)
-    h = np.zeros(8)
-    A = np.zeros((8, 8))
-    b = np.zeros(8)
+    frame, h = np.zeros(3), np.zeros(8)
     n = 0
     for i in range(used.size):
         n += 1 if used[i] else 0
-    if n < 6 or not _fit(pattern, pixels, used, frame, h, A, b):
+    if n < 6 or not _fit(pattern, pixels, used, frame, h):
         return -1
-    if not _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
+    if not _leave_one_out(pattern, pixels, used, frame, h, out):
         return -1
     total = 0.0
     for i in range(used.size):
@@ -296,14 +339,14 @@ def outlier_dot(pattern, pixels, used, sigma, out):
 
 
 @kernel
-def _worst_outlier(pattern, pixels, used, frame, h, A, b, tolerance, sigma):
+def _worst_outlier(pattern, pixels, used, frame, h, tolerance, sigma):
     """The dot with the largest leave-one-out residual, -1 where all are within tolerance.
 
     It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root of
     (I - L)⁻¹. Of the dots beyond, the one with the largest studentised residual goes. -2 where the fit is degenerate.
     """
     out = np.zeros((used.size, 3))
-    if not _leave_one_out(pattern, pixels, used, frame, h, A, b, out):
+    if not _leave_one_out(pattern, pixels, used, frame, h, out):
         return -2
     worst = -1
     largest = 0.0
@@ -324,17 +367,14 @@ def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
     would remain; with five dots left nothing tells which one is wrong, so that ``least`` must be at least
     5. ``H`` gets the homography.
     """
-    frame = np.zeros(3)
-    h = np.zeros(8)
-    A = np.zeros((8, 8))
-    b = np.zeros(8)
+    frame, h = np.zeros(3), np.zeros(8)
     count = 0
     for i in range(used.size):
         count += 1 if used[i] else 0
     while count >= least:
-        if not _fit(pattern, pixels, used, frame, h, A, b):
+        if not _fit(pattern, pixels, used, frame, h):
             return False
-        worst = _worst_outlier(pattern, pixels, used, frame, h, A, b, tolerance, sigma)
+        worst = _worst_outlier(pattern, pixels, used, frame, h, tolerance, sigma)
         if worst == -1:
             _in_pixels(frame, h, H)
             return True

@@ -14,6 +14,9 @@ BOOL = types.boolean
 INT = types.int64
 INT32 = types.int32
 FLOAT = types.float64
+SINGLE = types.float32
+BYTE = types.uint8
+WORD = types.uint64
 
 
 def given(dtype: Any, dimensions: int) -> Any:

@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.numerics.compilation import inlined_kernel, kernel
+from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo_drivers.detectors.components import (
     BRIGHT,
+    LEVEL,
+    NOTHING,
     QXX,
     QXY,
     QYY,
@@ -16,12 +18,15 @@ from stereoservo_drivers.detectors.components import (
     SLOPE_XX,
     SLOPE_XY,
     SLOPE_YY,
-    U,
+    VALID,
+    F,
     V,
-    aperture_of,
+    X,
+    Y,
     half_sizes,
-    median_level,
+    lanes,
 )
+from stereoservo_drivers.detectors.homographies import lower_root
 
 RING = 2
 """Width of the surroundings outside the skirt [px] that give background and noise."""
@@ -39,103 +44,30 @@ EVEN = 1e6
 """Variance [1/px²] of a slope of which nothing is known."""
 
 
-@kernel
-def _add(sums, x, y, level, tail, times):
-    """Moments of one pixel's place, level and tail into ``sums`` (15,)."""
-    sums[0] += times
-    sums[1] += times * level
-    sums[2] += times * x
-    sums[3] += times * y
-    sums[4] += times * x * x
-    sums[5] += times * x * y
-    sums[6] += times * y * y
-    sums[7] += times * x * level
-    sums[8] += times * y * level
-    sums[9] += times * level * level
-    sums[10] += times * tail
-    sums[11] += times * tail * x
-    sums[12] += times * tail * y
-    sums[13] += times * tail * tail
-    sums[14] += times * tail * level
-
-
-@inlined_kernel
-def _ring_row(row, first, y, aperture, histogram, ring, sums):
-    """Add the pixels of a ``row``, at x = ``first``, ... and ``y`` [px] from the centre, that are outside the skirt.
-
-    Their |level| to ``histogram``, (x, y, level, tail) to ``ring`` (n, 4), their moments to ``sums`` (15,), which
-    begins with the number of pixels.
-    """
-    q11, q12, q22, skirt, sign, zero = aperture
-    width = 4.0 * skirt * skirt
-    # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
-    fall = 1.0 / ((skirt + RING) ** 2 - skirt * skirt)
-    before = count = int(sums[0])
-    # sums along the row: their powers of y follow
-    si = sx = sxx = sxi = sii = st = stx = stt = sti = 0.0
-    for k in range(row.size):
-        x = k + first
-        gx = q11 * x + q12 * y
-        gy = q12 * x + q22 * y
-        e = x * gx + y * gy - 1.0
-        g2 = gx * gx + gy * gy
-        if e >= 0.0 and e * e >= width * g2:
-            level = sign * row[k] + zero
-            near = max(1.0 - (0.25 * e * e / g2 - skirt * skirt) * fall, 0.0)
-            tail = near * near * near
-            histogram[int(abs(level))] += 1
-            ring[count, 0] = x
-            ring[count, 1] = y
-            ring[count, 2] = level
-            ring[count, 3] = tail
-            count += 1
-            si += level
-            sx += x
-            sxx += x * x
-            sxi += x * level
-            sii += level * level
-            st += tail
-            stx += tail * x
-            stt += tail * tail
-            sti += tail * level
-    n = float(count - before)
-    sums[0] += n
-    sums[1] += si
-    sums[2] += sx
-    sums[3] += n * y
-    sums[4] += sxx
-    sums[5] += sx * y
-    sums[6] += n * y * y
-    sums[7] += sxi
-    sums[8] += si * y
-    sums[9] += sii
-    sums[10] += st
-    sums[11] += stx
-    sums[12] += st * y
-    sums[13] += stt
-    sums[14] += sti
-
-
 class Surface(NamedTuple):
     """Levels about a dot: a plane and the tail of its blur, and the ``variance`` about them; -1 where there are none.
 
-    ``plane_level``: that of the plane under the centre where the tail is not fitted.
+    ``plane_level``: that of the plane under the centre where the tail is not fitted; ``count`` of pixels.
     """
 
     variance: float
     plane_level: float
+    count: float
     level: float
     slope_x: float
     slope_y: float
     slope_t: float
 
 
+NO_SURFACE = Surface(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @kernel
 def _fit_surface(sums):
-    """Least squares by the moments ``sums`` (15,): the plane first, then the tail in what the plane leaves."""
+    """Least squares by the moments ``sums`` (15): the plane first, then the tail in what the plane leaves."""
     n = sums[0]
-    if n < 12.0:
-        return Surface(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if n < 24.0:
+        return NO_SURFACE
     si, sx, sy, st = sums[1], sums[2], sums[3], sums[10]
     sxx = sums[4] - sx * sx / n
     sxy = sums[5] - sx * sy / n
@@ -145,7 +77,7 @@ def _fit_surface(sums):
     sii = sums[9] - si * si / n
     d = sxx * syy - sxy * sxy
     if d <= 0.0:
-        return Surface(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return NO_SURFACE
     slope_x = (syy * sxi - sxy * syi) / d
     slope_y = (sxx * syi - sxy * sxi) / d
     plane_level = level = (si - slope_x * sx - slope_y * sy) / n
@@ -161,121 +93,177 @@ def _fit_surface(sums):
         level -= slope_t * (st - tail_x * sx - tail_y * sy) / n
         slope_x -= slope_t * tail_x
         slope_y -= slope_t * tail_y
-    return Surface(max(left, 0.0) / (n - 4.0), plane_level, level, slope_x, slope_y, slope_t)
+    return Surface(max(left, 0.0) / (n - 4.0), plane_level, n, level, slope_x, slope_y, slope_t)
+
+
+@reassociating_kernel
+def _ring_moments(level, valid, xs, ys, ellipse, box, limit, surface, sums):
+    """Sums over the VALID pixels of a ``box`` (its middle and half size in x, then in y) outside an ellipse's skirt
+    within ``limit`` of a ``surface``: 1, level, x, y, x², xy, y², x level, y level, level², tail, tail x, tail y,
+    tail², tail level; into ``sums`` (15,).
+    """
+    q11, q12, q22, cx, cy, skirt = ellipse
+    width, inner = F(4.0) * skirt * skirt, skirt * skirt
+    # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
+    fall = F(1.0) / ((skirt + F(RING)) * (skirt + F(RING)) - inner)
+    base, slope_x, slope_y, slope_t = surface
+    si = sx = sy = sxx = sxy = syy = sxi = syi = sii = st = stx = sty = stt = sti = count = F(0.0)
+    for k in range(level.size):
+        x, y, i, one = xs[k] - cx, ys[k] - cy, level[k], valid[k]
+        gx = q11 * x + q12 * y
+        gy = q12 * x + q22 * y
+        e = max(x * gx + y * gy - F(1.0), F(0.0))
+        g2 = gx * gx + gy * gy + NOTHING
+        e *= e
+        tail = max(F(1.0) - (F(0.25) * e / g2 - inner) * fall, F(0.0))
+        tail = tail * tail * tail
+        away = abs(i - base - slope_x * x - slope_y * y - slope_t * tail)
+        one = one if e >= width * g2 and abs(xs[k] - box[0]) <= box[1] else F(0.0)
+        one = one if away <= limit and abs(ys[k] - box[2]) <= box[3] else F(0.0)
+        mx, my, mt, mi = one * x, one * y, one * tail, one * i
+        count += one
+        si += mi
+        sx += mx
+        sy += my
+        sxx += mx * x
+        sxy += mx * y
+        syy += my * y
+        sxi += mx * i
+        syi += my * i
+        sii += mi * i
+        st += mt
+        stx += mt * x
+        sty += mt * y
+        stt += mt * tail
+        sti += mt * i
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = count, si, sx, sy, sxx, sxy, syy
+    sums[7], sums[8], sums[9], sums[10] = sxi, syi, sii, st
+    sums[11], sums[12], sums[13], sums[14] = stx, sty, stt, sti
 
 
 @kernel
-def surroundings(image, dark, background, skirt, reach, out, plane):
-    """Variance of the dot's surroundings about a plane and the tail of the dot's blur [grey levels squared]; -1 where
-    there is too little to see. ``plane`` (2,) gets the plane's level under the centre above ``background``, and the
-    number of pixels.
+def surroundings(patch, planes, box, ellipse, limit):
+    """The surface about a dot's ``ellipse`` in a ``box`` of a patch, of variance [levels²] -1 where there is too
+    little to see.
 
-    Pixels off by more than four robust standard deviations (a neighbour's skirt, the plate's edge) do not
-    count.
+    Pixels off by more than ``limit``, then by more than three standard deviations (a neighbour's skirt, the plate's
+    edge) do not count.
     """
-    aperture = aperture_of(dark, background, skirt, out)
-    cu, cv = out[U], out[V]
-    half_u, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
-    half_u, half_v = half_u + (reach + RING), half_v + (reach + RING)
-    rows, columns = image.shape
-    lo_u, hi_u = max(int(cu - half_u), 0), min(int(cu + half_u) + 1, columns - 1)
-    lo_v, hi_v = max(int(cv - half_v), 0), min(int(cv + half_v) + 1, rows - 1)
-    histogram, sums = np.zeros(256, np.int32), np.zeros(15)
-    ring = np.empty(((hi_u - lo_u + 1) * (hi_v - lo_v + 1), 4))
-    plane[:] = 0.0
-    for v in range(lo_v, hi_v + 1):
-        _ring_row(image[v, lo_u : hi_u + 1], lo_u - cu, v - cv, aperture, histogram, ring, sums)
-    count = int(sums[0])
-    if count < 24:
-        return -1.0
-    limit = 4.0 * 1.4826 * median_level(histogram, count) + 2.0
-    counted = np.ones(count, np.bool_)
-    fit = Surface(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    left, top, right, bottom = box
+    a, b = lanes(patch, max(top, patch.top), min(bottom, patch.bottom))
+    middle = (
+        F(0.5 * (left + right) - patch.left), F(0.5 * (right - left)), F(0.5 * (top + bottom) - patch.top),
+        F(0.5 * (bottom - top)),
+    )  # fmt: skip
+    level, valid, xs, ys = planes[LEVEL, a:b], planes[VALID, a:b], planes[X, a:b], planes[Y, a:b]
+    fit, sums = Surface(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.empty(15)
     for _ in range(2):
-        for k in range(count):
-            x, y, level, tail = ring[k, 0], ring[k, 1], ring[k, 2], ring[k, 3]
-            near = abs(level - fit.level - fit.slope_x * x - fit.slope_y * y - fit.slope_t * tail) <= limit
-            if near != counted[k]:
-                # few change sides
-                counted[k] = near
-                _add(sums, x, y, level, tail, 1.0 if near else -1.0)
+        surface = F(fit.level), F(fit.slope_x), F(fit.slope_y), F(fit.slope_t)
+        _ring_moments(level, valid, xs, ys, ellipse, middle, F(limit), surface, sums)
         fit = _fit_surface(sums)
         if fit.variance < 0.0:
-            return -1.0
-        plane[0], plane[1] = fit.plane_level, sums[0]
+            return NO_SURFACE
         limit = 3.0 * np.sqrt(fit.variance) + 0.5
     # what lies within three standard deviations of a Gaussian has 0.973 of its variance
-    return fit.variance / 0.973 if fit.variance > 1.0 else fit.variance
+    variance = fit.variance / 0.973 if fit.variance > 1.0 else fit.variance
+    return Surface(variance, fit.plane_level, fit.count, fit.level, fit.slope_x, fit.slope_y, fit.slope_t)
+
+
+@reassociating_kernel
+def _inner_moments(level, xs, ys, ellipse, base, A, right):
+    """Sums over the pixels with q = dᵀQd up to INNER: products of 1, x², xy, y², q², x, y with each other into the
+    lower triangle of ``A`` (7, 7), with the level above ``base`` into ``right`` (7,). Returns the number of pixels and
+    the sum of that level squared.
+    """
+    q11, q12, q22, cx, cy, _ = ellipse
+    n = p = r = s = t = u = v = pp = pr = rr = rs = ss = pt = rt = st = tt = F(0.0)
+    tu = tv = pu = pv = su = sv = l1 = lp = lr = ls = lt = lu = lv = ll = F(0.0)
+    for k in range(level.size):
+        x, y = xs[k] - cx, ys[k] - cy
+        q = x * (q11 * x + F(2.0) * q12 * y) + q22 * y * y
+        one = F(1.0) if q <= F(INNER) else F(0.0)
+        i = level[k] - base
+        xx, xy, yy, qq = x * x, x * y, y * y, q * q
+        mx, my, mi, mt = one * x, one * y, one * i, one * qq
+        mxx, mxy, myy = one * xx, one * xy, one * yy
+        n += one
+        p += mxx
+        r += mxy
+        s += myy
+        t += mt
+        u += mx
+        v += my
+        pp += mxx * xx
+        pr += mxx * xy
+        rr += mxx * yy
+        rs += mxy * yy
+        ss += myy * yy
+        pt += mt * xx
+        rt += mt * xy
+        st += mt * yy
+        tt += mt * qq
+        tu += mt * x
+        tv += mt * y
+        pu += mxx * x
+        pv += mxx * y
+        su += myy * x
+        sv += myy * y
+        l1 += mi
+        lp += mi * xx
+        lr += mi * xy
+        ls += mi * yy
+        lt += mi * qq
+        lu += mi * x
+        lv += mi * y
+        ll += mi * i
+    A[0, 0] = n
+    A[1, 0], A[1, 1] = p, pp
+    A[2, 0], A[2, 1], A[2, 2] = r, pr, rr
+    A[3, 0], A[3, 1], A[3, 2], A[3, 3] = s, rr, rs, ss
+    A[4, 0], A[4, 1], A[4, 2], A[4, 3], A[4, 4] = t, pt, rt, st, tt
+    A[5, 0], A[5, 1], A[5, 2], A[5, 3], A[5, 4], A[5, 5] = u, pu, pv, su, tu, p
+    A[6, 0], A[6, 1], A[6, 2], A[6, 3], A[6, 4], A[6, 5], A[6, 6] = v, pv, su, sv, tv, r, s
+    right[0], right[1], right[2], right[3], right[4], right[5], right[6] = l1, lp, lr, ls, lt, lu, lv
+    return n, ll
 
 
 @kernel
-def inside(image, dark, background, contrast, out):
+def inside(patch, planes, ellipse, contrast, out):
     """Relative slope of the level inside a dot with its covariance under unit noise, and the noise there, into ``out``.
 
-    Least squares of the levels on 1, x, y, x², xy, y², q² with q = dᵀQd < INNER: the even terms take up what blur and
+    Least squares of the levels on 1, x², xy, y², q², x, y with q = dᵀQd < INNER: the even terms take up what blur and
     motion do to a small dot.
     """
-    q11, q12, q22 = out[QXX], out[QXY], out[QYY]
-    det = q11 * q22 - q12 * q12
-    cu, cv = out[U], out[V]
-    half_u, half_v = np.sqrt(INNER * q22 / det), np.sqrt(INNER * q11 / det)
-    A = np.zeros((TERMS, TERMS + 3))
-    row = np.empty(TERMS)
-    row[0] = 1.0
-    count = 0
-    square = 0.0
-    for v in range(int(np.ceil(cv - half_v)), int(np.floor(cv + half_v)) + 1):
-        y = v - cv
-        for u in range(int(np.ceil(cu - half_u)), int(np.floor(cu + half_u)) + 1):
-            x = u - cu
-            q = x * (q11 * x + 2.0 * q12 * y) + q22 * y * y
-            if q > INNER:
-                continue
-            level = float(image[v, u])
-            if dark:
-                level = 255.0 - level
-            level -= background + contrast
-            row[1], row[2], row[3], row[4], row[5], row[6] = x, y, x * x, x * y, y * y, q * q
-            for i in range(TERMS):
-                for j in range(i, TERMS):
-                    A[i, j] += row[i] * row[j]
-                A[i, TERMS] += row[i] * level
-            square += level * level
-            count += 1
     out[BRIGHT] = -1.0
     out[SLOPE], out[SLOPE + 1] = 0.0, 0.0
     out[SLOPE_XX], out[SLOPE_XY], out[SLOPE_YY] = EVEN, 0.0, EVEN
-    if count < MIN_INNER:
+    _, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
+    half_v *= np.sqrt(INNER)
+    a, b = lanes(patch, int(np.ceil(out[V] - half_v)), int(np.floor(out[V] + half_v)))
+    A = np.empty((TERMS + 2, TERMS))
+    right, z = A[TERMS], A[TERMS + 1]
+    level, xs, ys = planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]
+    count, squares = _inner_moments(level, xs, ys, ellipse, F(contrast), A, right)
+    if count < MIN_INNER or not lower_root(A[:TERMS]):
         return
-    A[1, TERMS + 1] = A[2, TERMS + 2] = 1.0
-    right = A[:, TERMS].copy()
+    square = np.float64(squares)
     for i in range(TERMS):
+        z[i] = right[i]
         for j in range(i):
-            A[i, j] = A[j, i]
-    for i in range(TERMS):
-        # positive definite: no pivoting
-        if A[i, i] < 1e-9:
-            return
-        f = 1.0 / A[i, i]
-        for j in range(TERMS + 3):
-            A[i, j] *= f
-        for k in range(TERMS):
-            if k != i and A[k, i] != 0.0:
-                g = A[k, i]
-                for j in range(TERMS + 3):
-                    A[k, j] -= g * A[i, j]
+            z[i] -= A[i, j] * z[j]
+        z[i] /= A[i, i]
+        square -= z[i] * z[i]
     even = -right[0] * right[0] / count
-    for i in range(TERMS):
-        square -= A[i, TERMS] * right[i]
-        if i not in (1, 2):
-            even += A[i, TERMS] * right[i]
+    for i in range(TERMS - 1, -1, -1):
+        for j in range(i + 1, TERMS):
+            z[i] -= A[j, i] * z[j]
+        z[i] /= A[i, i]
+        if i < TERMS - 2:
+            even += z[i] * right[i]
     square -= UNLIKE_EVEN * UNLIKE_EVEN * max(even, 0.0)
     out[BRIGHT] = max(square, 0.0) / (count - TERMS)
-    level = contrast + A[0, TERMS]
-    out[SLOPE], out[SLOPE + 1] = A[1, TERMS] / level, A[2, TERMS] / level
-    f = 1.0 / (level * level)
-    out[SLOPE_XX], out[SLOPE_XY], out[SLOPE_YY] = (
-        f * A[1, TERMS + 1],
-        f * A[1, TERMS + 2],
-        f * A[2, TERMS + 2],
-    )
+    mean = contrast + z[0]
+    out[SLOPE], out[SLOPE + 1] = z[TERMS - 2] / mean, z[TERMS - 1] / mean
+    p, q, r = A[TERMS - 2, TERMS - 2], A[TERMS - 1, TERMS - 2], A[TERMS - 1, TERMS - 1]
+    f = 1.0 / (mean * mean * p * p * r * r)
+    out[SLOPE_XX], out[SLOPE_XY], out[SLOPE_YY] = f * (q * q + r * r), -f * p * q, f * p * p

@@ -11,11 +11,14 @@ import numpy as np
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
+from stereoservo_drivers.detectors.components import AREA
 from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle, misfits
-from stereoservo_drivers.detectors.kernel_types import FLOAT, INT, compile_for, given, written
+from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile_for, given, written
 
 CLEAR = 1.6
 """Least ratio of misfits between the second-best and the best explanation of the same dots."""
+ROUNDNESS = 4.25
+"""Sum of the half axes over the root of their product, of an ellipse of axes 1:16: no spot is thinner."""
 MOST_RIVALS = 32
 """Explanations of as many dots beyond which nothing is clear."""
 
@@ -108,6 +111,37 @@ def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):
     return count
 
 
+@kernel
+def _least_areas(areas):
+    """Area that a dot's image has at least (m,), where it has been measured as ``areas`` (m,): blur inflates what is
+    thin.
+    """
+    # the inverse of area <= 1.25 pi (a + 0.7) (b + 0.7)
+    slope = 0.7 * ROUNDNESS * np.sqrt(np.pi)
+    least = np.empty(areas.size)
+    for i in range(areas.size):
+        root = np.sqrt(max(slope * slope + 4.0 * (areas[i] / 1.25 - 0.5 * np.pi), 0.0)) - slope
+        least[i] = 0.25 * max(root, 0.0) ** 2
+    return least
+
+
+@kernel
+def _sizes_agree(foretold, depths, least, areas, quadruple, missing):
+    """Whether all but ``missing`` of the dots of a ``quadruple`` have areas as their homography foretells, loosely.
+
+    ``foretold`` is the fourth's area, ``depths`` (3) those of the first three over the fourth's: the areas are as
+    1 / depth³. Of the dots ``least`` (m,) and ``areas`` (m,).
+    """
+    for i in range(4):
+        cubed = 1.0 if i == 3 else depths[i] ** 3
+        k = quadruple[i]
+        if least[k] * cubed > foretold or areas[k] * cubed < 0.74 * foretold:
+            missing -= 1
+            if missing < 0:
+                return False
+    return True
+
+
 class Dots(NamedTuple):
     """What a face is searched among: ``pixels`` (m, 2) and ``areas`` (m,) [px²]."""
 
@@ -153,7 +187,10 @@ def _explain(pattern, radius, dots, gates, rivals, best_count, known, scratch):
         return 0, 0.0
     if count == best_count:
         for c in range(known):
-            if (rivals.owners[c] == trial).all():
+            same = True
+            for d in range(trial.size):
+                same = same and rivals.owners[c, d] == trial[d]
+            if same:
                 return 0, 0.0
     for d in range(pattern.shape[0]):
         used[d] = trial[d] >= 0
@@ -176,7 +213,9 @@ def _clearly_best(rivals, known, tolerance):
     """Row of the best of ``known`` explanations; -1 if another one of some of the same dots is nearly as good."""
     owners, fits = rivals
     n = owners.shape[1]
-    best = int(np.argmin(fits[:known]))
+    best = 0
+    for c in range(known):
+        best = c if fits[c] < fits[best] else best
     for c in range(known):
         if c != best and (fits[c] < CLEAR * fits[best] or fits[c] < 0.5 * tolerance):
             for d in range(n):
@@ -194,6 +233,27 @@ def _inverse_turns(pattern, basis):
 
 
 @kernel
+def _fourths(us, vs, three, turns, limit, out):
+    """Which dots at (us, vs) (m,) make triangles of the right sign with any two of ``three``, and of ``limit`` or more
+    times the pattern's, into ``out`` (m,); their number. ``turns`` as :func:`_inverse_turns` returns them.
+    """
+    i, j, k = three
+    _, s013, s023, s123 = turns
+    ju, jv, ku, kv = us[j] - us[i], vs[j] - vs[i], us[k] - us[i], vs[k] - vs[i]
+    turn = ju * kv - jv * ku
+    count = 0
+    for l in range(us.size):  # noqa: E741
+        lu, lv = us[l] - us[i], vs[l] - vs[i]
+        ijl, ikl = ju * lv - jv * lu, ku * lv - kv * lu
+        # that of j, k, l is what is left of the whole
+        right = (ijl * s013 >= limit) & (ikl * s023 >= limit) & ((turn - ijl + ikl) * s123 >= limit)
+        # no branch: one in seven is right
+        out[count] = l
+        count += 1 if right else 0
+    return count
+
+
+@kernel
 def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tolerance, owner):
     """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas``
     (m,) [px²].
@@ -208,42 +268,43 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
     """
     n, m = pattern.shape[0], pixels.shape[0]
     unit = np.pi * radius * radius
+    third = 1.0 / (3.0 * unit)
+    smallest, fourths = _least_areas(areas), np.empty(m, np.int64)
+    us, vs = pixels[:, 0].copy(), pixels[:, 1].copy()
     dots, gates = Dots(pixels, areas), Gates(least, reach, tolerance)
     rivals = Rivals(np.zeros((MOST_RIVALS, n), np.int64), np.zeros(MOST_RIVALS))
     scratch = Scratch(
         np.zeros((3, 3)), np.zeros(7), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_),
         np.zeros((n, 2)), np.zeros(n),
     )  # fmt: skip
-    best_count = known = 0
+    best_count = known = np.int64(0)
     owner[:] = -1
     for row in range(bases.shape[0]):
         basis, inverse = bases[row], inverses[row]
-        s012, s013, s023, s123 = _inverse_turns(pattern, basis)
+        turns = s012, s013, s023, s123 = _inverse_turns(pattern, basis)
         for i in range(m):
             for j in range(m):
                 if j == i or areas[j] > 3.0 * areas[i] or areas[i] > 3.0 * areas[j]:
                     continue
-                ju, jv = pixels[j, 0] - pixels[i, 0], pixels[j, 1] - pixels[i, 1]
+                ju, jv = us[j] - us[i], vs[j] - vs[i]
                 for k in range(m):
-                    ku, kv = pixels[k, 0] - pixels[i, 0], pixels[k, 1] - pixels[i, 1]
+                    ku, kv = us[k] - us[i], vs[k] - vs[i]
                     # twice the triangle's signed area; 0 for k in (i, j)
                     turn = ju * kv - jv * ku
-                    foretold = (areas[i] + areas[j] + areas[k]) / (3.0 * unit)
+                    foretold = (areas[i] + areas[j] + areas[k]) * third
                     if turn * s012 < 0.4 * foretold or turn * s012 > 2.0 * foretold:
                         continue
-                    for l in range(m):  # noqa: E741
-                        lu, lv = pixels[l, 0] - pixels[i, 0], pixels[l, 1] - pixels[i, 1]
+                    some = _fourths(us, vs, (i, j, k), turns, 0.3 * foretold, fourths)
+                    for l in fourths[:some]:  # noqa: E741
+                        lu, lv = us[l] - us[i], vs[l] - vs[i]
                         ijl, ikl = ju * lv - jv * lu, ku * lv - kv * lu
-                        # that of j, k, l is what is left of the whole
-                        if (
-                            ijl * s013 < 0.3 * foretold
-                            or ikl * s023 < 0.3 * foretold
-                            or (turn - ijl + ikl) * s123 < 0.3 * foretold
-                        ):
+                        scale, wanted = 1.0 / (turn * s012), max(least, best_count)
+                        depths = (turn - ijl + ikl) * s123 * scale, ikl * s023 * scale, ijl * s013 * scale
+                        expected = unit * depths[0] * depths[1] * depths[2] / scale
+                        if not _sizes_agree(expected, depths, smallest, areas, (i, j, k, l), n - wanted):
                             continue
                         if not _hypothesis(pixels[i], pixels[j], pixels[k], pixels[l], inverse, scratch.H):
                             continue
-                        wanted = max(least, best_count)
                         if not _promising(pattern, pixels, basis, wanted, reach + 0.5, scratch.H):
                             continue
                         count, misfit = _explain(
@@ -255,19 +316,72 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
                             best_count, known = count, 0
                         if known == MOST_RIVALS:
                             return 0
-                        rivals.owners[known] = scratch.trial
+                        for d in range(n):
+                            rivals.owners[known, d] = scratch.trial[d]
                         rivals.fits[known] = misfit
                         known += 1
     best = _clearly_best(rivals, known, tolerance) if known else -1
     if best < 0:
         return 0
-    owner[:] = rivals.owners[best]
+    for d in range(n):
+        owner[d] = rivals.owners[best, d]
     return best_count
+
+
+@kernel
+def find_copies(pattern, radius, bases, inverses, centres, areas, least, reach, tolerance, owners):
+    """All occurrences of a face among dots, as :func:`find_face` finds one, into ``owners`` (k, n); their number."""
+    m, n = areas.size, pattern.shape[0]
+    left = np.arange(m)
+    pixels, sizes, owner = np.empty((m, 2)), np.empty(m), np.empty(n, np.int64)
+    count = 0
+    while m >= least and count < owners.shape[0]:
+        for k in range(m):
+            pixels[k, 0], pixels[k, 1], sizes[k] = centres[left[k], 0], centres[left[k], 1], areas[left[k]]
+        # the first basis is the corners, the others stand in where one is hidden
+        first = 0
+        found = 0
+        while first < bases.shape[0] and found == 0:
+            end = 1 if first == 0 else bases.shape[0]
+            found = find_face(
+                pattern, radius, pixels[:m], sizes[:m], bases[first:end], inverses[first:end], least, reach,
+                tolerance, owner,
+            )  # fmt: skip
+            first = end
+        if found == 0:
+            break
+        for d in range(n):
+            owners[count, d] = left[owner[d]] if owner[d] >= 0 else -1
+            if owner[d] >= 0:
+                left[owner[d]] = -1
+        count += 1
+        kept = 0
+        for k in range(m):
+            if left[k] >= 0:
+                left[kept] = left[k]
+                kept += 1
+        m = kept
+    return count
+
+
+@kernel
+def find_faces(patterns, radii, bases, inverses, sought, spots, gates, owners, counts):
+    """Occurrences of the faces (f, n, 2) that are ``sought`` (f,) among ``spots`` (m, FIELDS) into ``owners``
+    (f, k, n), their numbers into ``counts`` (f,). ``gates``: as :func:`find_face` takes them (3,).
+    """
+    centres, areas = spots[:, :2].copy(), spots[:, AREA].copy()
+    for f in range(radii.size):
+        counts[f] = 0
+        if sought[f]:
+            counts[f] = find_copies(
+                patterns[f], radii[f], bases[f], inverses[f], centres, areas, int(gates[0]), gates[1], gates[2],
+                owners[f],
+            )  # fmt: skip
 
 
 def compile_kernels() -> None:
     """Compile what the detector calls, or load it from the cache."""
     compile_for(
-        find_face, given(FLOAT, 2), FLOAT, given(FLOAT, 2), given(FLOAT, 1), given(INT, 2), given(FLOAT, 3),
-        INT, FLOAT, FLOAT, written(INT, 1),
+        find_faces, given(FLOAT, 3), given(FLOAT, 1), given(INT, 3), given(FLOAT, 4), given(BOOL, 1),
+        written(FLOAT, 2), given(FLOAT, 1), written(INT, 3), written(INT, 1),
     )  # fmt: skip

@@ -1,4 +1,6 @@
-"""Decorators that compile functions with numba as kernels of the control loop, cached on disk, without fastmath."""
+"""Decorators that compile functions with numba as kernels, cached on disk; those of the control loop without
+fastmath.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,17 @@ def inlined_kernel(function: _F) -> _F:
     return _compile(function, inline="always")
 
 
-def _compile(function: _F, **inline: str) -> _F:
-    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", **inline}
+def reassociating_kernel(function: _F) -> _F:
+    """A :func:`kernel` whose sums may be taken in any order, so that a loop over pixels uses vector instructions.
+
+    For detectors alone, which stand outside of the replayed core: its bits depend on the processor. NaN and infinity
+    are what they are elsewhere.
+    """
+    return _compile(function, fastmath={"reassoc", "nsz", "contract"})
+
+
+def _compile(function: _F, **more: Any) -> _F:
+    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", **more}
     try:
         compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"

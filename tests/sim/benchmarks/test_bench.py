@@ -83,7 +83,8 @@ def test_cycle_times_kernels_and_core():
 def test_features_find_the_dots():
     result = run_features(1, 0, quiet)
     assert result["dots_found"]["least"] >= 7
-    assert set(result["ms"]) == {"cold", "tracking", "cv2_threshold_and_connected_components"}
+    baseline = "cv2_threshold_and_connected_components"
+    assert set(result["ms"]) == {"cold", "tracking", "tracking_2x4", baseline}
     for row in result["robustness"]:
         low, high = row["tracked"]["all_faces_wilson_95"]
         assert low <= row["tracked"]["all_faces"] / row["tracked"]["frames"] <= high
