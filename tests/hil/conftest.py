@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -58,6 +60,14 @@ def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
         else:
             os.environ[key] = value
     shutil.rmtree(root)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_kernels() -> None:
+    """A first start refuses goals in the images until all is compiled; these tests begin with the second."""
+    subprocess.run(
+        [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())], check=True
+    )
 
 
 @pytest.fixture(scope="session")
