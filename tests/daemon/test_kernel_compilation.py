@@ -2,6 +2,7 @@
 without a model; and how the kernels of a first start get into a loop that runs.
 """
 
+import os
 import pickle
 import subprocess
 import sys
@@ -14,7 +15,13 @@ import pytest
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.daemon import kernel_compilation
-from stereoservo.daemon.kernel_compilation import KernelLoader, compiled, example_model, example_settings
+from stereoservo.daemon.kernel_compilation import (
+    KernelLoader,
+    compiled,
+    example_model,
+    example_settings,
+    kernels_to_come,
+)
 from stereoservo.messages.goals import Goal, PointTarget, Request, RunGoal
 from stereoservo.numerics.compilation import KERNELS, Overload, kernel, overloads
 
@@ -129,11 +136,11 @@ def test_kernels_are_loaded_one_at_a_time_once_a_new_record_is_there(
     record = kernel_compilation._Compiled(
         kernel_compilation._machine(), {__file__: (0, 0)}, {}, (wanted,) * 3
     )
-    path.write_bytes(pickle.dumps(record))
+    path.write_bytes(pickle.dumps(tuple(record)))
     loader.advance(10**10)
     assert not loads, "the sources have changed since"
     stamps = {__file__: kernel_compilation._stamp(__file__)}
-    path.write_bytes(pickle.dumps(record._replace(sources=stamps)) + b" ")
+    path.write_bytes(pickle.dumps(tuple(record._replace(sources=stamps))) + b" ")
     loader.advance(11 * 10**9)
     for count in (1, 2, 3):
         loader.advance((11 + count) * 10**9)
@@ -152,13 +159,23 @@ def test_a_record_holds_for_its_sources_and_its_cache_alone(
     (cache / "kernels.x-1.py311.1.nbc").touch()
     stamps = {str(source): kernel_compilation._stamp(source)}
     record = kernel_compilation._Compiled(kernel_compilation._machine(), stamps, {str(cache): 1}, ())
-    path.write_bytes(pickle.dumps(record))
+    path.write_bytes(pickle.dumps(tuple(record)))
     assert compiled() == ()
-    path.write_bytes(pickle.dumps(record._replace(machine=("another",))))
+    path.write_bytes(pickle.dumps(tuple(record._replace(machine=("another",)))))
     assert compiled() is None
-    path.write_bytes(pickle.dumps(record))
+    path.write_bytes(pickle.dumps(tuple(record)))
     (cache / "kernels.x-1.py311.1.nbc").unlink()
     assert compiled() is None
     (cache / "kernels.x-1.py311.1.nbc").touch()
     source.write_text("x = 22\n")
     assert compiled() is None
+
+
+@pytest.mark.process
+def test_what_one_process_has_compiled_another_knows() -> None:
+    command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]
+    subprocess.run(command, check=True, timeout=290)
+    found = compiled()
+    assert found is not None
+    assert {"cartesian_step", "limit_velocity"} & {overload.name for overload in found}
+    assert kernels_to_come() is None

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -65,9 +63,7 @@ def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
 @pytest.fixture(scope="session", autouse=True)
 def compiled_kernels() -> None:
     """A first start refuses goals in the images until all is compiled; these tests begin with the second."""
-    subprocess.run(
-        [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())], check=True
-    )
+    assert cli.invoke(["warmup"]) == 0
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,8 @@ beside the others, and how a servo process gets those into a loop that runs.
 Kernels are compiled by running an example cell: an arm with two cameras runs some steps of each law; kernels are
 compiled by types, not by sizes. The cameras' lenses bend, so that the lens's kernels run too. A file in the cache of
 numba tells that all are compiled, of which sources, and with which signatures.
-``python -m stereoservo.daemon.kernel_compilation PARENT_PID`` compiles what is not compiled yet, niced.
+``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside]`` compiles what is not compiled yet; ``beside``
+others that work: niced.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ CAMERAS = ("left", "right")
 MARKERS = tuple(range(6))
 STEPS = 40  # a short plan is executed in a third of them
 PERIOD_NS = 4_000_000
-MODULE, RECORD = "stereoservo.daemon.kernel_compilation", "record"
-"""This module, and the argument for its second part."""
+MODULE, RECORD, BESIDE = "stereoservo.daemon.kernel_compilation", "record", "beside"
+"""This module, and its second arguments: for the second part of its work, and for low priority."""
 NICE = 10
 """Of the process that compiles while cameras and arm work."""
 LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
@@ -286,10 +287,12 @@ def _cached(folder: str) -> int:
 def compiled() -> tuple[Overload, ...] | None:
     """The signatures of all kernels, where all are in the cache, of these sources and for this computer; else None."""
     try:
-        record = pickle.loads(_record_path().read_bytes())  # in numba's cache, which is read likewise
+        record = _Compiled(
+            *pickle.loads(_record_path().read_bytes())
+        )  # in numba's cache, which is read likewise
     except Exception:  # not there, or damaged: whatever unpickling raises
         return None
-    if not isinstance(record, _Compiled) or record.machine != _machine():
+    if record.machine != _machine():
         return None
     if any(_stamp(source) != stamp for source, stamp in record.sources.items()):
         return None
@@ -315,7 +318,7 @@ def record_compiled() -> None:
         {folder: _cached(folder) for folder in folders},
         found,
     )
-    write_atomically(_record_path(), pickle.dumps(record))
+    write_atomically(_record_path(), pickle.dumps(tuple(record)))
 
 
 class KernelLoader:
@@ -361,13 +364,14 @@ def kernels_to_come() -> KernelLoader | None:
 
 
 def main() -> int:
-    """Entry of the process; its argument is the parent's id."""
+    """Entry of the process; its first argument is the parent's id."""
     die_with_parent(int(sys.argv[1]), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.argv[2:] == [RECORD]:
         record_compiled()
     elif _has_cache():
-        os.nice(NICE)
+        if sys.argv[2:] == [BESIDE]:
+            os.nice(NICE)
         _wait_for_others()
         if compiled() is None:
             warm_up()

@@ -110,7 +110,7 @@ class Compilation:
         """Start it where it is due; returns how it failed, once, else ''."""
         if self._process is None:
             if self._due is not None and now >= self._due:
-                self._process = _spawn(["stereoservo.daemon.kernel_compilation", str(os.getpid())])
+                self._process = _spawn(["stereoservo.daemon.kernel_compilation", str(os.getpid()), "beside"])
             return ""
         code = self._process.poll()
         if code is None:

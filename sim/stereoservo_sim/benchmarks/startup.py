@@ -88,7 +88,8 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
     """Wall seconds from the start of ``stereoservo run`` until clients are answered, until the arm makes trial motions,
-    and until all kernels are loaded; CPU seconds of all its processes until then.
+    and until all kernels are loaded; CPU seconds of all its processes until then. ``overruns``: cycles that came late,
+    those behind a kernel that was loaded at rest among them.
     """
     cpu = _children_cpu()
     began = time.monotonic()
@@ -122,7 +123,8 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
         "calibrating_s": calibrating - began,
         "compiled_s": compiled - began,
         "cpu_s": _children_cpu() - cpu,
-        "latest_ms": state.loop.lateness_us["max"] * 1e-3,
+        "cycles": state.loop.cycles,
+        "overruns": state.loop.overruns,
     }
 
 
