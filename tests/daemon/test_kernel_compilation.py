@@ -14,7 +14,7 @@ import pytest
 
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.daemon import kernel_compilation
+from stereoservo.daemon import kernel_compilation, supervisor
 from stereoservo.daemon.kernel_compilation import (
     KernelLoader,
     compiled,
@@ -179,3 +179,30 @@ def test_what_one_process_has_compiled_another_knows() -> None:
     assert found is not None
     assert {"cartesian_step", "limit_velocity"} & {overload.name for overload in found}
     assert kernels_to_come() is None
+
+
+def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    codes = iter([3, 0])
+    began: list[list[str]] = []
+
+    def spawn(arguments: list[str]) -> subprocess.Popen[bytes]:
+        began.append(arguments)
+        return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({next(codes)})"])
+
+    monkeypatch.setattr(supervisor, "_spawn", spawn)
+    compilation = supervisor.Compilation()
+
+    def told(now: float) -> str:
+        assert compilation._process is not None
+        compilation._process.wait(30.0)
+        return compilation.look(now)
+
+    assert told(1.0) == "ended with exit code 3; starting again in 10 s"
+    assert compilation.look(10.9) == ""
+    assert len(began) == 1
+    assert compilation.look(11.0) == ""
+    assert len(began) == 2
+    assert told(12.0) == ""
+    assert compilation.look(1000.0) == ""
+    assert len(began) == 2
+    compilation.end()

@@ -11,6 +11,7 @@ others that work: niced.
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import pickle
 import platform
@@ -350,7 +351,9 @@ class KernelLoader:
                 self._loading = None if found is None else load(found)
             return
         self._due_ns = now_ns + self.PAUSE_NS
-        self.loaded = next(self._loading, self) is self
+        if next(self._loading, self) is self:
+            self.loaded = True
+            gc.freeze()  # what numba has made is not looked through again: that would hold up the loop
 
 
 def kernels_to_come() -> KernelLoader | None:
