@@ -4,6 +4,7 @@ this process has compiled, and a log of it.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import sys
@@ -97,34 +98,38 @@ def _forget_literals(dispatcher: Any) -> None:
 
 class _CompileLog(event.Listener):  # type: ignore[misc]
     """Appends to ``path``: process, kernel, types of the arguments, and CPU seconds of this thread, those of the
-    kernels compiled meanwhile apart.
+    kernels compiled meanwhile apart; at the end of the process its CPU seconds in all.
     """
 
     def __init__(self, path: str) -> None:
         self._path = path
         self._running: list[tuple[float, list[float]]] = []
+        atexit.register(lambda: self._append({"cpu_s": time.process_time()}))
 
     def on_start(self, event: Any) -> None:
         self._running.append((time.thread_time(), []))
 
     def on_end(self, event: Any) -> None:
-        import json  # for this alone: a servo process has none
-
         began, inner = self._running.pop()
         seconds = time.thread_time() - began
         if self._running:
             self._running[-1][1].append(seconds)
         function = event.data["dispatcher"].py_func
-        line = {
-            "process": os.path.basename(sys.argv[0]).removesuffix(".py"),
-            "pid": os.getpid(),
-            "module": function.__module__,
-            "kernel": function.__qualname__,
-            "signature": ", ".join(map(str, event.data["args"])),
-            "seconds": seconds - sum(inner),
-        }
+        self._append(
+            {
+                "module": function.__module__,
+                "kernel": function.__qualname__,
+                "signature": ", ".join(map(str, event.data["args"])),
+                "seconds": seconds - sum(inner),
+            }
+        )
+
+    def _append(self, line: dict[str, Any]) -> None:
+        import json  # for this alone: a servo process has none
+
+        process = os.path.basename(sys.argv[0]).removesuffix(".py")
         with open(self._path, "a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps({"process": process, "pid": os.getpid(), **line}) + "\n")
 
 
 if LOG_VARIABLE in os.environ:

@@ -22,11 +22,12 @@ from rich.console import Console
 from rich.table import Table
 
 from stereoservo.client import Client, ClientError
-from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE
+from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.messages.discovery import DaemonError, DaemonProcess
 from stereoservo.messages.goals import Calibrate
 from stereoservo.messages.wire import encode
 from stereoservo.numerics.compilation import LOG_VARIABLE
+from stereoservo_sim.benchmarks.service_bench import processes_of
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.experiments.experiment import ExperimentError
@@ -88,17 +89,19 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
     """Wall seconds from the start of ``stereoservo run`` until clients are answered, until the arm makes trial motions,
-    and until all kernels are loaded; CPU seconds of all its processes until then. ``overruns``: cycles that came late,
-    those behind a kernel that was loaded at rest among them.
+    and until all kernels are loaded. CPU seconds of what prepares the start, of what compiles beside the work, and of
+    the others until the trial motions. ``overruns``: cycles that came late, those behind a kernel that was loaded at
+    rest among them.
     """
-    cpu = _children_cpu()
     began = time.monotonic()
-    log = folder / f"{name}.txt"
+    text, log = folder / f"{name}.txt", folder / f"{name}.log"
     try:
         with DaemonProcess(
-            shipped_cell_path(CELLS[0]), options=("--seed", str(seed)), log=log,
-            environment={LOG_VARIABLE: str(folder / f"{name}.log")},
-        ) as daemon:  # fmt: skip
+            shipped_cell_path(CELLS[0]),
+            options=("--seed", str(seed)),
+            log=text,
+            environment={LOG_VARIABLE: str(log)},
+        ) as daemon:
             info = daemon.wait_ready()
             ready = time.monotonic()
             with Client(info.cell) as client:
@@ -107,6 +110,8 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
                 client.request("calibrate", client.keys.command("calibrate", client.operator), command)
                 client.wait_state(lambda state: state.source == "calibrate", "trial motions", 10.0)
                 calibrating = time.monotonic()
+                pids = {daemon.process.pid, *processes_of(cell_directories(info.cell).runtime).values()}
+                others = sum(_cpu_of(pid) for pid in pids)
                 client.disable()
                 state = client.wait_state(
                     lambda state: all(reason.code != "COMPILING" for reason in state.reasons),
@@ -115,17 +120,32 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
             compiled = time.monotonic()
             code = daemon.stop()
     except (ClientError, DaemonError) as error:
-        raise ExperimentError("startup", f"the {name} start: {error}; {log.read_text()[-2000:]}") from error
+        raise ExperimentError("startup", f"the {name} start: {error}; {text.read_text()[-2000:]}") from error
     if code != 0:
-        raise ExperimentError("startup", f"the daemon ended with exit code {code}: {log.read_text()[-2000:]}")
+        raise ExperimentError(
+            "startup", f"the daemon ended with exit code {code}: {text.read_text()[-2000:]}"
+        )
+    cpu = {line["process"]: line["cpu_s"] for line in _lines(log) if "cpu_s" in line}
+    spent = {
+        "preparation_cpu_s": cpu["cell_preparation"],
+        "compilation_cpu_s": cpu["kernel_compilation"],
+        "others_cpu_s": others,
+    }
     return {
         "ready_s": ready - began,
         "calibrating_s": calibrating - began,
         "compiled_s": compiled - began,
-        "cpu_s": _children_cpu() - cpu,
+        **spent,
+        "cpu_s": sum(spent.values()),
         "cycles": state.loop.cycles,
         "overruns": state.loop.overruns,
     }
+
+
+def _cpu_of(pid: int) -> float:
+    """CPU seconds of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _children_cpu() -> float:
@@ -139,10 +159,10 @@ def compiled_kernels(log: Path) -> list[dict[str, Any]]:
 
     numba compiles functions of its own, such as ``np.zeros``, in each process; they are not cached.
     """
-    lines = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     found: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for line in lines:
-        found[f"{line['module']}.{line['kernel']}"].append(line)
+    for line in _lines(log):
+        if "kernel" in line:
+            found[f"{line['module']}.{line['kernel']}"].append(line)
     rows = [
         {
             "kernel": name,
@@ -154,6 +174,10 @@ def compiled_kernels(log: Path) -> list[dict[str, Any]]:
         for name, those in found.items()
     ]
     return sorted(rows, key=lambda row: -row["seconds"])
+
+
+def _lines(log: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
 
 
 def _commands(repetitions: int, progress: ProgressCall) -> dict[str, Any]:
