@@ -317,6 +317,20 @@ def test_a_broken_command_is_listed_and_fails_alone(
     assert run("ls")[0] == 0
 
 
+def test_help_reads_the_text_of_a_plugin_without_importing_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    info = tmp_path / "acme-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[stereoservo.commands]\nacme-sing = acme_singing:sing\n")
+    (tmp_path / "acme_singing.py").write_text('def sing() -> None:\n    """Sings a song."""\n')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert cli.invoke(["--help"]) == 0
+    assert "Sings a song." in capfd.readouterr().out
+    assert "acme_singing" not in sys.modules
+
+
 def test_a_damaged_recording_is_an_error_with_the_file(tmp_path: Path, run: Run) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(b"no recording")

@@ -55,6 +55,10 @@ def test_messages_need_msgspec_only() -> None:
         (["status", "nowhere"], 1),
         (["goal", "nowhere", "--joint", "j1=0"], 1),
         (["enable", "nowhere"], 1),
+        (["calibrate", "nowhere"], 1),
+        (["warmup", "--help"], 0),
+        (["bench", "--help"], 0),
+        (["reproduce", "--help"], 0),
     ],
 )
 def test_the_verbs_of_a_client_import_no_numerical_library(

@@ -520,3 +520,24 @@ def test_a_state_of_version_6_is_taken_up(bench: Any) -> None:
     old["version"] = 5
     with pytest.raises(StateVersionError):
         decode_state(msgspec.msgpack.encode(old))
+
+
+def test_what_needs_kernels_that_are_not_compiled_yet_is_refused_and_the_model_waits(bench: Any) -> None:
+    bench.step(model_update=ModelUpdate(bench.truth.model), compiling=True)
+    bench.step(Enable(), compiling=True)
+    for _ in range(20):
+        status = bench.step(compiling=True).status
+    assert (status.model_epoch, status.lifecycle) == (0, "active")
+    assert [reason.code for reason in status.reasons] == ["COMPILING"]
+    for command in (goal(bench, bench.q), Teach("park", 1), Calibrate("00000011", check=True)):
+        (reply,) = [e for e in bench.step(command, compiling=True).events if e.kind == "reply"]
+        assert not reply.accepted
+        assert [reason.code for reason in reply.reasons] == ["COMPILING"]
+    joints = RunGoal(Goal("00000012", JointTarget({"j1": float(bench.q[0]) + 0.01})))
+    (reply,) = [e for e in bench.step(joints, compiling=True).events if e.kind == "reply"]
+    assert reply.accepted
+    bench.run(2.0)
+    status = bench.step().status
+    assert status.model_epoch == bench.truth.model.epoch
+    assert status.reasons == ()
+    assert bench.reply(goal(bench, bench.q)).accepted

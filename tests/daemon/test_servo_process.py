@@ -105,7 +105,7 @@ class StubArm:
 class Bench:
     """A servo process, its arm, and a gateway's ends of its links, on virtual time."""
 
-    def __init__(self, directory: Path, *, dry_run: bool = False) -> None:
+    def __init__(self, directory: Path, *, dry_run: bool = False, kernels: Any = None) -> None:
         self.directories = CellDirectories("bench", directory, directory)
         create_stop_slot(self.directories.stop_slot)
         create_slot(self.directories.observation_slot("left"), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
@@ -131,8 +131,9 @@ class Bench:
         self.beats: list[float] = []
         """How long the next sign of life may take, each time that one was given."""
         self.process = ServoProcess(
-            core, self.arm, self.links, self.clock, rate_hz=RATE_HZ, dry_run=dry_run, beat=self.beats.append
-        )
+            core, self.arm, self.links, self.clock, rate_hz=RATE_HZ, dry_run=dry_run, beat=self.beats.append,
+            kernels=kernels,
+        )  # fmt: skip
         self.pacing = ClockPacing(round(1e9 / RATE_HZ), now=self.clock.now_ns, sleep=self.clock.sleep)
         self.control: PacketChannel | None = None
         self.events: list[Event] = []
@@ -491,4 +492,38 @@ def test_an_observation_of_wrong_shapes_never_reaches_the_core(
         assert bench.links.observations() == ()
         writer.write(encode(good))
         assert len(bench.links.observations()) == 1
+    bench.links.close()
+
+
+class Kernels:
+    """Kernels to come: loaded with the tenth call."""
+
+    def __init__(self) -> None:
+        self.asked: list[bool] = []
+        self.loaded = False
+        self.moving = lambda: False
+
+    def advance(self, now_ns: int) -> None:
+        self.asked.append(self.moving())
+        self.loaded = len(self.asked) == 10
+
+
+def test_kernels_are_loaded_at_rest_alone_and_told_until_they_are(tmp_path: Path) -> None:
+    kernels = Kernels()
+    bench = Bench(tmp_path, kernels=kernels)
+    kernels.moving = lambda: bool(np.any(bench.arm.written[-1:]))
+    bench.connect()
+    bench.process.configure()
+    bench.run(1)
+    enabled(bench)
+    jog(bench)
+    before = len(kernels.asked)
+    assert before < 10
+    jog(bench)
+    assert len(kernels.asked) == before, "the arm moved"
+    assert "COMPILING" in [reason.code for reason in bench.state().status.reasons]
+    bench.run(400)
+    assert len(kernels.asked) == 10
+    assert not any(kernels.asked)
+    assert "COMPILING" not in [reason.code for reason in bench.state().status.reasons]
     bench.links.close()

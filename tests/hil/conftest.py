@@ -60,6 +60,12 @@ def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
     shutil.rmtree(root)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def compiled_kernels() -> None:
+    """A first start refuses goals in the images until all is compiled; these tests begin with the second."""
+    assert cli.invoke(["warmup"]) == 0
+
+
 @pytest.fixture(scope="session")
 def cell_file(roots: Path) -> Path:
     """The fake cell, with a quick calibration around the simulated cell's base."""

@@ -72,34 +72,37 @@ class LazyGroup(TyperGroup):
         return _command(cmd_name, function)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The list of ``--help``; the commands of this distribution are not imported for it."""
+        """The list of ``--help``: no command is imported for it whose text can be read from its source."""
         names = self.list_commands(ctx)
         width = formatter.width - 6 - max(len(name) for name in names)
-        own = {
-            plugin.name: plugin.value
-            for plugin in plugins.list_plugins(plugins.COMMANDS)
-            if plugin.distribution.split()[0] == "stereoservo"
-        } | {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
+        places = {plugin.name: plugin.value for plugin in plugins.list_plugins(plugins.COMMANDS)}
+        places |= {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
         rows = []
         for name in names:
-            command = _described(name, own[name]) if name in own else self.get_command(ctx, name)
+            command = _described(name, places[name]) or self.get_command(ctx, name)
             rows.append((name, command.get_short_help_str(width)))
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 
 
 def _described(name: str, where: str) -> Any:
-    """A command that has only its help text, read from the source of ``module:function`` without an import."""
+    """A command that has only its help text, read from the source of ``module:function`` without an import; None where
+    that cannot be read.
+    """
     module, _, function = where.partition(":")
-    spec = importlib.util.find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
-    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
-    (found,) = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == function)
+    try:
+        spec = importlib.util.find_spec(module)
+        source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
+        tree = ast.parse(source)
+    except Exception:  # whatever a third party's package raises on import, or holds in place of source
+        return None
+    found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == function]
+    if not found:
+        return None
 
     def described() -> None: ...
 
-    described.__doc__ = ast.get_docstring(found)
+    described.__doc__ = ast.get_docstring(found[0])
     return _command(name, described)
 
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 
-from stereoservo.cli.output import JsonOption, emit
-from stereoservo.daemon.kernel_compilation import compile_in_parallel, warm_up
+from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.daemon.process_control import child_environment
 
 
 def warmup(json: JsonOption = False) -> None:
     """Compile the kernels of the loop, so that the first start is as fast as any other."""
     began = time.monotonic()
-    compile_in_parallel()
-    warm_up()
+    command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]
+    done = subprocess.run(command, env=child_environment(), stdout=sys.stderr, check=False)
+    if done.returncode != 0:
+        raise CommandError(
+            "compilation", f"compiling ended with exit code {done.returncode}; its message is above"
+        )
     seconds = time.monotonic() - began
     emit({"seconds": seconds}, f"kernels are compiled ({seconds:.1f} s)", json)

@@ -22,8 +22,10 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import project_points
 
 
-def warm_up_laws() -> None:
-    """Compile, or load from numba's cache, the kernels of all laws, limited rates included."""
+def warm_up_laws(*, own: bool = True) -> None:
+    """Compile, or load from numba's cache, the kernels of all laws, limited rates included; without ``own``: of those
+    of other distributions.
+    """
     operators = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
     K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
     matrices = np.stack([K @ np.hstack([np.eye(3), np.array([[x], [0], [1.0]])]) for x in (0.1, -0.1)])
@@ -38,6 +40,8 @@ def warm_up_laws() -> None:
         np.arange(3),
     )  # fmt: skip
     for name, law in list(LAWS.items()):
+        if not own and law.step.__module__.startswith("stereoservo."):
+            continue
         try:
             law.step(scene, task, Options(1.0, 0.004, rotation_rate=1e-3, translation_rate=1e-3))
         except (

@@ -143,3 +143,18 @@ class RefusalError(Exception):
         self.reason = Reason(code, "info", subject, value, threshold, unit, hint)
         self.reasons = (self.reason, *further)
         self.plan = plan
+
+
+COMPILING = (
+    "first start on this computer: control laws, path planner and the watch over the model are still being compiled, "
+    "which takes a minute or two. Calibration, jog, home and joint goals work already; a model waits, and goals in the "
+    "images, teaching and checks are refused: ask again when this reason has gone from the status"
+)
+"""What is not ready, and what is."""
+
+
+def no_model(context: StepContext, hint: str) -> RefusalError:
+    """The refusal of what needs a model, where none is in use; ``hint``: how to get one."""
+    if context.inputs.compiling:
+        return RefusalError("COMPILING", COMPILING)
+    return RefusalError("NO_MODEL", hint)

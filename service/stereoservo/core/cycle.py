@@ -36,8 +36,9 @@ class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
     reanchored: tuple[str, ...] = ()
 
 
-class StepInputs(msgspec.Struct, frozen=True, eq=False):
-    """Everything that one step may depend on. ``stop``: the stop slot was raised since the last step.
+class StepInputs(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
+    """Everything that one step may depend on. ``stop``: the stop slot was raised since the last step. ``compiling``:
+    the kernels that work with a model are not loaded yet (the first start on a computer); a model waits for them.
 
     ``driver_active``: what the servo process did with the driver (it owns enable and disable); the core's lifecycle
     follows ``driver_active`` and asks for transitions through ``StepOutputs.driver_request``.
@@ -54,6 +55,7 @@ class StepInputs(msgspec.Struct, frozen=True, eq=False):
     driver_active: bool = False
     driver_fault: DriverFault | None = None
     parameter_epoch: int = 0
+    compiling: bool = False
 
 
 EventKind = Literal[

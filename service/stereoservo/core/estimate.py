@@ -63,7 +63,9 @@ def estimate(context: StepContext) -> StepContext:
 
 
 def _take_model(context: StepContext) -> None:
-    """A new model waits until the arm rests and no law runs; then every estimate starts again."""
+    """A new model waits until the arm rests and no law runs, and until the kernels that it needs are loaded; then every
+    estimate starts again.
+    """
     state, update = context.state, context.inputs.model_update
     if update is not None:
         try:
@@ -72,7 +74,7 @@ def _take_model(context: StepContext) -> None:
             context.emit("warning", message=f"model refused: {error}")
         else:
             _await_model(update, context)
-    if state.pending_model is None:
+    if state.pending_model is None or context.inputs.compiling:
         return
     run = state.reanchoring
     if state.pending_reanchored:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.context import COMPILING, SourceOutput, StepContext
 from stereoservo.core.cycle import Event, Status, StepOutputs
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
@@ -104,6 +104,8 @@ def _reasons(context: StepContext, motion: SourceOutput, limited: SafetyResult) 
         found.extend(explain(state.source, context, tuple(found)))
     if state.planning is not None:
         found.append(planning_reason(state.planning))
+    if context.inputs.compiling:
+        found.append(Reason("COMPILING", "info", hint=COMPILING))
     if state.stopped:
         if state.stop_reason is not None:
             found.append(state.stop_reason)

@@ -1,5 +1,6 @@
 """Preparation of a run in a process of its own: checks cell file and drivers, writes the run plan (the configuration
-that all processes read), compiles the numba kernels.
+that all processes read), compiles the numba kernels that a cell needs before all others: its detectors', and those of a
+core without a model.
 
 It is a process of its own: a driver that crashes when it is asked for its description ends nothing else.
 ``python -m stereoservo.daemon.cell_preparation CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID JSON_OPTIONS``.
@@ -17,7 +18,7 @@ import msgspec
 
 from stereoservo.daemon.camera_setup import describe_camera, make_camera
 from stereoservo.daemon.ipc_messages import RunPlan, save_plan
-from stereoservo.daemon.kernel_compilation import compile_in_parallel, warm_up
+from stereoservo.daemon.kernel_compilation import collect_seldom, warm_up_first
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_file
 from stereoservo.ports import plugins
@@ -111,6 +112,7 @@ def main() -> int:
     cell_path, runtime, state = (Path(argument) for argument in sys.argv[1:4])
     die_with_parent(int(sys.argv[4]), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    collect_seldom()
     try:
         plan = make_plan(cell_path, runtime, state, msgspec.json.decode(sys.argv[5], type=PlanOptions))
     except (CellFileError, DriverError, plugins.PluginError) as error:
@@ -121,8 +123,7 @@ def main() -> int:
     except OSError as error:
         print(f"{runtime}: the run plan cannot be written: {error.strerror}", file=sys.stderr)
         return EXIT_INVALID
-    compile_in_parallel()
-    warm_up()
+    warm_up_first()
     return 0
 
 

@@ -1,20 +1,29 @@
-"""Compiles all numba kernels of a servo process (core, laws, planner, monitors) into the cache on disk, in parallel
-processes, by running an example cell.
+"""The numba kernels of a servo process (core, laws, planner, monitors): which are compiled first, which by a process
+beside the others, and how a servo process gets those into a loop that runs.
 
-An example arm with two cameras runs some steps of each law; kernels are compiled by types, not by sizes. The
-cameras' lenses bend, so that the lens's kernels run too.
+Kernels are compiled by running an example cell: an arm with two cameras runs some steps of each law; kernels are
+compiled by types, not by sizes. The cameras' lenses bend, so that the lens's kernels run too. A file in the cache of
+numba tells that all are compiled, of which sources, and with which signatures.
+``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside]`` compiles what is not compiled yet; ``beside``
+others that work: niced.
 """
 
 from __future__ import annotations
 
+import fcntl
+import gc
 import os
+import pickle
+import platform
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
+import llvmlite.binding
 import msgspec
+import numba
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS
@@ -30,17 +39,20 @@ from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.kernels import distort_pixel
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
+from stereoservo.messages.files import write_atomically
 from stereoservo.messages.goals import (
     DEFAULT_LAW,
     Command,
     FeatureTarget,
     Goal,
+    Jog,
     PointSource,
     Request,
     RunGoal,
     UpdateGoal,
 )
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import KERNELS, Overload, load, overloads
 from stereoservo.planning.planner_warmup import warm_up_planner
 from stereoservo.ports.devices import CameraObservation, JointState
 
@@ -50,19 +62,52 @@ CAMERAS = ("left", "right")
 MARKERS = tuple(range(6))
 STEPS = 40  # a short plan is executed in a third of them
 PERIOD_NS = 4_000_000
+MODULE, RECORD, BESIDE = "stereoservo.daemon.kernel_compilation", "record", "beside"
+"""This module, and its second arguments: for the second part of its work, and for low priority."""
+NICE = 10
+"""Of the process that compiles while cameras and arm work."""
 LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
 
+def warm_up_first() -> None:
+    """Compile, or load, what a core needs that has no model: it jogs, moves joints, and makes trial motions.
+
+    Laws of other distributions run as well, lest their kernels be compiled in the loop.
+    """
+    model = example_model()
+    pixels = _example_pixels(model)
+    core = ServoCore(example_settings())
+    jog = Request(1, "warmup", Jog({JOINTS[0]: 0.1}))
+    for step in range(1, 4):
+        inputs = _inputs(step, pixels, model)
+        core.step(
+            msgspec.structs.replace(
+                inputs, model_update=None, requests=(jog,), driver_active=True, compiling=True
+            )
+        )
+    warm_up_laws(own=False)
+
+
 def warm_up() -> None:
-    """Run each law, the planner and fault isolation on the example cell, which compiles their kernels."""
-    warm_up_incidences()
+    """Run each law, the planner and fault isolation on the example cell, which compiles their kernels, or loads them.
+
+    What a goal in the images needs comes first, what is rarely asked for last.
+    """
     warm_up_laws()
     warm_up_planner()
+    _warm_up_goals()
+    warm_up_incidences()
     rehearse_mobile()
     model = example_model()
-    pixels = np.stack(
-        [distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras]
-    )
+    matrices = np.array([camera.matrix for camera in model.cameras])
+    find_groups(model.marker_points, matrices, FLAT_PX, model.generators, exhaustive=0)
+    _warm_up_fault_isolation(model, _example_pixels(model))
+
+
+def _warm_up_goals() -> None:
+    """A core accepts, plans and runs a goal by each law."""
+    model = example_model()
+    pixels = _example_pixels(model)
     seven = np.ones(7)  # a redundant arm's self-motion
     distort_pixel(LENS, 1.0, 1.0)  # for set-points that are said anew in a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
@@ -89,9 +134,6 @@ def warm_up() -> None:
             requests = () if command is None else (Request(1, "warmup", command),)
             inputs = _inputs(step, pixels, model)
             core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
-    _warm_up_fault_isolation(model, pixels)
-    matrices = np.array([camera.matrix for camera in model.cameras])
-    find_groups(model.marker_points, matrices, FLAT_PX, model.generators, exhaustive=0)
 
 
 def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
@@ -123,6 +165,11 @@ def _observation(camera: str, pixels: FloatArray, step: int, now_ns: int) -> Cam
     covariances = np.tile(0.01 * np.eye(2), (len(MARKERS), 1, 1))
     shutter_ns = now_ns - PERIOD_NS // 2
     return CameraObservation(camera, step, shutter_ns, now_ns, np.array(MARKERS), pixels.copy(), covariances)
+
+
+def _example_pixels(model: CellModel) -> FloatArray:
+    """Raw pixels (c, m, 2) of the markers."""
+    return np.stack([distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras])
 
 
 def _project(matrix: FloatArray, points: FloatArray) -> FloatArray:
@@ -200,36 +247,155 @@ def example_settings() -> CoreSettings:
     )
 
 
-WARM_UPS: Mapping[str, Callable[[], None]] = {
-    "laws": warm_up_laws,
-    "planning": warm_up_planner,
-    "incidences": warm_up_incidences,
-}
-"""The longest first."""
+# -- what is compiled -------------------------------------------------------------------------------------------
 
 
-def compile_in_parallel() -> None:
-    """Compile the kernels of ``WARM_UPS`` in parallel processes, unless those of the largest are already compiled."""
-    if _compiled() or len(os.sched_getaffinity(0)) < 2:
-        return
-    command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]
-    children = [subprocess.Popen([*command, name]) for name in WARM_UPS]
-    for child in children:
-        child.wait()
+class _Compiled(NamedTuple):
+    """Content of the file in the cache."""
+
+    machine: tuple[str, ...]
+    sources: dict[str, tuple[int, int]]
+    caches: dict[str, int]
+    overloads: tuple[Overload, ...]
 
 
-def _compiled() -> bool:
-    name = cartesian_step.__name__
-    cache = Path(cartesian_step.stats.cache_path)  # type: ignore[attr-defined]
-    return any(cache.glob(f"*.{name}-*.nbc"))
+def _has_cache() -> bool:
+    return cartesian_step.stats.cache_path is not None  # type: ignore[attr-defined]
+
+
+def _record_path() -> Path:
+    return Path(cartesian_step.stats.cache_path) / f"compiled-{sys.implementation.cache_tag}.pickle"  # type: ignore[attr-defined]
+
+
+def _machine() -> tuple[str, ...]:
+    return platform.python_version(), numba.__version__, llvmlite.binding.get_host_cpu_name()
+
+
+def _stamp(file: str | Path) -> tuple[int, int]:
+    """Modification time [ns] and size, as numba tells whether a file has changed; zeros where it is not there."""
+    try:
+        status = os.stat(file)
+    except OSError:
+        return 0, 0
+    return status.st_mtime_ns, status.st_size
+
+
+def _cached(folder: str) -> int:
+    """Number of compiled kernels in a folder of the cache."""
+    return sum(1 for _ in Path(folder).glob("*.nbc"))
+
+
+def compiled() -> tuple[Overload, ...] | None:
+    """The signatures of all kernels, where all are in the cache, of these sources and for this computer; else None."""
+    try:
+        record = _Compiled(
+            *pickle.loads(_record_path().read_bytes())
+        )  # in numba's cache, which is read likewise
+    except Exception:  # not there, or damaged: whatever unpickling raises
+        return None
+    if record.machine != _machine():
+        return None
+    if any(_stamp(source) != stamp for source, stamp in record.sources.items()):
+        return None
+    if any(_cached(folder) < count for folder, count in record.caches.items()):
+        return None
+    return record.overloads
+
+
+def record_compiled() -> None:
+    """Load all kernels out of the cache, and record there which a servo process loads.
+
+    To be called in a process that has compiled none: one that has holds those, too, that only other kernels call. Laws
+    of other distributions are not recorded: every servo process runs them before its loop.
+    """
+    warm_up()
+    found = tuple(overload for overload in overloads() if overload.module.startswith("stereoservo."))
+    kernels = [KERNELS[overload.module, overload.name] for overload in found]
+    sources = {kernel.py_func.__code__.co_filename for kernel in kernels}
+    folders = {kernel.stats.cache_path for kernel in kernels}
+    record = _Compiled(
+        _machine(),
+        {source: _stamp(source) for source in sources},
+        {folder: _cached(folder) for folder in folders},
+        found,
+    )
+    write_atomically(_record_path(), pickle.dumps(tuple(record)))
+
+
+class KernelLoader:
+    """Gets kernels that another process compiles into a loop that runs: one at a time, for `advance` is called only
+    where nothing moves and a cycle may come late.
+    """
+
+    LOOK_NS = 500_000_000
+    PAUSE_NS = 20_000_000
+    """Between two kernels: the drives are sent commands meanwhile."""
+
+    def __init__(self) -> None:
+        self.loaded = False
+        self._due_ns = 0
+        self._loading: Iterator[None] | None = None
+        self._record = _record_path()
+        self._known = _stamp(self._record)
+
+    def advance(self, now_ns: int) -> None:
+        """Load the next kernel, once all are compiled and it is time."""
+        if self.loaded or now_ns < self._due_ns:
+            return
+        if self._loading is None:
+            self._due_ns = now_ns + self.LOOK_NS
+            stamp = _stamp(self._record)
+            if stamp != self._known:
+                self._known = stamp
+                found = compiled()
+                self._loading = None if found is None else load(found)
+            return
+        self._due_ns = now_ns + self.PAUSE_NS
+        if next(self._loading, self) is self:
+            self.loaded = True
+            gc.freeze()  # what numba has made is not looked through again: that would hold up the loop
+
+
+def kernels_to_come() -> KernelLoader | None:
+    """The loader of what is not compiled yet; None where all is, and where no cache can be written: then a process
+    compiles for itself.
+    """
+    if not _has_cache():
+        return None
+    loader = KernelLoader()
+    return loader if compiled() is None else None
+
+
+def collect_seldom() -> None:
+    """Make the garbage collector rare: what numba makes while it compiles stays, and looking through it costs a
+    twentieth of the time.
+    """
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def main() -> int:
-    """Entry of a process; its arguments are the parent's id and a key of ``WARM_UPS``."""
+    """Entry of the process; its first argument is the parent's id."""
     die_with_parent(int(sys.argv[1]), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    WARM_UPS[sys.argv[2]]()
+    if sys.argv[2:] == [RECORD]:
+        record_compiled()
+    elif _has_cache():
+        if sys.argv[2:] == [BESIDE]:
+            os.nice(NICE)
+        _wait_for_others()
+        if compiled() is None:
+            collect_seldom()
+            warm_up()
+            os.execv(sys.executable, [sys.executable, "-m", MODULE, sys.argv[1], RECORD])
     return 0
+
+
+def _wait_for_others() -> None:
+    """Have one process at a time compile into this cache, until it ends."""
+    lock = os.open(_record_path().with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
+    os.set_inheritable(lock, True)  # it is kept by what this process becomes
+    fcntl.flock(lock, fcntl.LOCK_EX)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from stereoservo.core.cycle import DriverFault, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan
-from stereoservo.daemon.kernel_compilation import warm_up
+from stereoservo.daemon.kernel_compilation import KernelLoader, kernels_to_come, warm_up, warm_up_first
 from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
 from stereoservo.daemon.pacing import ClockPacing, LoopStatistics, prepare_realtime
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
@@ -54,7 +54,8 @@ class ServoProcess:
     """The servo loop of one cell, a cycle at a time, on any links, pacing and clock.
 
     ``dry_run``: the core's commands and requests are computed and never reach the drives. ``beat``: told in every
-    cycle, and before what may take longer, within how many seconds it is told again.
+    cycle, and before what may take longer, within how many seconds it is told again. ``kernels``: those that are not
+    compiled yet; they are loaded once they are, a kernel at a time in cycles in which nothing moves.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class ServoProcess:
         rate_hz: float,
         dry_run: bool = False,
         beat: Callable[[float], None] = lambda limit_s: None,
+        kernels: KernelLoader | None = None,
     ) -> None:
         self.core = core
         self.driver = driver
@@ -75,6 +77,7 @@ class ServoProcess:
         self._period_ns = round(1e9 / rate_hz)
         self._dry_run = dry_run
         self._beat = beat
+        self._kernels = kernels
         self._stream = StepStream(core.settings, rate_hz)
         self._configured = False
         self._active = False
@@ -219,6 +222,7 @@ class ServoProcess:
             driver_configured=self._configured,
             driver_active=self._active,
             driver_fault=self._fault,
+            compiling=self._kernels is not None,
         )
         self._stream.before(self._links.step_recorder(), self.core, now_ns)
         outputs = self.core.step(inputs)
@@ -228,7 +232,15 @@ class ServoProcess:
         self._publish(outputs, pacing)
         self._stream.after(inputs, outputs)
         self._beat(SERVO_HANG_S)
+        if self._kernels is not None and not self._moving:
+            self._load_kernels(self._kernels, now_ns)
         return inputs, outputs
+
+    def _load_kernels(self, kernels: KernelLoader, now_ns: int) -> None:
+        """Load the next kernel, if it is time. Never compiles: what is loaded is in the cache."""
+        kernels.advance(now_ns)
+        if kernels.loaded:
+            self._kernels = None
 
     def come_to_rest(self, pacing: Pacing, cut_short: Callable[[], bool]) -> None:
         """Cycle until the core's command is zero, at most ``REST_TIMEOUT_S`` or until ``cut_short``."""
@@ -270,7 +282,12 @@ def run(plan: RunPlan, termination: Termination) -> None:
     locks = [FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}")]
     if hardware is not None:
         locks.append(ChannelLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
-    warm_up()  # compiled kernels are loaded now, not in the middle of a cycle
+    # Compiled kernels are loaded now, not in the middle of a cycle.
+    kernels = kernels_to_come()
+    if kernels is None:
+        warm_up()
+    else:
+        warm_up_first()
     core = ServoCore(plan.settings())
     driver = make_driver(plan, clock)
     rate_hz = plan.cell.servo.rate_hz
@@ -278,7 +295,14 @@ def run(plan: RunPlan, termination: Termination) -> None:
     heartbeat = HeartbeatWriter(directories.heartbeat_slot("servo"))
     try:
         process = ServoProcess(
-            core, driver, links, clock, rate_hz=rate_hz, dry_run=plan.dry_run, beat=heartbeat.beat
+            core,
+            driver,
+            links,
+            clock,
+            rate_hz=rate_hz,
+            dry_run=plan.dry_run,
+            beat=heartbeat.beat,
+            kernels=kernels,
         )
         try:
             # Before the drives are asked for: collecting garbage holds up every thread of this process, a driver's too.

@@ -54,7 +54,8 @@ from stereoservo.messages.locks import FileLock, holder
 from stereoservo.messages.run_record import begin_run, end_run, run_is_up
 from stereoservo.ports.clock import MonotonicClock
 
-READY_TIMEOUT_S = 60.0
+READY_TIMEOUT_S = 300.0
+"""A servo process whose cache cannot be written compiles all kernels before it is ready."""
 SERVO_END_S = 6.0
 OTHERS_END_S = 4.0
 FIRST_PAUSE_S = 0.5
@@ -97,11 +98,41 @@ class Child:
     restarts: int = 0
 
 
+class Compilation:
+    """The process that compiles what a first start lacks, niced, beside all others."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._due: float | None = 0.0
+        self.look(0.0)
+
+    def look(self, now: float) -> str:
+        """Start it where it is due; returns how it failed, once, else ''."""
+        if self._process is None:
+            if self._due is not None and now >= self._due:
+                self._process = _spawn(["stereoservo.daemon.kernel_compilation", str(os.getpid()), "beside"])
+            return ""
+        code = self._process.poll()
+        if code is None:
+            return ""
+        self._process = None
+        self._due = None if code == 0 else now + LONGEST_PAUSE_S
+        return "" if code == 0 else f"{_how(code)}; starting again in {LONGEST_PAUSE_S:g} s"
+
+    def end(self) -> None:
+        """Idempotent."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
 @dataclass
 class Supervisor:
     """The processes of one cell."""
 
     plan: RunPlan
+    compilation: Compilation | None = None
     children: list[Child] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -175,6 +206,8 @@ class Supervisor:
             code = child.process.poll()
             if code is not None:
                 self._ended(child, child.hung or _how(code), now)
+        if self.compilation is not None and (how := self.compilation.look(now)):
+            self._reporter.report("process_ended", f"the compilation of kernels {how}")
         self._reporter.flush()
 
     def _ended(self, child: Child, how: str, now: float) -> None:
@@ -211,14 +244,19 @@ def _how(code: int) -> str:
 
 def _start(child: Child) -> None:
     child.watch.begin()
-    child.process = subprocess.Popen(
-        [sys.executable, "-m", *child.arguments],
+    child.process = _spawn(child.arguments)
+    child.started = time.monotonic()
+
+
+def _spawn(arguments: list[str]) -> subprocess.Popen[bytes]:
+    """A Python process of a module with its arguments."""
+    return subprocess.Popen(
+        [sys.executable, "-m", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=sys.stderr,
         env=child_environment(),
         start_new_session=True,  # Ctrl-C goes to the supervisor, which ends them in order
     )
-    child.started = time.monotonic()
 
 
 def _end(children: list[Child], grace_s: float) -> None:
@@ -239,7 +277,7 @@ def _end(children: list[Child], grace_s: float) -> None:
 def prepare(
     cell_path: Path, options: PlanOptions, directories: CellDirectories, termination: Termination
 ) -> RunPlan | None:
-    """Check the cell with its drivers, compile the kernels, create the slots; None when terminated meanwhile.
+    """Check the cell with its drivers, compile the first kernels, create the slots; None when terminated meanwhile.
 
     Raises StartError.
     """
@@ -347,16 +385,20 @@ def run_cell(
         termination = Termination(grace_s=0.0)
         clean(directories)
         record_run(partial(begin_run, directories, options.boot, os.getpid()))
+        compilation = (
+            Compilation()
+        )  # of what is needed later, beside the preparation and, niced, beside the work
         try:
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")
-                Supervisor(plan).run(termination, lambda: on_ready(plan))
+                Supervisor(plan, compilation).run(termination, lambda: on_ready(plan))
             asked = signal.Signals(termination.first).name
             record_run(partial(end_run, directories, f"somebody asked for it ({asked})", in_order=True))
         except Exception as error:
             record_run(partial(end_run, directories, str(error)))
             raise
         finally:
+            compilation.end()
             clean(directories)
         return termination.first

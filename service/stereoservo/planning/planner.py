@@ -234,7 +234,7 @@ def _spans_a_plane(body: FloatArray) -> bool:
 @kernel
 def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArray:
     """Unit displacements (3, 3): away from ``camera_centres`` (c, 3), right and down in ``camera`` (3, 4)."""
-    P = camera[:, :3]
+    P = camera[:, :3].copy()
     rows = np.zeros((3, 3))
     rows[1], rows[2] = _cross(P[1], P[2]), _cross(P[2], P[0])
     sign = 1.0 if _dot(P[0], rows[1]) >= 0.0 else -1.0

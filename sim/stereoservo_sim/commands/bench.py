@@ -65,6 +65,12 @@ def _soak_live(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
     return run_soak_live(repetitions, seed, progress)
 
 
+def _startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.startup import run_startup
+
+    return run_startup(repetitions, seed, progress)
+
+
 BENCHES: dict[str, Bench] = {
     "calibration": _calibration,
     "can": _can,
@@ -74,6 +80,7 @@ BENCHES: dict[str, Bench] = {
     "kills": _kills,
     "soak": _soak,
     "soak-live": _soak_live,
+    "startup": _startup,
 }
 """By the name given on the command line."""
 
@@ -85,7 +92,7 @@ def bench(
         typer.Option(
             min=1,
             help="Timed fits of `calibration`, trials of each of `faults`, ten of `kills`, two virtual minutes of "
-            "`soak`, two real ones of `soak-live`; the others take a multiple.",
+            "`soak`, two real ones of `soak-live`, commands of `startup`; the others take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
@@ -123,7 +130,7 @@ def _find(what: str) -> Bench:
 
 
 def _show(answer: dict[str, Any], console: Console) -> None:
-    """Print one line a figure, nested names joined by points; tables of faults."""
+    """Print one line a figure, nested names joined by points; tables of faults and of what a start compiles."""
     if answer["bench"] == "faults":
         from stereoservo_sim.benchmarks.faults.bench import show_faults
 
@@ -131,6 +138,11 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         answer = {
             key: value for key, value in answer.items() if key not in ("rows", "wall", "service", "inputs")
         }
+    if answer["bench"] == "startup":
+        from stereoservo_sim.benchmarks.startup import show_startup
+
+        show_startup(answer, console)
+        answer = {key: value for key, value in answer.items() if key != "kernels"}
     for name, value in _flat(answer, ""):
         console.print(f"{name:<44} {f'{value:.4g}' if isinstance(value, float) else value}", soft_wrap=True)
 

@@ -16,8 +16,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from stereoservo.cli import interruption
-from stereoservo.cli.calibrate.recorded_images import fit_images, table_of_images
-from stereoservo.cli.calibrate.stored_trials import fit_stored_trials, table, table_of_stored
 from stereoservo.cli.output import (
     EXIT_FAILED,
     CellArgument,
@@ -29,11 +27,10 @@ from stereoservo.cli.output import (
     note,
 )
 from stereoservo.client import Client, FailedError
-from stereoservo.daemon.jobs.check_job import load_checks
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import DaemonProcess, NotRunningError, find_daemon
-from stereoservo.messages.wire import EventMessage
+from stereoservo.messages.wire import CalibrationResult, EventMessage
 
 TRIALS_SHARE = 0.9
 SHOWN_CHECKS = 8
@@ -119,12 +116,16 @@ def calibrate(
     if images is not None:
         if lines is not None:
             raise CommandError("argument", "--lines go with --trials; --images keeps its trial data for that")
+        from stereoservo.cli.calibrate.recorded_images import fit_images, source_of_images  # OpenCV and more
+
         from_images = fit_images(cell, images, output)
-        emit(from_images, table_of_images(from_images), json)
+        emit(from_images, f"{_table(from_images)}\n{source_of_images(from_images)}", json)
         return
     if trials is not None:
+        from stereoservo.cli.calibrate.stored_trials import fit_stored_trials, source_of_stored
+
         result = fit_stored_trials(cell, trials, lines, lines_sigma, output)
-        emit(result, table_of_stored(result), json)
+        emit(result, f"{_table(result)}\n{source_of_stored(result)}", json)
         return
     if lines is not None or output is not None:
         raise CommandError(
@@ -163,7 +164,23 @@ def calibrate(
             raise
         except FailedError as error:
             raise _failure(error) from error
-    emit(result, table(result), json)
+    emit(result, _table(result), json)
+
+
+def _table(result: CalibrationResult) -> str:
+    """A calibration's result as lines of text."""
+    lines = [
+        f"model epoch {result.epoch} ({result.stratum}): {result.rms_px:.4f} px rms over "
+        f"{result.measurements} "
+        f"measurements, {result.outliers} left out, chi-square "
+        f"{'as expected' if result.covariance_ok else 'NOT as expected'}",
+        *(f"  {name:16} {rms:.4f} px" for name, rms in result.per_joint_px.items()),
+        f"  {result.verdict}",
+        f"  model  {result.model}",
+        f"  report {result.report or 'none could be written'}",
+        f"  figures {result.figures}",
+    ]
+    return "\n".join(lines)
 
 
 def _failure(error: FailedError, **data: Any) -> CommandError:
@@ -231,6 +248,8 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
 
 def _print_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
     """Print the report of a check, with earlier checks where they are stored on this host."""
+    from stereoservo.daemon.jobs.check_job import load_checks  # numpy and more
+
     past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
     history = [
         {"created": one.created, "epoch": one.model_epoch, "status": one.status, "sigmas": one.sigmas,

@@ -12,7 +12,7 @@ from stereoservo.cli.calibrate.stored_trials import (
     StoredFit,
     fit_stored_trials,
     resolve_cell,
-    table_of_stored,
+    source_of_stored,
 )
 from stereoservo.cli.output import CommandError, note
 
@@ -69,8 +69,8 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
     return ImageFit(**{**msgspec.structs.asdict(fit), "from_images": used})
 
 
-def table_of_images(result: ImageFit) -> str:
-    """The result as lines of text."""
+def source_of_images(result: ImageFit) -> str:
+    """What the fit was made of, as lines of text."""
     used = result.from_images
     what = "" if used is None else f"\n  images {used.directory}: {used.stops} stops, {used.frames} frames"
-    return table_of_stored(result) + what
+    return source_of_stored(result) + what

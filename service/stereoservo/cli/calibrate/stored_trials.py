@@ -1,5 +1,5 @@
 """Calibration from stored trial data for ``stereoservo calibrate CELL --trials FILE.npz``: lenses from a file of
-straight lines, fit, stored model, and the result as a table.
+straight lines, fit, stored model, and what it was made of.
 """
 
 from __future__ import annotations
@@ -38,25 +38,9 @@ class StoredFit(CalibrationResult, frozen=True):
     lines: LinesUsed | None = None
 
 
-def table(result: CalibrationResult) -> str:
-    """A calibration's result as lines of text."""
-    lines = [
-        f"model epoch {result.epoch} ({result.stratum}): {result.rms_px:.4f} px rms over "
-        f"{result.measurements} "
-        f"measurements, {result.outliers} left out, chi-square "
-        f"{'as expected' if result.covariance_ok else 'NOT as expected'}",
-        *(f"  {name:16} {rms:.4f} px" for name, rms in result.per_joint_px.items()),
-        f"  {result.verdict}",
-        f"  model  {result.model}",
-        f"  report {result.report or 'none could be written'}",
-        f"  figures {result.figures}",
-    ]
-    return "\n".join(lines)
-
-
-def table_of_stored(result: StoredFit) -> str:
-    """The result of a fit of stored trials as lines of text."""
-    lines = [table(result), f"  fitted in {result.seconds:.1f} s"]
+def source_of_stored(result: StoredFit) -> str:
+    """What a fit of stored trials was made of, and what becomes of it, as lines of text."""
+    lines = [f"  fitted in {result.seconds:.1f} s"]
     if result.lines is not None:
         used = "; ".join(f"{name}: {', '.join(names)}" for name, names in result.lines.cameras.items())
         lines.append(f"  lines  {result.lines.file} (noise {result.lines.sigma_px:g} px), {used}")

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.context import RefusalError, StepContext, no_model
 from stereoservo.core.goals.execute import (
     begin,
     drop_lookahead_plan,
@@ -246,7 +246,7 @@ def trusted_model(context: StepContext) -> int:
     """Epoch of the model in use. Raises RefusalError where there is none, or none that holds."""
     state = context.state
     if state.model is None or context.arrays is None or state.readiness == ModelReadiness.NONE:
-        raise RefusalError("NO_MODEL", "the cell has no model yet: calibrate first")
+        raise no_model(context, "the cell has no model yet: calibrate first")
     if state.readiness == ModelReadiness.SUSPECT:
         raise RefusalError(
             "MODEL_SUSPECT",
@@ -514,7 +514,7 @@ def _calibrate(command: Calibrate, request: Request, context: StepContext) -> st
             "trial motions begin",
         )
     elif state.model is None:
-        raise RefusalError("NO_MODEL", "the cell has no model to check: calibrate first")
+        raise no_model(context, "the cell has no model to check: calibrate first")
     else:
         visiting = start_check(command.id, context, state.model, command.reset_zeros)
         what = "check motion begins"

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.context import RefusalError, StepContext, no_model
 from stereoservo.core.monitors.camera_relocalization import refuse_while_moved
 from stereoservo.core.monitors.moving_camera import moving_cameras, refuse_moving
 from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
@@ -22,8 +22,8 @@ def start_teaching(command: Teach, request: Request, context: StepContext) -> st
     """Begin to average. Raises RefusalError without a model, in motion, and while another goal is taught."""
     state = context.state
     if state.model is None:
-        raise RefusalError(
-            "NO_MODEL", "the cell has no model yet: calibrate first, so that the goal can carry its epoch"
+        raise no_model(
+            context, "the cell has no model yet: calibrate first, so that the goal can carry its epoch"
         )
     if state.teaching is not None:
         raise RefusalError(

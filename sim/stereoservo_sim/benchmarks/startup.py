@@ -1,0 +1,206 @@
+"""``bench startup``: a cell's first start with an empty cache of compiled kernels beside its second one, what compiles
+in which process, and what commands cost before they do anything.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from stereoservo.client import Client, ClientError
+from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
+from stereoservo.messages.discovery import DaemonError, DaemonProcess
+from stereoservo.messages.goals import Calibrate
+from stereoservo.messages.wire import encode
+from stereoservo.numerics.compilation import LOG_VARIABLE
+from stereoservo_sim.benchmarks.service_bench import processes_of
+from stereoservo_sim.benchmarks.timing import summary
+from stereoservo_sim.cells import CELLS, shipped_cell_path
+from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.progress import ProgressCall
+
+COMMANDS = (
+    ("--help",), ("status", "--help"), ("goal", "--help"), ("run", "--help"), ("calibrate", "--help"),
+    ("warmup", "--help"), ("demo", "--help"), ("simulate", "--help"),
+)  # fmt: skip
+COMPILED_S = 900.0
+
+
+def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """``first``, ``second``: start of the demo's cell with an empty and with the full cache. ``kernels``: what the
+    first compiled. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
+
+    Raises ExperimentError where the daemon does not come up.
+    """
+    commands = _commands(repetitions, progress)
+    with tempfile.TemporaryDirectory(prefix="stereoservo-startup-") as scratch:
+        folder = Path(scratch)
+        environment = {
+            RUNTIME_VARIABLE: str(folder / "run"),
+            STATE_VARIABLE: str(folder / "state"),
+            "NUMBA_CACHE_DIR": str(folder / "cache"),
+        }
+        with _environment(environment):
+            starts = []
+            for k, name in enumerate(("first", "second")):
+                progress("starts", k, 2)
+                starts.append(_start(folder, name, seed))
+            progress("starts", 2, 2)
+        kernels = compiled_kernels(folder / "first.log")
+        again = compiled_kernels(folder / "second.log")
+    return {
+        "first": starts[0],
+        "second": starts[1] | {"signatures": sum(row["signatures"] for row in again)},
+        "signatures": sum(row["signatures"] for row in kernels),
+        "compile_cpu_s": sum(row["seconds"] for row in kernels),
+        "repeated": [row["kernel"] for row in kernels if row["repeated"]],
+        "commands": commands,
+        "kernels": kernels,
+    }
+
+
+@contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
+    """Wall seconds from the start of ``stereoservo run`` until clients are answered, until the arm makes trial motions,
+    and until all kernels are loaded. CPU seconds of what prepares the start, of what compiles beside the work, and of
+    the others until the trial motions. ``overruns``: cycles that came late, those behind a kernel that was loaded at
+    rest among them.
+    """
+    began = time.monotonic()
+    text, log = folder / f"{name}.txt", folder / f"{name}.log"
+    try:
+        with DaemonProcess(
+            shipped_cell_path(CELLS[0]),
+            options=("--seed", str(seed)),
+            log=text,
+            environment={LOG_VARIABLE: str(log)},
+        ) as daemon:
+            info = daemon.wait_ready()
+            ready = time.monotonic()
+            with Client(info.cell) as client:
+                client.enable()
+                command = encode(Calibrate(str(uuid.uuid4())))
+                client.request("calibrate", client.keys.command("calibrate", client.operator), command)
+                client.wait_state(lambda state: state.source == "calibrate", "trial motions", 10.0)
+                calibrating = time.monotonic()
+                pids = {daemon.process.pid, *processes_of(cell_directories(info.cell).runtime).values()}
+                others = sum(_cpu_of(pid) for pid in pids)
+                client.disable()
+                state = client.wait_state(
+                    lambda state: all(reason.code != "COMPILING" for reason in state.reasons),
+                    "all kernels", COMPILED_S,
+                )  # fmt: skip
+            compiled = time.monotonic()
+            code = daemon.stop()
+    except (ClientError, DaemonError) as error:
+        raise ExperimentError("startup", f"the {name} start: {error}; {text.read_text()[-2000:]}") from error
+    if code != 0:
+        raise ExperimentError(
+            "startup", f"the daemon ended with exit code {code}: {text.read_text()[-2000:]}"
+        )
+    cpu = {line["process"]: line["cpu_s"] for line in _lines(log) if "cpu_s" in line}
+    spent = {
+        "preparation_cpu_s": cpu["cell_preparation"],
+        "compilation_cpu_s": cpu["kernel_compilation"],
+        "others_cpu_s": others,
+    }
+    return {
+        "ready_s": ready - began,
+        "calibrating_s": calibrating - began,
+        "compiled_s": compiled - began,
+        **spent,
+        "cpu_s": sum(spent.values()),
+        "cycles": state.loop.cycles,
+        "overruns": state.loop.overruns,
+    }
+
+
+def _cpu_of(pid: int) -> float:
+    """CPU seconds of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _children_cpu() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def compiled_kernels(log: Path) -> list[dict[str, Any]]:
+    """The kernels that the processes with this log have compiled, the longest first. ``repeated``: a signature that two
+    processes compiled, or two of this package's own that one kernel was compiled for.
+
+    numba compiles functions of its own, such as ``np.zeros``, in each process; they are not cached.
+    """
+    found: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for line in _lines(log):
+        if "kernel" in line:
+            found[f"{line['module']}.{line['kernel']}"].append(line)
+    rows = [
+        {
+            "kernel": name,
+            "signatures": len(those),
+            "repeated": name.startswith("stereoservo") and len(those) > 1,
+            "seconds": sum(line["seconds"] for line in those),
+            "processes": sorted({line["process"] for line in those}),
+        }
+        for name, those in found.items()
+    ]
+    return sorted(rows, key=lambda row: -row["seconds"])
+
+
+def _lines(log: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+
+
+def _commands(repetitions: int, progress: ProgressCall) -> dict[str, Any]:
+    """CPU seconds of commands."""
+    calls = {"python -c pass": ["-c", "pass"]}
+    calls |= {" ".join(words): ["-m", "stereoservo.cli.main", *words] for words in COMMANDS}
+    found = {}
+    for k, (name, arguments) in enumerate(calls.items()):
+        samples = []
+        for _ in range(repetitions + 1):
+            before = _children_cpu()
+            subprocess.run([sys.executable, *arguments], stdout=subprocess.DEVNULL, check=True)
+            samples.append(_children_cpu() - before)
+        found[name] = summary(samples[1:], digits=3)  # the first one writes bytecode
+        progress("commands", k + 1, len(calls))
+    return found
+
+
+def show_startup(figures: dict[str, Any], console: Console) -> None:
+    """The table of what compiles."""
+    table = Table("kernel", "signatures", "seconds", "processes", box=None)
+    for row in figures["kernels"]:
+        table.add_row(
+            row["kernel"], str(row["signatures"]), f"{row['seconds']:.2f}", " ".join(row["processes"])
+        )
+    console.print(table)
