@@ -225,13 +225,12 @@ class RecordedTrialCollector:
         for stop, joints in seen:
             moved = np.flatnonzero(np.abs(joints - base) > near)
             alone = moved[moved != self.trial.spread_joint]
-            if alone.size > 1:
-                self._leave_out("more than one joint is away from the base")
-            elif any(bool((np.abs(joints - place) < near).all()) for place in places):
+            if any(bool((np.abs(joints - place) < near).all()) for place in places):
                 self._leave_out("the arm was there before")
             else:
                 places.append(joints)
                 trial = int(alone[0]) if alone.size else (self.trial.spread_joint if moved.size else -1)
+                trial = -1 if alone.size > 1 else trial
                 samples = averages(stop.sums, self.settings)
                 event = Event(
                     len(events) + 1, stop.rest.end_ns, "calibration_sample", id="images", joints=joints
