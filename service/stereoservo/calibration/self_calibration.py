@@ -514,9 +514,7 @@ def _bundles_with_joint_errors(
         noisy = start.with_joint_noise(found.noise(at))
         first = _bundles(noisy, report_progress, options)
         rows = _reduced_rows(noisy, first.final)
-        better = _refined_by_joint_errors(
-            noisy, first, options, rows, found, beside_scales=beside_scales
-        )
+        better = _refined_by_joint_errors(noisy, first, options, rows, found, beside_scales=beside_scales)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
         raise _JointErrorsError from error
     if better is None:
