@@ -128,9 +128,13 @@ def test_exact_parameters_scatter_by_the_errors_of_the_joints(bundle):
     )
 
 
-@pytest.mark.parametrize("seed", [10, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "seed", [10, *(pytest.param(k, marks=pytest.mark.slow) for k in (30, 33, 38, 64, 70))]
+)
 def test_ellipses_hold_where_errors_are_likely(seed):
-    """Ripple far below the noise of a pixel: called good with 70 and 63 % inside the 95 % ellipses."""
+    """Ripple, sag and coupling that pixels bury: all were called good, with 70 to 84 % inside the 95 % ellipses, from
+    single joints at equal steps.
+    """
     verdict = judged_mechanics(seed)
     assert verdict.usable
     assert verdict.grade == "usable"

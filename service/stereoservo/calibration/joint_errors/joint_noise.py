@@ -201,7 +201,7 @@ def stop_equations(
     projected = own[:, :, None] * whole
     half = np.linalg.solve(np.linalg.cholesky(information), projected).reshape(-1, e + p + 1)
     matrix = -half.T @ half
-    matrix[:e] += factors.reshape(-1, e).T @ whole.reshape(-1, e + p + 1)
+    matrix[:e] += factors.reshape(len(at) * n, e).T @ whole.reshape(len(at) * n, e + p + 1)
     matrix[e:, :e] = matrix[:e, e:].T
     matrix[np.arange(e), np.arange(e)] += 1.0
     prior = prior_rows(rig, charts, data)
