@@ -22,7 +22,7 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
-from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, share_inside
+from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, judged_mechanics, share_inside
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.mechanical_trials import mechanical_trials
 from stereoservo_sim.world.mechanics import preset
@@ -181,6 +181,15 @@ def test_a_scale_that_gears_may_imitate_is_told_as_either():
     assert said.grade == "usable"
     assert said.reasons[0].startswith("joint j3 is off by an amount that changes with the posture")
     assert result.model.statistics.chi2_ok
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [23, 28, 49], ids=["sag", "more sag", "coupling"])
+def test_gears_that_give_way_are_no_other_cause(seed):
+    """They were refused: as an implausible lens, as outliers that do not settle, as a wrong scale."""
+    verdict = judged_mechanics(seed)
+    assert verdict.code == ""
+    assert verdict.grade == "usable"
 
 
 @pytest.mark.parametrize("name", ["strain_wave", "planetary_qdd", "serial_servo"])

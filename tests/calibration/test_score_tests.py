@@ -13,7 +13,9 @@ from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.joint_errors.joint_noise import joint_columns
 from stereoservo.calibration.joint_errors.score_tests import (
     LIKELY,
+    SHOWN,
     likely_errors,
+    point_optimal_weights,
     score_tests,
     weighted_chi2_tail,
 )
@@ -52,6 +54,23 @@ def test_the_tail_of_unequal_weights_is_that_of_draws():
         assert weighted_chi2_tail(value, weights) == pytest.approx(float((draws > value).mean()), rel=0.05)
     assert weighted_chi2_tail(0.0, weights) == 1.0
     assert weighted_chi2_tail(1.0, np.zeros(3)) == 1.0
+
+
+def test_weights_are_made_for_the_variance_that_they_show():
+    """As many errors as a trial has: a few that move much, many that move little. The plain score follows the few,
+    and misses errors of the many.
+    """
+    sizes = np.repeat([10.0, 1.0], [6, 48])
+    weights = point_optimal_weights(sizes)
+    v = weights / (sizes * (1.0 - weights))
+    assert v == pytest.approx(v[0])
+    assert v[0] * (weights @ sizes) == pytest.approx(SHOWN * np.sqrt(2.0 * weights @ weights), rel=0.01)
+    squares = np.random.default_rng(5).standard_normal((20_000, 54)) ** 2
+    power = []
+    for chosen in (weights, sizes):
+        limit = np.quantile(squares @ chosen, 0.995)
+        power.append(float(((squares * np.repeat([1.0, 2.0], [6, 48])) @ chosen > limit).mean()))
+    assert power[0] > power[1] + 0.1
 
 
 def drawn(rows, rng, deviations):
@@ -109,9 +128,13 @@ def test_exact_parameters_scatter_by_the_errors_of_the_joints(bundle):
     )
 
 
-@pytest.mark.parametrize("seed", [10, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "seed", [10, *(pytest.param(k, marks=pytest.mark.slow) for k in (30, 33, 38, 64, 70))]
+)
 def test_ellipses_hold_where_errors_are_likely(seed):
-    """Ripple far below the noise of a pixel: called good with 70 and 63 % inside the 95 % ellipses."""
+    """Ripple, sag and coupling that pixels bury: all were called good, with 70 to 84 % inside the 95 % ellipses, from
+    single joints at equal steps.
+    """
     verdict = judged_mechanics(seed)
     assert verdict.usable
     assert verdict.grade == "usable"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -11,6 +12,7 @@ import pytest
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.sources.calibration import enough_inside, extrapolated, plan_sides
 from stereoservo.core.sources.check import check_targets
+from stereoservo.core.sources.trial_stops import combined_offsets, stop_offset
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.messages.goals import Calibrate, Enable, Home, RenewGoal
 
@@ -106,6 +108,49 @@ def test_a_joint_that_hardly_moves_the_markers_is_named_with_a_cure(benches: Any
     assert "raise calibration.range.j6" in reason.hint
 
 
+def test_all_joints_stand_apart_at_once_where_the_markers_stay_in_view(bench: Any) -> None:
+    bench = with_trials(bench, together=8, frames=1)
+    base = bench.settings.trials.base
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    apart = np.array([e.joints - base for e in samples if e.trial < 0][1:])
+    assert apart.shape == (8, 6)
+    assert (np.abs(apart) > 0.035).all()
+    assert (np.abs(apart) < 0.06).all()
+    assert np.linalg.matrix_rank(np.sign(apart)) == 6
+    assert all(one.progress <= two.progress for one, two in pairwise(samples))
+    assert min(s.ids.size for e in samples for s in e.samples) >= 6
+
+
+def test_stops_of_all_joints_that_would_lose_the_markers_are_left_out(benches: Any) -> None:
+    """Every joint alone goes as far as the view does: together they would go beyond."""
+    bench = with_trials(benches(0, noise_px=0.05), range=np.full(6, np.nan), stops=7, together=8, frames=1)
+    base = bench.settings.trials.base
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    low, high = (np.array([f(moved(samples, j, base)) for j in range(6)]) for f in (np.min, np.max))
+    apart = np.array([e.joints - base for e in samples if e.trial < 0][1:])
+    told = [e for e in bench.events if e.kind == "warning" and "of all joints" in e.message]
+    assert len(apart) >= 4
+    assert len(apart) + len(told) == 8
+    wanted = np.array([combined_offsets(k, low, high) for k in range(8)])
+    shares = np.array([(one @ wanted.T / (wanted**2).sum(axis=1)).max() for one in apart])
+    assert shares.max() < 1.02
+    assert shares.min() < 0.8  # some had to be shrunk
+
+
+@pytest.mark.parametrize("period", [2.0 * np.pi / 200, 2.0 * np.pi / 320])
+def test_stops_do_not_repeat_with_the_ripple_of_a_gear(period: float) -> None:
+    """Where equal steps are whole periods, all stops but the outermost show the same."""
+    step = 4.0 * period
+    stops = [stop_offset(side, k, 5, step) for side in (1, -1) for k in range(1, 6)]
+    assert np.abs(np.sort(np.abs(stops))[-2:]) == pytest.approx(5 * step)
+    assert np.diff(sorted([0.0, *stops])).min() >= 0.5 * step
+    ripple = np.sin(2.0 * np.pi * np.array([*stops, 0.0]) / period)
+    assert ripple.std() > 0.5
+    assert np.abs(np.sin(2.0 * np.pi * step * np.arange(-5, 6) / period)).max() < 1e-9
+
+
 def test_a_spread_joint_visits_its_positions_at_every_stop_of_the_joints_before_it(bench: Any) -> None:
     offsets = np.linspace(-0.15, 0.15, 3)
     bench = with_trials(bench, spread_joint=5, spread_offsets=offsets)
@@ -133,7 +178,7 @@ def test_a_keep_out_on_the_way_ends_a_side_before_it(bench: Any) -> None:
     bench.core = ServoCore(bench.settings)
     end, samples = calibrated(bench)
     assert end.kind == "calibration_finished", end
-    assert moved(samples, 3, base).max() == pytest.approx(0.05, abs=2e-3)
+    assert moved(samples, 3, base).max() == pytest.approx(stop_offset(1, 1, 2, 0.05), abs=2e-3)
     assert [
         e for e in bench.events if e.kind == "warning" and "j4" in e.message and "keep-out post" in e.message
     ]

@@ -13,6 +13,7 @@ import pytest
 
 from stereoservo.calibration.fit_assessment import REMEDIES, assess_failure, assess_fit
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials, save_trials
+from stereoservo.core.sources.trial_stops import combined_offsets
 from stereoservo.daemon.jobs.calibration_report import floors, residuals_of, write_report
 from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
 from stereoservo.kinematics.model import CellModel, FitStatistics, JointStatistics, load_model
@@ -22,7 +23,10 @@ SIGMA = 0.05
 
 
 def trials(cell: SyntheticCell, seed: int = 1, noise: float = SIGMA) -> TrialData:
-    return cell.trials(noise, np.random.default_rng(seed), stated=SIGMA)
+    single, joint = cell.stops(9)
+    together = [cell.home + combined_offsets(k, -cell.ranges, cell.ranges) for k in range(8)]
+    stops = np.vstack([single, together]), np.append(joint, np.full(8, -1))
+    return cell.trials(noise, np.random.default_rng(seed), positions=stops, stated=SIGMA)
 
 
 @pytest.fixture(scope="module")

@@ -98,6 +98,14 @@ def refine_to_convergence(
     return solution, inliers
 
 
+def with_whole_stops(every: Measurements, inliers: BoolArray) -> BoolArray:
+    """Inliers (k,) with the pixels of those stops of which most were left out: errors of the joints, once these are
+    better known, may explain them.
+    """
+    lost = np.bincount(every.stop, weights=~inliers) > 0.5 * np.bincount(every.stop)
+    return np.asarray(inliers | lost[every.stop])
+
+
 def _joint_errors(solution: Solution, every: Measurements, inliers: BoolArray) -> JointErrors | None:
     """Errors of the joints as in a solution, and as likely ones as explain stops that are outliers as a whole."""
     noise, errors = every.joint_noise, solution.data.joint_errors

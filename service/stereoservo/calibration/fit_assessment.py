@@ -121,6 +121,14 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
     _residuals(model, report, reasons, advice)
     _left_out(model, report, reasons, advice)
     _errors_of_readings(report, reasons, advice)
+    if report.untested:
+        reasons.append(
+            "joints moved one at a time from one configuration only: what sag, or joints that turn with others, do to "
+            "several at once is untested"
+        )
+        advice.append(
+            "stops of all joints at once (calibration.together) test it; do the markers stay in view there?"
+        )
     _identified(model, report, depth_spread, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
     summary = f"residual {statistics.rms_px:.3g} px rms" + (

@@ -93,15 +93,15 @@ class JointNoise:
         """Number of errors that stops have in common."""
         return len(self.deviations) + len(self.giving_way) * int(self.features.shape[1])
 
-    def common_factors(self, stop: int) -> FloatArray:
-        """Error (n, common) of each joint at ``stop`` for a unit of each error that stops have in common."""
-        n, e, r = len(self.posture), len(self.deviations), self.features.shape[1]
-        factors = np.zeros((n, self.common))
-        shared = self.shared[stop]
-        for joint in np.flatnonzero(shared >= 0):
-            factors[joint, shared[joint]] = self.deviations[shared[joint]]
-        for k, joint in enumerate(self.giving_way):
-            factors[joint, e + k * r : e + (k + 1) * r] = self.posture[joint] * self.features[stop]
+    def common_factors(self, stops: IntArray) -> FloatArray:
+        """Error (k, n, common) of each joint at ``stops`` (k,) for a unit of each error that stops have in common."""
+        e, r = len(self.deviations), self.features.shape[1]
+        factors = np.zeros((len(stops), len(self.posture), self.common))
+        at, joint = np.nonzero(self.shared[stops] >= 0)
+        error = self.shared[stops[at], joint]
+        factors[at, joint, error] = self.deviations[error]
+        for k, one in enumerate(self.giving_way):
+            factors[:, one, e + k * r : e + (k + 1) * r] = self.posture[one] * self.features[stops]
         return factors
 
     def common_offsets(self, common: FloatArray) -> FloatArray:
@@ -170,6 +170,10 @@ class Measurements:
     def with_joint_noise(self, noise: JointNoise | None) -> Measurements:
         """The measurements as reported, with another noise of the joint readings."""
         return replace(self.corrected(None), joint_noise=noise)
+
+    def with_errors_removed(self) -> Measurements:
+        """The measurements at readings from which the estimated errors are removed, taken for exact."""
+        return replace(self, joint_noise=None, joint_errors=None)
 
     def select(self, keep: npt.NDArray[np.bool_] | IntArray) -> Measurements:
         """The measurements where ``keep`` (k,) holds, or those of the indices ``keep``."""

@@ -14,7 +14,11 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.bundle_inliers import projective_bundle, refine_to_convergence
+from stereoservo.calibration.bundle_inliers import (
+    projective_bundle,
+    refine_to_convergence,
+    with_whole_stops,
+)
 from stereoservo.calibration.bundle_statistics import chi2_within, degrees_of_freedom
 from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
@@ -75,7 +79,7 @@ Progress = Callable[[str, float], None]
 
 OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
 """Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
-OF_JOINT_ERRORS = frozenset({"joint_kind", "too_few_stops"})
+OF_JOINT_ERRORS = frozenset({"joint_kind", "joint_without_effect", "too_few_stops"})
 """Causes by which single joints are refused that errors of the readings imitate."""
 WILD = 100.0
 """Squared residual over the median from which a pixel of the linked joints is a wrong one."""
@@ -349,20 +353,19 @@ def _fit(
             raise
         start, inexact = _inexact_start(trials, report_progress, options, priors, bend, error), True
     components, doubtful, chance = None, False, 0.0
-    found = _components_at_start(start) if joint_errors == "beside scales" else None
+    beside_scales = joint_errors == "beside scales"
+    found = None if joint_errors == "none" else _components_at_start(start, beside_scales)
     if inexact and found is None:
         raise _JointErrorsError
     if found is not None:
         start, bundles, components, doubtful = _bundles_with_joint_errors(
-            start, found, report_progress, options
+            start, found, report_progress, options, beside_scales
         )
     else:
         bundles = _bundles(start, report_progress, options)
         if joint_errors != "none":
             rows = _reduced_rows(start, bundles.final)
-            refined = _refined_by_joint_errors(
-                start, bundles, options, rows, beside_scales=joint_errors == "beside scales"
-            )
+            refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
             elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
@@ -476,8 +479,10 @@ def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Meas
     return every.corrected(solution.data.joint_errors).select(inliers)
 
 
-def _components_at_start(start: _Start) -> VarianceComponents | None:
-    """Significant variance components of the linked joints, with cameras free; None where there are none."""
+def _components_at_start(start: _Start, scales: bool) -> VarianceComponents | None:
+    """Significant variance components of the linked joints, with cameras free, beside ``scales`` of these where wanted;
+    None where there are none.
+    """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
     if chi2_within(free.cost, degrees_of_freedom(free)):
@@ -486,25 +491,30 @@ def _components_at_start(start: _Start) -> VarianceComponents | None:
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     near = squares <= WILD * max(1.0, float(np.median(squares)))
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
-    found = estimate_components(_reduced_rows(start, free), scales=True)
+    found = estimate_components(_reduced_rows(start, free), scales=scales)
     return found if found is not None and found.significant else None
 
 
 def _bundles_with_joint_errors(
-    start: _Start, found: VarianceComponents, report_progress: Progress, options: FitOptions
+    start: _Start,
+    found: VarianceComponents,
+    report_progress: Progress,
+    options: FitOptions,
+    beside_scales: bool,
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool]:
     """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError where
     they do not explain the data, ScalesError.
     """
     at = readings(start.trials.positions - start.zero)
-    factors = wrong_scales(start.trials, found)
-    if (factors != 1.0).any():
-        raise ScalesError(factors, found)
+    if beside_scales:
+        factors = wrong_scales(start.trials, found)
+        if (factors != 1.0).any():
+            raise ScalesError(factors, found)
     try:
         noisy = start.with_joint_noise(found.noise(at))
         first = _bundles(noisy, report_progress, options)
         rows = _reduced_rows(noisy, first.final)
-        better = _refined_by_joint_errors(noisy, first, options, rows, found)
+        better = _refined_by_joint_errors(noisy, first, options, rows, found, beside_scales=beside_scales)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
         raise _JointErrorsError from error
     if better is None:
@@ -535,6 +545,7 @@ def _refined_by_joint_errors(
         if (factors != 1.0).any():
             raise ScalesError(factors, beside)
     components = estimate_components(rows, scales=False, near=beside)
+    inliers = with_whole_stops(start.every, inliers)
     for _ in range(2):
         if components is None:
             return None

@@ -127,8 +127,8 @@ def trial_stops(
             markers_lost=lost,
             strayed=strayed,
         )
-    largest = np.bincount(groups[stops]).argmax()
-    _check_effect(trials, stops[groups[stops] == largest], joint)
+    apart = [stops[groups[stops] == group] for group in np.unique(groups[stops])]
+    _check_effect(trials, max(apart, key=lambda own: float(np.ptp(positions[own, joint]))), joint)
     return stops, groups[stops], base
 
 

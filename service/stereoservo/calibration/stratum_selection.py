@@ -269,6 +269,9 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
     the projective.
     """
     noise = generator_noise(solution)
+    # Where joints have errors, those of the projective bundle lead most of the way to a start's minimum, for a tenth of
+    # the time.
+    exact = data.with_errors_removed()
     selector = StratumSelector(solution, options)
     least, nearest, unique = stratum_upgrade.planes_at_infinity(solution.rig.generators, noise)
     finite: list[FloatArray] = []
@@ -285,14 +288,16 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
         try:
             chain = solve(
                 start,
-                data,
+                exact,
                 "metric",
                 cameras=False,
                 loss="soft_l1",
                 max_evaluations=20,
                 tolerance=1e-2,
             )
-            metric = solve(chain.rig, data, "metric", lenses=solution.lenses, max_evaluations=80)
+            metric = solve(chain.rig, exact, "metric", lenses=solution.lenses, max_evaluations=80)
+            if data.joint_noise is not None:
+                metric = solve(metric.rig, data, "metric", lenses=solution.lenses, max_evaluations=80)
         except np.linalg.LinAlgError as error:
             selector.notes.append(f"no metric start: {error}")
             continue

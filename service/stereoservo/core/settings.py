@@ -71,6 +71,8 @@ class TrialSettings(msgspec.Struct, frozen=True, eq=False):
     min_markers: int
     min_range: float
     wait_s: float
+    together: int = 0
+    """Stops at which all joints stand apart from the base."""
     spread_joint: int = -1
     """Joint that visits ``spread_offsets`` (p,) [rad or m] from its base at the stops of others; -1: none."""
     spread_offsets: FloatArray = msgspec.field(default_factory=lambda: np.zeros(1))
@@ -328,6 +330,7 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
         min_markers=section.min_markers,
         min_range=section.min_range,
         wait_s=section.wait_s,
+        together=section.together if len(names) > 1 else 0,
         spread_joint=spread_joint,
         spread_offsets=offsets,
     )

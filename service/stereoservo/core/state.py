@@ -29,7 +29,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
-STATE_VERSION = 7
+STATE_VERSION = 8
 HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
 
 
@@ -262,7 +262,8 @@ class PoseMeasurement(Leased, eq=False, kw_only=True):
 
 
 class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
-    """The calibration programme: joint after joint, stop after stop. ``k`` counts steps from the base.
+    """The calibration programme: joint after joint, stop after stop, then all joints at once (``joint`` is their
+    number). ``k`` counts steps from the base, and the stops of all joints.
 
     ``last``, ``before`` (p, c, m, 2) [px], NaN where unseen: the markers at the two outermost stops of this side, for
     each of the p positions of the spread joint (1 without), at the offsets ``last_at``, ``before_at`` from the base.
@@ -294,6 +295,10 @@ class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
     """Largest motion in the images between base and a stop, in sigmas, by joint."""
     sigma_px: float
     """Of one marker at a stop, median."""
+    slope_sums: FloatArray
+    """Sums (n, c, m, 2) over a joint's stops of its offset from the base times the markers' motion [rad px or m px]."""
+    slope_weights: FloatArray
+    """Sums (n, c, m) of the squared offsets."""
 
 
 class CheckMotion(PoseMeasurement, tag="checking", eq=False, kw_only=True):

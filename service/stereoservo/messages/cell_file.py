@@ -156,7 +156,7 @@ class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``.
+    """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``, then all at once.
 
     A joint without a range goes outwards as far as the markers stay in every view, up to 0.6 rad or 0.2 m.
     """
@@ -173,6 +173,9 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Smallest motion of a joint [rad or m] that can be used."""
     wait_s: Positive = 2.0
     """How long to wait at a stop for enough frames before backing off."""
+    together: Annotated[int, Meta(ge=0, le=8)] = 8
+    """Stops, after those of single joints, at which all joints stand apart from the base by about half of what each was
+    driven; 0: none."""
     spread: SpreadSection | None = None
 
 

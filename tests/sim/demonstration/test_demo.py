@@ -121,6 +121,42 @@ def test_more_seeds_do_likewise(tmp_path: Path, seed: int) -> None:
     check(run_demo(tmp_path, "--lockstep", "--seed", str(seed)))
 
 
+def rippled(folder: Path, amplitude: float) -> Path:
+    """The plain cell's file, with gears that ripple by so much [rad]."""
+    gears = (
+        f"j{j + 1} = {{ ripple = {amplitude}, ripple_order = 200, ripple_phase = {1.1 * j} }}"
+        for j in range(6)
+    )
+    text = CELL_FILES["demo"].read_text()
+    assert text.count("[joints.options]\n") == 1
+    path = folder / "demo.toml"
+    path.write_text(
+        text.replace("[joints.options]\n", f"[joints.options]\nmechanics = {{ {', '.join(gears)} }}\n")
+    )
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.parametrize("amplitude", [0.05e-3, 0.3e-3])
+def test_gears_that_ripple(tmp_path: Path, amplitude: float) -> None:
+    """The first ended with a chi-square of 12 904 of 2 373, the second without a model."""
+    check(run_demo(tmp_path / "out", "--lockstep", "--cell", str(rippled(tmp_path, amplitude))))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.parametrize("name", ["strain_wave", "planetary_qdd", "serial_servo"])
+def test_joints_as_they_are(tmp_path: Path, name: str) -> None:
+    """Coarse encoders never arrived. The way there leaves its line by the play; its end does not."""
+    result = run_demo(tmp_path, "--lockstep", "--mechanics", name)
+    assert result["converged"] is True
+    assert result["calibration"]["chi2_ok"] is True
+    assert result["replay"]["identical"] is True
+    assert max(goal["final_error_px"] for goal in result["goals"]) <= 0.3
+    assert max(goal["final_error_mm"] for goal in result["goals"]) <= 0.5
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(len(LOCKSTEP) * len(SEEDS) * TIMEOUT_S)
 @pytest.mark.parametrize("cell", LOCKSTEP)

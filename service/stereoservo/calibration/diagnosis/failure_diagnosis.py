@@ -67,6 +67,13 @@ MISFITS = frozenset(
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 """Shares of outliers with which a fit serves to explain them."""
 
+APART = 0.1
+"""Of a joint's way over the trials, how far from its middle it stands apart."""
+LEAST_TOGETHER = 4
+"""Stops with several joints apart that test what these do together."""
+MOVED = 0.02
+"""Distance of the trials' bases [rad or m] from which they are different configurations."""
+
 
 def diagnose_failure(
     trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
@@ -241,20 +248,24 @@ def review_notes(
 
 
 def untested(trials: TrialData) -> tuple[str, ...]:
-    """Notes on what the trials do not determine: the order of joints that only ever move alone, from one
-    configuration.
+    """Notes on what the trials do not determine: what joints do together, and their order, where these only ever move
+    alone, from one configuration.
     """
     n = len(trials.joint_names)
-    free = bool((trials.trials < 0).any())
+    apart = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(
+        trials.positions, axis=0
+    )
+    together = int(((trials.trials < 0) & (apart.sum(axis=1) > 1)).sum())
     bases = [
         np.median(trials.positions[trials.trials == j], axis=0)
         for j in range(n)
         if (trials.trials == j).any()
     ]
-    moved = bool(bases) and float(np.ptp(np.array(bases), axis=0).max(initial=0.0)) > 0.02
-    if n < 2 or free or moved:
+    moved = bool(bases) and float(np.ptp(np.array(bases), axis=0).max(initial=0.0)) > MOVED
+    if n < 2 or together >= LEAST_TOGETHER or moved:
         return ()
     return (
-        "the order of the joints and the mount of the cameras: they move one at a time from one configuration, so the "
-        "model takes what the cell states. Free poses, or trials from different configurations, would test it",
+        "the order of the joints, the mount of the cameras, and errors that depend on several joints (sag, joints that "
+        "turn with others): joints move one at a time from one configuration. Stops of all joints "
+        "(calibration.together), or trials from different configurations, would test it",
     )

@@ -60,7 +60,7 @@ def error_columns(rig: RigModel, data: Measurements) -> FloatArray:
     common = np.zeros((len(slopes), noise.common))
     for one in stops:
         here = stop == one
-        common[here] = slopes[here] @ noise.common_factors(one)
+        common[here] = slopes[here] @ noise.common_factors(np.array([one]))[0]
     columns = np.hstack([own.reshape(len(slopes), -1), common])
     return columns[:, columns.any(axis=0)]
 
@@ -117,7 +117,7 @@ class _Whitened(NamedTuple):
 def _whitened(one: StopRows, data: Measurements) -> _Whitened:
     noise = data.joint_noise
     assert noise is not None
-    rows = np.hstack([one.joints @ noise.common_factors(one.stop), one.rows])
+    rows = np.hstack([one.joints @ noise.common_factors(np.array([one.stop]))[0], one.rows])
     basis, triangle = np.linalg.qr(one.joints * noise.own[one.stop])
     values, vectors = np.linalg.eigh(np.eye(len(triangle)) + triangle @ triangle.T)
     shrink = np.eye(len(triangle)) - (vectors / np.sqrt(values)) @ vectors.T
@@ -129,13 +129,16 @@ def _whitened(one: StopRows, data: Measurements) -> _Whitened:
 @dataclass(frozen=True)
 class StopEquations:
     """Normal matrix (e + p + 1, e + p + 1) of whitened rows, columns of ``sizes`` (p,) scaled to unit length, shared
-    errors first and residuals last; what each stop's own errors follow from; ``cost`` at the present errors.
+    errors first and residuals last; ``cost`` at the present errors. Of each of the ``stops`` (k,): the ``information``
+    (k, n, n) on its own errors, and how these follow from the rest, ``projected`` (k, n, e + p + 1).
     """
 
     matrix: FloatArray
     sizes: FloatArray
     cost: float
-    stops: tuple[tuple[int, FloatArray, FloatArray], ...]
+    stops: IntArray
+    information: FloatArray
+    projected: FloatArray
     data: Measurements
 
     @cached_property
@@ -168,34 +171,46 @@ class StopEquations:
         common = -np.linalg.solve(self.matrix[:e, :e], self.matrix[:e, e:] @ step) if e else np.zeros(0)
         whole = np.concatenate([common, x, [1.0]])
         own = np.zeros_like(self.data.offsets)
-        for stop, triangle, projected in self.stops:
-            information = np.eye(triangle.shape[1]) + triangle.T @ triangle
-            own[stop] = -np.linalg.solve(information, triangle.T @ (projected @ whole))
+        own[self.stops] = -np.linalg.solve(self.information, (self.projected @ whole)[:, :, None])[:, :, 0]
         return JointErrors(own, common)
 
 
 def stop_equations(
     rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
 ) -> StopEquations:
-    """Normal equations of sorted ``data`` with joint noise; ``weights`` as for `normal_equations`."""
-    assert data.joint_noise is not None
-    e, p = data.joint_noise.common, charts.size
-    matrix = np.zeros((e + p + 1, e + p + 1))
-    matrix[np.arange(e), np.arange(e)] = 1.0
-    corrections, cost, stops = data.corrections, 0.0, []
+    """Normal equations of sorted ``data`` with joint noise; ``weights`` as for `normal_equations`.
+
+    Of a stop's rows ``A`` and its own errors' ``U`` they are ``Aᵀ A - Aᵀ U (1 + Uᵀ U)⁻¹ Uᵀ A``.
+    """
+    noise = data.joint_noise
+    assert noise is not None
+    e, p, n = noise.common, charts.size, len(rig.kinds)
+    corrections, cost = data.corrections, 0.0
+    inner, stops, gram, moments = np.zeros((p + 1, p + 1)), [], [], []
     for one in stop_rows(rig, charts, data, weights):
         present = one.rows[:, -1] + one.joints @ corrections[one.stop]
         cost += float(present @ present)
-        white = _whitened(one, data)
-        matrix += white.rows.T @ white.rows
-        stops.append((one.stop, white.triangle, white.projected))
+        inner += one.rows.T @ one.rows
+        stops.append(one.stop)
+        gram.append(one.joints.T @ one.joints)
+        moments.append(one.joints.T @ one.rows)
+    at, G = np.array(stops, dtype=np.int64), np.array(gram).reshape(-1, n, n)
+    own, factors = noise.own[at], noise.common_factors(at)
+    whole = np.concatenate([G @ factors, np.array(moments).reshape(-1, n, p + 1)], axis=2)
+    information = np.eye(n) + own[:, :, None] * G * own[:, None, :]
+    projected = own[:, :, None] * whole
+    half = np.linalg.solve(np.linalg.cholesky(information), projected).reshape(-1, e + p + 1)
+    matrix = -half.T @ half
+    matrix[:e] += factors.reshape(len(at) * n, e).T @ whole.reshape(len(at) * n, e + p + 1)
+    matrix[e:, :e] = matrix[:e, e:].T
+    matrix[np.arange(e), np.arange(e)] += 1.0
     prior = prior_rows(rig, charts, data)
-    matrix[e:, e:] += prior.T @ prior
+    matrix[e:, e:] += inner + prior.T @ prior
     cost += float((prior[:, -1] ** 2).sum()) + (0.0 if data.joint_errors is None else data.joint_errors.cost)
-    sizes = np.sqrt(np.diag(matrix)[e:-1])
+    sizes = np.sqrt(np.maximum(np.diag(matrix)[e:-1], 0.0))
     sizes[sizes == 0.0] = 1.0
     scale = np.concatenate([np.ones(e), sizes, [1.0]])
-    return StopEquations(matrix / np.outer(scale, scale), sizes, cost, tuple(stops), data)
+    return StopEquations(matrix / np.outer(scale, scale), sizes, cost, at, information, projected, data)
 
 
 def estimated_errors(rig: RigModel, charts: Charts, data: Measurements) -> JointErrors:
@@ -321,7 +336,7 @@ def exact_fit_factor(rig: RigModel, charts: Charts, data: Measurements, triangle
         slopes = (one.rows[:, :-1] / sizes).T @ one.joints
         moved = slopes * noise.own[one.stop]
         own += moved @ moved.T
-        common += slopes @ noise.common_factors(one.stop)
+        common += slopes @ noise.common_factors(np.array([one.stop]))[0]
     unit = triangle / sizes
     # With A = R⁻ᵀ Jᵀ Z the covariance is R⁻¹ (I + A Aᵀ) R⁻ᵀ.
     half = np.linalg.solve(unit.T, own + common @ common.T)

@@ -25,6 +25,8 @@ LIKELY = 0.02
 """Probability with which exact joint readings are said to have likely errors."""
 ONE_JOINT = 0.2
 """Share of it that is spent on errors of one joint alone; the rest is on those of all joints alike."""
+SHOWN = 3.0
+"""Standard deviations by which a test's statistic shows the variance that it is made for."""
 LEAST_CHANCE = 1e-12
 """Probability that is stated where it is none to the accuracy of numbers."""
 NEGLIGIBLE = 1e-10
@@ -73,14 +75,34 @@ def score_tests(reduced: ReducedRows) -> ScoreTests | None:
         here = np.flatnonzero(members)
         if not len(here):
             return 1.0
-        weights = np.linalg.eigvalsh(products[np.ix_(here, here)])
-        return weighted_chi2_tail(float(scores[here] @ scores[here]), weights)
+        sizes, axes = np.linalg.eigh(products[np.ix_(here, here)])
+        kept = sizes > NEGLIGIBLE * max(float(sizes[-1]), 0.0)
+        squares = (scores[here] @ axes[:, kept]) ** 2 / sizes[kept]
+        weights = point_optimal_weights(sizes[kept])
+        return weighted_chi2_tail(float(weights @ squares), weights)
 
     kinds = np.arange(3)
     single = [[probability(reduced.component == kind * n + joint) for joint in range(n)] for kind in kinds]
     return ScoreTests(
         np.array(single), np.array([probability(reduced.component // n == kind) for kind in kinds])
     )
+
+
+def point_optimal_weights(sizes: FloatArray) -> FloatArray:
+    """Weights (k,) of squared normal variates whose variances are ``1 + v sizes`` (k,), by which their sum tells best a
+    variance ``v`` that it barely shows: by ``SHOWN`` of the sum's standard deviations at ``v`` = 0.
+    """
+    if not len(sizes):
+        return sizes
+
+    def shown(log_v: float) -> float:
+        v = float(np.exp(log_v))
+        weights = v * sizes / (1.0 + v * sizes)
+        return float(v * (weights @ sizes)) - SHOWN * float(np.sqrt(2.0 * (weights @ weights)))
+
+    about = -float(np.log(sizes.mean()))
+    v = float(np.exp(brentq(shown, about - 20.0, about + 20.0, xtol=1e-3)))
+    return np.asarray(v * sizes / (1.0 + v * sizes))
 
 
 def weighted_chi2_tail(value: float, weights: FloatArray) -> float:

@@ -1,10 +1,12 @@
 """Motion source of calibration: moves each joint alone from a base posture, chooses its range by the images of a small
 first motion, and averages the markers' pixels at every stop.
 
-From the base, joint l goes in equal steps to one side, then to the other (thesis 5.4.1, fig. 5.13). How far it goes is
-stated in the cell file, or found out on the way (`plan_sides`): as far as the markers stay in every view. At a stop
+From the base, joint l goes in steps to one side, then to the other (thesis 5.4.1, fig. 5.13), uneven ones
+(`stop_offset`). How far it goes is stated in the cell file, or found out on the way (`plan_sides`): as far as the
+markers stay in every view. At a stop
 the pixels are averaged at rest; a spread joint, where there is one, visits several positions there (fig. 5.16). A step
-that loses the markers is taken back and that side is closed.
+that loses the markers is taken back and that side is closed. At last all joints stand apart from the base at once
+(`trial_stops`), where the straight lines of the single ones say that the markers stay.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from stereoservo.core.sources.measure_at_pose import (
     trial_settings,
     unseen_at_base,
 )
+from stereoservo.core.sources.trial_stops import combined_offsets, in_view_at, stop_offset
 from stereoservo.core.state import CalibrationMotion
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
@@ -51,7 +54,8 @@ def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSetting
         id=goal_id, lease_s=None, lease_until_ns=0, joint=-1, side=1, k=0, count=0, step=0.0, reach=np.zeros(2),
         turn=-1, seen_turns=0, base_pixels=unseen, last=unseen.copy(), last_at=0.0, before=unseen.copy(),
         before_at=0.0, lowest=trials.base.copy(), highest=trials.base.copy(), stops=np.zeros(n, np.int64),
-        motion_sigmas=np.zeros(n), sigma_px=0.0,
+        motion_sigmas=np.zeros(n), sigma_px=0.0, slope_sums=np.zeros((n, *unseen.shape[1:])),
+        slope_weights=np.zeros((n, *unseen.shape[1:3])),
         **first_visit(trials.base, q, now_ns, settings),  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -102,19 +106,25 @@ def _stop_done(
     mean = mean_joints(trials)
     # The base with the spread joint turned is a stop of that joint's own.
     trial = settings.spread_joint if trials.joint < 0 and trials.turn >= 0 else trials.joint
+    trial = -1 if _combining(trials) else trial
     context.emit(
         "calibration_sample", id=trials.id, joints=mean, samples=samples, trial=trial,
         progress=_progress(trials, settings),
     )  # fmt: skip
-    _remember(trials, context, settings, samples)
+    if not _combining(trials):
+        _remember(trials, context, settings, samples, mean)
     trials.seen_turns += 1
     return _turn_done(trials, context, settings, "", mean)
 
 
 def _remember(
-    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, samples: tuple[Sample, ...]
+    trials: CalibrationMotion,
+    context: StepContext,
+    settings: TrialSettings,
+    samples: tuple[Sample, ...],
+    mean: FloatArray,
 ) -> None:
-    """Keep the pixels for the extrapolation to the next stop, and how far the markers moved."""
+    """Keep the pixels for the extrapolation to the next stop, and how far and how fast the markers moved."""
     pixels, sigmas = marker_pixels(samples, context.settings)
     slot = _slot(trials, context, settings)
     if trials.joint < 0:
@@ -125,13 +135,24 @@ def _remember(
     trials.last[slot] = pixels
     moved = image_motion(trials.base_pixels[slot], pixels, sigmas)
     trials.motion_sigmas[trials.joint] = max(trials.motion_sigmas[trials.joint], moved)
+    offset, shift = float(mean[trials.joint] - settings.base[trials.joint]), pixels - trials.base_pixels[slot]
+    seen = np.isfinite(shift).all(axis=-1)
+    trials.slope_sums[trials.joint, seen] += offset * shift[seen]
+    trials.slope_weights[trials.joint, seen] += offset**2
 
 
 def _progress(trials: CalibrationMotion, settings: TrialSettings) -> float:
-    done = 0.0
-    if trials.joint >= 0:
+    done, n = 0.0, len(trials.stops)
+    if _combining(trials):
+        done = n + trials.k / settings.together
+    elif trials.joint >= 0:
         done = trials.joint + min(1.0, float(trials.stops[trials.joint]) / settings.stops)
-    return min(1.0, done / len(trials.stops))
+    return min(1.0, done / (n + (settings.together > 0)))
+
+
+def _combining(trials: CalibrationMotion) -> bool:
+    """Whether the single joints are done, and all stand apart from the base at once."""
+    return trials.joint == len(trials.stops)
 
 
 # -- one stop: the positions of the spread joint ------------------------------------------------------------
@@ -140,7 +161,7 @@ def _progress(trials: CalibrationMotion, settings: TrialSettings) -> float:
 def _turns(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> int:
     """How many positions the spread joint visits at a stop of the present joint; 0: it stays at its base."""
     spread = settings.spread_joint
-    if spread < 0 or trials.joint == spread:
+    if spread < 0 or trials.joint == spread or _combining(trials):
         return 0
     if trials.joint < 0:
         return len(settings.spread_offsets)
@@ -186,8 +207,16 @@ def _turn_done(
         _turn_to(trials, context, settings, trials.turn + 1)
         enter(trials, "move", context)
         return _rest(context)
-    if trials.joint < 0:
+    if trials.joint < 0 or (_combining(trials) and not lost):
         return _next(trials, context, settings)
+    if _combining(trials):
+        context.emit(
+            "warning", id=trials.id,
+            message=f"calibration: stop {trials.k} of all joints loses the markers {lost}; left out",
+        )  # fmt: skip
+        trials.target = settings.base.copy()
+        enter(trials, "return", context)
+        return _rest(context)
     if trials.seen_turns == 0:
         return _back_off(trials, context, settings, lost)
     trials.stops[trials.joint] += 1
@@ -205,6 +234,11 @@ def _turn_done(
 def _next(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
     """Choose the next stop: further on this side, the other side, the next joint, or home."""
     while True:
+        if _combining(trials):
+            if not _aim_all(trials, context, settings):
+                trials.target = settings.base.copy()
+                enter(trials, "finish", context)
+            return _rest(context)
         if trials.joint >= 0:
             if trials.step == 0.0:  # how far it may go is not known yet
                 size = probe_size(context.settings.joint_kinds[trials.joint])
@@ -221,11 +255,10 @@ def _next(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
             if poor is not None:
                 return _abort(trials, context, poor)
         trials.joint += 1
-        if trials.joint == len(trials.stops):
-            trials.target = settings.base.copy()
-            enter(trials, "finish", context)
-            return _rest(context)
-        _begin_joint(trials, context, settings)
+        if _combining(trials):
+            trials.k = 0
+        else:
+            _begin_joint(trials, context, settings)
 
 
 def _planned(trials: CalibrationMotion, settings: TrialSettings) -> bool:
@@ -278,7 +311,7 @@ def _other_side(trials: CalibrationMotion, settings: TrialSettings) -> None:
 
 def _further(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
     """Set out for the next stop of this side, where the markers will be seen there."""
-    offset = trials.side * (trials.k + 1) * trials.step
+    offset = stop_offset(trials.side, trials.k + 1, trials.count, trials.step)
     if not _planned(trials, settings):
         if trials.k >= trials.count:
             return False
@@ -331,6 +364,36 @@ def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSetting
     return True
 
 
+def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
+    """Set out for the next stop of all joints at once; False after the last."""
+    everything = list(range(len(trials.stops)))
+    low, high = trials.lowest - settings.base, trials.highest - settings.base
+    weights = np.maximum(trials.slope_weights, 1e-300)[..., None]
+    slopes = np.where(trials.slope_weights[..., None] > 0.0, trials.slope_sums / weights, np.nan)
+    while trials.k < settings.together:
+        offsets = in_view_at(
+            combined_offsets(trials.k, low, high),
+            lambda at: enough_inside(
+                trials.base_pixels[-1:] + np.nansum(at[:, None, None, None] * slopes, axis=0),
+                context.settings,
+                settings,
+            ),
+        )
+        trials.k += 1
+        if offsets is None:
+            why = "(the markers would leave a view)"
+        else:
+            why = blocked(settings.base + offsets, everything, context)
+            if not why:
+                trials.target, trials.seen_turns, trials.turn = settings.base + offsets, 0, -1
+                enter(trials, "move", context)
+                return True
+        context.emit(
+            "warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints left out {why}"
+        )
+    return False
+
+
 def _back_off(
     trials: CalibrationMotion, context: StepContext, settings: TrialSettings, where: str
 ) -> SourceOutput:
@@ -345,7 +408,7 @@ def _back_off(
         _probe_failed(trials)
     else:
         trials.k -= 1
-        trials.target[trials.joint] += trials.side * trials.k * trials.step
+        trials.target[trials.joint] += stop_offset(trials.side, trials.k, trials.count, trials.step)
         smallest = 2.0 * probe_size(context.settings.joint_kinds[trials.joint])
         if _planned(trials, settings) and trials.k == 0 and trials.step > smallest:
             trials.step *= 0.5

@@ -222,16 +222,19 @@ class RecordedTrialCollector:
         near = SAME_POSITION * self.settings.arrival
         events: list[Event] = []
         places: list[FloatArray] = []
+        together = 0
         for stop, joints in seen:
             moved = np.flatnonzero(np.abs(joints - base) > near)
             alone = moved[moved != self.trial.spread_joint]
-            if alone.size > 1:
+            if alone.size > 1 and together == self.trial.together:
                 self._leave_out("more than one joint is away from the base")
             elif any(bool((np.abs(joints - place) < near).all()) for place in places):
                 self._leave_out("the arm was there before")
             else:
                 places.append(joints)
                 trial = int(alone[0]) if alone.size else (self.trial.spread_joint if moved.size else -1)
+                if alone.size > 1:
+                    together, trial = together + 1, -1
                 samples = averages(stop.sums, self.settings)
                 event = Event(
                     len(events) + 1, stop.rest.end_ns, "calibration_sample", id="images", joints=joints

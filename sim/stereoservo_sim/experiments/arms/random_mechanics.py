@@ -20,6 +20,7 @@ from rich.console import Console
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.core.sources.trial_stops import combined_offsets, in_view_at, stop_offset
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -27,7 +28,7 @@ from stereoservo_sim.experiments.experiment import show_rows
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.mechanical_trials import links_and_readings, mechanical_trials
 from stereoservo_sim.world.mechanics import Mechanics
-from stereoservo_sim.world.random_cells import RandomCase, hidden_out_of_view, random_case
+from stereoservo_sim.world.random_cells import MIN_SHOWN, RandomCase, hidden_out_of_view, random_case
 from stereoservo_sim.world.synthetic import FIRST_MARKER
 
 SEEDS = 10
@@ -36,6 +37,8 @@ NOISES = (0.01, 0.5)
 """[px], log-uniform."""
 MECHANISMS = ("ripple", "encoder", "play", "sag", "coupling")
 """The mechanism of seed k is the one at k modulo their number."""
+TOGETHER = 8
+"""Stops of all joints at once, as a cell file has by default."""
 INSIDE = 5.991
 """Squared distance that holds 95 % of two Gaussian coordinates."""
 WELL = 0.85
@@ -112,13 +115,31 @@ def judged_mechanics(seed: int) -> MechanicsVerdict:
 
 
 def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
-    """Positions (s, n) of the case's trials and the joint (s,) that moves, in the order of the trial programme: each
-    joint from its middle to one end, then beyond the middle to the other.
+    """Positions (s, n) of the case's trials and the joint (s,) that moves, as the trial programme drives them: each
+    joint from its base to one end, then beyond the base to the other; at last all at once (-1), where enough markers
+    stay in view.
     """
-    motors, moved = case.cell.stops(case.stops)
-    offsets = motors[np.arange(len(motors)), moved] - case.cell.home[moved]
-    order = np.lexsort((np.abs(offsets), offsets < 0.0, moved))
-    return motors[order], moved[order]
+    home, ranges = case.cell.home, case.cell.ranges
+    counts = ((1, case.stops // 2), (-1, case.stops - 1 - case.stops // 2))
+    shares = [0.0] + [
+        stop_offset(side, k, count, 1.0 / count) for side, count in counts for k in range(1, count + 1)
+    ]
+    motors, moved = [], []
+    for joint in range(len(home)):
+        for share in shares:
+            stop = home.copy()
+            stop[joint] += share * ranges[joint]
+            motors.append(stop)
+            moved.append(joint)
+    for k in range(TOGETHER):
+        offsets = in_view_at(
+            combined_offsets(k, -ranges, ranges),
+            lambda at: bool(case.cell.in_view((home + at)[None]).all(axis=0).sum() >= MIN_SHOWN),
+        )
+        if offsets is not None:
+            motors.append(home + offsets)
+            moved.append(-1)
+    return np.array(motors), np.array(moved, dtype=np.int64)
 
 
 def share_inside(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> float:
