@@ -55,6 +55,7 @@ from stereoservo.calibration.rig_model import (
     reversed_trials,
     with_joints_reversed,
 )
+from stereoservo.calibration.shutter_offset import shutter_offsets
 from stereoservo.calibration.single_joint_fit import (
     MIN_MARKERS,
     fit_single_joint,
@@ -137,7 +138,12 @@ def fit_model(
         notes=(*result.report.notes, *notes, *of_scene),
         untested=untested(chain),
     )
-    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+    model = msgspec.structs.replace(
+        model,
+        loads=trials.loads,
+        shutter_offsets=() if trials.way is None else shutter_offsets(model, trials.way),
+    )
+    return CalibrationFit(model, report)
 
 
 def _chosen_fit(

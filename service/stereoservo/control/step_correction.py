@@ -182,8 +182,8 @@ def corrected_step(
 
 FREEDOMS = 6
 SINGULAR = 3e-3
-"""Singular value of the stacked operators, over the largest, below which the arm is near a singularity: a spherical wrist
-within some tenths of a degree of stretched.
+"""Singular value of the stacked operators, over the largest, below which the arm is near a singularity: a spherical
+wrist within some tenths of a degree of stretched.
 """
 LEAST_DAMPING = 3e-4
 """Of a motion that the arm has lost, relative to the largest singular value: between the noise of learnt operators and

@@ -136,6 +136,14 @@ class MarkerGroup(msgspec.Struct, frozen=True):
     roundness: float
 
 
+class ShutterOffset(msgspec.Struct, frozen=True):
+    """By how much later than its stamps tell the shutter of ``camera`` opens [s], and its standard deviation [s]."""
+
+    camera: str
+    offset_s: float
+    deviation_s: float
+
+
 class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Calibrated model: projective kinematics, cameras and markers in one projective frame.
 
@@ -176,6 +184,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Coplanar groups of its markers; None where they have not been looked for."""
     joint_accuracy: JointAccuracy | None = None
     """Errors of the joint readings; None where none are known: predictions then take them for exact."""
+    shutter_offsets: tuple[ShutterOffset, ...] = ()
+    """Of the cameras whose stamps the trial motions could tell against the joints' stamps."""
 
     @property
     def tip_first(self) -> bool:
@@ -276,6 +286,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         check_loads(model.loads, n, path)
     if model.joint_accuracy is not None:
         _check_accuracy(model.joint_accuracy, n, path)
+    _check_offsets(model, path)
     _check_scene(model, path)
     for k, group in enumerate(model.marker_groups or ()):
         if len(set(group.triple)) < 3 or not {*group.triple} <= {*group.members} <= {*range(m)}:
@@ -285,6 +296,26 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
                 f"is of markers {group.members}, by {group.triple}: indices from 0 to {m - 1}, three of them "
                 "different, are needed",
             )
+
+
+LONGEST_OFFSET_S = 1.0
+"""Largest offset of shutter stamps that a model may state."""
+
+
+def _check_offsets(model: CellModel, path: Path | str) -> None:
+    """Check the offsets of the cameras' stamps: of cameras that are there, once each, finite and bounded."""
+    names = [camera.name for camera in model.cameras]
+    for k, offset in enumerate(model.shutter_offsets):
+        key = f"shutter_offsets[{k}]"
+        if offset.camera not in names or any(o.camera == offset.camera for o in model.shutter_offsets[:k]):
+            raise ModelFileError(
+                path, key, f"is of camera {offset.camera!r}; once each of {', '.join(names)} is valid"
+            )
+        if not (abs(offset.offset_s) <= LONGEST_OFFSET_S and 0.0 <= offset.deviation_s <= LONGEST_OFFSET_S):
+            raise ModelFileError(
+                path, key,
+                f"is {offset.offset_s} s ± {offset.deviation_s} s; up to {LONGEST_OFFSET_S:g} s is taken",
+            )  # fmt: skip
 
 
 def lens_size(cameras: tuple[CameraModel, ...]) -> int:

@@ -11,12 +11,23 @@ from functools import partial
 
 import numpy as np
 
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, ModelUpdate, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
+from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings, TrialSettings
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import Command, Enable, FeatureTarget, Goal, LawName, Request, RunGoal
+from stereoservo.messages.goals import (
+    Calibrate,
+    Command,
+    Enable,
+    FeatureTarget,
+    Goal,
+    LawName,
+    Request,
+    RunGoal,
+)
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
 from stereoservo_sim.world.mechanical_trials import synthetic_load
@@ -34,6 +45,9 @@ TRANSFER_S = 0.02
 LEAST_SIGMA_PX = 0.01
 FIRST_FRAMES_S = 0.5
 """Time in which the core sees the arm at rest before it is given a goal."""
+STOPS, FRAMES = 7, 4
+"""Of a joint's trial motion, and averaged at a stop."""
+LONGEST_TRIALS_S = 600.0
 ENDS = ("goal_reached", "goal_aborted", "goal_cancelled")
 
 
@@ -53,8 +67,8 @@ class Imperfections:
 
 @dataclass(frozen=True)
 class GoalEnd:
-    """How a goal ended: the ``kind`` of its last event ("" where it had none in time), the reasons' ``codes``, the core's
-    ``verdict`` on its images, the ``seconds`` that it took.
+    """How a goal ended: the ``kind`` of its last event ("" where it had none in time), the reasons' ``codes``, the
+    core's ``verdict`` on its images, the ``seconds`` that it took.
     """
 
     kind: str
@@ -64,10 +78,10 @@ class GoalEnd:
 
 
 class DrivenCell:
-    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use; ``links``: where the joints really stand."""
+    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: where the joints stand."""
 
     def __init__(
-        self, cell: SyntheticCell, model: CellModel, q: FloatArray, seed: int,
+        self, cell: SyntheticCell, model: CellModel | None, q: FloatArray, seed: int,
         imperfections: Imperfections = Imperfections(), *, law: LawName = "cartesian3", limit: float = np.pi,
     ) -> None:  # fmt: skip
         self.cell, self._wrong = cell, imperfections
@@ -78,14 +92,14 @@ class DrivenCell:
             self._gears = Transmission(imperfections.mechanics, q, partial(synthetic_load, cell))
             self._set_positions = self._gears.motor.copy()
         self._offset = np.zeros_like(q) if imperfections.zero_offset is None else imperfections.zero_offset
-        self.settings = _settings(cell, model, imperfections.mechanics, law, limit)
+        self.settings = _settings(cell, q, imperfections.mechanics, law, limit)
         self.core = ServoCore(self.settings)
         self._period_ns = round(1e9 / RATE_HZ)
         self._now_ns, self._seq, self._active = 1_000_000_000, 0, False
         self._pending: list[CameraObservation] = []
         self._past: list[tuple[int, FloatArray]] = []
         self.command = np.zeros_like(q)
-        self.step(model_update=ModelUpdate(with_groups(model)))
+        self.step(model_update=None if model is None else ModelUpdate(with_groups(model)))
         self.step(Enable())
         for _ in range(round(FIRST_FRAMES_S * RATE_HZ)):
             self.step()
@@ -158,6 +172,20 @@ class DrivenCell:
         held = tuple(reason.code for reason in outputs.status.reasons)
         return GoalEnd("", held, self._verdict(outputs), limit / RATE_HZ)
 
+    def trials(self) -> TrialData:
+        """What the core's trial motions show. Raises CalibrationError."""
+        collector = TrialCollector(self.settings)
+        outputs = self.step(Calibrate(str(uuid.UUID(int=self._seq + 1))))
+        for _ in range(round(LONGEST_TRIALS_S * RATE_HZ)):
+            for event in outputs.events:
+                collector.add(event)
+                if event.kind == "calibration_finished":
+                    return collector.trials()
+                if event.kind == "calibration_aborted" or event.accepted is False:
+                    raise CalibrationError("aborted", event.message)
+            outputs = self.step()
+        raise CalibrationError("aborted", f"trial motions take more than {LONGEST_TRIALS_S:g} s")
+
     def rest(self, seconds: float) -> tuple[FloatArray, int]:
         """Pixels (c, m, 2) averaged over a time without a goal, and how often a joint's command changed its sign."""
         total, reversals = np.zeros_like(self.pixels()), 0
@@ -215,22 +243,25 @@ def _codes(event: Event) -> tuple[str, ...]:
 
 
 def _settings(
-    cell: SyntheticCell, model: CellModel, mechanics: Sequence[Mechanics] | None, law: LawName, limit: float
+    cell: SyntheticCell, q: FloatArray, mechanics: Sequence[Mechanics] | None, law: LawName, limit: float
 ) -> CoreSettings:
     n = len(cell.home)
     low, high = cell.home - limit, cell.home + limit
+    trials = TrialSettings(
+        q.copy(), np.where(cell.ranges > 0.0, cell.ranges, np.nan), STOPS, FRAMES, 0.2, 1.0, 4, 0.05, 1.0
+    )
     return CoreSettings(
         cell="campaign",
-        joint_names=model.joint_names,
-        joint_kinds=model.joint_kinds,
+        joint_names=cell.joint_names,
+        joint_kinds=cell.kinds,
         cameras=tuple(
-            CameraSettings(camera.name, cell.width, cell.height, CAMERA_HZ, cell.mount, model.marker_ids)
-            for camera in model.cameras
+            CameraSettings(f"cam{c}", cell.width, cell.height, CAMERA_HZ, cell.mount, cell.marker_ids)
+            for c in range(len(cell.poses))
         ),
         limits=LimitSettings(
             low, high, np.full(n, SPEED), np.full(n, ACCELERATION), 0.01, np.zeros((0, n, 2)), (), 0.5, 0.1, 1.0
         ),
-        trials=None,
+        trials=trials,
         home=None,
         rate_hz=RATE_HZ,
         law=law,

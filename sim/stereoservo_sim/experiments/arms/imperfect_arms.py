@@ -1,10 +1,10 @@
 """Experiment: goals in pictures for arms that are not perfect, by the servo core with its watch and safety stage: how
 many are reached, and how far those that are called reached are from their set-points in truth.
 
-Cases are those of `random_rigs`; every joint has play, sag, gear ripple and friction at once, and its zero is off by some
-tenths of a degree since the model was learnt. No camera moves. The model is learnt from the same arm's trial motions
-(``self``), or the true one, which states the errors of the readings that the mechanics cause (``exact``). A range of
-seeds is continued with another: ``--seed 100 --seeds 100`` are the cases behind ``--seeds 100``.
+Cases are those of `random_rigs`; every joint has play, sag, gear ripple and friction at once, and its zero is off by
+some tenths of a degree since the model was learnt. No camera moves. The model is learnt from the same arm's trial
+motions (``self``), or the true one, which states the errors of the readings that the mechanics cause (``exact``). A
+range of seeds is continued with another: ``--seed 100 --seeds 100`` are the cases behind ``--seeds 100``.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ def imperfect_arm(seed: int) -> tuple[RandomCase, Imperfections]:
     ripple = np.exp(rng.uniform(*np.log(RIPPLES)))
     gears = [
         Mechanics(
-            play=float(play * rng.uniform(0.5, 1.0)), sag=float(sag), dead_speed=float(friction * rng.uniform(0.5, 1.0)),
+            play=float(play * rng.uniform(0.5, 1.0)), sag=float(sag),
+            dead_speed=float(friction * rng.uniform(0.5, 1.0)),
             ripple=float(ripple), ripple_order=float(rng.uniform(100.0, 320.0)),
             ripple_phase=float(rng.uniform(0.0, 2.0 * np.pi)),
         )
@@ -248,8 +249,8 @@ def show_imperfect_arms(answer: dict[str, Any], console: Console) -> None:
     for kind in ("false", "lost"):
         for goal in answer[kind]:
             console.print(
-                f"{kind}: case {goal['seed']} goal {goal['goal']}: {goal['outcome']} after {goal['seconds']:.1f} s, true "
-                f"error {goal['error_px']:.3g} px, {goal['later_px']:.3g} px later, watch {goal['verdict']}, "
+                f"{kind}: case {goal['seed']} goal {goal['goal']}: {goal['outcome']} after {goal['seconds']:.1f} s, "
+                f"true error {goal['error_px']:.3g} px, {goal['later_px']:.3g} px later, watch {goal['verdict']}, "
                 f"{', '.join(goal['codes'])}"
                 + (f"; load near zero: {', '.join(goal['zero_load'])}" if goal["zero_load"] else "")
             )

@@ -1,9 +1,9 @@
-"""Experiment: goals from starts and to goals near the singularities of an arm with a spherical wrist, by every law in the
-servo core: wrist, elbow and shoulder, exactly there and within half a degree.
+"""Experiment: goals from starts near the singularities of an arm with a spherical wrist, by every law in the servo
+core: wrist, elbow and shoulder, exactly there and within half a degree.
 
-Each case is one start before the cameras, drawn by its seed, and one goal in pictures, a fifth of a radian away in all
-joints; the model is the true one. A case counts for a law where `stereo` or `trajectory` reaches it. A range of seeds is
-continued with another.
+Each case is one start before the cameras, drawn by its seed, and one goal in pictures, up to a fifth of a radian away
+in all joints; the model is the true one. A case counts for a law where `stereo` or `trajectory` reaches it. A range of
+seeds is continued with another.
 """
 
 from __future__ import annotations
@@ -64,9 +64,18 @@ def singular_case(seed: int) -> tuple[SyntheticCell, FloatArray, FloatArray, flo
             start[2] = 0.5 * np.pi + offset
         else:
             start[1] = _over_the_base(start, offset)
-        turns = rotation("x", 180) @ rotation("y", float(rng.uniform(-25, 25))) @ rotation("x", float(rng.uniform(-25, 25)))
+        turns = (
+            rotation("x", 180)
+            @ rotation("y", float(rng.uniform(-25, 25)))
+            @ rotation("x", float(rng.uniform(-25, 25)))
+        )
         cell = placed(
-            ("revolute",) * 6, tuple(dh_link(*row) for row in RX90_ROWS), two_faces(), start, np.full(6, 0.3), turns
+            ("revolute",) * 6,
+            tuple(dh_link(*row) for row in RX90_ROWS),
+            two_faces(),
+            start,
+            np.full(6, 0.3),
+            turns,
         )
         for _ in range(20):
             goal = start + rng.uniform(-AWAY, AWAY, 6)
@@ -129,7 +138,9 @@ def run_singularities(seeds: int = 12, seed: int = 0, progress: ProgressCall | N
         "seeds": seeds,
         "title": f"singularities: cases {seed} to {seed + seeds - 1}",
         "rows": rows,
-        "refused": dict(Counter(f"{v.law} {v.codes[0]}" for v in verdicts if v.outcome == "refused" and v.codes)),
+        "refused": dict(
+            Counter(f"{v.law} {v.codes[0]}" for v in verdicts if v.outcome == "refused" and v.codes)
+        ),
         "lost": lost,
         "cpu_s": round(time.process_time() - started, 1),
         "thesis": {"note": "none: 8.5 leaves singularities to the planner"},
