@@ -99,6 +99,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             ),
         ),
         Experiment(
+            "late-drives",
+            "drives 100 to 150 ms late with friction, unstated: goals with the learnt model and with the true one",
+            "arms.late_drives",
+            (repetitions(10),),
+        ),
+        Experiment(
             "inverse-kinematics",
             "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
             "arms.inverse_kinematics",

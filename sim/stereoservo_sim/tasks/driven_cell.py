@@ -78,7 +78,9 @@ class GoalEnd:
 
 
 class DrivenCell:
-    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: where the joints stand."""
+    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: where the joints stand, and
+    ``path``: where they stood after each cycle.
+    """
 
     def __init__(
         self, cell: SyntheticCell, model: CellModel | None, q: FloatArray, seed: int,
@@ -99,6 +101,7 @@ class DrivenCell:
         self._pending: list[CameraObservation] = []
         self._past: list[tuple[int, FloatArray]] = []
         self.command = np.zeros_like(q)
+        self.path: list[FloatArray] = []
         self.step(model_update=None if model is None else ModelUpdate(with_groups(model)))
         self.step(Enable())
         for _ in range(round(FIRST_FRAMES_S * RATE_HZ)):
@@ -141,6 +144,7 @@ class DrivenCell:
             self._expose()
         self.command = np.zeros_like(self.links) if outputs.command is None else outputs.command
         self._drive(self.command, 1.0 / RATE_HZ)
+        self.path.append(self.links.copy())
         return outputs
 
     def run_goal(
