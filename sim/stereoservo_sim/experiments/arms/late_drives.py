@@ -2,7 +2,7 @@
 stated: goals by the servo core with the model that the arm has learnt, and beside it with the true one.
 
 Cases are those of `random_rigs`, all joints alike. The overshoot is the farthest that a joint goes beyond its place at
-the goal, over the longest way of a joint. Above 150 ms of the arm's greatest speed the watch on following errors takes a
+the goal, over the longest way of a joint. Above 150 ms at the greatest speed the watch on following errors takes a
 late joint for one that does not follow. A range of seeds is continued with another.
 """
 
