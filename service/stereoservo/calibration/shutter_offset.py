@@ -17,7 +17,8 @@ import numpy as np
 from stereoservo.calibration.trial_data import WayObservations
 from stereoservo.geometry.distortion import undistort
 from stereoservo.kinematics.covariance import predicted_pixels
-from stereoservo.kinematics.model import CellModel, ShutterOffset
+from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.shutter_stamps import ShutterOffset
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 LEAST_WAY = {"revolute": 0.01, "prismatic": 0.002}
@@ -54,6 +55,13 @@ class _Way(NamedTuple):
     times: FloatArray
     positions: FloatArray
     seen: tuple[tuple[FloatArray, FloatArray], ...]
+
+
+def with_shutter_offsets(model: CellModel, way: WayObservations | None) -> CellModel:
+    """The model with the offsets that the ways between its stops show, where they were kept."""
+    return (
+        model if way is None else msgspec.structs.replace(model, shutter_offsets=shutter_offsets(model, way))
+    )
 
 
 def shutter_offsets(model: CellModel, way: WayObservations) -> tuple[ShutterOffset, ...]:

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
+from stereoservo.kinematics.shutter_stamps import ShutterOffset, offset_faults
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS, Mount
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.files import read_bounded, verify_checksum, with_checksum, write_atomically
@@ -134,14 +135,6 @@ class MarkerGroup(msgspec.Struct, frozen=True):
     above: int
     below: int
     roundness: float
-
-
-class ShutterOffset(msgspec.Struct, frozen=True):
-    """By how much later than its stamps tell the shutter of ``camera`` opens [s], and its standard deviation [s]."""
-
-    camera: str
-    offset_s: float
-    deviation_s: float
 
 
 class CellModel(msgspec.Struct, frozen=True, eq=False):
@@ -286,7 +279,8 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         check_loads(model.loads, n, path)
     if model.joint_accuracy is not None:
         _check_accuracy(model.joint_accuracy, n, path)
-    _check_offsets(model, path)
+    for key, message in offset_faults(model.shutter_offsets, [camera.name for camera in model.cameras]):
+        raise ModelFileError(path, key, message)
     _check_scene(model, path)
     for k, group in enumerate(model.marker_groups or ()):
         if len(set(group.triple)) < 3 or not {*group.triple} <= {*group.members} <= {*range(m)}:
@@ -296,26 +290,6 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
                 f"is of markers {group.members}, by {group.triple}: indices from 0 to {m - 1}, three of them "
                 "different, are needed",
             )
-
-
-LONGEST_OFFSET_S = 1.0
-"""Largest offset of shutter stamps that a model may state."""
-
-
-def _check_offsets(model: CellModel, path: Path | str) -> None:
-    """Check the offsets of the cameras' stamps: of cameras that are there, once each, finite and bounded."""
-    names = [camera.name for camera in model.cameras]
-    for k, offset in enumerate(model.shutter_offsets):
-        key = f"shutter_offsets[{k}]"
-        if offset.camera not in names or any(o.camera == offset.camera for o in model.shutter_offsets[:k]):
-            raise ModelFileError(
-                path, key, f"is of camera {offset.camera!r}; once each of {', '.join(names)} is valid"
-            )
-        if not (abs(offset.offset_s) <= LONGEST_OFFSET_S and 0.0 <= offset.deviation_s <= LONGEST_OFFSET_S):
-            raise ModelFileError(
-                path, key,
-                f"is {offset.offset_s} s ± {offset.deviation_s} s; up to {LONGEST_OFFSET_S:g} s is taken",
-            )  # fmt: skip
 
 
 def lens_size(cameras: tuple[CameraModel, ...]) -> int:
