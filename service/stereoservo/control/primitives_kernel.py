@@ -21,6 +21,8 @@ from stereoservo.planning.primitives import (
     RIGID_FREEDOMS,
 )
 
+OUT = 0.1
+"""Of the way from a face to a camera: about the size of the face, so that lengths along and across it are alike."""
 SPANS_NO_SPACE = 1e-26
 """Share of a coordinate's square that others do not explain, below which points span no space."""
 
@@ -209,8 +211,9 @@ def freedoms_of(V: FloatArray, values: FloatArray) -> FloatArray:
 
 @kernel
 def normal_frame(points: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Change of frame (4, 4), and its inverse, in which ``points`` (k, 4) and ``centres`` (c, 4) together, all of one
-    height, have the identity as their second moment; the identity where they span no space.
+    """Change of frame (4, 4), and its inverse, in which ``points`` (k, 4) and places a little way from their middle to
+    each of ``centres`` (c, 4), all of one height, have the identity as their second moment; the identity where they
+    span no space.
 
     Coordinates there are the same up to a rotation of 4-vectors, whatever projective frame the arguments come from: so
     are norms, angles and singular values of what is conjugated with it. By Gram and Schmidt from the points' rows.
@@ -219,7 +222,13 @@ def normal_frame(points: FloatArray, centres: FloatArray) -> tuple[FloatArray, F
     rows = np.empty((k + c, 4))
     for p in range(k + c):
         for i in range(4):
-            rows[p, i] = points[p, i] / math.sqrt(k) if p < k else centres[p - k, i] / math.sqrt(c)
+            rows[p, i] = points[p % k, i] / math.sqrt(k)
+    for p in range(c):
+        for i in range(4):
+            middle = 0.0
+            for h in range(k):
+                middle += points[h, i] / k
+            rows[k + p, i] = (middle + OUT * (centres[p, i] - middle)) / math.sqrt(c)
     R = np.zeros((4, 4))
     good = True
     for i in range(4):

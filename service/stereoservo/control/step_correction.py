@@ -181,11 +181,11 @@ def corrected_step(
 # -- near singularities -----------------------------------------------------------------------------------------
 
 FREEDOMS = 6
-SINGULAR = 3e-3
+SINGULAR = 3e-4
 """Singular value of the stacked operators, over the largest, below which the arm is near a singularity: a spherical
-wrist within some tenths of a degree of stretched.
+wrist within some tenths of a degree of stretched, or less.
 """
-LEAST_DAMPING = 3e-4
+LEAST_DAMPING = 3e-5
 """Of a motion that the arm has lost, relative to the largest singular value: between the noise of learnt operators and
 `SINGULAR`.
 """
@@ -193,7 +193,7 @@ SPANNED = 1e-3
 """Share of a bracket beyond the motions that are known, below which it tells no new one."""
 LOST = 0.5
 """Share of a motion that the damped step does not make, above which the joints set out to leave the singularity."""
-LEAVING = 100.0
+LEAVING = 300.0
 """Joint motion out of the singularity, over what is lost in units of the largest singular value."""
 LEAVING_RATE = 0.5
 """[rad/s or m/s] at most."""
