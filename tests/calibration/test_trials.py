@@ -9,6 +9,7 @@ import pytest
 from stereoservo.calibration.trial_data import (
     CalibrationError,
     TrialCamera,
+    WayObservations,
     check_trials,
     decode_trials,
     encode_trials,
@@ -60,6 +61,32 @@ def test_loads_of_the_joints_come_back_and_may_be_missing(trials):
             continue
         with pytest.raises(CalibrationError, match="velocities"):
             decode_trials(rewritten(data, **arrays), "here.npz")
+
+
+def seen_on_the_way(trials, frames=5, samples=9, seen=3):
+    rng = np.random.default_rng(2)
+    pixels = rng.uniform(0.0, 480.0, (frames, seen, 2))
+    pixels[1, 2] = np.nan
+    return WayObservations(
+        ways=np.arange(frames) // 2, cameras=np.arange(frames) % 2, times=rng.uniform(0.0, 9.0, frames),
+        markers=np.full((frames, seen), trials.marker_ids[0]), pixels=pixels, joint_ways=np.zeros(samples, np.int64),
+        joint_times=np.linspace(0.0, 9.0, samples), positions=rng.normal(size=(samples, len(trials.joint_names))),
+    )  # fmt: skip
+
+
+def test_what_was_seen_on_the_way_comes_back_and_may_be_missing(trials):
+    assert decode_trials(encode_trials(trials)).way is None
+    way = seen_on_the_way(trials)
+    again = decode_trials(encode_trials(wrong(trials, way=way))).way
+    for field in WayObservations.__struct_fields__:
+        assert np.array_equal(getattr(again, field), getattr(way, field), equal_nan=field == "pixels"), field
+    for words, field, array in (
+        ("way_positions has shape", "positions", way.positions[:, 1:]),
+        ("way_times holds numbers", "times", np.full(5, np.nan)),
+        ("0 to 1 are cameras", "cameras", np.full(5, 2)),
+    ):
+        with pytest.raises(CalibrationError, match=words):
+            check_trials(wrong(trials, way=wrong(way, **{field: array})))
 
 
 def holed(positions):

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from oracles.cartesian import CartesianStep, cartesian_law
+from stereoservo.control.cartesian_components import FaceTask
 from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.cartesian2 import cartesian2_reasons
-from stereoservo.control.laws.cartesian3 import FaceTask, Pace, cartesian_step
+from stereoservo.control.laws.cartesian3 import Pace, cartesian_step
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.planning.three_point_decomposition import ComponentStatus
 

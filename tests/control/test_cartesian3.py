@@ -6,8 +6,9 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from oracles.cartesian import cartesian3_law
+from stereoservo.control.cartesian_components import FaceTask
 from stereoservo.control.law import LawStep
-from stereoservo.control.laws.cartesian3 import FaceTask, cartesian3_reasons, cartesian3_step
+from stereoservo.control.laws.cartesian3 import cartesian3_reasons, cartesian3_step
 from stereoservo.control.stereo_cycle import stereo_step
 from stereoservo.kinematics.kernels import image_jacobian
 from stereoservo.planning.three_point_decomposition import ComponentStatus

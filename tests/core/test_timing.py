@@ -7,7 +7,7 @@ import pytest
 
 from stereoservo.core.ingest import remember_joints
 from stereoservo.core.monitor_state import CameraTiming
-from stereoservo.core.prediction import MODEL_SIGMA_PX, fold_timing, motion_at
+from stereoservo.core.prediction import MODEL_SIGMA_PX, fold_timing, joints_at, motion_at
 from stereoservo.core.report import advice, offset_s
 from stereoservo.core.state import HISTORY, JointHistory
 from stereoservo.ports.devices import JointState
@@ -70,6 +70,16 @@ def test_old_frames_are_forgotten() -> None:
         late.append(offset_s(timing)[0])
         assert timing.seen_ns == t_ns, k
     assert abs(late[-1]) < 0.001
+
+
+def test_a_third_of_a_second_of_joint_samples_is_kept_at_a_kilohertz() -> None:
+    history = JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, 1)))
+    for k in range(2000):
+        remember_joints(history, JointState(k, k * 1_000_000, np.array([1e-3 * k]), np.zeros(1)))
+    for back_ms in (0, 1, 2, 7, 150, 300):
+        found = joints_at(history, (1999 - back_ms) * 1_000_000)
+        assert found is not None
+        assert found[0] == pytest.approx(1e-3 * (1999 - back_ms), abs=1e-12), back_ms
 
 
 def test_motion_is_known_between_samples_and_for_one_interval_after_them() -> None:

@@ -25,6 +25,7 @@ from stereoservo.kinematics.model import (
     load_model,
     save_model,
 )
+from stereoservo.kinematics.shutter_stamps import ShutterOffset
 from stereoservo.messages.files import write_atomically
 
 SCENE = (901, 902, 903, 904)
@@ -32,6 +33,7 @@ GROUP = MarkerGroup((0, 1, 2), (0, 1, 2, 4), 1, 0, 0.1 + 0.2)
 GROUP_OUTSIDE = MarkerGroup((0, 1, 5), (0, 1, 5), 1, 0, 0.3)
 GROUP_TWICE = MarkerGroup((0, 1, 1), (0, 1, 2), 1, 0, 0.3)
 GROUP_OF_OTHERS = MarkerGroup((0, 1, 3), (0, 1, 2, 4), 1, 0, 0.3)
+OF_NO_CAMERA = (ShutterOffset("high", 0.0, 0.0),)
 HOLED = np.where(np.arange(32).reshape(2, 4, 4) == 27, np.nan, 1.0)
 
 
@@ -99,7 +101,10 @@ def test_round_trip_keeps_every_bit(seed, zero):
 
 def test_file_round_trip(tmp_path):
     path = tmp_path / "model.json"
-    model = make_model(1, stratum="affine", projective_to_euclidean=None, statistics=None)
+    offsets = (ShutterOffset("right", -0.1 / 3, 1e-4 / 3),)
+    model = make_model(
+        1, stratum="affine", projective_to_euclidean=None, statistics=None, shutter_offsets=offsets
+    )
     save_model(model, path)
     same(load_model(path), model)
     assert json.loads(path.read_text())["generators"][0][0] == model.generators[0, 0].tolist()
@@ -150,6 +155,10 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         ("projective_to_euclidean", "given", {"stratum": "affine"}),
         ("projective_to_euclidean", r"shape \(3, 3\)", {"projective_to_euclidean": np.eye(3)}),
         ("cameras[0]", "0x480", {"cameras": (CameraModel("left", np.ones((3, 4)), 0, 480),)}),
+        ("shutter_offsets[0]", "'high'; once each of left, right", {"shutter_offsets": OF_NO_CAMERA}),
+        ("shutter_offsets[1]", "once each", {"shutter_offsets": (ShutterOffset("left", 0.0, 0.0),) * 2}),
+        ("shutter_offsets[0]", "is nan s", {"shutter_offsets": (ShutterOffset("left", np.nan, 0.0),)}),
+        ("shutter_offsets[0]", "up to 1 s is taken", {"shutter_offsets": (ShutterOffset("left", 0.0, 2.0),)}),
         ("cameras[0].matrix", r"shape \(4, 4\)", {"cameras": (CameraModel("left", np.eye(4), 640, 480),)}),
     ],
 )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from oracles.face_visibility import Way, way_in_sight
 from oracles.step_correction import corrected_step
 from stereoservo.control.face_visibility import APPROACH
-from stereoservo.control.laws.cartesian3 import STEP_OF_BOUND
+from stereoservo.control.laws.cartesian3 import LONGEST_STEP, STEP_OF_BOUND
 from stereoservo.geometry.homogeneous import plane_of_points
 from stereoservo.geometry.screws import exp_twist
 from stereoservo.kinematics.composition import Composition
@@ -197,6 +197,7 @@ def _velocity(
         velocity: FloatArray = np.minimum(gains * allowed, rates) @ screws
         return velocity
     amounts = np.minimum(np.minimum(-np.expm1(-gains * dt_s) * allowed, rates * dt_s), limits)
+    amounts = amounts / max(1.0, float(np.abs(amounts @ screws).max()) / LONGEST_STEP)
     wanted = points
     for part, amount in zip(reversed(parts), amounts[::-1], strict=True):
         wanted = wanted @ exp_twist(amount * part.generator).T

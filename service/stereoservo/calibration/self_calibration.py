@@ -59,6 +59,7 @@ from stereoservo.calibration.rig_model import (
     reversed_trials,
     with_joints_reversed,
 )
+from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.single_joint_fit import (
     MIN_MARKERS,
     fit_single_joint,
@@ -102,13 +103,11 @@ def fit_model(
 
     Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
     joints from the base in both cases. Static markers become the model's static points. ``lens_priors``: by
-    camera name, an estimate of its lens from straight lines
-    (`geometry.distortion.lens_from_lines`).
+    camera name, an estimate of its lens from straight lines (`geometry.distortion.lens_from_lines`).
 
     ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
-    Between that and the noise floor the model's ``chi2_ok`` is false and the report's notes contain what is
-    known.
+    Between that and the noise floor ``chi2_ok`` is false and the report's notes contain what is known.
     """
     check_trials(trials)
     mount = common_mount(trials)
@@ -141,7 +140,8 @@ def fit_model(
         notes=(*result.report.notes, *notes, *of_scene),
         untested=untested(chain),
     )
-    return CalibrationFit(msgspec.structs.replace(model, loads=trials.loads), report)
+    model = msgspec.structs.replace(model, loads=trials.loads)
+    return CalibrationFit(with_shutter_offsets(model, trials.way), report)
 
 
 def _chosen_fit(

@@ -24,6 +24,7 @@ TRIALS_SCHEMA = 1
 MAX_TRIALS_BYTES = 1 << 30
 LOADS = "loads_"
 STATIC = "static_"
+WAY = "way_"
 MAX_POSITION = 1e6
 """Largest joint position [rad or m] that is taken for one."""
 MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
@@ -81,6 +82,24 @@ class StaticObservations(msgspec.Struct, frozen=True, eq=False):
     sigmas: FloatArray
 
 
+class WayObservations(msgspec.Struct, frozen=True, eq=False):
+    """Frames and joint samples of the ways between stops.
+
+    Frames: ``ways`` (f,) number of the way, ``cameras`` (f,) index, ``times`` (f,) [s] as stamped, ``markers`` (f, k)
+    ids or -1, raw ``pixels`` (f, k, 2), NaN where there is none. Joint samples: ``joint_ways`` (j,), ``joint_times``
+    (j,) [s], ``positions`` (j, n).
+    """
+
+    ways: IntArray
+    cameras: IntArray
+    times: FloatArray
+    markers: IntArray
+    pixels: FloatArray
+    joint_ways: IntArray
+    joint_times: FloatArray
+    positions: FloatArray
+
+
 class TrialData(msgspec.Struct, frozen=True, eq=False):
     """Stops of trial motions and what the cameras saw there.
 
@@ -88,7 +107,8 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
     seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
     one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: the loads
-    that the drives reported meanwhile, if any; copied into the model. ``static``: markers that do not move.
+    that the drives reported meanwhile, if any; copied into the model. ``static``: markers that do not move. ``way``:
+    what was seen between the stops.
     """
 
     joint_names: tuple[str, ...]
@@ -102,6 +122,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     images: int = 0
     loads: JointLoads | None = None
     static: StaticObservations | None = None
+    way: WayObservations | None = None
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
@@ -165,6 +186,8 @@ def check_trials(trials: TrialData) -> None:
             raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
     if trials.static is not None:
         _check_static(trials, trials.static)
+    if trials.way is not None:
+        _check_way(trials, trials.way)
     if trials.loads is not None:
         try:
             check_loads(trials.loads, n)
@@ -231,6 +254,26 @@ def _check_static(trials: TrialData, static: StaticObservations) -> None:
     seen = finite_rows(static.pixels)
     if not (np.isfinite(static.sigmas[seen]).all() and (static.sigmas[seen] > 0.0).all()):
         raise CalibrationError("bad_data", "static sigmas are not all positive numbers", key="static")
+
+
+def _check_way(trials: TrialData, way: WayObservations) -> None:
+    f, k, j = len(way.times), way.markers.shape[-1] if way.markers.ndim == 2 else 0, len(way.joint_times)
+    shapes: dict[str, tuple[int, ...]] = {
+        "ways": (f,), "cameras": (f,), "times": (f,), "markers": (f, k), "pixels": (f, k, 2), "joint_ways": (j,),
+        "joint_times": (j,), "positions": (j, len(trials.joint_names)),
+    }  # fmt: skip
+    for key, shape in shapes.items():
+        array = getattr(way, key)
+        if array.shape != shape:
+            raise CalibrationError(
+                "bad_data", f"way_{key} has shape {array.shape}; {shape} is needed", key="way"
+            )
+        if key != "pixels" and not np.isfinite(array).all():
+            raise CalibrationError("bad_data", f"way_{key} holds numbers that are not finite", key="way")
+    if f and not 0 <= int(way.cameras.min()) <= int(way.cameras.max()) < len(trials.cameras):
+        raise CalibrationError(
+            "bad_data", f"way_cameras: 0 to {len(trials.cameras) - 1} are cameras", key="way"
+        )
 
 
 def _check_sizes(trials: TrialData) -> None:
@@ -315,6 +358,7 @@ def encode_trials(trials: TrialData) -> bytes:
         sigmas=np.asarray(trials.sigmas, dtype=np.float64),
         **_load_arrays(trials.loads),  # type: ignore[arg-type]
         **_static_arrays(trials.static),  # type: ignore[arg-type]
+        **_way_arrays(trials.way),  # type: ignore[arg-type]
     )
     return buffer.getvalue()
 
@@ -335,6 +379,25 @@ def _static_arrays(static: StaticObservations | None) -> dict[str, npt.NDArray[A
         STATIC + "pixels": np.asarray(static.pixels, dtype=np.float64),
         STATIC + "sigmas": np.asarray(static.sigmas, dtype=np.float64),
     }
+
+
+def _way_arrays(way: WayObservations | None) -> dict[str, npt.NDArray[Any]]:
+    return (
+        {}
+        if way is None
+        else {WAY + field: getattr(way, field) for field in WayObservations.__struct_fields__}
+    )
+
+
+def _way(arrays: dict[str, npt.NDArray[Any]]) -> WayObservations | None:
+    if WAY + "times" not in arrays:
+        return None
+    whole = ("ways", "cameras", "markers", "joint_ways")
+    fields: dict[str, Any] = {
+        field: arrays[WAY + field].astype(np.int64 if field in whole else np.float64, casting="same_kind")
+        for field in WayObservations.__struct_fields__
+    }
+    return WayObservations(**fields)
 
 
 def _static(arrays: dict[str, npt.NDArray[Any]]) -> StaticObservations | None:
@@ -380,6 +443,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             images=header.images,
             loads=_loads(arrays),
             static=_static(arrays),
+            way=_way(arrays),
         )
         try:
             check_trials(trials)

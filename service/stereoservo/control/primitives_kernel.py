@@ -21,6 +21,11 @@ from stereoservo.planning.primitives import (
     RIGID_FREEDOMS,
 )
 
+OUT = 0.1
+"""Of the way from a face to a camera: about the size of the face, so that lengths along and across it are alike."""
+SPANS_NO_SPACE = 1e-26
+"""Share of a coordinate's square that others do not explain, below which points span no space."""
+
 
 @kernel
 def dot(x: FloatArray, y: FloatArray) -> float:
@@ -178,8 +183,8 @@ def set_plane_rows(operators: FloatArray, a: FloatArray, system: FloatArray, row
 
 
 @kernel
-def freedoms_of(operators: FloatArray) -> FloatArray:
-    """`primitives.arm_freedoms`: the basis (n, r)."""
+def stacked_singular(operators: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Right singular vectors (n, n) and values (n,), descending, of the operators stacked as columns (16, n)."""
     n = operators.shape[0]
     stacked = np.empty((16, n))
     for j in range(n):
@@ -187,6 +192,13 @@ def freedoms_of(operators: FloatArray) -> FloatArray:
             for k in range(4):
                 stacked[4 * i + k, j] = operators[j, i, k]
     V, values = right_singular(stacked)
+    return V, values
+
+
+@kernel
+def freedoms_of(V: FloatArray, values: FloatArray) -> FloatArray:
+    """`primitives.arm_freedoms`: the basis (n, r), from `stacked_singular`."""
+    n = V.shape[0]
     rank = 0
     while rank < min(n, RIGID_FREEDOMS) and values[rank] > RANK_RATIO * values[0]:
         rank += 1
@@ -195,3 +207,63 @@ def freedoms_of(operators: FloatArray) -> FloatArray:
         for k in range(rank):
             basis[j, k] = V[j, k] / values[k]
     return basis
+
+
+@kernel
+def normal_frame(points: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Change of frame (4, 4), and its inverse, in which ``points`` (k, 4) and places a little way from their middle to
+    each of ``centres`` (c, 4), all of one height, have the identity as their second moment; the identity where they
+    span no space.
+
+    Coordinates there are the same up to a rotation of 4-vectors, whatever projective frame the arguments come from: so
+    are norms, angles and singular values of what is conjugated with it. By Gram and Schmidt from the points' rows.
+    """
+    k, c = points.shape[0], centres.shape[0]
+    rows = np.empty((k + c, 4))
+    for p in range(k + c):
+        for i in range(4):
+            rows[p, i] = points[p % k, i] / math.sqrt(k)
+    for p in range(c):
+        for i in range(4):
+            middle = 0.0
+            for h in range(k):
+                middle += points[h, i] / k
+            rows[k + p, i] = (middle + OUT * (centres[p, i] - middle)) / math.sqrt(c)
+    R = np.zeros((4, 4))
+    good = True
+    for i in range(4):
+        before = 0.0
+        for p in range(k + c):
+            before += rows[p, i] ** 2
+        for _ in range(2):  # once more: what is left of a column may be small
+            for h in range(i):
+                along = 0.0
+                for p in range(k + c):
+                    along += rows[p, h] * rows[p, i]
+                R[h, i] += along
+                for p in range(k + c):
+                    rows[p, i] -= along * rows[p, h]
+        square = 0.0
+        for p in range(k + c):
+            square += rows[p, i] ** 2
+        good = good and square > SPANS_NO_SPACE * before and math.isfinite(square)
+        if not good:
+            break
+        R[i, i] = math.sqrt(square)
+        for p in range(k + c):
+            rows[p, i] /= R[i, i]
+    change, inverse = np.zeros((4, 4)), np.zeros((4, 4))
+    for i in range(4):
+        if not good:
+            change[i, i] = inverse[i, i] = 1.0
+            continue
+        for h in range(4):
+            inverse[i, h] = R[h, i]
+    if good:  # the inverse of the lower triangle, column by column
+        for h in range(4):
+            for i in range(h, 4):
+                total = 1.0 if i == h else 0.0
+                for m in range(h, i):
+                    total -= inverse[i, m] * change[m, h]
+                change[i, h] = total / inverse[i, i]
+    return change, inverse

@@ -4,6 +4,8 @@ the law's instantaneous screws intend (thesis 8.5.2).
 The screws of a law hold for an instant: driven together for a whole step, joints turn one another's axes, and what
 comes out is off by the brackets of (8.46). Instead of their series, Newton's method finds the step of the joints that
 displaces the body's points exactly as meant, from the first-order step on.
+
+Near a singularity of the arm that step does not exist, or is far too large; `damped_step` is the one to take there.
 """
 
 from __future__ import annotations
@@ -174,3 +176,152 @@ def corrected_step(
                 best[j] = found[j]
             break
     return best
+
+
+# -- near singularities -----------------------------------------------------------------------------------------
+
+FREEDOMS = 6
+SINGULAR = 3e-4
+"""Singular value of the stacked operators, over the largest, below which the arm is near a singularity: a spherical
+wrist within some tenths of a degree of stretched, or less.
+"""
+LEAST_DAMPING = 3e-5
+"""Of a motion that the arm has lost, relative to the largest singular value: between the noise of learnt operators and
+`SINGULAR`.
+"""
+SPANNED = 1e-3
+"""Share of a bracket beyond the motions that are known, below which it tells no new one."""
+LOST = 0.5
+"""Share of a motion that the damped step does not make, above which the joints set out to leave the singularity."""
+LEAVING = 300.0
+"""Joint motion out of the singularity, over what is lost in units of the largest singular value."""
+LEAVING_RATE = 0.5
+"""[rad/s or m/s] at most."""
+EXACT = 1e-6
+"""Share of the largest singular value below which the lost motion has no sign."""
+LEADS = 0.3
+"""Share of a unit vector from which a joint tells its sign."""
+
+
+@kernel
+def rigid_motions(operators: FloatArray, V: FloatArray, values: FloatArray) -> tuple[FloatArray, bool]:
+    """Orthonormal operators (6, 4, 4) of all rigid motions, and whether the arm, near a singularity, tells them.
+
+    What the arm can still make well is taken from ``operators`` (n, 4, 4), by their singular vectors ``V`` (n, n) and
+    ``values`` (n,); what it has lost, from their brackets (8.46), which are rigid motions, too.
+    """
+    n = operators.shape[0]
+    found = np.zeros((FREEDOMS, 4, 4))
+    count = 0
+    while count < FREEDOMS and values[count] > SINGULAR * values[0]:
+        for j in range(n):
+            for i in range(4):
+                for k in range(4):
+                    found[count, i, k] += V[j, count] / values[count] * operators[j, i, k]
+        count += 1
+    left, best = np.empty((4, 4)), np.empty((4, 4))
+    first, second = np.empty((4, 4)), np.empty((4, 4))
+    while count < FREEDOMS:
+        longest = 0.0
+        for a in range(n):
+            for b in range(a + 1, n):
+                multiply4_into(operators[a], operators[b], first)
+                multiply4_into(operators[b], operators[a], second)
+                size = 0.0
+                for i in range(4):
+                    for k in range(4):
+                        left[i, k] = first[i, k] - second[i, k]
+                        size += left[i, k] ** 2
+                rest = _without(found, count, left)
+                if rest > SPANNED * SPANNED * size and rest > longest:
+                    longest = rest
+                    for i in range(4):
+                        for k in range(4):
+                            best[i, k] = left[i, k] / math.sqrt(rest)
+        if longest == 0.0:
+            return found, False
+        for i in range(4):
+            for k in range(4):
+                found[count, i, k] = best[i, k]
+        count += 1
+    return found, True
+
+
+@kernel
+def _without(found: FloatArray, count: int, left: FloatArray) -> float:
+    """``left`` (4, 4) less its parts along the first ``count`` of ``found``; the square of what remains."""
+    for _ in range(2):
+        for h in range(count):
+            along = 0.0
+            for i in range(4):
+                for k in range(4):
+                    along += found[h, i, k] * left[i, k]
+            for i in range(4):
+                for k in range(4):
+                    left[i, k] -= along * found[h, i, k]
+    rest = 0.0
+    for i in range(4):
+        for k in range(4):
+            rest += left[i, k] ** 2
+    return rest
+
+
+@kernel
+def damped_step(
+    operators: FloatArray, V: FloatArray, values: FloatArray, wanted: FloatArray, time_s: float
+) -> FloatArray:
+    """Joint step (n,) near a singularity that makes of the motion ``wanted`` (4, 4) what the arm can, damped.
+
+    Where most of it is lost, the joints move in the way that moves the body least (a stretched wrist: its first joint
+    against its last), until the arm can make what is wanted. ``V`` (n, n), ``values`` (n,): of `stacked_singular`;
+    ``time_s``: of the step.
+    """
+    n = operators.shape[0]
+    rank = min(n, FREEDOMS)
+    step = np.zeros(n)
+    left, image = wanted.copy(), np.empty((4, 4))
+    whole = 0.0
+    for i in range(4):
+        for k in range(4):
+            whole += wanted[i, k] ** 2
+    for r in range(rank):
+        _image_into(operators, V, r, image)
+        along = 0.0
+        for i in range(4):
+            for k in range(4):
+                along += image[i, k] * wanted[i, k]
+        ratio = values[r] / (SINGULAR * values[0])
+        damping = LEAST_DAMPING * values[0] * math.sqrt(max(0.0, 1.0 - ratio * ratio))
+        amount = along / (values[r] ** 2 + damping**2)
+        for j in range(n):
+            step[j] += amount * V[j, r]
+        for i in range(4):
+            for k in range(4):
+                left[i, k] -= amount * image[i, k]
+    lost, pairing = 0.0, 0.0
+    for i in range(4):
+        for k in range(4):
+            lost += left[i, k] ** 2
+            pairing += image[i, k] * left[i, k]
+    if lost > LOST * LOST * whole:
+        lost = math.sqrt(lost)
+        if not abs(pairing) > EXACT * values[0] * lost:
+            pairing = 1.0
+            for back in range(n):
+                if abs(V[n - 1 - back, rank - 1]) > LEADS:
+                    pairing = V[n - 1 - back, rank - 1]
+        amount = math.copysign(min(LEAVING * lost / values[0], LEAVING_RATE * time_s), pairing)
+        for j in range(n):
+            step[j] += amount * V[j, rank - 1]
+    return step
+
+
+@kernel
+def _image_into(operators: FloatArray, V: FloatArray, column: int, image: FloatArray) -> None:
+    """The operator (4, 4) of the joint motion in a column of ``V``."""
+    for i in range(4):
+        for k in range(4):
+            total = 0.0
+            for j in range(operators.shape[0]):
+                total += V[j, column] * operators[j, i, k]
+            image[i, k] = total

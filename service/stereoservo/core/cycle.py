@@ -104,6 +104,25 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
     scatter: FloatArray
 
 
+class WayFrame(msgspec.Struct, frozen=True, eq=False):
+    """A frame taken on the way: number of its ``camera`` in the cell, stated shutter time, some markers' ``ids`` (k,)
+    and raw ``pixels`` (k, 2).
+    """
+
+    camera: int
+    t_ns: int
+    ids: IntArray
+    pixels: FloatArray
+
+
+class WayRecord(msgspec.Struct, frozen=True, eq=False):
+    """What was seen on the way to a stop: ``frames``, and joint samples ``positions`` (k, n) at ``joints_ns`` (k,)."""
+
+    frames: tuple[WayFrame, ...]
+    joints_ns: IntArray
+    positions: FloatArray
+
+
 class Event(msgspec.Struct, frozen=True, eq=False):
     """Something a client may not miss. ``seq`` counts from the core's start; ``t_ns`` monotonic."""
 
@@ -123,6 +142,8 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     progress: float | None = None
     plan: PlanReport | None = None
     """Of a reply to a goal that was planned."""
+    way: WayRecord | None = None
+    """Of the way to a calibration's stop."""
     loads: JointLoads | None = None
     """Of finished trial motions, where the drives tell."""
     cameras: tuple[str, ...] = ()

@@ -121,7 +121,10 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     state.model = model
     context.derived.load_limits = load_limits(settings, model)
     state.readiness = fitted_readiness(model)
-    state.cameras = [camera_estimate(len(model.marker_ids)) for _ in settings.cameras]
+    offsets = stated_offsets(model)
+    state.cameras = [
+        camera_estimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
+    ]
 
 
 def fitted_readiness(model: CellModel) -> ModelReadiness:
@@ -155,11 +158,12 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
     estimate = state.cameras[camera]
     estimate.last_seq = observation.seq
     estimate.last_visible = int(observation.ids.size)
-    at_shutter = joints_at(state.history, observation.t_shutter_ns)
+    shutter_ns = observation.t_shutter_ns + estimate.offset_ns
+    at_shutter = joints_at(state.history, shutter_ns)
     if arrays is None or at_shutter is None:
         return
     prediction = predict(arrays, at_shutter)
-    motion = motion_at(state.history, observation.t_shutter_ns)
+    motion = motion_at(state.history, shutter_ns)
     speed = state.velocities if motion is None else motion
     sights = frame_sights(arrays, camera, ideal_observation(arrays, camera, observation), prediction, speed)
     if motion is not None:  # where the arm was is known, and not only expected
@@ -168,10 +172,40 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
                 state, settings, arrays, camera, sights, prediction, at_shutter, context.emit
             )
         fold_residuals(state.watching, camera, sights, at_shutter)
+        _follow_offset(camera, context)
     if not _unknown(camera, state, settings):
         used = state.watching.masked == 0.0
         common = common_change(estimate, sights, used, prediction.jacobian[camera], arrays)
         accept_sights(estimate, sights, used, settings, common)
+
+
+FOLLOWED_S = 0.02
+"""How far the offset of shutter stamps may be followed from what the trial motions have shown."""
+FOLLOWED_DEVIATION_S = 0.001
+"""Standard deviation at which motion has shown an offset well enough to follow it."""
+
+
+def stated_offsets(model: CellModel) -> dict[str, int]:
+    """Offsets [ns] of the shutter stamps by camera, as the trial motions have shown them."""
+    return {offset.camera: round(1e9 * offset.offset_s) for offset in model.shutter_offsets}
+
+
+def _follow_offset(camera: int, context: StepContext) -> None:
+    """Correct the offset of a camera's stamps by what its markers have shown in motion, within a bound.
+
+    Only where the trial motions have shown it, and none of the joints: play of a joint looks like a late picture.
+    """
+    state, model = context.state, context.state.model
+    timing = state.watching.sightings[camera].timing
+    if timing.square < FOLLOWED_DEVIATION_S**-2 or model is None or model.joint_accuracy is not None:
+        return
+    stated = stated_offsets(model).get(context.settings.cameras[camera].name)
+    if stated is None:
+        return
+    bound = round(1e9 * FOLLOWED_S)
+    offset = state.cameras[camera].offset_ns + round(1e9 * timing.product / timing.square)
+    state.cameras[camera].offset_ns = min(max(offset, stated - bound), stated + bound)
+    timing.product = timing.square = 0.0
 
 
 def _unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from stereoservo.core.context import Ingested, StepContext
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.state import HISTORY, CoreState, JointHistory, Refused
+from stereoservo.core.state import HISTORY, LEAST_APART_NS, CoreState, JointHistory, Refused
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
@@ -127,7 +127,11 @@ def _append_joints(sample: JointState | None, context: StepContext) -> FloatArra
 
 
 def remember_joints(history: JointHistory, sample: JointState) -> None:
-    """Append a joint sample to the ring."""
+    """Append a joint sample to the ring; it takes the place of the last one where that is close to the one before."""
+    if history.count > 1:
+        before = int(history.t_ns[(history.count - 2) % HISTORY])
+        if 0 <= int(history.t_ns[(history.count - 1) % HISTORY]) - before < LEAST_APART_NS:
+            history.count -= 1
     slot = history.count % HISTORY
     history.t_ns[slot] = sample.t_ns
     history.positions[slot] = sample.positions

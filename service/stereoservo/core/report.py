@@ -249,7 +249,9 @@ def priors(
         covariance = np.zeros((ids.size, 2, 2))
         covariance[:, 0, 0] = covariance[:, 1, 1] = sigma * sigma
         pixels = prediction.pixels[camera] + np.where(fresh[:, None], estimate.innovation, 0.0)
-        prior = Prior(settings.cameras[camera].name, now_ns, ids, pixels, speed, covariance)
+        # The vision process asks for the stamps that the camera tells.
+        stamp_ns = now_ns - estimate.offset_ns
+        prior = Prior(settings.cameras[camera].name, stamp_ns, ids, pixels, speed, covariance)
         found.append(_raw_prior(prior, arrays.lenses[camera]))
     return tuple(found)
 

@@ -12,7 +12,7 @@ import numpy as np
 from stereoservo.control.face_choice import FaceChoice
 from stereoservo.control.faces import Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
-from stereoservo.core.cycle import decode_array, encode
+from stereoservo.core.cycle import WayFrame, decode_array, encode
 from stereoservo.core.monitor_state import (
     MobileCamera,
     ModelMonitor,
@@ -30,7 +30,8 @@ from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
 STATE_VERSION = 8
-HISTORY = 128  # joint samples kept for interpolation: half a second at 250 Hz
+HISTORY = 128  # joint samples kept for interpolation: a third of a second at 1 kHz, half of one at 250 Hz
+LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
 
 
 class JointHistory(msgspec.Struct, eq=False):
@@ -61,6 +62,8 @@ class CameraEstimate(msgspec.Struct, eq=False):
     agreeing_frames: int = 0
     """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
     rms_px: float = 0.0
+    offset_ns: int = 0
+    """By which its shutter opens later than its stamps tell, as far as known."""
 
 
 class Refused(msgspec.Struct, eq=False):
@@ -299,6 +302,10 @@ class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
     """Sums (n, c, m, 2) over a joint's stops of its offset from the base times the markers' motion [rad px or m px]."""
     slope_weights: FloatArray
     """Sums (n, c, m) of the squared offsets."""
+    way_frames: list[WayFrame] = []
+    """Of the way to the next stop, with the joint samples (n,) at ``way_ns``."""
+    way_ns: list[int] = []
+    way_joints: list[FloatArray] = []
 
 
 class CheckMotion(PoseMeasurement, tag="checking", eq=False, kw_only=True):
@@ -485,11 +492,12 @@ def no_contact(n: int, samples: int) -> Contact:
     )
 
 
-def camera_estimate(markers: int) -> CameraEstimate:
-    """An estimate that has seen nothing, for ``markers`` markers."""
+def camera_estimate(markers: int, offset_ns: int = 0) -> CameraEstimate:
+    """An estimate that has seen nothing, for ``markers`` markers; ``offset_ns``: of the shutter stamps."""
     return CameraEstimate(
-        innovation=np.zeros((markers, 2)), sigma=np.ones(markers), seen_ns=np.zeros(markers, np.int64)
-    )
+        innovation=np.zeros((markers, 2)), sigma=np.ones(markers), seen_ns=np.zeros(markers, np.int64),
+        offset_ns=offset_ns,
+    )  # fmt: skip
 
 
 class StateVersionError(ValueError):

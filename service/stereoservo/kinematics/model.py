@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
+from stereoservo.kinematics.shutter_stamps import ShutterOffset, offset_faults
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS, Mount
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.files import read_bounded, verify_checksum, with_checksum, write_atomically
@@ -176,6 +177,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Coplanar groups of its markers; None where they have not been looked for."""
     joint_accuracy: JointAccuracy | None = None
     """Errors of the joint readings; None where none are known: predictions then take them for exact."""
+    shutter_offsets: tuple[ShutterOffset, ...] = ()
+    """Of the cameras whose stamps the trial motions could tell against the joints' stamps."""
 
     @property
     def tip_first(self) -> bool:
@@ -276,6 +279,8 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         check_loads(model.loads, n, path)
     if model.joint_accuracy is not None:
         _check_accuracy(model.joint_accuracy, n, path)
+    for key, message in offset_faults(model.shutter_offsets, [camera.name for camera in model.cameras]):
+        raise ModelFileError(path, key, message)
     _check_scene(model, path)
     for k, group in enumerate(model.marker_groups or ()):
         if len(set(group.triple)) < 3 or not {*group.triple} <= {*group.members} <= {*range(m)}:

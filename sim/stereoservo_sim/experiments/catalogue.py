@@ -90,6 +90,21 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(10),),
         ),
         Experiment(
+            "imperfect-arms",
+            "goals of arms with play, sag, ripple, friction and shifted zeros: reached, and true errors of those",
+            "arms.imperfect_arms",
+            (
+                repetitions(10),
+                Option("model", str, "self (learnt by the arm) or exact (the true one, stating its errors)"),
+            ),
+        ),
+        Experiment(
+            "late-drives",
+            "drives 100 to 150 ms late with friction, unstated: goals with the learnt model and with the true one",
+            "arms.late_drives",
+            (repetitions(10),),
+        ),
+        Experiment(
             "inverse-kinematics",
             "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
             "arms.inverse_kinematics",
@@ -120,10 +135,22 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(3),),
         ),
         Experiment(
+            "late-pictures",
+            "pictures that are later than their stamps tell: learnt in the trial motions, applied, goals with it",
+            "cameras.late_pictures",
+            (repetitions(10),),
+        ),
+        Experiment(
             "mobile-cameras",
             "fig. 9.1: four cameras before one tool, two of them carried about: every pair, all, and all on the move",
             "cameras.mobile_cameras",
             (repetitions(3),),
+        ),
+        Experiment(
+            "singularities",
+            "goals from wrist, elbow and shoulder singularities by every law: reached, refused, time-outs",
+            "laws.singularities",
+            (repetitions(12),),
         ),
         Experiment(
             "laws",

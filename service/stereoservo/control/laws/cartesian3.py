@@ -14,39 +14,39 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.control.cartesian_components import Components, FaceTask, decompose, is_flat
 from stereoservo.control.face_visibility import APPROACH, way_in_sight
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.primitives_kernel import (
     apply,
-    apply_transposed,
-    as_rotation,
-    complement,
     dot,
     freedoms_of,
     minors,
     norm,
-    primitive,
+    normal_frame,
     scale_primitive,
-    set_plane_rows,
-    set_point_rows,
-    unit,
+    stacked_singular,
 )
-from stereoservo.control.step_correction import corrected_step, exponential_into
-from stereoservo.kinematics.kernels import multiply4_into
+from stereoservo.control.step_correction import (
+    FREEDOMS,
+    SINGULAR,
+    corrected_step,
+    damped_step,
+    exponential_into,
+    rigid_motions,
+)
+from stereoservo.kinematics.kernels import multiply4_into, transform_points
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.primitives import (
-    DEGENERATE_RATIO,
     HINGE,
     PLANAR,
     REACH_RATIO,
     TRANSLATION,
 )
 from stereoservo.planning.three_point_decomposition import (
-    COINCIDENT,
     DONE,
-    FLAT_FACE,
     MOVES,
     NO_FACE,
     NOT_REACHABLE,
@@ -55,203 +55,12 @@ from stereoservo.planning.three_point_decomposition import (
 
 COMPONENTS, UNITS = (TRANSLATION, HINGE, PLANAR), ("", "rad", "rad")
 ROTATION = "rotation of the body about its centre"
+LONGEST_STEP = 1.0
+"""[rad or m] Of a joint while a velocity is held: near a singularity a small motion of the body takes more."""
 STEP_OF_BOUND = 0.9
 """Of the way to a visibility bound, how much one step may make."""
 BLOCKED = 1e-3
 """Share of what is left below which a component that waits stands."""
-
-
-@kernel
-def _shifted(A: FloatArray, centre: FloatArray) -> FloatArray:
-    """Points moved in parallel so that their middle is the centre."""
-    out = np.empty((3, 4))
-    for k in range(4):
-        shift = centre[k] - (A[0, k] + A[1, k] + A[2, k]) / 3.0
-        for i in range(3):
-            out[i, k] = A[i, k] + shift
-    return out
-
-
-@kernel
-def is_flat(A: FloatArray, face: FloatArray) -> bool:
-    """Whether the points (3, 4), of plane (4,), are collinear or not finite."""
-    first = norm(A[1] - A[0])
-    second = norm(A[2] - A[0])
-    return not norm(face) > FLAT_FACE * first * second * norm(A[0])
-
-
-class FaceTask(NamedTuple):
-    """Three ``points`` (3, 4) of one face now and at the goal, ``targets`` (3, 4); ``centre`` and ``centre_target``
-    (4,): all of height ``a∞ᵀM = 1``.
-    """
-
-    points: FloatArray
-    targets: FloatArray
-    centre: FloatArray
-    centre_target: FloatArray
-
-
-class Components(NamedTuple):
-    """Translation, hinge and planar turn (7.18 to 7.24): ``screws`` (3, n), ``generators`` (3, 4, 4), ``amount`` (3,),
-    ``status`` (3,). Amounts are >= 0, angles in [0, π]. Screws and generators of components that are done or not
-    reachable are zero.
-    """
-
-    screws: FloatArray
-    generators: FloatArray
-    amount: FloatArray
-    status: IntArray
-
-
-@kernel
-def decompose(operators: FloatArray, basis: FloatArray, task: FaceTask) -> Components:
-    """The components of a motion. ``basis`` (n, r) of the arm's freedoms."""
-    points, targets, centre = task.points, task.targets, task.centre
-    n = operators.shape[0]
-    found = Components(np.zeros((3, n)), np.zeros((3, 4, 4)), np.zeros(3), np.full(3, DONE))
-    system = np.zeros((8, n))
-    unit_centre = unit(centre)
-    _translation(operators, basis, task, unit_centre, system, found)
-    A_c = _shifted(points, centre)
-    A_r = _shifted(targets, centre)
-    a = unit(minors(A_c[0], A_c[1], A_c[2]))
-    a_t = unit(minors(A_r[0], A_r[1], A_r[2]))
-    _hinge(operators, basis, centre, unit_centre, a, a_t, A_c, A_r, system, found)
-    set_plane_rows(operators, a, system, 0)
-    set_point_rows(operators, unit_centre, system, 4)
-    found.status[2] = NOT_REACHABLE
-    screw, H = np.zeros(n), np.zeros((4, 4))
-    if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
-        theta = _planar_angle(H, A_c, A_r)
-        if theta < 0.0:
-            scale_primitive(screw, H, -1.0)
-            theta = -theta
-        found.amount[2] = theta
-        _keep(screw, H, 2, found)
-    return found
-
-
-@kernel
-def _translation(
-    operators: FloatArray, basis: FloatArray, task: FaceTask, unit_centre: FloatArray, system: FloatArray,
-    found: Components,
-) -> None:  # fmt: skip
-    """The centre's translation into the first of the components; ``system`` (8, n): scratch."""
-    centre, centre_target = task.centre, task.centre_target
-    n = operators.shape[0]
-    displacement = np.empty(4)
-    for k in range(4):
-        displacement[k] = centre_target[k] - centre[k]
-    tau = norm(displacement)
-    if tau > COINCIDENT * norm(centre):
-        found.amount[0] = tau
-        found.status[0] = NOT_REACHABLE
-        direction = unit(displacement)
-        a1, a2 = complement(unit_centre, direction)
-        set_plane_rows(operators, a1, system, 0)
-        set_plane_rows(operators, a2, system, 4)
-        screw, H = np.zeros(n), np.zeros((4, 4))
-        if primitive(operators, basis, system, screw, H):
-            step = apply(H, centre)
-            scale = math.copysign(norm(step), dot(step, direction))
-            if abs(scale) > DEGENERATE_RATIO * norm(centre):
-                scale_primitive(screw, H, 1.0 / scale)
-                found.amount[0] = dot(displacement, apply(H, centre))
-                _keep(screw, H, 0, found)
-
-
-@kernel
-def _hinge(
-    operators: FloatArray, basis: FloatArray, centre: FloatArray, unit_centre: FloatArray, a: FloatArray,
-    a_t: FloatArray, A_c: FloatArray, A_r: FloatArray, system: FloatArray, found: Components,
-) -> None:  # fmt: skip
-    """The hinge of the face's plane ``a`` (4,) to ``a_t`` into the second of the components.
-
-    The face's points at the goal, ``A_r`` (3, 4), are turned back by it; ``A_c`` (3, 4): those now.
-    """
-    n = operators.shape[0]
-    together = dot(a, a_t)
-    difference = np.empty(4)
-    for k in range(4):
-        difference[k] = a_t[k] - together * a[k]
-    hinged = True
-    axis_point = np.empty(4)
-    if norm(difference) > COINCIDENT:
-        axis_point = minors(a, unit(difference), unit_centre)
-    elif together > 0.0:
-        hinged = False
-    else:
-        longest = -1.0
-        for i in range(3):
-            length = norm(A_c[i] - centre)
-            if length > longest:
-                longest = length
-                for k in range(4):
-                    axis_point[k] = A_c[i, k]
-    if hinged:
-        found.amount[1] = math.acos(min(1.0, max(-1.0, together)))
-        found.status[1] = NOT_REACHABLE
-        along = dot(axis_point, unit_centre)
-        second_point = np.empty(4)
-        for k in range(4):
-            second_point[k] = axis_point[k] - along * unit_centre[k]
-        set_point_rows(operators, unit_centre, system, 0)
-        set_point_rows(operators, unit(second_point), system, 4)
-        screw, H = np.zeros(n), np.zeros((4, 4))
-        if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
-            theta = _hinge_angle(H, a, a_t)
-            if theta < 0.0:
-                scale_primitive(screw, H, -1.0)
-                theta = -theta
-            found.amount[1] = theta
-            _keep(screw, H, 1, found)
-            sine, versine = math.sin(-theta), 2.0 * math.sin(0.5 * theta) ** 2
-            for i in range(3):
-                once = apply(H, A_r[i])
-                twice = apply(H, once)
-                for k in range(4):
-                    A_r[i, k] += sine * once[k] + versine * twice[k]
-
-
-@kernel
-def _keep(screw: FloatArray, H: FloatArray, i: int, found: Components) -> None:
-    found.status[i] = MOVES
-    for j in range(screw.shape[0]):
-        found.screws[i, j] = screw[j]
-    for k in range(4):
-        for m in range(4):
-            found.generators[i, k, m] = H[k, m]
-
-
-@kernel
-def _hinge_angle(H: FloatArray, a: FloatArray, a_t: FloatArray) -> float:
-    u = apply_transposed(H, a)
-    v = apply_transposed(H, u)
-    uu, vv, uv, ur, vr = 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(4):
-        right = a_t[k] - a[k] - v[k]
-        uu += u[k] * u[k]
-        vv += v[k] * v[k]
-        uv -= u[k] * v[k]
-        ur -= u[k] * right
-        vr += v[k] * right
-    return math.atan2(ur * vv - uv * vr, uv * ur - uu * vr)
-
-
-@kernel
-def _planar_angle(H: FloatArray, A: FloatArray, A_r: FloatArray) -> float:
-    uu, vv, uv, ur, vr = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(A.shape[0]):
-        u = apply(H, A[i])
-        v = apply(H, u)
-        for k in range(4):
-            right = A_r[i, k] - A[i, k] - v[k]
-            uu += u[k] * u[k]
-            vv += v[k] * v[k]
-            uv += u[k] * v[k]
-            ur += u[k] * right
-            vr += v[k] * right
-    return math.atan2(ur * vv - uv * vr, uv * ur - uu * vr)
 
 
 @kernel
@@ -379,33 +188,103 @@ def cartesian_step(
         centres += abs(centre[k]) + abs(centre_target[k])
     if is_flat(points, face) or is_flat(targets, target_face) or not math.isfinite(centres):
         return velocity, errors, allowed, shown
-    basis = freedoms_of(operators)
-    parts = decompose(operators, basis, task)
-    sight = _kept_in_view(operators, basis, task, face, target_face, camera_centres, single, parts)
+    V, values = stacked_singular(operators)
+    driven, basis, singular = operators, freedoms_of(V, values), False
+    if n >= FREEDOMS and not values[FREEDOMS - 1] > SINGULAR * values[0]:
+        rigid, singular = rigid_motions(operators, V, values)
+        if singular:
+            driven, basis = rigid, np.eye(FREEDOMS)
+    parts = decompose(driven, basis, task)
+    sight = _kept_in_view(driven, basis, task, face, target_face, camera_centres, single, parts)
     steps = _paced(parts, sight, pace, errors, allowed, shown)
-    for i in range(count):
-        for j in range(n):
-            velocity[j] += steps[i] * parts.screws[i, j]
-    if dt_s > 0.0:
-        held, wanted = np.empty((4, 4)), np.empty((4, 4))
-        for k in range(4):
-            for i in range(3):
-                held[i, k] = points[i, k]
-            held[3, k] = centre[k]
-        for i in range(4):
-            for k in range(4):
-                wanted[i, k] = held[i, k]
-        work = np.empty((3, 4, 4))
-        for back in range(count):
-            i = count - 1 - back
-            if steps[i] != 0.0:
-                _moved_into(parts.generators[i], steps[i], wanted, work)
-        step = corrected_step(operators, composition, held, wanted, velocity)
-        for j in range(n):
-            velocity[j] = step[j] / dt_s
+    if singular:
+        wanted = np.zeros((4, 4))
+        for i in range(count):
+            for a in range(4):
+                for k in range(4):
+                    wanted[a, k] += steps[i] * parts.generators[i, a, k]
+        velocity = damped_step(operators, V, values, wanted, dt_s if dt_s > 0.0 else 1.0)
+        if dt_s > 0.0:
+            for j in range(n):
+                velocity[j] /= dt_s
+    else:
+        _exact_into(operators, composition, task, parts, steps, dt_s, velocity)
     if sight.hinge_first:
         errors[1] = sight.whole
         shown[1] = WAITS
+    return velocity, errors, allowed, shown
+
+
+@kernel
+def _exact_into(
+    operators: FloatArray, composition: int, task: FaceTask, parts: Components, steps: FloatArray, dt_s: float,
+    velocity: FloatArray,
+) -> None:  # fmt: skip
+    """The joint ``velocity`` (n,) of the components' ``steps`` (k,), corrected for the time that it is held.
+
+    A step that would take a joint too far is shortened as a whole: no correction holds for it.
+    """
+    points, centre = task.points, task.centre
+    n, count = velocity.shape[0], steps.shape[0]
+    for i in range(count):
+        for j in range(n):
+            velocity[j] += steps[i] * parts.screws[i, j]
+    if not dt_s > 0.0:
+        return
+    most = 0.0
+    for j in range(n):
+        most = max(most, abs(velocity[j]))
+    share = 1.0 if not most > LONGEST_STEP else LONGEST_STEP / most
+    for j in range(n):
+        velocity[j] *= share
+    held, wanted = np.empty((4, 4)), np.empty((4, 4))
+    for k in range(4):
+        for i in range(3):
+            held[i, k] = points[i, k]
+        held[3, k] = centre[k]
+    for i in range(4):
+        for k in range(4):
+            wanted[i, k] = held[i, k]
+    work = np.empty((3, 4, 4))
+    for back in range(count):
+        i = count - 1 - back
+        if steps[i] != 0.0:
+            _moved_into(parts.generators[i], share * steps[i], wanted, work)
+    step = corrected_step(operators, composition, held, wanted, velocity)
+    for j in range(n):
+        velocity[j] = step[j] / dt_s
+
+
+@kernel
+def normalised_step(
+    operators: FloatArray,
+    composition: int,
+    task: FaceTask,
+    camera_centres: FloatArray,
+    pace: Pace,
+    single: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
+    the task error are those of the frame that the arguments are in.
+    """
+    n = operators.shape[0]
+    change, back = normal_frame(task.points, camera_centres)
+    turned, work = np.empty((n, 4, 4)), np.empty((4, 4))
+    for j in range(n):
+        multiply4_into(change, operators[j], work)
+        multiply4_into(work, back, turned[j])
+    inner = FaceTask(
+        transform_points(change, task.points), transform_points(change, task.targets), apply(change, task.centre),
+        apply(change, task.centre_target),
+    )  # fmt: skip
+    before = norm(task.centre_target - task.centre)
+    ratio = norm(inner.centre_target - inner.centre) / before if before > 0.0 else 1.0
+    inner_pace = Pace(pace.gains, pace.dt_s, pace.rotation_rate, ratio * pace.translation_rate)
+    velocity, errors, allowed, shown = cartesian_step(
+        turned, composition, inner, transform_points(change, camera_centres), inner_pace, single
+    )
+    errors[0] /= ratio
+    allowed[0] /= ratio
     return velocity, errors, allowed, shown
 
 
@@ -508,7 +387,7 @@ def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> Law
     """The step of a law with ``count`` components, 3 or 2, each at the gain of ``options``."""
     face = FaceTask(scene.points[task.face], task.target_points[task.face], task.centre, task.centre_target)
     pace = Pace(np.full(count, options.gain), options.dt_s, options.rotation_rate, options.translation_rate)
-    step = cartesian_step(scene.operators, scene.composition, face, scene.camera_centres, pace, count == 2)
+    step = normalised_step(scene.operators, scene.composition, face, scene.camera_centres, pace, count == 2)
     return LawStep(*step, 1.0)
 
 

@@ -378,7 +378,7 @@ def to_look_from(
         mobile = state.mobile[c]
         assert mobile is not None
         matrices[c] = moved_matrix(arrays.matrices[c], mobile.way)
-        cameras[c] = camera_estimate(len(arrays.marker_ids))
+        cameras[c] = camera_estimate(len(arrays.marker_ids), cameras[c].offset_ns)
         if mobile.place == "lost":
             unknown = (*unknown, settings.cameras[c].name)
     here = _arrays_with(arrays, matrices)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.cycle import Sample
+from stereoservo.core.cycle import Sample, WayFrame, WayRecord
 from stereoservo.core.monitors.collision import learnt_loads
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.measure_at_pose import (
@@ -63,6 +63,7 @@ def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSetting
 def trials_step(trials: CalibrationMotion, context: StepContext) -> SourceOutput:
     """One step of the programme."""
     settings = trial_settings(context.settings)
+    _record_way(trials, context)
     if trials.phase in ("move", "return", "finish"):
         return _move(trials, context, settings)
     samples = collect_samples(trials, context, settings)
@@ -109,12 +110,46 @@ def _stop_done(
     trial = -1 if _combining(trials) else trial
     context.emit(
         "calibration_sample", id=trials.id, joints=mean, samples=samples, trial=trial,
-        progress=_progress(trials, settings),
+        progress=_progress(trials, settings), way=_way_record(trials),
     )  # fmt: skip
     if not _combining(trials):
         _remember(trials, context, settings, samples, mean)
     trials.seen_turns += 1
     return _turn_done(trials, context, settings, "", mean)
+
+
+WAY_FRAMES, WAY_JOINTS, WAY_MARKERS = 200, 2000, 8
+"""Frames and joint samples kept of one way, and markers of a frame: enough to tell how late its stamp is."""
+WAY_APART_NS = 2_000_000
+"""Between joint samples that are kept."""
+
+
+def _record_way(trials: CalibrationMotion, context: StepContext) -> None:
+    """Keep what is seen on the way to a stop, until its markers are averaged; nothing of a way that is too long."""
+    cameras = [camera.name for camera in context.settings.cameras]
+    for observation in context.observations:
+        if len(trials.way_frames) < WAY_FRAMES and observation.ids.size:
+            chosen = slice(None, None, max(1, -(-observation.ids.size // WAY_MARKERS)))
+            trials.way_frames.append(
+                WayFrame(
+                    cameras.index(observation.camera), observation.t_shutter_ns,
+                    np.asarray(observation.ids[chosen], dtype=np.int64), np.array(observation.pixels[chosen]),
+                )
+            )  # fmt: skip
+    now_ns = context.state.last_joints_ns
+    due = not trials.way_ns or now_ns - trials.way_ns[-1] >= WAY_APART_NS
+    if due and len(trials.way_ns) < WAY_JOINTS:
+        trials.way_ns.append(now_ns)
+        trials.way_joints.append(context.q.copy())
+
+
+def _way_record(trials: CalibrationMotion) -> WayRecord | None:
+    """What was kept of the way that ends here; the next one begins."""
+    frames, times, joints = trials.way_frames, trials.way_ns, trials.way_joints
+    trials.way_frames, trials.way_ns, trials.way_joints = [], [], []
+    if len(times) == WAY_JOINTS or len(frames) < 2:
+        return None
+    return WayRecord(tuple(frames), np.array(times, dtype=np.int64), np.array(joints))
 
 
 def _remember(

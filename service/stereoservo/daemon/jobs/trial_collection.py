@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.calibration.static_points import static_markers, static_observations
-from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData
+from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations
 from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.kinematics.model import JointLoads
@@ -106,6 +106,35 @@ class TrialCollector:
             images=images,
             loads=self._loads,
             static=static,
+            way=self._way(),
+        )
+
+    def _way(self) -> WayObservations | None:
+        """What was seen between the stops; None where nothing was kept."""
+        records = [(k, event.way) for k, event in enumerate(self._stops) if event.way is not None]
+        frames = [(k, frame) for k, record in records for frame in record.frames]
+        if not frames:
+            return None
+        most = max(len(frame.ids) for _, frame in frames)
+        markers = np.full((len(frames), most), -1, dtype=np.int64)
+        pixels = np.full((len(frames), most, 2), np.nan)
+        for row, (_, frame) in enumerate(frames):
+            markers[row, : len(frame.ids)] = frame.ids
+            pixels[row, : len(frame.ids)] = frame.pixels
+        start_ns = int(
+            records[0][1].joints_ns[0]
+        )  # of this boot's clock: seconds from there keep their digits
+        return WayObservations(
+            ways=np.array([k for k, _ in frames], dtype=np.int64),
+            cameras=np.array([frame.camera for _, frame in frames], dtype=np.int64),
+            times=np.array([1e-9 * (frame.t_ns - start_ns) for _, frame in frames]),
+            markers=markers,
+            pixels=pixels,
+            joint_ways=np.concatenate([np.full(len(record.joints_ns), k) for k, record in records]).astype(
+                np.int64
+            ),
+            joint_times=np.concatenate([1e-9 * (record.joints_ns - start_ns) for _, record in records]),
+            positions=np.concatenate([record.positions for _, record in records]),
         )
 
     def _noise_factor(self, camera: CameraSettings) -> float:

@@ -1,0 +1,186 @@
+"""How much later than their stamps tell the cameras' shutters open, against the joints' stamps, from what was seen on
+the ways between the stops of the trial motions.
+
+On such a way one joint moves. Each frame, by the model, tells where this joint stands; the joint's samples tell when it
+stood there. A part of the difference that is the same all along a way is none of time: play of the joint, once it is
+taken up, or its zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.trial_data import WayObservations
+from stereoservo.geometry.distortion import undistort
+from stereoservo.kinematics.covariance import predicted_pixels
+from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.shutter_stamps import ShutterOffset
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+
+LEAST_WAY = {"revolute": 0.01, "prismatic": 0.002}
+"""[rad, m] that the joint goes on a way that counts."""
+ALONE = 0.02
+"""Share of it that another joint may move meanwhile."""
+LONGEST_S, GRID_S = 0.3, 0.005
+"""Offsets that are looked for, and their distance at first."""
+STEPS = 3
+STEP = 1e-5
+"""[rad or m] For slopes."""
+SLOPE_S = 0.01
+"""Half of the time over which a joint's speed is taken."""
+FAR_SIGMAS = 4.0
+FEWEST = 20
+"""Frames of a camera with the joint in motion."""
+FEWEST_OF_WAY = 4
+PLAY = 0.03
+"""[rad or m] that a joint goes before its link does, at most."""
+MOVING = 0.1
+"""Of a way's greatest speed, from which a joint moves."""
+LEAST_DEVIATION_S = 1e-4
+
+
+_Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Samples of a joint, times and positions, and frames of a camera, stamps and where the joint stands by the picture."""
+
+
+class _Way(NamedTuple):
+    """One way of one joint: its samples ``times`` (j,), ``positions`` (j,); frames of each camera: stamps and where the
+    joint stands by the picture.
+    """
+
+    times: FloatArray
+    positions: FloatArray
+    seen: tuple[tuple[FloatArray, FloatArray], ...]
+
+
+def with_shutter_offsets(model: CellModel, way: WayObservations | None) -> CellModel:
+    """The model with the offsets that the ways between its stops show, where they were kept."""
+    return (
+        model if way is None else msgspec.structs.replace(model, shutter_offsets=shutter_offsets(model, way))
+    )
+
+
+def shutter_offsets(model: CellModel, way: WayObservations) -> tuple[ShutterOffset, ...]:
+    """Offsets of the cameras that saw enough of moving joints."""
+    ways = list(_ways(model, way))
+    found = []
+    for c, camera in enumerate(model.cameras):
+        series = [(w.times, w.positions, *w.seen[c]) for w in ways if len(w.seen[c][0]) > 2]
+        if series:
+            offset = _aligned(series)
+            if offset is not None:
+                found.append(ShutterOffset(camera.name, *offset))
+    return tuple(found)
+
+
+def _ways(model: CellModel, way: WayObservations) -> Iterator[_Way]:
+    for number in np.unique(way.joint_ways):
+        of_way = way.joint_ways == number
+        times, positions = way.joint_times[of_way], way.positions[of_way]
+        travel = np.ptp(positions, axis=0)
+        joint = int(travel.argmax())
+        others = np.delete(travel, joint).max(initial=0.0)
+        if travel[joint] < LEAST_WAY[model.joint_kinds[joint]] or others > ALONE * travel[joint]:
+            continue
+        seen: list[tuple[FloatArray, FloatArray]] = []
+        for c in range(len(model.cameras)):
+            rows = np.flatnonzero((way.ways == number) & (way.cameras == c))
+            start = np.array([np.interp(way.times[rows], times, q) for q in positions.T]).T
+            shown, known = _joint_by_pictures(model, c, joint, start, way, rows)
+            seen.append((way.times[rows][known], shown[known]))
+        yield _Way(times, positions[:, joint], tuple(seen))
+
+
+def _joint_by_pictures(
+    model: CellModel, camera: int, joint: int, start: FloatArray, way: WayObservations, rows: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Where (f,) a joint stands by each frame, with the others as in ``start`` (f, n), and which are known."""
+    column = {marker: i for i, marker in enumerate(model.marker_ids)}
+    index = np.array([column.get(i, -1) for i in way.markers[rows].reshape(-1).tolist()], dtype=np.int64)
+    index = index.reshape(len(rows), -1)
+    seen = (index >= 0) & np.isfinite(way.pixels[rows]).all(axis=-1)
+    lens = model.cameras[camera].lens
+    ideal = undistort(lens, np.where(seen[..., None], way.pixels[rows], lens[1:3]))
+    seen &= np.isfinite(ideal).all(axis=-1)
+    straight = _one_pinhole(model, camera)
+    positions, shift = start.copy(), np.zeros(start.shape[1])
+    shift[joint] = STEP
+    at = np.arange(len(rows))[:, None], np.maximum(index, 0)
+    for _ in range(STEPS):
+        here = predicted_pixels(straight, positions)[0][at]
+        slope = (predicted_pixels(straight, positions + shift)[0][at] - here) / STEP
+        slope = np.where(seen[..., None], slope, 0.0)
+        apart = np.where(seen[..., None], ideal - here, 0.0)
+        square = (slope * slope).sum(axis=(1, 2))
+        positions[:, joint] += (slope * apart).sum(axis=(1, 2)) / np.maximum(square, 1e-12)
+    shown: FloatArray = positions[:, joint]
+    return shown, (square > 0.0) & np.isfinite(shown)
+
+
+def _one_pinhole(model: CellModel, camera: int) -> CellModel:
+    """The model with one of its cameras, without its lens."""
+    chosen = model.cameras[camera]
+    lens = chosen.lens.copy()
+    lens[[0, *range(4, len(lens))]] = 0.0
+    return msgspec.structs.replace(model, cameras=(msgspec.structs.replace(chosen, lens=lens),))
+
+
+def _aligned(series: list[_Series]) -> tuple[float, float] | None:
+    """Offset [s] by which the joint's course by the pictures lies behind that by its samples, with its deviation; None
+    where too little moves.
+    """
+    kept = [np.ones(len(stamps), dtype=bool) for _, _, stamps, _ in series]
+    grid = np.arange(-LONGEST_S, LONGEST_S + 0.5 * GRID_S, GRID_S)
+    costs = [
+        sum(float((_apart(way, offset, use) ** 2).sum()) for way, use in zip(series, kept, strict=True))
+        for offset in grid.tolist()
+    ]
+    offset, deviation = float(grid[int(np.argmin(costs))]), np.inf
+    for _ in range(2 * STEPS):
+        apart = [_apart(way, offset, use) for way, use in zip(series, kept, strict=True)]
+        slopes = [_speeds(way, offset, use) for way, use in zip(series, kept, strict=True)]
+        y, v = np.concatenate(apart), np.concatenate(slopes)
+        square = float((v * v).sum())
+        moving = sum(int((np.abs(s) > MOVING * np.abs(s).max(initial=0.0)).sum()) for s in slopes)
+        if moving < FEWEST or not square > 0.0:
+            return None
+        step = float((v * y).sum()) / square
+        offset = float(np.clip(offset + step, -LONGEST_S, LONGEST_S))
+        scale = 1.4826 * float(np.median(np.abs(y - step * v)))
+        deviation = (
+            float(np.sqrt((v * v * (y - step * v) ** 2).sum())) / square
+        )  # jitter grows with the speed
+        for k, way in enumerate(series):
+            use = _beyond_play(way, offset)
+            every = _apart(way, offset, np.ones(len(use), dtype=bool))
+            use &= np.abs(every - np.median(every[use])) <= max(FAR_SIGMAS * scale, 1e-12)
+            kept[k] = use
+    return offset, max(deviation, LEAST_DEVIATION_S)
+
+
+def _beyond_play(way: _Series, offset: float) -> BoolArray:
+    """Which frames show the joint where it has taken up its play; of a way too short for that, all."""
+    times, positions, stamps, _ = way
+    travel = np.abs(np.interp(stamps + offset, times, positions) - positions[0])
+    beyond: BoolArray = travel > min(PLAY, 0.5 * float(travel.max()))
+    return beyond if beyond.sum() >= FEWEST_OF_WAY else np.ones(len(stamps), dtype=bool)
+
+
+def _apart(way: _Series, offset: float, use: BoolArray) -> FloatArray:
+    """By the pictures less by the samples ``offset`` later than stamped, without what is common."""
+    times, positions, stamps, shown = way
+    apart = (shown - np.interp(stamps + offset, times, positions))[use]
+    return np.asarray(apart - apart.mean()) if len(apart) else apart
+
+
+def _speeds(way: _Series, offset: float, use: BoolArray) -> FloatArray:
+    times, positions, stamps, _ = way
+    at = (stamps + offset)[use]
+    speed = (np.interp(at + SLOPE_S, times, positions) - np.interp(at - SLOPE_S, times, positions)) / (
+        2.0 * SLOPE_S
+    )
+    return np.asarray(speed - speed.mean()) if len(speed) else speed
