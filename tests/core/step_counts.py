@@ -92,6 +92,16 @@ def counts(model_path: Path, markers: int, measure: Literal["lines", "bytes"]) -
     def replies(outputs: list[StepOutputs]) -> list[Any]:
         return [event for output in outputs for event in output.events if event.kind == "reply"]
 
+    def answered(name: str, asked: Goal) -> None:
+        """Ask for a goal, and go on until it is answered: of a large body after some steps."""
+        answers = replies(run(name, RunGoal(asked)))
+        for _ in range(100):
+            if answers:
+                break
+            answers = replies([loop.step()])
+        if not (answers and answers[0].accepted):
+            raise RuntimeError(f"goal of {name}: {[answer.message for answer in answers]}")
+
     core.name = "model"
     loop.take_model()
     run("steps", steps=12)
@@ -110,11 +120,9 @@ def counts(model_path: Path, markers: int, measure: Literal["lines", "bytes"]) -
         ("joints", JointTarget({"j1": float(cell.home[0]) + 0.1})),
         ("incidence", IncidenceTarget((corner,), model_epoch=model.epoch)),
     ):
-        answers = replies(run(name, RunGoal(goal(name, target, check=True)), steps=3))
-        if not (answers and answers[0].accepted):
-            raise RuntimeError(f"goal of {name}: {[answer.message for answer in answers]}")
+        answered(name, goal(name, target, check=True))
     here = goal("here", loop.target_at(0.0), law="cartesian3")
-    run("here", RunGoal(here), steps=3)
+    answered("here", here)
     run("update", UpdateGoal(here.id, loop.target_at(0.001)))
     run("steps", steps=12)
     run("cancel", CancelGoal(here.id))

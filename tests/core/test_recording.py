@@ -207,6 +207,18 @@ def test_a_recording_of_before_models_had_groups_replays(benches: Any, tmp_path:
     assert not is_recorded(bench.core.state, msgspec.msgpack.encode(changed))
 
 
+def test_a_state_of_before_goals_were_resolved_in_parts_is_read(bench: Any) -> None:
+    bench.ready()
+    bench.step(RunGoal(Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(bench.q + 0.1)))))
+    state = msgspec.msgpack.decode(encode_state(bench.core.state))
+    del state["planning"]["goal"], state["planning"]["resolution"]
+    of_then = msgspec.msgpack.encode(state)
+    assert is_recorded(bench.core.state, of_then)
+    planned = decode_state(of_then).planning
+    assert planned is not None
+    assert planned.goal.id == str(uuid.UUID(int=1))
+
+
 def of_version(version: int) -> bytes:
     """A state of another version, which holds other fields, too."""
     return msgspec.msgpack.encode({"version": version, "step": 3, "something_else": [1, 2]})

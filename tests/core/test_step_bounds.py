@@ -1,4 +1,4 @@
-"""What a step of the core does grows no faster than the markers: counted in lines and bytes, never in time."""
+"""What a step of the core does is bounded, and grows no faster than the markers: counted, never in time."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from stereoservo.control.marker_groups import with_groups
+from stereoservo.core.cycle import StepInputs, StepOutputs, encode
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.state import decode_state, encode_state
 from stereoservo.kinematics.model import save_model
-from stereoservo_sim.benchmarks.core_loop import rx90_with_facets
+from stereoservo_sim.benchmarks.core_loop import PARTS, CoreLoop, rx90_with_facets
 from stereoservo_sim.world.exact_model import exact_model
 
+from .operation_counts import recorded
 from .step_counts import counts
 
 SIZES = (4, 16, 64, 256)
@@ -24,6 +29,11 @@ GROWTH = 1.5
 """By how much the work of a marker may grow from one size to the next, four times as large: m log m, and no m²."""
 ONCE = {"lines": 120_000, "bytes": 1_000_000}
 """What a step may do whatever the body: every three of the 24 markers that are tried, in two cameras."""
+
+
+MOST_LINES = {"kernels": 5_000_000, "Python": 10_000}
+"""Of one step in the largest cell (256 markers, 8 cameras, 12 joints); `bench cycle` tells how long they take."""
+COSTLIEST = ("model", "moving, frames", "moving, way begun", "moving, update")
 
 
 def of_lines(model: Path, markers: int) -> dict[str, int]:
@@ -65,3 +75,51 @@ def test_no_step_grows_faster_than_its_markers(
                 before,
                 after,
             )
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    "kinds", [COSTLIEST, pytest.param((), marks=pytest.mark.slow)], ids=["costliest", "all"]
+)
+def test_no_step_in_the_largest_cell_does_more_than_is_stated(kinds: tuple[str, ...], tmp_path: Path) -> None:
+    path = tmp_path / "steps.msgpack"
+    done = recorded(path, kinds)
+    assert set(kinds) <= set(done)
+    script = Path(__file__).with_name("operation_counts.py")
+    run = subprocess.run(
+        [sys.executable, str(script), str(path)],
+        capture_output=True, text=True, check=False, env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    found: dict[str, tuple[int, int]] = json.loads(run.stdout)
+    print(json.dumps(found))
+    assert set(found) == set(done)
+    for kind, (kernels, other) in found.items():
+        assert 0 < kernels <= MOST_LINES["kernels"], (kind, kernels)
+        assert 0 < other <= MOST_LINES["Python"], (kind, other)
+
+
+def test_a_goal_of_a_large_body_goes_on_from_every_state_bit_for_bit() -> None:
+    class Twin(CoreLoop):
+        """Runs each step a second time, by a core whose state has been written and read."""
+
+        again: StepOutputs | None = None
+
+        def before(self, kind: str, inputs: StepInputs) -> None:
+            copied = decode_state(encode_state(self.core.state))
+            self.again = ServoCore(self.core.settings, copied).step(inputs)
+
+        def step(self, **inputs: Any) -> StepOutputs:
+            outputs = super().step(**inputs)
+            assert encode(self.again) == encode(outputs)
+            return outputs
+
+    cell = rx90_with_facets(256, 4)
+    loop = Twin(cell, 0, with_groups(exact_model(cell)))
+    for number in range(2):  # the second one preempts the first
+        loop.start_goal("cartesian3", number)
+        for _ in range(3):
+            loop.step()
+    kinds = {kind for kind, _ in loop.times}
+    assert {*PARTS, "way begun", "told"} <= kinds
+    assert {f"moving, {part}" for part in (*PARTS, "way begun", "told")} <= kinds

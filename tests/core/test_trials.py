@@ -14,7 +14,9 @@ from stereoservo.core.sources.calibration import enough_inside, extrapolated, pl
 from stereoservo.core.sources.check import check_targets
 from stereoservo.core.sources.trial_stops import combined_offsets, stop_offset
 from stereoservo.core.state import decode_state, encode_state
-from stereoservo.messages.goals import Calibrate, Enable, Home, RenewGoal
+from stereoservo.messages.goals import Calibrate, Enable, Home, JointTarget, RenewGoal
+
+from .conftest import BASE
 
 GOAL = "00000011"
 ENDS = ("calibration_finished", "calibration_aborted", "check_finished")
@@ -269,3 +271,25 @@ def test_check_needs_a_model_and_keeps_inside_the_limits(bench: Any) -> None:
     settings = msgspec.structs.replace(bench.settings, limits=limits)
     targets = check_targets(settings, bench.truth.model)
     assert (targets < limits.position_max - limits.position_margin).all()
+
+
+def test_trials_that_preempt_a_fast_goal_brake_at_the_acceleration_limit_and_are_slow_from_there(
+    bench: Any,
+) -> None:
+    with_trials(bench, speed_scale=0.1)
+    bench.run(0.1)
+    bench.step(Enable())
+    assert bench.reply(bench.goal(JointTarget({"j1": 2.0, "j2": float(BASE[1]) + 1.0}))).accepted
+    bench.run(0.6)
+    limits = bench.settings.limits
+    slow, change = 0.1 * limits.velocity_max[0], limits.acceleration_max[0] / bench.settings.rate_hz
+    before = float(np.abs(bench.commands[-1]).max())
+    assert before > 5.0 * slow
+    bench.commands.clear()
+    assert bench.reply(Calibrate(GOAL)).accepted
+    bench.run(2.0)
+    speeds = np.abs(bench.commands).max(axis=1)
+    braking = before - change * np.arange(1, len(speeds) + 1)
+    assert (speeds <= np.maximum(braking, slow) + 1e-9).all()
+    assert speeds[0] > slow
+    assert speeds[-1] > 0.0

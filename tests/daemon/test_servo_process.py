@@ -17,7 +17,6 @@ from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
-    STATE_LAYOUT,
     Ask,
     Heartbeat,
     Hello,
@@ -34,6 +33,7 @@ from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Command, Enable, Jog, Request, Reset, Resume
+from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import (

@@ -8,7 +8,6 @@ import pytest
 
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
-    STATE_LAYOUT,
     PlanError,
     RunPlan,
     load_plan,
@@ -17,6 +16,7 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_stop_slot
 from stereoservo.daemon.supervisor import restore
 from stereoservo.messages.cell_file import check_cell
+from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointSpec
 
 CELL = check_cell(

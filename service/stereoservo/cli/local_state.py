@@ -10,6 +10,7 @@ import msgspec
 from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.servo_state import STATE_LAYOUT, decode_state, read_run, state_message
 from stereoservo.messages.wire import StateMessage
 
 AGAIN_S = 0.2
@@ -55,19 +56,15 @@ def _silent(directories: CellDirectories, process: str, usual_s: float) -> str:
 
 def newest_state(directories: CellDirectories) -> StateMessage | None:
     """The newest state that the servo process wrote, as the gateway would tell it; None where it cannot be read."""
-    # All the numerical libraries, for a cell that is in trouble only.
-    from stereoservo.daemon.ipc_messages import STATE_LAYOUT, PlanError, load_plan, state_decoder
-    from stereoservo.gateway.publisher import state_message
-
     try:
-        plan = load_plan(directories.runtime)
+        run = read_run(directories.runtime)
         reader = SlotReader(directories.state_slot, STATE_LAYOUT)
         record = reader.newest()
         reader.close()
         if record is None:
             return None
-        state = state_decoder.decode(record)
-    except (PlanError, SlotError, msgspec.MsgspecError):
+        state = decode_state(record)
+    except (OSError, ValueError, SlotError, msgspec.MsgspecError):
         return None
     alive = not servo_silence(directories)
-    return state_message(plan, plan.boot, state, servo_alive=alive, last_event=0)
+    return state_message(run, run.boot, state, servo_alive=alive, last_event=0)

@@ -21,6 +21,11 @@ CLEARLY_BETTER = 2.0
 """Ratio of image areas from which on another triangle takes over."""
 MOST_TRIED = 24
 """Markers of a face of which every three are tried; of more, so many that are spread out in the images."""
+LEAST_TRIED = 6
+LOOKS = 32_768
+"""Triangles times cameras of one choice, at most: of a body with many large faces fewer markers of each are tried, but
+`LEAST_TRIED`.
+"""
 LASTING = 8.0
 """How many times its area a triangle counts that shows its front at the goal too."""
 
@@ -121,6 +126,29 @@ def spread_in_images(
 
 
 @kernel
+def markers_tried(members: FloatArray, usable: FloatArray, cameras: int) -> int:
+    """Of how many ``usable`` (m,) markers of each face every three are tried: `MOST_TRIED`, or as `LOOKS` allows.
+
+    ``members`` (f, m).
+    """
+    sizes = np.zeros(members.shape[0], np.int64)
+    for f in range(members.shape[0]):
+        for i in range(members.shape[1]):
+            if usable[i] > 0.0 and members[f, i] > 0.0:
+                sizes[f] += 1
+    most = MOST_TRIED
+    while most > LEAST_TRIED:
+        looks = 0
+        for f in range(sizes.shape[0]):
+            k = min(sizes[f], most)
+            looks += cameras * (k * (k - 1) * (k - 2) // 6)
+        if looks <= LOOKS:
+            break
+        most -= 1
+    return most
+
+
+@kernel
 def choose_triangle(
     members: FloatArray,
     lasting: FloatArray,
@@ -138,6 +166,7 @@ def choose_triangle(
     best = np.zeros(3, np.int64)
     best_face, best_count, best_area = -1, 0, 0.0
     candidates = np.empty(markers, np.int64)
+    most = markers_tried(members, usable, weights.shape[0])
     # faces first; across faces only where none is seen
     for f in range(faces + 1):
         if f == faces and best_count > 0:
@@ -147,7 +176,7 @@ def choose_triangle(
             if usable[i] > 0.0 and (f == faces or members[f, i] > 0.0):
                 candidates[found] = i
                 found += 1
-        tried = spread_in_images(candidates[:found], pixels, weights)
+        tried = spread_in_images(candidates[:found], pixels, weights, most if f < faces else MOST_TRIED)
         for a in range(tried.shape[0]):
             for b in range(a + 1, tried.shape[0]):
                 for c in range(b + 1, tried.shape[0]):

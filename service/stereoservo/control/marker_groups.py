@@ -14,6 +14,7 @@ step.
 from __future__ import annotations
 
 import math
+from itertools import chain
 from typing import NamedTuple
 
 import msgspec
@@ -159,12 +160,15 @@ def groups_of(model: CellModel) -> MarkerGroups | None:
     given = model.marker_groups
     if not given:
         return None if given is None else no_groups()
+    members = [group.members for group in given]
+    triples = np.fromiter(chain.from_iterable(group.triple for group in given), np.int64, 3 * len(given))
+    sides = np.fromiter(chain.from_iterable((g.above, g.below) for g in given), np.int64, 2 * len(given))
     return MarkerGroups(
-        np.array([group.triple for group in given], dtype=np.int64),
-        np.cumsum([0, *(len(group.members) for group in given)], dtype=np.int64),
-        np.array([i for group in given for i in group.members], dtype=np.int64),
-        np.array([(group.above, group.below) for group in given], dtype=np.int64),
-        np.array([group.roundness for group in given]),
+        triples.reshape(-1, 3),
+        np.cumsum([0, *map(len, members)], dtype=np.int64),
+        np.fromiter(chain.from_iterable(members), np.int64),
+        sides.reshape(-1, 2),
+        np.fromiter((group.roundness for group in given), np.float64, len(given)),
     )
 
 

@@ -162,7 +162,7 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
     at_shutter = joints_at(state.history, shutter_ns)
     if arrays is None or at_shutter is None:
         return
-    prediction = predict(arrays, at_shutter)
+    prediction = predict(arrays, at_shutter, camera)
     motion = motion_at(state.history, shutter_ns)
     speed = state.velocities if motion is None else motion
     sights = frame_sights(arrays, camera, ideal_observation(arrays, camera, observation), prediction, speed)
@@ -175,7 +175,7 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
         _follow_offset(camera, context)
     if not _unknown(camera, state, settings):
         used = state.watching.masked == 0.0
-        common = common_change(estimate, sights, used, prediction.jacobian[camera], arrays)
+        common = common_change(estimate, sights, used, prediction.jacobian[0], arrays)
         accept_sights(estimate, sights, used, settings, common)
 
 
@@ -222,8 +222,4 @@ def masked_ids(state: CoreState) -> tuple[int, ...]:
     """Ids of markers that are not used."""
     if state.model is None:
         return ()
-    return tuple(
-        marker
-        for marker, masked in zip(state.model.marker_ids, state.watching.masked, strict=True)
-        if masked > 0.0
-    )
+    return tuple(state.model.marker_ids[int(i)] for i in np.flatnonzero(state.watching.masked > 0.0))

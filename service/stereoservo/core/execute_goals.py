@@ -12,10 +12,9 @@ from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.accept import (
     accept,
     answer_waiting,
-    prepare,
+    enqueue,
     report_without_plan,
     require_motion_allowed,
-    trusted_model,
 )
 from stereoservo.core.goals.execute import (
     begin,
@@ -25,7 +24,8 @@ from stereoservo.core.goals.execute import (
     end_source,
 )
 from stereoservo.core.goals.marker_body import BodyState, place_now
-from stereoservo.core.goals.plan import begin_plan, go_on_planning, plan_report
+from stereoservo.core.goals.plan import go_on_planning, plan_again, plan_report
+from stereoservo.core.goals.prepare import prepare, set_up, trusted_model
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.sources.law import awaits_plan
 from stereoservo.core.state import (
@@ -35,7 +35,7 @@ from stereoservo.core.state import (
     ServoGoal,
     Source,
 )
-from stereoservo.messages.goals import Goal
+from stereoservo.messages.goals import Goal, PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 
@@ -125,36 +125,65 @@ def _watch_leases(context: StepContext) -> None:
 
 def _plan_on(job: PlanJob, context: StepContext) -> None:
     state = context.state
-    if not go_on_planning(job):
+    if job.resolution is not None and job.goal.id in context.goals_read:
+        return  # of a large body: its markers' faces were this step's work
+    try:
+        if job.planning is None:
+            if not set_up(job, context) or job.planning is not None:
+                return
+        elif not go_on_planning(job):
+            return
+        trusted_model(context)
+        report = _report_of(job, context)
+    except RefusalError as refusal:
+        state.planning = None
+        _refused(job, refusal, context)
         return
     state.planning = None
-    goal = job.source.goal
+    _end_job(job, report, context)
+
+
+def _report_of(job: PlanJob, context: StepContext) -> PlanReport | None:
+    """Of a goal that is looked at: its plan, and of those that cannot be planned why. Raises RefusalError."""
+    assert job.source is not None
+    if job.planning is not None:
+        return plan_report(job, context)
+    return None if job.purpose == "enqueue" else report_without_plan(job.source, context)
+
+
+def _end_job(job: PlanJob, report: PlanReport | None, context: StepContext) -> None:
+    """Do what a goal was looked at for."""
+    state, source, goal = context.state, job.source, job.goal
+    assert source is not None
     try:
-        trusted_model(context)
-        report = plan_report(job, context)
-        if job.purpose == "reply":
-            _fresh(job, context)
-            message, _ = accept(goal, job.source, report, context)
-            context.emit(
-                "reply", request=job.request, accepted=True, id=goal.id, message=message, plan=report
-            )
+        message = ""
+        if job.purpose == "enqueue":
+            message = enqueue(goal, context)
+        elif job.purpose == "reply":
+            _fresh(job, source, context)
+            message, _ = accept(goal, source, report, context)
         elif job.purpose == "queue":
-            begin(job.source, context)  # in hold, too: it waits to be resumed
+            begin(source, context)  # in hold, too: it waits to be resumed
+        elif job.purpose == "ahead" and source.pose_known:
+            state.ahead = source
         elif job.purpose == "ahead":
-            state.ahead = job.source
+            state.not_ahead = goal.id
     except RefusalError as refusal:
         _refused(job, refusal, context)
+        return
+    if message:
+        context.emit("reply", request=job.request, accepted=True, id=goal.id, message=message, plan=report)
 
 
-def _fresh(job: PlanJob, context: StepContext) -> None:
+def _fresh(job: PlanJob, source: ServoGoal, context: StepContext) -> None:
     """A way that is followed begins where the arm rests: one that has moved since plans anew when it rests."""
-    if job.source.plan is not None and bool((np.abs(context.q - job.joints) > MOVED_SINCE).any()):
-        job.source.plan = None
+    if source.plan is not None and bool((np.abs(context.q - job.joints) > MOVED_SINCE).any()):
+        source.plan = None
 
 
 def _refused(job: PlanJob, refusal: RefusalError, context: StepContext) -> None:
-    goal, state = job.source.goal, context.state
-    if job.purpose == "reply":
+    goal, state = job.goal, context.state
+    if job.purpose in ("reply", "enqueue"):
         context.emit(
             "reply", request=job.request, accepted=False, id=goal.id, message=str(refusal), reasons=refusal.reasons,
             plan=refusal.plan,
@@ -177,7 +206,7 @@ def _next_plan(context: StepContext) -> None:
         if bool((np.abs(state.command) < AT_REST).all()) and bool(
             (np.abs(state.velocities) < 10 * AT_REST).all()
         ):
-            state.planning = begin_plan(source, context, place_now(context), context.q, "again", -1)
+            state.planning = plan_again(source, context)
         return
     if state.held:
         return
@@ -186,9 +215,9 @@ def _next_plan(context: StepContext) -> None:
         state.queued_until_ns.pop(goal.id, None)
         try:
             require_motion_allowed(context)
-            prepared, place = prepare(goal, context)
-            if isinstance(prepared, ServoGoal) and prepared.pose_known and place is not None:
-                state.planning = begin_plan(prepared, context, place, context.q, "queue", -1)
+            prepared = prepare(goal, context, "queue")
+            if isinstance(prepared, PlanJob):
+                state.planning = prepared
             else:
                 report_without_plan(prepared, context)
                 begin(prepared, context)
@@ -226,12 +255,12 @@ def _plan_ahead(goal: Goal, source: Source, context: StepContext) -> None:
     now = place_now(context)
     place = BodyState(now.settings, now.arrays, source.target_points, now.operators, now.faces)
     try:
-        prepared, _ = prepare(goal, context, place)
+        prepared = prepare(goal, context, "ahead", place=place, joints=source.goal_joints)
     except RefusalError:
         state.not_ahead = goal.id  # told when its turn comes
         return
-    if isinstance(prepared, ServoGoal) and prepared.pose_known:
-        state.planning = begin_plan(prepared, context, place, source.goal_joints, "ahead", -1)
+    if isinstance(prepared, PlanJob):
+        state.planning = prepared
     else:
         state.not_ahead = goal.id
 

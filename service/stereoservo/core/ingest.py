@@ -7,6 +7,8 @@ of the future is wrong, however little. What is refused is not stored, so that o
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stereoservo.core.context import Ingested, StepContext
@@ -16,6 +18,7 @@ from stereoservo.core.state import HISTORY, LEAST_APART_NS, CoreState, JointHist
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation, JointState
 
 VELOCITY_FILTER_S = 0.01
@@ -314,19 +317,35 @@ def _wrong_sights(observation: CameraObservation, camera: CameraSettings) -> str
     pixels, covariances = observation.pixels, observation.covariances
     if pixels.shape != (count, 2) or covariances.shape != (count, 2, 2):
         return f"{count} markers have pixels {pixels.shape} and covariances {covariances.shape}"
-    inside = np.abs(pixels / (camera.width, camera.height) - 0.5).max(axis=1, initial=0.0) <= 1.5
-    largest = np.abs(covariances).reshape(count, 4).max(axis=1, initial=0.0).reshape(count, 1, 1)
-    known = np.where(largest <= LARGEST_SIGMA_PX**2, covariances, 0.0)
-    determinants = known[:, 0, 0] * known[:, 1, 1] - known[:, 0, 1] * known[:, 1, 0]
-    precise = (known[:, 0, 0] > 0.0) & (determinants > 0.0)
-    outside, vague = np.flatnonzero(~inside), np.flatnonzero(~precise)
-    if not outside.size + vague.size:
-        return ""
-    k = int(outside[0] if outside.size else vague[0])
-    marker = observation.ids[k]
-    if outside.size:
-        return f"marker {marker} is at {pixels[k].tolist()} in an image of {camera.width}x{camera.height}"
-    return f"marker {marker} has the covariance {covariances[k].tolist()}"
+    outside, vague = _first_wrong(
+        np.ascontiguousarray(pixels, dtype=np.float64), np.ascontiguousarray(covariances, dtype=np.float64),
+        float(camera.width), float(camera.height),
+    )  # fmt: skip
+    if outside >= 0:
+        marker, at = observation.ids[outside], pixels[outside].tolist()
+        return f"marker {marker} is at {at} in an image of {camera.width}x{camera.height}"
+    if vague >= 0:
+        return f"marker {observation.ids[vague]} has the covariance {covariances[vague].tolist()}"
+    return ""
+
+
+@kernel
+def _first_wrong(pixels: FloatArray, covariances: FloatArray, width: float, height: float) -> tuple[int, int]:
+    """The first of ``pixels`` (k, 2) farther from the image than its own size, and the first of ``covariances``
+    (k, 2, 2) that is none; -1 where there is none such.
+    """
+    outside, vague = -1, -1
+    for k in range(pixels.shape[0]):
+        u, v = pixels[k, 0] / width - 0.5, pixels[k, 1] / height - 0.5
+        if outside < 0 and not (abs(u) <= 1.5 and abs(v) <= 1.5):
+            outside = k
+        C = covariances[k]
+        largest = max(abs(C[0, 0]), abs(C[0, 1]), abs(C[1, 0]), abs(C[1, 1]))
+        numbers = math.isfinite(C[0, 0] + C[0, 1] + C[1, 0] + C[1, 1])
+        known = numbers and largest <= LARGEST_SIGMA_PX * LARGEST_SIGMA_PX
+        if vague < 0 and not (known and C[0, 0] > 0.0 and C[0, 0] * C[1, 1] - C[0, 1] * C[1, 0] > 0.0):
+            vague = k
+    return outside, vague
 
 
 def _impossible_frame(observation: CameraObservation, wrong: str) -> Reason:

@@ -16,7 +16,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
 from stereoservo.kinematics.model import CellModel, lens_size
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,15 @@ class ModelArrays:
     scene_points: FloatArray
     scene_pixels: FloatArray
     """Static points in the images (c, s, 2): they never move there."""
-    rows: dict[int, int]
-    """Rows of `FrameResiduals`: the markers, then the static points."""
+    row_ids: IntArray
+    """Ids of the markers and static points (k,), ascending; ``row_of`` (k,): their rows in `FrameResiduals`, which has
+    the markers, then the static points.
+    """
+    row_of: IntArray
     groups: MarkerGroups | None
     """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
+    sights: int
+    """Markers times cameras: what the work of a step grows with."""
     joint_accuracy: JointAccuracy | None
     """Errors of joint readings, where the trials have shown some; none larger than `LARGEST_JOINT_ERROR`."""
     joint_variances: FloatArray
@@ -117,6 +122,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
     scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
     scene_pixels, _ = project_points(matrices, scene)
     accuracy = _bounded_accuracy(model)
+    row_ids, row_of = rows_by_id((*model.marker_ids, *model.scene_ids))
     return ModelArrays(
         generators=np.ascontiguousarray(model.generators, dtype=np.float64),
         kinds=np.array([kind == "prismatic" for kind in model.joint_kinds], dtype=np.uint8),
@@ -134,13 +140,22 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         scene_ids=model.scene_ids,
         scene_points=scene,
         scene_pixels=scene_pixels,
-        rows={marker: i for i, marker in enumerate((*model.marker_ids, *model.scene_ids))},
+        row_ids=row_ids,
+        row_of=row_of,
         groups=groups_of(model),
+        sights=len(model.marker_ids) * len(matrices),
         joint_accuracy=accuracy,
         joint_variances=np.zeros(len(model.zero))
         if accuracy is None
         else accuracy.stated**2 + accuracy.posture**2,
     )
+
+
+def rows_by_id(ids: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+    """The ``ids`` (k,), ascending, and the place of each among those given."""
+    given = np.array(ids, dtype=np.int64)
+    order = np.argsort(given, kind="stable")
+    return given[order], order
 
 
 LARGEST_JOINT_ERROR = 0.1

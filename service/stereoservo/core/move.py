@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.goals.resolve import unplanned_report
+from stereoservo.core.goals.servoing import unplanned_report
 from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step
 from stereoservo.core.sources.incidence import incidence_motion, incidence_report

@@ -69,12 +69,12 @@ def chain_at(arrays: ModelArrays, q: FloatArray) -> tuple[FloatArray, FloatArray
     return found
 
 
-def predict(arrays: ModelArrays, q: FloatArray) -> Prediction:
-    """Bring the projective kinematics to ``q`` (5.21) and predict every marker in every camera (8.35)."""
+def predict(arrays: ModelArrays, q: FloatArray, camera: int | None = None) -> Prediction:
+    """Bring the projective kinematics to ``q`` (5.21) and predict every marker in every camera, or in one (8.35)."""
     return Prediction(
         *_predict(
             arrays.generators, arrays.kinds, arrays.zero, np.ascontiguousarray(q), arrays.tip_first,
-            arrays.marker_points, arrays.matrices,
+            arrays.marker_points, arrays.matrices if camera is None else arrays.matrices[camera : camera + 1],
         )
     )  # fmt: skip
 
@@ -167,11 +167,11 @@ def ideal_observation(arrays: ModelArrays, camera: int, observation: CameraObser
     lens = arrays.lenses[camera]
     if len(lens) == 4 and lens[0] == 0.0:
         return observation
-    pixels, covariances, seen = undistort_sights(
-        lens,
-        np.array(observation.pixels, dtype=np.float64),
-        np.array(observation.covariances, dtype=np.float64),
+    pixels, covariances = (
+        np.array(observation.pixels, np.float64),
+        np.array(observation.covariances, np.float64),
     )
+    pixels, covariances, seen = undistort_sights(lens, pixels, covariances)
     return msgspec.structs.replace(
         observation, ids=observation.ids[seen], pixels=pixels[seen], covariances=covariances[seen]
     )
@@ -200,20 +200,26 @@ def frame_sights(
     prediction: Prediction,
     speed: FloatArray,
 ) -> FrameResiduals:
-    """Innovations of an observation in ideal pixels against the ``prediction`` at its shutter.
+    """Innovations of an observation in ideal pixels against the ``prediction`` of this camera at its shutter.
 
     ``speed`` (n,): of the joints then.
     """
-    rows = np.array([arrays.rows.get(i, -1) for i in observation.ids.tolist()], dtype=np.int64)
-    standing = np.zeros((len(arrays.scene_ids), *prediction.jacobian.shape[2:]))
-    innovation, spread, seen, velocity = innovations(
+    rows = rows_of(observation.ids.astype(np.int64), arrays.row_ids, arrays.row_of)
+    innovation, spread, noise, seen, velocity = innovations(
         rows, np.ascontiguousarray(observation.pixels), np.ascontiguousarray(observation.covariances),
-        np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])),
-        np.concatenate((prediction.jacobian[camera], standing)), speed, TIMING_SIGMA_S,
+        prediction.pixels[0], arrays.scene_pixels[camera], prediction.jacobian[0], speed, TIMING_SIGMA_S,
     )  # fmt: skip
-    noise, known = np.ones(seen.size), rows >= 0
-    noise[rows[known]] = 0.5 * (observation.covariances[known, 0, 0] + observation.covariances[known, 1, 1])
     return FrameResiduals(observation.t_shutter_ns, innovation, spread, noise, seen, velocity)
+
+
+@kernel
+def rows_of(ids: IntArray, known: IntArray, rows: IntArray) -> IntArray:
+    """Of each of the ``ids`` (k,): its row among those that are ``known`` (m,), ascending, or -1."""
+    found = np.empty(ids.size, np.int64)
+    for k in range(ids.size):
+        at = np.searchsorted(known, ids[k])
+        found[k] = rows[at] if at < known.size and known[at] == ids[k] else -1
+    return found
 
 
 def fold_residuals(watching: ModelMonitor, camera: int, sights: FrameResiduals, q: FloatArray) -> None:
@@ -234,14 +240,7 @@ def fold_residuals(watching: ModelMonitor, camera: int, sights: FrameResiduals, 
     sighting.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
     sighting.worst = int(worst)
     sighting.worst_px = 0.0 if worst < 0 else float(np.sqrt((sighting.innovation[worst] ** 2).sum()))
-    rows = used > 0.0
-    fold_timing(
-        sighting.timing,
-        sighting.innovation[rows],
-        sights.velocity[rows],
-        sights.noise[rows],
-        sights.t_shutter_ns,
-    )
+    fold_timing(sighting.timing, sights, used)
 
 
 def used_rows(watching: ModelMonitor, sighting: CameraMonitor) -> FloatArray:
@@ -257,15 +256,13 @@ MOVING_PX_S = 20.0
 """Mean pixel speed below which a frame says nothing of time."""
 
 
-def fold_timing(
-    timing: CameraTiming, innovations: FloatArray, velocities: FloatArray, variances: FloatArray, t_ns: int
-) -> None:
-    """Take in a frame: ``innovations`` [px] and ``velocities`` [px/s] (k, 2), ``variances`` (k,) [px²] a coordinate.
+def fold_timing(timing: CameraTiming, sights: FrameResiduals, used: FloatArray) -> None:
+    """Take in the rows of a frame that are ``used`` (k,) > 0.
 
     The markers of a frame share what the model is off by: they count as one sight, not as k.
     """
-    k = variances.shape[0]
-    speed, product, square = _timing_sums(innovations, velocities, variances)
+    t_ns = sights.t_shutter_ns
+    k, speed, product, square = _timing_sums(sights.innovation, sights.velocity, sights.noise, used)
     if k == 0 or speed < MOVING_PX_S * k:
         return
     elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns else 0.0
@@ -277,17 +274,22 @@ def fold_timing(
 
 @kernel
 def _timing_sums(
-    innovations: FloatArray, velocities: FloatArray, variances: FloatArray
-) -> tuple[float, float, float]:
-    """Sums over a frame's markers: pixel speeds, and of the weighted fit of innovations to velocities."""
-    speed, product, square = 0.0, 0.0, 0.0
+    innovations: FloatArray, velocities: FloatArray, variances: FloatArray, used: FloatArray
+) -> tuple[int, float, float, float]:
+    """How many markers of a frame are ``used`` (k,) > 0, and sums over these: pixel speeds, and of the weighted fit of
+    innovations to velocities.
+    """
+    count, speed, product, square = 0, 0.0, 0.0, 0.0
     for i in range(variances.shape[0]):
+        if not used[i] > 0.0:
+            continue
+        count += 1
         vu, vv = velocities[i, 0], velocities[i, 1]
         speed += math.sqrt(vu * vu + vv * vv)
         weight = 1.0 / (variances[i] + MODEL_SIGMA_PX * MODEL_SIGMA_PX)
         product += weight * (vu * innovations[i, 0] + vv * innovations[i, 1])
         square += weight * (vu * vu + vv * vv)
-    return speed, product, square
+    return count, speed, product, square
 
 
 @kernel
@@ -344,12 +346,9 @@ COMMON_ROUNDS = 8
 
 
 def common_change(
-    estimate: CameraEstimate,
-    sights: FrameResiduals,
-    used: BoolArray,
-    jacobian: FloatArray,
+    estimate: CameraEstimate, sights: FrameResiduals, used: BoolArray, jacobian: FloatArray,
     arrays: ModelArrays,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Change of the innovations (m, 2) [px] since the filtered ones that joints explain which pass through their play
     or step, within the errors that the model states of them; zeros where it states none, or where nothing changed.
 
@@ -357,8 +356,10 @@ def common_change(
     """
     m, n = used.size, jacobian.shape[2]
     none = np.zeros((m, 2))
-    known = used & (estimate.seen_ns > 0)
-    if arrays.joint_accuracy is None or int((rows := sights.seen[:m] & known).sum()) < 3:
+    if arrays.joint_accuracy is None:
+        return none
+    rows = sights.seen[:m] & used & (estimate.seen_ns > 0)
+    if int(rows.sum()) < 3:
         return none
     change = (sights.innovation[:m] - estimate.innovation)[rows]
     variance = MODEL_SIGMA_PX**2 + 0.5 * (sights.spread[:m][rows, 0, 0] + sights.spread[:m][rows, 1, 1])
@@ -382,12 +383,8 @@ def common_change(
 def marker_weights(cameras: list[CameraEstimate], now_ns: int, coast_s: float) -> FloatArray:
     """(c, m) 1/sigma [1/px] of markers that a camera saw within ``coast_s``, 0 elsewhere."""
     limit = int(coast_s * 1e9) + 50_000_000
-    return np.array(
-        [
-            np.where((e.seen_ns > 0) & (now_ns - e.seen_ns <= limit), 1.0 / np.maximum(e.sigma, 1e-3), 0.0)
-            for e in cameras
-        ]
-    )
+    seen_ns, sigma = np.array([e.seen_ns for e in cameras]), np.array([e.sigma for e in cameras])
+    return np.where((seen_ns > 0) & (now_ns - seen_ns <= limit), 1.0 / np.maximum(sigma, 1e-3), 0.0)
 
 
 def pixels_now(prediction: Prediction, cameras: list[CameraEstimate]) -> FloatArray:
@@ -493,36 +490,37 @@ def distance2(x: float, y: float, a: float, b: float, c: float) -> float:
 
 @kernel
 def innovations(
-    rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, jacobian: FloatArray,
-    speed: FloatArray, timing_s: float,
-) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:  # fmt: skip
-    """Of each marker of the model: observed less ``predicted`` (m, 2) [px], its covariance (m, 2, 2) by detector and
-    timing, whether it was seen (m,), and its velocity (m, 2) [px/s].
+    rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, standing: FloatArray,
+    jacobian: FloatArray, speed: FloatArray, timing_s: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray]:  # fmt: skip
+    """The fields of `FrameResiduals`, k rows: observed less ``predicted`` (m, 2) or ``standing`` (s, 2) [px].
 
-    ``rows`` (k,): the model's marker of each sight, or -1. ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter
-    stamp that is off by ``timing_s`` [s] moves.
+    ``rows``: the row of each sight, or -1. ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter stamp that is off by
+    ``timing_s`` [s] moves.
     """
-    m, n = jacobian.shape[0], jacobian.shape[2]
+    markers, n = jacobian.shape[0], jacobian.shape[2]
+    m = markers + standing.shape[0]
     innovation, spread, velocity = np.zeros((m, 2)), np.zeros((m, 2, 2)), np.zeros((m, 2))
-    seen = np.zeros(m, dtype=np.bool_)
+    seen, noise = np.zeros(m, dtype=np.bool_), np.ones(m)
     for k in range(rows.size):
         i = rows[k]
         if i < 0:
             continue
         seen[i] = True
+        noise[i] = 0.5 * (covariances[k, 0, 0] + covariances[k, 1, 1])
         for a in range(2):
-            innovation[i, a] = pixels[k, a] - predicted[i, a]
+            innovation[i, a] = pixels[k, a] - (predicted[i, a] if i < markers else standing[i - markers, a])
         u = v = 0.0
         for j in range(n):
-            u += jacobian[i, 0, j] * speed[j]
-            v += jacobian[i, 1, j] * speed[j]
+            u += jacobian[i, 0, j] * speed[j] if i < markers else 0.0
+            v += jacobian[i, 1, j] * speed[j] if i < markers else 0.0
         velocity[i, 0], velocity[i, 1] = u, v
         t = timing_s * timing_s
         spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
         spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
         spread[i, 1, 0] = spread[i, 0, 1]
         spread[i, 1, 1] = covariances[k, 1, 1] + t * v * v
-    return innovation, spread, seen, velocity
+    return innovation, spread, noise, seen, velocity
 
 
 @kernel

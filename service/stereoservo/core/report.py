@@ -242,13 +242,11 @@ def priors(
     for camera, estimate in enumerate(cameras):
         if settings.cameras[camera].name in unknown:
             continue
-        speed = (prediction.jacobian[camera] * velocities).sum(axis=-1)
-        fresh = (now_ns - estimate.seen_ns <= 1_000_000_000) & (estimate.seen_ns > 0)
-        unseen_px = _unseen_sigma(prediction.jacobian[camera], arrays)
-        sigma = np.where(fresh, 1.0, unseen_px) + TIMING_SIGMA_S * np.abs(speed).max(axis=-1)
-        covariance = np.zeros((ids.size, 2, 2))
-        covariance[:, 0, 0] = covariance[:, 1, 1] = sigma * sigma
-        pixels = prediction.pixels[camera] + np.where(fresh[:, None], estimate.innovation, 0.0)
+        jacobian = prediction.jacobian[camera]
+        pixels, speed, covariance = expected_sights(
+            prediction.pixels[camera], jacobian, velocities, estimate.innovation, now_ns - estimate.seen_ns,
+            estimate.seen_ns, _unseen_sigma(jacobian, arrays),
+        )  # fmt: skip
         # The vision process asks for the stamps that the camera tells.
         stamp_ns = now_ns - estimate.offset_ns
         prior = Prior(settings.cameras[camera].name, stamp_ns, ids, pixels, speed, covariance)
@@ -256,14 +254,42 @@ def priors(
     return tuple(found)
 
 
+@kernel
+def expected_sights(
+    predicted: FloatArray, jacobian: FloatArray, velocities: FloatArray, innovation: FloatArray,
+    age_ns: IntArray, seen_ns: IntArray, unseen_px: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Pixels (m, 2), their velocities (m, 2) and covariances (m, 2, 2) that a camera is expected to have.
+
+    ``predicted`` (m, 2) with its ``jacobian`` (m, 2, n), plus the ``innovation`` (m, 2) of markers seen of late, at
+    ``seen_ns`` (m,), ``age_ns`` (m,) ago; ``unseen_px`` (m,): deviation of the others.
+    """
+    m, n = jacobian.shape[0], jacobian.shape[2]
+    pixels, speed, covariance = np.empty((m, 2)), np.empty((m, 2)), np.zeros((m, 2, 2))
+    for i in range(m):
+        fresh = age_ns[i] <= SEEN_LATELY_NS and seen_ns[i] > 0
+        fastest = 0.0
+        for a in range(2):
+            along = 0.0
+            for j in range(n):
+                along += jacobian[i, a, j] * velocities[j]
+            speed[i, a] = along
+            fastest = max(fastest, abs(along))
+            pixels[i, a] = predicted[i, a] + (innovation[i, a] if fresh else 0.0)
+        sigma = (1.0 if fresh else unseen_px[i]) + TIMING_SIGMA_S * fastest
+        covariance[i, 0, 0] = covariance[i, 1, 1] = sigma * sigma
+    return pixels, speed, covariance
+
+
+SEEN_LATELY_NS = 1_000_000_000
 LARGEST_WINDOW_PX = 20.0
 """Deviation beyond which a detector does better to look in the whole image."""
 
 
-def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> float | FloatArray:
-    """Deviation [px] of markers that were not seen of late, by their ``jacobian`` (m, 2, n)."""
+def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
+    """Deviations (m,) [px] of markers that were not seen of late, by their ``jacobian`` (m, 2, n)."""
     if arrays.joint_accuracy is None:
-        return FIRST_SIGHT_SIGMA_PX
+        return np.full(len(jacobian), FIRST_SIGHT_SIGMA_PX)
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
     return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
 

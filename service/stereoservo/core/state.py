@@ -25,7 +25,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Goal, Request
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
@@ -327,22 +327,51 @@ class TeachingState(ObservationStatistics, eq=False):
     started_ns: int
 
 
-Purpose = Literal["reply", "queue", "ahead", "again"]
+class GoalResolution(msgspec.Struct, eq=False, kw_only=True):
+    """A target that is being resolved in the model's frame, a part of the work after the other (`core.goals.resolve`).
+
+    From a body at ``start`` (m, 4) with its ``faces``, the arm at ``joints`` (n,), corrected, with its ``operators``
+    (n, 4, 4). ``part``: the next one; ``rounds``: of least squares done. What comes out: ``set_points`` (c, m, 2) ideal
+    pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1: the whole body at the goal, where
+    ``pose_known``, and the ``displacement`` (4, 4) that takes it there; ``targets`` (m, 4) where ``known`` (m,): what
+    fixed it; ``face`` (3,): three of these that span a face.
+    """
+
+    joints: FloatArray
+    start: FloatArray
+    operators: FloatArray
+    faces: Faces
+    needs_pose: bool
+    part: int
+    rounds: int
+    set_points: FloatArray
+    wanted: FloatArray
+    targets: FloatArray
+    known: BoolArray
+    pose_known: bool
+    face: IntArray
+    displacement: FloatArray
+    points: FloatArray
+
+
+Purpose = Literal["reply", "enqueue", "queue", "ahead", "again"]
 
 
 class PlanJob(msgspec.Struct, eq=False, kw_only=True):
-    """A goal that is being planned, and the ``source`` that it comes to.
+    """A goal that is being resolved, then planned, and the ``source`` that it comes to.
 
-    ``purpose``: to answer ``request``; the next one of the queue; the one after this, ahead; the active one anew. From
-    ``joints`` (n,) with the body at ``points`` (m, 4).
+    ``purpose``: to answer ``request``; to queue it, which answers ``request``; the next one of the queue; the one after
+    this, ahead; the active one anew. From ``joints`` (n,) with the body at ``points`` (m, 4).
     """
 
     request: int
     purpose: Purpose
-    source: ServoGoal
-    planning: Planning
+    goal: Goal
+    source: ServoGoal | None
+    planning: Planning | None
     joints: FloatArray
     points: FloatArray
+    resolution: GoalResolution | None = None
 
 
 Source = (
@@ -512,9 +541,10 @@ class StateVersionError(ValueError):
 
 
 class _Versioned(msgspec.Struct):
-    """What every state says of itself, whatever else it holds."""
+    """What every state says of itself, whatever else it holds; and the goal that was being planned."""
 
     version: int
+    planning: dict[str, Any] | None = None
 
 
 _decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
@@ -528,7 +558,14 @@ def encode_state(state: CoreState) -> bytes:
 def decode_state(data: bytes) -> CoreState:
     """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
     # Asked first: a state of another version may hold other fields, too.
-    version = msgspec.msgpack.decode(data, type=_Versioned).version
+    told = msgspec.msgpack.decode(data, type=_Versioned)
+    version = told.version
+    if (
+        told.planning is not None and "goal" not in told.planning
+    ):  # of before large bodies were planned in parts
+        state_of_then = msgspec.msgpack.decode(data)
+        state_of_then["planning"]["goal"] = told.planning["source"]["goal"]
+        data = msgspec.msgpack.encode(state_of_then)
     if version == 6:
         data = msgspec.msgpack.encode(_from_version_6(data))
     elif version != STATE_VERSION:

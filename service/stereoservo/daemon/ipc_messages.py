@@ -18,6 +18,7 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.messages.goals import Request
 from stereoservo.messages.recording_request import RecordedImages
+from stereoservo.messages.servo_state import MAX_PLAN_BYTES, plan_path
 from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
@@ -30,13 +31,11 @@ from stereoservo.recording.step_records import StepMessage
 
 OBSERVATION_LAYOUT = "CameraObservation.1"
 PRIOR_LAYOUT = "Prior.1"
-STATE_LAYOUT = "ServoState.1"
 OBSERVATION_CAPACITY = 1 << 16
 PRIOR_CAPACITY = 1 << 16
 STATE_CAPACITY = 1 << 16
 
 COMMISSIONING_SPEED = 0.05
-MAX_PLAN_BYTES = 1 << 24
 
 
 class RunPlan(msgspec.Struct, frozen=True):
@@ -154,11 +153,11 @@ _plan_decoder = msgspec.msgpack.Decoder(RunPlan)
 
 def save_plan(plan: RunPlan) -> None:
     """Write the plan into the runtime directory. Raises OSError."""
-    write_atomically(Path(plan.runtime) / "plan.msgpack", encode(plan))
+    write_atomically(plan_path(Path(plan.runtime)), encode(plan))
 
 
 def load_plan(runtime: Path) -> RunPlan:
     """Read the plan of the cell whose runtime directory this is. Raises PlanError."""
-    path = runtime / "plan.msgpack"
+    path = plan_path(runtime)
     with decoding(lambda cause: PlanError(path, f"{cause}; this process is started by `stereoservo run`")):
         return _plan_decoder.decode(read_bounded(path, MAX_PLAN_BYTES))

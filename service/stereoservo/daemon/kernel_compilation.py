@@ -47,6 +47,7 @@ from stereoservo.messages.goals import (
     Goal,
     Jog,
     PointSource,
+    PointTarget,
     Request,
     RunGoal,
     UpdateGoal,
@@ -131,6 +132,10 @@ def _warm_up_goals() -> None:
                 command = RunGoal(Goal(goal_id, target, law=law, points=points))
             elif step == STEPS - 5:
                 command = UpdateGoal(goal_id, target)
+            elif step == STEPS - 3:
+                points_now = zip(MARKERS, model.marker_points.tolist(), strict=True)
+                body = PointTarget({marker: tuple(point) for marker, point in points_now}, model.epoch)
+                command = RunGoal(Goal(f"{goal_id}-0001", body, check=True))
             requests = () if command is None else (Request(1, "warmup", command),)
             inputs = _inputs(step, pixels, model)
             core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))

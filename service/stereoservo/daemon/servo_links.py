@@ -14,7 +14,6 @@ from stereoservo.daemon.ipc_messages import (
     PRIOR_CAPACITY,
     PRIOR_LAYOUT,
     STATE_CAPACITY,
-    STATE_LAYOUT,
     Ask,
     Hello,
     NewModel,
@@ -29,6 +28,7 @@ from stereoservo.daemon.seqpacket import ChannelError, ChannelServer, PacketChan
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Request
+from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraObservation, Prior
 from stereoservo.recording.step_records import StepMessage
 

@@ -39,7 +39,6 @@ from stereoservo.daemon.ipc_messages import (
     PRIOR_CAPACITY,
     PRIOR_LAYOUT,
     STATE_CAPACITY,
-    STATE_LAYOUT,
     PlanError,
     RunPlan,
     load_plan,
@@ -52,6 +51,7 @@ from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock, holder
 from stereoservo.messages.run_record import begin_run, end_run, run_is_up
+from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 300.0

@@ -55,7 +55,6 @@ from stereoservo.gateway.publisher import (
     ReplyThread,
     cell_info,
     features_message,
-    state_message,
 )
 from stereoservo.gateway.recordings import CannotRecordError, Recordings
 from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
@@ -77,6 +76,7 @@ from stereoservo.messages.discovery import DaemonInfo
 from stereoservo.messages.files import write_atomically
 from stereoservo.messages.keys import VERBS, KeySpace
 from stereoservo.messages.run_record import read_run
+from stereoservo.messages.servo_state import state_message
 from stereoservo.messages.wire import (
     CellInfo,
     EventMessage,

@@ -20,7 +20,7 @@ import stereoservo
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CoreSettings
-from stereoservo.daemon.ipc_messages import RunPlan, ServoState
+from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.taught_goals import TaughtGoal
 from stereoservo.gateway.boundary import LimitedLog
 from stereoservo.kinematics.model import CellModel
@@ -33,10 +33,8 @@ from stereoservo.messages.wire import (
     EventMessage,
     FeaturesMessage,
     JointInfo,
-    LoopInfo,
     MessageError,
     ModelInfo,
-    StateMessage,
     TaughtInfo,
     encode,
 )
@@ -160,77 +158,6 @@ class KeeperNotes:
             self._texts.pop(topic, None)
         if text and not known:
             self._log.add("warning", message=text, origin="gateway")
-
-
-def state_message(
-    plan: RunPlan,
-    boot: str,
-    state: ServoState,
-    *,
-    servo_alive: bool,
-    last_event: int,
-    notes: tuple[str, ...] = (),
-    refused_messages: int = 0,
-) -> StateMessage:
-    """The state in the clients' format; numbers that are not finite are left out."""
-    status, loop = state.status, state.loop
-    names = tuple(joint.name for joint in plan.joints.joints)
-    now_ns = time.monotonic_ns()
-    return StateMessage(
-        cell=plan.cell.cell.name,
-        boot=boot,
-        t_ns=status.t_ns,
-        t_wall=time.time() - (now_ns - status.t_ns) * 1e-9,
-        lifecycle=status.lifecycle,
-        model=status.model,
-        model_epoch=status.model_epoch,
-        source=status.source,
-        goal=status.goal,
-        law=status.law,
-        level=status.level,
-        reasons=tuple(status.reasons),
-        joints=_finite(names, status.positions),
-        velocities=_finite(names, status.velocities),
-        command=_finite(names, status.command),
-        error_px=_number(status.error_px),
-        task_error=tuple(float(x) for x in status.task_error if np.isfinite(x)),
-        innovation_px={name: value for name, value in status.innovation_px.items() if np.isfinite(value)},
-        visible=status.visible,
-        loop=LoopInfo(
-            rate_hz=loop.rate_hz,
-            cycles=loop.cycles,
-            overruns=loop.overruns,
-            skipped=loop.skipped,
-            lateness_us={"p50": loop.p50_us, "p99": loop.p99_us, "max": loop.max_us},
-            work_us={"p50": loop.work_p50_us, "p99": loop.work_p99_us, "max": loop.work_max_us},
-            records_dropped=state.records_dropped,
-        ),
-        driver_active=state.driver_active,
-        servo_alive=servo_alive,
-        dry_run=plan.dry_run,
-        differences=state.differences,
-        last_event=last_event,
-        notes=(*notes, *state.notes),
-        refused_messages=refused_messages,
-        progress=_number(status.progress),
-        seconds_left=_number(status.seconds_left),
-        efforts=_finite(names, status.efforts),
-        following_errors=_finite(names, status.following_errors),
-        effort_limits=_finite(names, status.effort_limits),
-        following_limits=_finite(names, status.following_limits),
-        health=status.health,
-    )
-
-
-def _number(value: float | None) -> float | None:
-    """A finite number, else None."""
-    return float(value) if value is not None and np.isfinite(value) else None
-
-
-def _finite(names: tuple[str, ...], values: Any) -> dict[str, float]:
-    if values is None:
-        return {}
-    return {name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)}
 
 
 def features_message(observation: CameraObservation) -> FeaturesMessage:

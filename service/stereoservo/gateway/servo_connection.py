@@ -13,7 +13,6 @@ from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, encode
 from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.ipc_messages import (
-    STATE_LAYOUT,
     Ask,
     Heartbeat,
     Hello,
@@ -30,6 +29,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Command, Request
+from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.recording.step_records import StepMessage
 
 HEARTBEAT_EVERY_S = 0.05

@@ -37,6 +37,8 @@ STRIDE, STRIDE_PX = 0.1, 2.0
 """Joint step of a sample [rad or frame lengths] from which on the midpoint is checked too; its tolerance."""
 DAMPING = 1e-9
 """Of the normal matrix, relative to its largest diagonal."""
+BY_MOMENTS = 64
+"""Markers above which a body's normal equations are formed by its moments."""
 LARGEST_STEP = 0.3
 """Of a joint in one iteration [rad or lengths]: larger ones lie beyond what a linear model says."""
 SELF_MOTION = 0.08
@@ -95,6 +97,8 @@ def _normal_equations(
 ) -> float:
     """Of least ``Σ|Ĥ_j x Δq_j − (x* − x)|²``; the largest ``|x* − x|``."""
     n, m = operators.shape[0], points.shape[0]
+    if m > BY_MOMENTS:
+        return _normal_equations_by_moments(operators, points, required, N, b)
     J = np.empty((3, n))
     worst = 0.0
     for i in range(n):
@@ -115,6 +119,51 @@ def _normal_equations(
     for i in range(n):
         for k in range(i):
             N[k, i] = N[i, k]
+    return math.sqrt(worst)
+
+
+@kernel
+def _normal_equations_by_moments(
+    operators: FloatArray, points: FloatArray, required: FloatArray, N: FloatArray, b: FloatArray
+) -> float:
+    """The same by the moments ``S = Σ x xᵀ`` (4, 4) and ``C = Σ (x* − x) xᵀ`` (3, 4), in which the body comes once.
+
+    ``N_ik = tr(Ĥ_i S Ĥ_kᵀ)``, ``b_i = tr(Ĥ_i Cᵀ)``, of the upper three rows.
+    """
+    S, C = np.zeros((4, 4)), np.zeros((3, 4))
+    x, way = np.ones(4), np.empty(3)
+    worst = 0.0
+    for p in range(points.shape[0]):
+        length = 0.0
+        for i in range(3):
+            x[i] = points[p, i]
+            way[i] = required[p, i] - points[p, i]
+            length += way[i] * way[i]
+        worst = max(worst, length)
+        for i in range(4):
+            for k in range(i + 1):
+                S[i, k] += x[i] * x[k]
+        for i in range(3):
+            for k in range(4):
+                C[i, k] += way[i] * x[k]
+    for i in range(4):
+        for k in range(i):
+            S[k, i] = S[i, k]
+    moved_moments = np.empty((3, 4))
+    for j in range(operators.shape[0]):
+        b[j] = 0.0
+        for r in range(3):
+            for k in range(4):
+                moved_moments[r, k] = 0.0
+                for i in range(4):
+                    moved_moments[r, k] += operators[j, r, i] * S[i, k]
+                b[j] += operators[j, r, k] * C[r, k]
+        for other in range(j + 1):
+            total = 0.0
+            for r in range(3):
+                for k in range(4):
+                    total += moved_moments[r, k] * operators[other, r, k]
+            N[j, other] = N[other, j] = total
     return math.sqrt(worst)
 
 

@@ -182,10 +182,10 @@ class Planning(msgspec.Struct, eq=False):
     failure: tuple[ClosestApproach, ...] = ()
 
 
-def plan_on(planning: Planning, samples: int) -> None:
-    """Evaluate at most ``samples`` samples of paths (those in the images alone count a sixteenth)."""
+def plan_on(planning: Planning, samples: float) -> None:
+    """Evaluate at most ``samples`` samples of paths, one at least (those in the images alone count a sixteenth)."""
     p = planning
-    work = max(1, samples) * WORK_OF_ARM
+    work = max(1, round(samples * WORK_OF_ARM))
     while work > 0 and not p.finished:
         if p.stage == Stage.MULTISTART_IK:
             _next_seed(p)

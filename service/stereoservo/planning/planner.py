@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from stereoservo.kinematics.kernels import invert4
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.motion_frame import (
     NUMBERS,
@@ -98,9 +98,10 @@ def start_planning(request: PlanRequest) -> Planning:
         raise PlanRequestError(
             f"{len(body)} markers on one line fix no pose: three that span a plane are needed"
         )
-    for face in np.asarray(r.faces).reshape(-1, 3):
-        if not _spans_a_plane(body[face]):
-            raise PlanRequestError(f"the markers {face.tolist()} of a face are on one line")
+    faces = np.array(r.faces, dtype=np.int64, order="C", copy=True).reshape(-1, 3)
+    lying = int(_face_on_a_line(body, faces))
+    if lying >= 0:
+        raise PlanRequestError(f"the markers {faces[lying].tolist()} of a face are on one line")
     centre_translation = local[-1].copy()
     rotation, residual, own, rank = _whole_displacement(
         body, goal, centre_translation, frame, inverse, operators
@@ -220,15 +221,35 @@ def _useful(kinds: FloatArray) -> tuple[bool, ...]:
     return True, both, hinge, planar, both
 
 
+@kernel
 def _spans_a_plane(body: FloatArray) -> bool:
     """Whether points (m, 3) are not all on one line."""
-    if len(body) < 3:
+    m = body.shape[0]
+    if m < 3:
         return False
-    edges = body - body.sum(axis=0) / len(body)
-    squares = (edges * edges).sum(axis=1)
-    along = edges[int(squares.argmax())]
-    across = squares * float(squares.max()) - (edges * along[None, :]).sum(axis=1) ** 2
-    return bool(float(across.max()) > COLLINEAR * float(squares.max()) ** 2)
+    middle = np.zeros(3)
+    for p in range(m):
+        for i in range(3):
+            middle[i] += body[p, i] / m
+    edges, longest, far = np.empty((m, 3)), -1.0, 0
+    for p in range(m):
+        for i in range(3):
+            edges[p, i] = body[p, i] - middle[i]
+        if _dot(edges[p], edges[p]) > longest:
+            longest, far = _dot(edges[p], edges[p]), p
+    across = 0.0
+    for p in range(m):
+        across = max(across, _dot(edges[p], edges[p]) * longest - _dot(edges[p], edges[far]) ** 2)
+    return bool(across > COLLINEAR * longest**2)
+
+
+@kernel
+def _face_on_a_line(body: FloatArray, faces: IntArray) -> int:
+    """The first of the ``faces`` (f, 3) of points (m, 3) whose markers are on one line, or -1."""
+    for f in range(faces.shape[0]):
+        if not _spans_a_plane(body[faces[f]]):
+            return f
+    return -1
 
 
 @kernel

@@ -162,6 +162,9 @@ def check_view(
     s = constraints
     broken = -1
     for c in range(s.cameras.shape[0]):
+        margin, width = s.margins[c] if bounded else 0.0, s.sizes[c, 0]
+        nearest, nearest_depth, nearest_marker = math.inf, 0.0, -1
+        outermost, outermost_px, outermost_marker = math.inf, 0.0, -1
         for p in range(points.shape[0]):
             if not s.must_stay_visible[p] > 0.0:
                 continue
@@ -169,28 +172,20 @@ def check_view(
                 s.cameras[c], s.lenses[c], s.sizes[c], points[p, 0], points[p, 1], points[p, 2]
             )
             relative_depth = depth / s.depths[c]
-            if (
-                _enter(
-                    table,
-                    4,
-                    1.0,
-                    relative_depth,
-                    NEAREST_DEPTH,
-                    relative_depth - NEAREST_DEPTH,
-                    c,
-                    p,
-                    path_parameter,
-                )
-                and broken < 0
-            ):
+            if relative_depth - NEAREST_DEPTH < nearest:
+                nearest, nearest_depth, nearest_marker = relative_depth - NEAREST_DEPTH, relative_depth, p
+            if (clearance - margin) / width < outermost:
+                outermost, outermost_px, outermost_marker = (clearance - margin) / width, clearance, p
+            if broken < 0 and relative_depth - NEAREST_DEPTH < -ROUNDING:
                 broken = 4
-            margin = s.margins[c] if bounded else 0.0
-            if (
-                _enter(table, 2, s.sizes[c, 0], clearance, margin, clearance - margin, c, p, path_parameter)
-                and broken < 0
-                and depth > 0.0
-            ):
+            if broken < 0 and clearance - margin < -ROUNDING * width and depth > 0.0:
                 broken = 2
+        # of each camera the closest one alone can be the closest of all
+        _enter(table, 4, 1.0, nearest_depth, NEAREST_DEPTH, nearest, c, nearest_marker, path_parameter)
+        _enter(
+            table, 2, width, outermost_px, margin, outermost_px - margin if outermost_marker >= 0 else math.inf,
+            c, outermost_marker, path_parameter,
+        )  # fmt: skip
         for f in range(s.faces.shape[0]):
             if s.sides[f, c] != 0.0:
                 angle = elevation(points, s.faces, f, s.sides[f, c], s.camera_centres[c])
@@ -339,30 +334,58 @@ def _elevations(points: FloatArray, faces: IntArray, camera_centres: FloatArray)
     return out
 
 
+@kernel
 def _required_visibility(
     body: FloatArray, goal: FloatArray, faces: IntArray, camera_centres: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Sides (f, c) of the faces and least elevations (f, c) [rad]; side 0 where a camera has no sight at both ends."""
-    sides, grazing = np.zeros((len(faces), len(camera_centres))), np.zeros((len(faces), len(camera_centres)))
-    elevations = _elevations(body, faces, camera_centres), _elevations(goal, faces, camera_centres)
-    centroid = body.sum(axis=0) / len(body)
-    size = math.sqrt(float(((body - centroid) ** 2).sum(axis=1).max()))
-    for f, (now, then) in enumerate(zip(*elevations, strict=True)):
+    cameras = camera_centres.shape[0]
+    sides, grazing = np.zeros((faces.shape[0], cameras)), np.zeros((faces.shape[0], cameras))
+    now, then = _elevations(body, faces, camera_centres), _elevations(goal, faces, camera_centres)
+    centroid, size = _extent(body)
+    for f in range(faces.shape[0]):
         side = _outside(body, faces[f], centroid, size)
         if side == 0.0:
-            side = 1.0 if float((now + then).sum()) >= 0.0 else -1.0
-        both = (side * now > 0.0) & (side * then > 0.0)
-        sides[f] = np.where(both, side, 0.0)
-        grazing[f] = np.clip(np.minimum(side * now, side * then) - YIELD_ANGLE, 0.0, GRAZING)
+            both = 0.0
+            for c in range(cameras):
+                both += now[f, c] + then[f, c]
+            side = 1.0 if both >= 0.0 else -1.0
+        for c in range(cameras):
+            if side * now[f, c] > 0.0 and side * then[f, c] > 0.0:
+                sides[f, c] = side
+            least = min(side * now[f, c], side * then[f, c]) - YIELD_ANGLE
+            grazing[f, c] = min(max(least, 0.0), GRAZING)
     return sides, grazing
 
 
+@kernel
+def _extent(body: FloatArray) -> tuple[FloatArray, float]:
+    """Centroid (3,) of the ``body`` (m, 3), and the largest distance from it."""
+    centroid, largest = np.zeros(3), 0.0
+    for p in range(body.shape[0]):
+        for i in range(3):
+            centroid[i] += body[p, i]
+    for i in range(3):
+        centroid[i] /= body.shape[0]
+    for p in range(body.shape[0]):
+        square = 0.0
+        for i in range(3):
+            square += (body[p, i] - centroid[i]) ** 2
+        largest = max(largest, square)
+    return centroid, math.sqrt(largest)
+
+
+@kernel
 def _outside(body: FloatArray, face: IntArray, centroid: FloatArray, size: float) -> float:
     """Sign of a face's plane outside a body of that ``centroid`` (3,) and ``size``; 0 where all markers lie in it."""
-    a, b, c = (body[int(i)] for i in face)
-    u, v = b - a, c - a
+    a = body[face[0]]
+    u, v = body[face[1]] - a, body[face[2]] - a
     normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
-    distance = float((normal * (centroid - a)).sum()) / math.sqrt(float((normal * normal).sum()))
+    along, square = 0.0, 0.0
+    for i in range(3):
+        along += normal[i] * (centroid[i] - a[i])
+        square += normal[i] * normal[i]
+    distance = along / math.sqrt(square)
     if abs(distance) < THICK * size:
         return 0.0
     return -1.0 if distance > 0.0 else 1.0

@@ -15,11 +15,20 @@ import numpy as np
 from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
+from stereoservo.core.state import CoreState, PlanJob, ServoGoal
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import Enable, FeatureTarget, Goal, LawName, Request, RunGoal
+from stereoservo.messages.goals import Enable, FeatureTarget, Goal, LawName, Request, RunGoal, UpdateGoal
 from stereoservo.ports.devices import CameraObservation, JointState
 from stereoservo_sim.world.exact_model import exact_model
-from stereoservo_sim.world.synthetic import SyntheticCell, rotation, rx90, translation
+from stereoservo_sim.world.synthetic import (
+    SEVEN_ROWS,
+    SyntheticCell,
+    dh_link,
+    placed,
+    rotation,
+    rx90,
+    translation,
+)
 
 RATE_HZ, FRAME_EVERY = 250.0, 10
 """Of the loop, and steps between images."""
@@ -30,8 +39,7 @@ PLANNING = 5000
 class CoreLoop:
     """A core in virtual time with perfect joints, and noise-free images that are one frame late.
 
-    ``times``: kind and duration [s] of each step: ``model`` (taken), ``goal`` (looked at), ``planning``, ``planned``
-    (the answer), ``frames`` (of all cameras), ``between`` them.
+    ``times``: kind (`kind_of_step`) and CPU time [s] of each step: what it computes, whatever else the machine does.
     """
 
     def __init__(self, cell: SyntheticCell, seed: int, model: CellModel | None = None) -> None:
@@ -53,13 +61,11 @@ class CoreLoop:
         observations, self.pending = self.pending, ()
         given = {"requests": (), **inputs}
         cycle = StepInputs(self.now_ns, period_ns, joints, observations, driver_active=self.active, **given)
-        kind = _kind(cycle, self.core)
-        at = time.perf_counter()
+        kind = kind_of_step(cycle, self.core.state)
+        self.before(kind, cycle)
+        at = time.thread_time()
         outputs = self.core.step(cycle)
-        seconds = time.perf_counter() - at
-        if kind == "planning" and self.core.state.planning is None:
-            kind = "planned"
-        self.times.append((kind, seconds))
+        self.times.append((kind, time.thread_time() - at))
         if outputs.driver_request:
             self.active = outputs.driver_request == "activate"
         if self.seq % FRAME_EVERY == 0:
@@ -67,6 +73,9 @@ class CoreLoop:
         if outputs.command is not None:
             self.q = self.q + outputs.command / RATE_HZ
         return outputs
+
+    def before(self, kind: str, inputs: StepInputs) -> None:
+        """What a test does before a step of this ``kind``: nothing here."""
 
     def take_model(self) -> None:
         """Put the model in use, and enable."""
@@ -85,11 +94,15 @@ class CoreLoop:
             }
         )
 
-    def start_goal(self, law: LawName) -> None:
-        """Take the model, and go for a goal that is far enough that the arm is under way for long."""
-        self.take_model()
-        run = RunGoal(Goal(str(uuid.UUID(int=self.seed + 1)), self.target_at(0.3), law=law, gain=0.2))
-        outputs = self.step(requests=(Request(2, "bench", run),))
+    def start_goal(self, law: LawName, number: int = 0) -> None:
+        """Go for a goal that is far enough that the arm is under way for long; the first one takes the model before.
+
+        Others preempt the one before them.
+        """
+        if number == 0:
+            self.take_model()
+        goal = Goal(str(uuid.UUID(int=self.seed + 1 + number)), self.target_at(0.3), law=law, gain=0.2)
+        outputs = self.step(requests=(Request(2 + number, "bench", RunGoal(goal)),))
         for _ in range(PLANNING):  # it is planned, a slice a step, before it is answered
             replies = [event for event in outputs.events if event.kind == "reply"]
             if replies:
@@ -97,6 +110,17 @@ class CoreLoop:
             outputs = self.step()
         if not (replies and replies[0].accepted):
             raise RuntimeError(f"the core did not take the goal: {[event.message for event in replies]}")
+
+    def move_goal(self, number: int) -> None:
+        """Move the active goal's set-points a little, and take a step."""
+        goal = self.core.state.source
+        if not isinstance(goal, ServoGoal):
+            raise RuntimeError("no goal is active")
+        move = UpdateGoal(goal.goal.id, self.target_at(0.3 + 1e-4 * number))
+        outputs = self.step(requests=(Request(1000 + number, "bench", move),))
+        replies = [event for event in outputs.events if event.kind == "reply"]
+        if not replies[0].accepted:
+            raise RuntimeError(f"the core did not move the goal: {replies[0].message}")
 
     def _images(self) -> tuple[CameraObservation, ...]:
         ids = np.array(self.cell.marker_ids)
@@ -110,15 +134,44 @@ class CoreLoop:
         )
 
 
-def _kind(inputs: StepInputs, core: ServoCore) -> str:
-    """What a step has to do."""
+PARTS = ("read", "face", "start", "fit")
+STAGES = ("way in images", "arm on way", "arm without limits", "straight in joints", "seeds")
+
+
+def kind_of_step(inputs: StepInputs, state: CoreState) -> str:
+    """What a step has to do: ``model`` (taken), ``goal`` (looked at), ``update`` (of its set-points); of a goal that is
+    looked at, a part of ``PARTS``, ``way begun``, a stage of ``STAGES``, ``told`` (its plan, and its start); ``frames``
+    (of all cameras), ``between`` them. While a law drives the arm they begin with ``moving``.
+    """
+    moving = "moving, " if isinstance(state.source, ServoGoal) else ""
+    return moving + _work(inputs, state.planning)
+
+
+def _work(inputs: StepInputs, job: PlanJob | None) -> str:
     if inputs.model_update is not None:
         return "model"
     if any(isinstance(request.command, RunGoal) for request in inputs.requests):
         return "goal"
-    if core.state.planning is not None:
-        return "planning"
-    return "frames" if inputs.observations else "between"
+    if any(isinstance(request.command, UpdateGoal) for request in inputs.requests):
+        return "update"
+    if job is None:
+        return "frames" if inputs.observations else "between"
+    if job.planning is not None:
+        return "told" if job.planning.finished else STAGES[job.planning.stage]
+    return "way begun" if job.resolution is None else PARTS[job.resolution.part]
+
+
+def largest_cell() -> SyntheticCell:
+    """A cell of 256 markers, 8 cameras and 12 joints, the most that there may be: the body of `rx90_with_facets`."""
+    small = rx90_with_facets(256, 8)
+    rows = [(0.7 * a, alpha, 0.7 * d) for a, alpha, d in SEVEN_ROWS[:-1]]
+    wrist = [(0, 90, 0.08), (0, 90, 0.05), (0, -90, 0.05), (0.05, 90, 0), (0, -90, 0.05), (0, 0, 0.05)]
+    home = np.radians((10, 30, 10, -70, 20, 50, 15, 20, 30, -25, 30, 10))
+    ranges = np.radians((5, 5, 6, 6, 8, 8, 10, 10, 10, 10, 15, 20))
+    facing = rotation("x", 180) @ rotation("y", 15) @ rotation("x", 10)
+    links = tuple(dh_link(*row) for row in (*rows, *wrist))
+    cell = placed(("revolute",) * 12, links, small.body, home, ranges, facing)
+    return dataclasses.replace(cell, intrinsics=small.intrinsics, poses=small.poses, lenses=small.lenses)
 
 
 def rx90_with_facets(markers: int, cameras: int) -> SyntheticCell:

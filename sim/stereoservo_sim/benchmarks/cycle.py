@@ -19,7 +19,13 @@ from stereoservo.kinematics.kernels import chain_forward, image_jacobian, projec
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import LawName
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.benchmarks.core_loop import FRAME_EVERY, RATE_HZ, CoreLoop, rx90_with_facets
+from stereoservo_sim.benchmarks.core_loop import (
+    FRAME_EVERY,
+    RATE_HZ,
+    CoreLoop,
+    largest_cell,
+    rx90_with_facets,
+)
 from stereoservo_sim.benchmarks.stereo_reference import stereo_law
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.progress import ProgressCall
@@ -29,7 +35,8 @@ from stereoservo_sim.world.synthetic import rx90
 GAIN, DAMPING = 1.0, 1e-6
 WARM_UP = 100
 """Steps of the core that do not count."""
-LARGE_BODIES = ((8, 2), (64, 2), (256, 2), (256, 8))
+LARGE_BODIES = ((8, 2, 6), (64, 2, 6), (256, 2, 6), (256, 8, 6), (256, 8, 12))
+"""Markers, cameras, joints."""
 """Markers and cameras."""
 
 
@@ -162,17 +169,27 @@ def _find_groups(model: CellModel, _: int) -> CellModel:
     return with_groups(model)
 
 
+GOALS, UPDATES, UPDATED_STEPS = 20, 20, 7
+
+
 def large_bodies(count: int, seed: int, progress: ProgressCall) -> list[dict[str, Any]]:
-    """Microseconds of each kind of core step, by the number of markers and cameras; and of finding their planes."""
+    """Microseconds of each kind of core step, by the number of markers, cameras and joints, with goals that preempt one
+    another while the arm moves and goals that are moved; and of finding the markers' planes.
+    """
     rows = []
-    for markers, cameras in LARGE_BODIES:
-        cell = rx90_with_facets(markers, cameras)
+    for markers, cameras, joints in LARGE_BODIES:
+        cell = rx90_with_facets(markers, cameras) if joints == 6 else largest_cell()
         bare = exact_model(cell)
         finding = timed(partial(_find_groups, bare), 2)[0]
         model = with_groups(bare)
         for _ in range(2):  # the first one compiles
             loop = CoreLoop(cell, seed, model)
-            loop.start_goal("cartesian3")
+            for number in range(GOALS):
+                loop.start_goal("cartesian3", number)
+                for _ in range(UPDATED_STEPS):
+                    loop.step()
+            for number in range(UPDATES):
+                loop.move_goal(number)
             for _ in range(count):
                 loop.step()
         by_kind: dict[str, list[float]] = {}
@@ -182,6 +199,7 @@ def large_bodies(count: int, seed: int, progress: ProgressCall) -> list[dict[str
             {
                 "markers": markers,
                 "cameras": cameras,
+                "joints": joints,
                 "groups_of_model_ms": 1e3 * min(finding),
                 "step_us": {kind: summary(times, 1e6) for kind, times in by_kind.items()},
             }

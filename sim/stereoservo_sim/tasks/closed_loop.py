@@ -288,8 +288,10 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         scene_ids=(),
         scene_points=np.zeros((0, 4)),
         scene_pixels=np.zeros((len(knowledge.matrices), 0, 2)),
-        rows={i: i for i in range(m)},
+        row_ids=np.arange(m),
+        row_of=np.arange(m),
         groups=None,
+        sights=m * len(knowledge.matrices),
         joint_accuracy=None,
         joint_variances=np.zeros(n),
     )

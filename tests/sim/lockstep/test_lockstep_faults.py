@@ -19,7 +19,6 @@ from stereoservo.core.cycle import Event, ModelUpdate, encode
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
-    STATE_LAYOUT,
     Ask,
     Heartbeat,
     Hello,
@@ -38,6 +37,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import CellFile, check_cell
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Disable, Enable, Goal, Jog, JointTarget, Request, Reset, RunGoal
+from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraObservation, DriverError, JointState
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.world.history import TrueJointHistory

@@ -20,17 +20,16 @@ from stereoservo.core.goals.execute import (
     end_source,
     preempt,
 )
-from stereoservo.core.goals.marker_body import BodyState, place_now
-from stereoservo.core.goals.plan import begin_plan
-from stereoservo.core.goals.resolve import joint_index, start_servoing
+from stereoservo.core.goals.marker_body import place_now
+from stereoservo.core.goals.prepare import prepare, trusted_model
+from stereoservo.core.goals.resolve import joint_index
 from stereoservo.core.monitors import camera_relocalization
 from stereoservo.core.monitors.camera_relocalization import refuse_while_moved
 from stereoservo.core.monitors.moving_camera import refuse_pixels
 from stereoservo.core.move import MOTION_SOURCES, goal_of
 from stereoservo.core.sources.calibration import start_trials
 from stereoservo.core.sources.check import start_check
-from stereoservo.core.sources.incidence import start_incidence
-from stereoservo.core.sources.joint_move import joint_goal, joint_move_to
+from stereoservo.core.sources.joint_move import joint_move_to
 from stereoservo.core.sources.streaming import update
 from stereoservo.core.sources.teaching import start_teaching
 from stereoservo.core.state import (
@@ -38,10 +37,10 @@ from stereoservo.core.state import (
     CalibrationMotion,
     CheckMotion,
     Holding,
-    IncidenceGoal,
     Jogging,
     JointMove,
     Leased,
+    PlanJob,
     ServoGoal,
     Source,
 )
@@ -51,37 +50,28 @@ from stereoservo.messages.goals import (
     CancelGoal,
     Command,
     Disable,
-    DisplacementTarget,
     Enable,
-    FeatureTarget,
     Goal,
     Hold,
     Home,
-    IncidenceTarget,
     Jog,
-    JointTarget,
     PlanReport,
-    PointTarget,
     ReanchorRefused,
     RenewGoal,
     Request,
     Reset,
     Resume,
     RunGoal,
-    TaughtTarget,
     Teach,
     UpdateGoal,
 )
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Lifecycle, ModelReadiness
+from stereoservo.messages.status import Lifecycle
 
 QUEUE_LENGTH = 16
 
 Accepted = tuple[str, PlanReport | None]
 """The message of an accepted request, and the report of its plan."""
-
-Prepared = tuple[JointMove | ServoGoal | IncidenceGoal, BodyState | None]
-"""The source that a goal comes to, and the place that it sets out from, where that counts."""
 
 _IDS: dict[type[Any], Callable[[Any], str]] = {
     RunGoal: attrgetter("goal.id"),
@@ -101,12 +91,12 @@ def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | N
             refuse_pixels(goal.target, state, context.settings)
         busy = MOTION_SOURCES[type(state.source)].subject(state.source) or state.queue
         if goal.mode == "queue" and busy:
-            return _enqueue(goal, context), None
-    source, place = prepare(goal, context)
-    if isinstance(source, ServoGoal) and source.pose_known and place is not None:
-        state.planning = begin_plan(source, context, place, context.q, "reply", request.request)
+            return _enqueue(goal, request.request, context)
+    prepared = prepare(goal, context, "reply", request.request)
+    if isinstance(prepared, PlanJob):
+        state.planning = prepared
         return None
-    return accept(goal, source, report_without_plan(source, context), context)
+    return accept(goal, prepared, report_without_plan(prepared, context), context)
 
 
 def require_motion_allowed(context: StepContext) -> None:
@@ -139,7 +129,7 @@ def planning_pending(context: StepContext) -> bool:
 def _known(goal_id: str, context: StepContext) -> bool:
     state = context.state
     job, source = state.planning, state.source
-    planned = job is not None and not job.source.goal.check and job.source.goal.id == goal_id
+    planned = job is not None and not job.goal.check and job.goal.id == goal_id
     active = MOTION_SOURCES[type(source)].subject(source) == goal_id
     return active or planned or any(goal.id == goal_id for goal in state.queue)
 
@@ -152,7 +142,8 @@ def new_id(goal_id: str, context: StepContext) -> None:
         )
 
 
-def _enqueue(goal: Goal, context: StepContext) -> str:
+def _enqueue(goal: Goal, request: int, context: StepContext) -> Accepted | None:
+    """Queue a goal: at once, or (None) once it is resolved."""
     state = context.state
     if len(state.queue) >= QUEUE_LENGTH:
         raise RefusalError(
@@ -162,7 +153,17 @@ def _enqueue(goal: Goal, context: StepContext) -> str:
             threshold=float(QUEUE_LENGTH),
             unit="goals",
         )
-    prepare(goal, context)  # what cannot be at all is refused now; its way is planned when its turn comes
+    # what cannot be at all is refused now; its way is planned when its turn comes
+    prepared = prepare(goal, context, "enqueue", request)
+    if isinstance(prepared, PlanJob):
+        state.planning = prepared
+        return None
+    return enqueue(goal, context), None
+
+
+def enqueue(goal: Goal, context: StepContext) -> str:
+    """Put a goal that can be into the queue."""
+    state = context.state
     state.queue.append(goal)
     _renew_queued(goal, context)
     return f"queued as number {len(state.queue)}; it is planned when its turn comes"
@@ -185,74 +186,6 @@ def accept(goal: Goal, source: Source, report: PlanReport | None, context: StepC
     preempt(context, f"goal {goal.id}")
     begin(source, context)
     return "accepted", report
-
-
-def prepare(goal: Goal, context: StepContext, place: BodyState | None = None) -> Prepared:
-    """A goal that sets out from a ``place`` of the body, None: from where it is. Raises RefusalError."""
-    return _PREPARE[type(goal.target)](goal, goal.target, context, place)
-
-
-def _prepare_joints(
-    goal: Goal, target: JointTarget, context: StepContext, place: BodyState | None
-) -> Prepared:
-    return joint_goal(goal, target, context), None
-
-
-def _prepare_taught(
-    goal: Goal, target: TaughtTarget, context: StepContext, place: BodyState | None
-) -> Prepared:
-    raise RefusalError(
-        "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
-    )
-
-
-def _prepare_incidences(
-    goal: Goal, target: IncidenceTarget, context: StepContext, place: BodyState | None
-) -> Prepared:
-    place = _trusted_place(context, place)
-    return start_incidence(goal, target, context, place), place
-
-
-def _prepare_servoing(
-    goal: Goal,
-    target: FeatureTarget | PointTarget | DisplacementTarget,
-    context: StepContext,
-    place: BodyState | None,
-) -> Prepared:
-    place = _trusted_place(context, place)
-    return start_servoing(goal, target, context, place), place
-
-
-def _trusted_place(context: StepContext, place: BodyState | None) -> BodyState:
-    """The body at ``place``, or where it is. Raises RefusalError without a model that holds."""
-    trusted_model(context)
-    if context.state.reanchoring is not None:
-        refuse_while_moved(context.state)
-    return place_now(context) if place is None else place
-
-
-_PREPARE: dict[type[Any], Callable[[Goal, Any, StepContext, BodyState | None], Prepared]] = {
-    JointTarget: _prepare_joints,
-    TaughtTarget: _prepare_taught,
-    IncidenceTarget: _prepare_incidences,
-    FeatureTarget: _prepare_servoing,
-    PointTarget: _prepare_servoing,
-    DisplacementTarget: _prepare_servoing,
-}
-"""How the source of a goal is made, by the kind of its target."""
-
-
-def trusted_model(context: StepContext) -> int:
-    """Epoch of the model in use. Raises RefusalError where there is none, or none that holds."""
-    state = context.state
-    if state.model is None or context.arrays is None or state.readiness == ModelReadiness.NONE:
-        raise no_model(context, "the cell has no model yet: calibrate first")
-    if state.readiness == ModelReadiness.SUSPECT:
-        raise RefusalError(
-            "MODEL_SUSPECT",
-            "the model no longer explains the images: check the cameras and the markers, then calibrate",
-        )
-    return state.model.epoch
 
 
 def renew(command: RenewGoal, context: StepContext) -> str:
@@ -303,7 +236,7 @@ def cancel(command: CancelGoal, context: StepContext) -> str:
         end_source(context, "goal_cancelled", (), "cancelled by its client")
         return "cancelled: it is not waited for any more, and the queue is empty"
     job = state.planning
-    if job is not None and job.source.goal.id == command.id and job.purpose != "ahead":
+    if job is not None and job.goal.id == command.id and job.purpose != "ahead":
         drop_plan(context, (), "cancelled by its client")
         return "cancelled while it was planned"
     if _cancel_waiting(command.id, context):
@@ -317,7 +250,7 @@ def cancel(command: CancelGoal, context: StepContext) -> str:
         )
     state.queue = kept
     state.queued_until_ns.pop(command.id, None)
-    if (job is not None and job.source.goal.id == command.id) or (
+    if (job is not None and job.goal.id == command.id) or (
         state.ahead is not None and state.ahead.goal.id == command.id
     ):
         drop_lookahead_plan(context)
@@ -551,8 +484,8 @@ def _jog(command: Jog, request: Request, context: StepContext) -> str:
         active = goal_of(state.source)
         waits = f"a goal is active ({active})" if active else "a reached goal waits to be acknowledged"
         raise RefusalError("BUSY", f"{waits}: cancel it before jogging", subject=active)
-    if state.planning is not None and not state.planning.source.goal.check:
-        planned = state.planning.source.goal.id
+    if state.planning is not None and not state.planning.goal.check:
+        planned = state.planning.goal.id
         raise RefusalError(
             "BUSY", f"goal {planned} is being planned: cancel it before jogging", subject=planned
         )

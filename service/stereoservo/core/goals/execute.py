@@ -86,7 +86,7 @@ def drop_lookahead_plan(context: StepContext) -> None:
 def end_queue(context: StepContext, reasons: tuple[Reason, ...], message: str) -> None:
     """Every queued goal ends with a terminal event too, and what is being planned is not begun."""
     job = context.state.planning
-    if job is not None and not job.source.goal.check:
+    if job is not None and not job.goal.check:
         drop_plan(context, reasons, message)
     cancel_queue(context, reasons, message)
 
@@ -108,8 +108,8 @@ def drop_plan(context: StepContext, reasons: tuple[Reason, ...], message: str) -
     job, state.planning = state.planning, None
     if job is None:
         return
-    goal = job.source.goal
-    if job.purpose == "reply":
+    goal = job.goal
+    if job.purpose in ("reply", "enqueue"):
         hint = f"{message} while it was planned"
         told = reasons or (Reason("CANCELLED", "info", goal.id, hint=hint),)
         context.emit("reply", request=job.request, accepted=False, id=goal.id, message=hint, reasons=told)

@@ -83,10 +83,10 @@ def place_now(context: StepContext) -> BodyState:
     return BodyState(context.settings, arrays, points, prediction.operators, faces)
 
 
-def view_of(place: BodyState, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def view_of(settings: CoreSettings, arrays: ModelArrays, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Ideal pixels (c, m, 2) of ``points`` (m, 4), and (c, m) 1 where they lie in the camera's image, 0 elsewhere."""
-    sizes = np.array([(camera.width, camera.height) for camera in place.settings.cameras], dtype=np.float64)
-    found: tuple[FloatArray, FloatArray] = _view(place.arrays.matrices, place.arrays.lenses, sizes, points)
+    sizes = np.array([(camera.width, camera.height) for camera in settings.cameras], dtype=np.float64)
+    found: tuple[FloatArray, FloatArray] = _view(arrays.matrices, arrays.lenses, sizes, points)
     return found
 
 
@@ -136,55 +136,83 @@ def goal_pose(
     ``targets`` (m, 4): triangulated goal points where ``known`` (m,); ``face`` (3,) spans a face. ``operators``
     (n, 4, 4): the arm's at present, a basis of displacements where the model knows no metric one.
     """
-    basis = operators if arrays.metric_basis is None else arrays.metric_basis
+    displacement, _ = displacement_by_law(
+        arrays, operators, points, targets, known, face, set_points, wanted, np.eye(4), LAW_STEPS
+    )
+    basis = displacement_basis(arrays, operators)
+    return refined_pose(arrays, basis, points, displacement, set_points, wanted)[0]
+
+
+def displacement_basis(arrays: ModelArrays, operators: FloatArray) -> FloatArray:
+    """Twists (k, 4, 4) that span displacements: the model's, or where it has none the arm's ``operators`` (n, 4, 4)."""
+    return operators if arrays.metric_basis is None else arrays.metric_basis
+
+
+def displacement_by_law(
+    arrays: ModelArrays,
+    operators: FloatArray,
+    points: FloatArray,
+    targets: FloatArray,
+    known: BoolArray,
+    face: IntArray,
+    set_points: FloatArray,
+    wanted: FloatArray,
+    displacement: FloatArray,
+    steps: int,
+) -> tuple[FloatArray, bool]:
+    """A displacement (4, 4) for least squares to start from, by so many ``steps`` of the law from the ``displacement``
+    of the steps before; and whether it has come near. Other arguments as of `goal_pose`.
+    """
+    basis = displacement_basis(arrays, operators)
     few = np.flatnonzero(known)
     if len(few) > MOST_TRIED:  # a start for least squares: it takes no more of a large body
         few = np.union1d(face, spread_in_images(few, set_points, wanted))
         face, some = np.searchsorted(few, face), np.ones(len(few), dtype=bool)
-        displacement = _displacement_by_law(basis, points[few], targets[few], some, face)
+        D, near = _displacement_by_law(basis, points[few], targets[few], some, face, displacement, steps)
     else:
-        displacement = _displacement_by_law(basis, points, targets, known, face)
-    return refined_pose(arrays, basis, points, displacement, set_points, wanted)
+        D, near = _displacement_by_law(basis, points, targets, known, face, displacement, steps)
+    return D, bool(near)
 
 
 def refined_pose(
     arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
     wanted: FloatArray, refinements: int = REFINEMENTS,
-) -> GoalPose:  # fmt: skip
-    """Least squares on all set-points, from a ``displacement`` (4, 4) near by; ``basis`` (k, 4, 4) of displacements."""
-    D, moved, pixels = _refine(basis, arrays.matrices, points, displacement, set_points, wanted, refinements)
+) -> tuple[GoalPose, bool]:  # fmt: skip
+    """Least squares on all set-points, from a ``displacement`` (4, 4) near by, and whether it has converged in so many
+    ``refinements``; ``basis`` (k, 4, 4) of displacements.
+    """
+    D, moved, pixels, converged = _refine(
+        basis, arrays.matrices, points, displacement, set_points, wanted, refinements
+    )
     distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
     worst = int(distance.max(axis=0).argmax())
-    return GoalPose(
-        moved,
-        D,
-        float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0))),
-        float(distance.max()),
-        arrays.marker_ids[worst],
-    )
+    rms_px = float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0)))
+    return GoalPose(moved, D, rms_px, float(distance.max()), arrays.marker_ids[worst]), bool(converged)
 
 
 @kernel
 def _displacement_by_law(
-    basis: FloatArray, points: FloatArray, targets: FloatArray, known: BoolArray, face: IntArray
-) -> FloatArray:
-    """Displacement (4, 4) that the Cartesian law comes to: the face of ``points`` (m, 4) onto that of ``targets``."""
+    basis: FloatArray, points: FloatArray, targets: FloatArray, known: BoolArray, face: IntArray,
+    displacement: FloatArray, steps: int,
+) -> tuple[FloatArray, bool]:  # fmt: skip
+    """Displacement (4, 4) that the Cartesian law comes to: the face of ``points`` (m, 4) onto that of ``targets``.
+
+    From a ``displacement``, by so many ``steps``; and whether these have come near.
+    """
     nobody = np.zeros((0, 4))  # on paper no camera has to keep sight of the face
     gains = np.full(3, LAW_GAIN)
-    D = np.zeros((4, 4))
-    for i in range(4):
-        D[i, i] = 1.0
-    moved = points.copy()
+    D = displacement.copy()
+    moved = transform_points(D, points)
     centre_target = _middle(targets, known)
-    for _ in range(LAW_STEPS):
+    for _ in range(steps):
         twist, _, _, _ = cartesian3_step(
             basis, FaceTask(moved[face], targets[face], _middle(moved, known), centre_target), nobody, gains
         )
         D = _onwards(basis, twist, D)
         moved = transform_points(D, points)
         if _all_below(twist, NEAR):
-            break
-    return D
+            return D, True
+    return D, False
 
 
 @kernel
@@ -209,10 +237,13 @@ def _refine(
     set_points: FloatArray,
     wanted: FloatArray,
     refinements: int,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least squares of `refined_pose`: displacement (4, 4), displaced points (m, 4) and their pixels (c, m, 2)."""
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """Least squares of `refined_pose`: displacement (4, 4), displaced points (m, 4), their pixels (c, m, 2), whether it
+    has converged.
+    """
     D = displacement
     moved = transform_points(D, points)
+    converged = False
     weights = np.repeat(wanted.copy().reshape(-1), 2)
     for _ in range(refinements):
         pixels, _ = project_points(matrices, moved)
@@ -220,9 +251,10 @@ def _refine(
         step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, REFINE_DAMPING)
         D = _onwards(basis, step, D)
         moved = transform_points(D, points)
-        if _all_below(step, CONVERGED):
+        converged = _all_below(step, CONVERGED)
+        if converged:
             break
-    return D, moved, project_points(matrices, moved)[0]
+    return D, moved, project_points(matrices, moved)[0], converged
 
 
 @kernel
@@ -243,21 +275,16 @@ def _all_below(values: FloatArray, limit: float) -> bool:
     return bool((np.abs(values) < limit).all())
 
 
-def body_at(
-    place: BodyState, targets: FloatArray, known: BoolArray, face: IntArray,
-    set_points: FloatArray, wanted: FloatArray,
-) -> GoalPose:  # fmt: skip
-    """The body at the goal, displaced rigidly. Raises RefusalError where no displacement fits."""
-    arrays = place.arrays
-    pose = goal_pose(arrays, place.operators, place.points, targets, known, face, set_points, wanted)
+def one_body(pose: GoalPose, points: FloatArray, targets: FloatArray, known: BoolArray) -> None:
+    """Raises RefusalError where no rigid displacement of ``points`` (m, 4) fits the goal: ``pose`` is the best."""
     if pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
-        return pose
+        return
     said = (
         f"marker {pose.worst_marker} is off by {pose.worst_px:.2f} px (rms {pose.rms_px:.2f} px; up to "
         f"{MAX_GOAL_RESIDUAL_PX} px is accepted)"
     )
     value = pose.worst_px if isfinite(pose.worst_px) else None
-    if mirrored(place.points, targets, known):
+    if mirrored(points, targets, known):
         raise RefusalError(
             "MIRRORED_GOAL",
             f"no displacement of the marker body explains the goal, it is its mirror image: {said}",

@@ -13,10 +13,11 @@ import numpy as np
 from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
-from stereoservo.core.goals.marker_body import BodyState, view_of
+from stereoservo.core.goals.marker_body import view_of
 from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
-from stereoservo.core.prediction import centre_of, chain_at
-from stereoservo.core.state import PlanJob, Purpose, ServoGoal
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import centre_of, chain_at, markers_at
+from stereoservo.core.state import PlanJob, ServoGoal
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.messages import goals
 from stereoservo.messages.goals import PlanReport
@@ -36,51 +37,60 @@ PLANNED_SPEED, PLANNED_ACCELERATION = 0.9, 0.7
 """Shares of the limits that a way is planned with: the rest is feedback's."""
 
 
-def begin_plan(
-    source: ServoGoal,
-    context: StepContext,
-    place: BodyState,
-    joints: FloatArray,
-    purpose: Purpose,
-    request: int,
-) -> PlanJob:
-    """Begin to plan the way of ``source`` from the body at ``place`` with the arm at ``joints`` (n,).
+def begin_plan(job: PlanJob, context: StepContext) -> None:
+    """Begin to plan the way of the job's source from where it sets out.
 
     Raises RefusalError where the request makes no sense.
     """
+    source, arrays = job.source, context.arrays
+    assert source is not None
+    assert arrays is not None
     try:
-        planning = start_planning(_plan_request(source, context, place, joints))
+        job.planning = start_planning(_plan_request(source, context, arrays, job.points, job.joints))
     except PlanRequestError as error:
         raise RefusalError("NOT_PLANNED", str(error)) from error
-    return PlanJob(
-        request=request, purpose=purpose, source=source, planning=planning, joints=joints.copy(),
-        points=place.points.copy(),
-    )  # fmt: skip
+
+
+def plan_again(source: ServoGoal, context: StepContext) -> PlanJob:
+    """Begin to plan the way of the active ``source`` anew, from where the body is. Raises RefusalError."""
+    assert context.arrays is not None
+    points = markers_at(context.arrays, context.q + context.state.correction)
+    job = PlanJob(
+        request=-1,
+        purpose="again",
+        goal=source.goal,
+        source=source,
+        planning=None,
+        joints=context.q.copy(),
+        points=points,
+    )
+    begin_plan(job, context)
+    return job
 
 
 def _plan_request(
-    source: ServoGoal, context: StepContext, place: BodyState, joints: FloatArray
+    source: ServoGoal, context: StepContext, arrays: ModelArrays, points: FloatArray, joints: FloatArray
 ) -> PlanRequest:
-    arrays, settings = place.arrays, context.settings
+    settings = context.settings
     limits, goal = settings.limits, source.goal
     used = np.flatnonzero(source.used > 0.0)
     margin = limits.position_margin
     keep_outs = limits.keep_outs.copy()
     keep_outs[:, :, 0] -= margin
     keep_outs[:, :, 1] += margin
-    kept = (view_of(place, place.points)[1][used] * source.wanted[used]).min(axis=0)
+    kept = (view_of(settings, arrays, points)[1][used] * source.wanted[used]).min(axis=0)
     return PlanRequest(
         operators=chain_at(arrays, joints)[1],
         composition=arrays.composition,
         joints=joints.copy(),
         matrices=np.ascontiguousarray(arrays.matrices[used]),
         camera_centres=np.ascontiguousarray(arrays.camera_centres[used]),
-        points=place.points.copy(),
+        points=points.copy(),
         targets=source.target_points.copy(),
         kept=kept,
-        centre=centre_of(source, joints + context.state.correction, arrays, place.points),
+        centre=centre_of(source, joints + context.state.correction, arrays, points),
         centre_target=source.centre_target.copy(),
-        faces=kept_faces(source.faces, place.points, source.target_points, arrays.camera_centres[used]),
+        faces=kept_faces(source.faces, points, source.target_points, arrays.camera_centres[used]),
         limits=PlanLimits(
             position_min=limits.position_min + margin,
             position_max=limits.position_max - margin,
@@ -100,23 +110,29 @@ def _plan_request(
 
 
 def go_on_planning(job: PlanJob) -> bool:
-    """A step's share of the work; whether it is done."""
-    if not job.planning.finished:
-        request = job.planning.request
-        pixels = len(request.points) * len(request.matrices)
-        plan_on(job.planning, max(1, min(SLICE, PIXELS_PER_STEP // pixels)))
-    return job.planning.finished
+    """A step's share of the work on a way; whether all is done: of a large body a step later, which reports it."""
+    planning = job.planning
+    assert planning is not None
+    if planning.finished:
+        return True
+    request = planning.request
+    pixels = len(request.points) * len(request.matrices)
+    plan_on(planning, min(SLICE, PIXELS_PER_STEP // pixels or PIXELS_PER_STEP / pixels))
+    return planning.finished and pixels <= PIXELS_PER_STEP
 
 
 def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
     """What came out, and the plan into the job's source. Raises RefusalError where the goal is not to be driven."""
-    source, plan = job.source, job.planning.plan
+    source, planning = job.source, job.planning
+    assert source is not None
+    assert planning is not None
+    plan = planning.plan
     if plan is not None:
         source.goal_joints = plan.joints[-1].copy()
         if context.derived.laws[source.law].planned:
             source.plan, source.plan_s, source.start_points = plan, 0.0, job.points.copy()
         return _planned(job, plan, context)
-    failures = job.planning.failure
+    failures = planning.failure
     approaches = tuple(_approach(failure, job, context) for failure in failures)
     texts = tuple(_text(failure, context) for failure in approaches)
     report = PlanReport(
@@ -147,17 +163,16 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
 
 def planning_reason(job: PlanJob) -> Reason:
     """That a goal is being planned."""
-    done = job.planning.followed
-    hint = (
-        f"goal {job.source.goal.id} is being planned ({done} ways tried); cancel it, hold or stop at any time"
-    )
-    return Reason("PLANNING", "info", job.source.goal.id, float(done), None, "ways", hint)
+    done = 0 if job.planning is None else job.planning.followed
+    hint = f"goal {job.goal.id} is being planned ({done} ways tried); cancel it, hold or stop at any time"
+    return Reason("PLANNING", "info", job.goal.id, float(done), None, "ways", hint)
 
 
 def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
     arrays = context.arrays
     assert arrays is not None
     source, settings = job.source, context.settings
+    assert source is not None
     count = min(reported_samples(arrays), len(plan.times))
     at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
     seconds = float(plan.times[-1])
@@ -192,6 +207,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
 def _exponential_s(job: PlanJob, context: StepContext) -> float:
     """Time in which the error decays to its tolerance at the goal's gain."""
     source, arrays = job.source, context.arrays
+    assert source is not None
     assert arrays is not None
     asked = source.wanted * source.used[:, None]
     error = float(_largest_error(arrays.matrices, job.points, source.set_points, asked))
@@ -224,6 +240,7 @@ def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> 
     elif approach.what == "NOT_REACHABLE":
         subject = MISSING_FREEDOMS[index] if 0 <= index < len(MISSING_FREEDOMS) else ""
     else:
+        assert job.source is not None
         subject = settings.cameras[int(np.flatnonzero(job.source.used > 0.0)[index])].name
     return goals.Approach(
         approach.what, subject, approach.value, approach.limit, approach.room, approach.unit, approach.share,

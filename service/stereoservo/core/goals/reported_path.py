@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 
 from stereoservo.core.model_arrays import ModelArrays
@@ -12,14 +15,16 @@ from stereoservo.numerics.compilation import kernel
 REPORTED = 17
 """Samples of a path that a report holds."""
 REPORTED_PIXELS = 2048
-"""Pixels that a report holds at most, as long as it has the ends of the path: of a large body it has fewer samples."""
+"""Pixels that a report holds at most: of a large body it has fewer samples, at least the ends of the path."""
+REPORTED_OF_LARGE = 512
+"""The same where the ends alone would be more: of these it has every second, third … marker."""
 
 Pixels = dict[int, tuple[tuple[float, float], ...]]
 
 
 def reported_samples(arrays: ModelArrays | None) -> int:
     """How many samples of a path a report holds: at least its ends."""
-    pixels = 1 if arrays is None else len(arrays.marker_ids) * len(arrays.matrices)
+    pixels = 1 if arrays is None else arrays.sights
     return max(2, min(REPORTED, REPORTED_PIXELS // pixels))
 
 
@@ -28,13 +33,16 @@ def reported_pixels(arrays: ModelArrays, displacements: FloatArray, points: Floa
 
     Markers that a lens does not image at all of them are left out.
     """
-    paths = _raw_paths(arrays.matrices, arrays.lenses, displacements, points)
+    pixels = len(displacements) * arrays.sights
+    every = 1 if pixels <= REPORTED_PIXELS else math.ceil(pixels / REPORTED_OF_LARGE)
+    told = np.ascontiguousarray(points[::every])
+    paths = _raw_paths(arrays.matrices, arrays.lenses, displacements, told)
     imaged: list[list[bool]] = np.asarray(np.isfinite(paths).all(axis=(0, 3))).tolist()
-    by_camera: list[list[list[tuple[float, float]]]] = paths.transpose(1, 2, 0, 3).tolist()
+    by_camera: list[list[list[Any]]] = paths.transpose(1, 2, 0, 3).tolist()
     return [
         {
-            marker: tuple((u, v) for u, v in path)
-            for marker, path, whole in zip(arrays.marker_ids, of_camera, whole_paths, strict=True)
+            marker: tuple(map(tuple, path))
+            for marker, path, whole in zip(arrays.marker_ids[::every], of_camera, whole_paths, strict=True)
             if whole
         }
         for of_camera, whole_paths in zip(by_camera, imaged, strict=True)

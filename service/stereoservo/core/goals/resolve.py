@@ -1,38 +1,41 @@
-"""Resolves a goal's target in the model's frame into set-points, body pose at the goal, centre and options, and
-creates the initial state of its control law. Refuses invalid targets.
+"""Resolves a goal's target in the model's frame into set-points and the body's pose at the goal, in parts: of a large
+body one a step. Refuses invalid targets.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from itertools import chain
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
-from stereoservo.control.face_choice import NOT_CHOSEN, spread_in_images
-from stereoservo.control.law import JacobianChoice
-from stereoservo.control.law_registry import LAWS
-from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.control.face_choice import spread_in_images
+from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.marker_body import (
+    LAW_STEPS,
     MIN_MARKERS,
+    REFINEMENTS,
     BodyState,
-    body_at,
+    GoalPose,
     determinant4,
+    displacement_basis,
+    displacement_by_law,
     enough_in_view,
     enough_shown,
     in_front,
     keeps_its_shape,
     mirrored,
+    one_body,
+    refined_pose,
     turned_to,
     view_of,
 )
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import chain_at
 from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.state import ServoGoal
+from stereoservo.core.state import GoalResolution
 from stereoservo.kinematics.kernels import (
     invert4,
     multiply4_into,
@@ -40,26 +43,19 @@ from stereoservo.kinematics.kernels import (
     triangulate,
     undistort_pixel,
 )
-from stereoservo.messages.goals import (
-    AdaptiveGain,
-    Centre,
-    DisplacementTarget,
-    FeatureTarget,
-    Goal,
-    JacobianName,
-    Pixel,
-    PlanReport,
-    PointTarget,
-)
+from stereoservo.messages.goals import DisplacementTarget, FeatureTarget, Pixel, PointTarget
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 
-JACOBIANS: dict[JacobianName, JacobianChoice] = {
-    "current": JacobianChoice.CURRENT,
-    "desired": JacobianChoice.DESIRED,
-    "mean": JacobianChoice.MEAN,
-    "fixed-depth": JacobianChoice.FIXED_DEPTH,
-}
+Resolvable = FeatureTarget | PointTarget | DisplacementTarget
+
+NOTHING = np.zeros(0)
+ROUNDS_OF_PIXELS = 4096
+"""Pixels of markers that the rounds of least squares of one step may have together."""
+AT_ONCE = 128
+"""Pixels of markers up to which a goal is resolved, and its plan set up, in one step."""
+STEPS = 8
+"""Of the law that finds where least squares starts, in one step, for larger bodies."""
 MIN_FACE_AREA_PX2 = 100.0
 SINGULAR = 1e-9
 """Determinant, relative to the fourth power of its largest entry, below which a matrix is no displacement."""
@@ -69,30 +65,29 @@ FINITE_HEIGHT = 1e-9
 """Height ``|a∞ᵀM|`` relative to ``|a∞||M|`` below which a point lies at infinity."""
 
 
-@dataclass(frozen=True)
-class ResolvedGoal:
-    """A target in the model's frame.
-
-    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1: the whole body
-    at the goal, where ``pose_known``, and the ``displacement`` (4, 4) that takes it there; ``known`` (m,): markers that
-    fixed it; ``face`` (3,): three that span a face.
-    """
-
-    set_points: FloatArray
-    wanted: FloatArray
-    points: FloatArray
-    displacement: FloatArray
-    known: FloatArray
-    pose_known: bool
-    face: IntArray
-
-
-def aim_at(
-    target: FeatureTarget | PointTarget | DisplacementTarget, place: BodyState, needs_pose: bool, epoch: int
-) -> ResolvedGoal:
+def aim_at(target: Resolvable, place: BodyState, needs_pose: bool, epoch: int) -> GoalResolution:
     """What ``target`` asks for. ``needs_pose``: of the law; ``epoch``: of the model in use. Raises RefusalError."""
     of_this_model(target.model_epoch, epoch)
-    return _RESOLVE[type(target)](target, place, needs_pose)
+    aim = begin_resolution(place, np.zeros(0), needs_pose)
+    while not resolve_part(aim, target, place):
+        pass
+    return aim
+
+
+def begin_resolution(place: BodyState, joints: FloatArray, needs_pose: bool) -> GoalResolution:
+    """A target of which nothing is resolved yet, for a body at ``place`` with the arm at ``joints`` (n,)."""
+    return GoalResolution(
+        joints=joints, start=place.points, operators=place.operators, faces=place.faces, needs_pose=needs_pose,
+        part=0, rounds=0, set_points=NOTHING, wanted=NOTHING, targets=NOTHING, known=np.zeros(0, np.bool_),
+        pose_known=False, face=np.zeros(3, np.int64), displacement=np.zeros((4, 4)), points=NOTHING,
+    )  # fmt: skip
+
+
+def resolve_part(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+    """Do the next part of the work; whether it was the last. Raises RefusalError where the target cannot be."""
+    if _PARTS[aim.part](aim, target, place):
+        aim.part += 1
+    return aim.part == len(_PARTS)
 
 
 def of_this_model(model_epoch: int | None, epoch: int) -> None:
@@ -108,25 +103,25 @@ def of_this_model(model_epoch: int | None, epoch: int) -> None:
 # -- set-points in images -------------------------------------------------------------------------------------
 
 
-def _features(target: FeatureTarget, place: BodyState, needs_pose: bool) -> ResolvedGoal:
+def _features(aim: GoalResolution, target: FeatureTarget, place: BodyState) -> None:
+    aim.set_points, aim.wanted = raw_set_points(target, place)
+
+
+def _triangulated(aim: GoalResolution, place: BodyState) -> None:
+    """Of set-points: where the markers are at the goal. Raises RefusalError where too few are shown."""
     arrays = place.arrays
-    set_points, wanted = raw_set_points(target, place)
-    targets, known = _intersected(arrays.matrices, set_points, wanted, arrays.plane_at_infinity)
-    shown = int((wanted.sum(axis=0) > 0).sum())
+    aim.targets, aim.known = _intersected(
+        arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity
+    )
+    shown = int((aim.wanted.sum(axis=0) > 0).sum())
     if shown < MIN_MARKERS:
         raise RefusalError(
             "TOO_FEW_MARKERS",
             f"the goal shows {shown} markers; at least {MIN_MARKERS} are needed to fix a pose",
             value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
         )  # fmt: skip
-    face: IntArray = np.zeros(3, np.int64)
-    pose_known = needs_pose or int(known.sum()) >= MIN_MARKERS
-    displacement = np.zeros((4, 4))
-    if pose_known:
-        face = _face(set_points, wanted, known, arrays)
-        pose = body_at(place, targets, known, face, set_points, wanted)
-        targets, displacement = pose.points, pose.displacement
-    return ResolvedGoal(set_points, wanted, targets, displacement, known.astype(np.float64), pose_known, face)
+    aim.points = aim.targets
+    aim.pose_known = aim.needs_pose or int(aim.known.sum()) >= MIN_MARKERS
 
 
 def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray, FloatArray]:
@@ -142,9 +137,9 @@ def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray,
     for name, markers in target.set_points.items():
         camera = camera_index(name, place.settings)
         shape = cameras[camera]
-        given = np.array(tuple(markers.values()), dtype=np.float64).reshape(-1, 2)
+        given = _numbers(markers.values(), 2)
         ideal = ideal_pixels(arrays.lenses[camera], given)
-        rows = [marker_index(marker, arrays) for marker in markers]
+        rows = marker_indices(markers, arrays)
         set_points[camera, rows], wanted[camera, rows] = ideal, 1.0
         inside = (given >= -0.5) & (given <= np.array((shape.width, shape.height)) - 0.5) & np.isfinite(ideal)
         for k in np.flatnonzero(~inside.all(axis=1)):
@@ -230,10 +225,24 @@ def marker_index(marker: int, arrays: ModelArrays) -> int:
     return found
 
 
+def marker_indices(markers: Iterable[int], arrays: ModelArrays) -> list[int]:
+    """`marker_index` of each of the ``markers``. Raises RefusalError."""
+    found = list(map(arrays.index.get, markers))
+    return [
+        marker_index(marker, arrays) if row is None else row
+        for marker, row in zip(markers, found, strict=True)
+    ]
+
+
+def _numbers(rows: Iterable[Iterable[float]], width: int) -> FloatArray:
+    """The ``rows`` of so many numbers each as (k, width)."""
+    return np.fromiter(chain.from_iterable(rows), np.float64).reshape(-1, width)
+
+
 # -- points and displacements ---------------------------------------------------------------------------------
 
 
-def _points(target: PointTarget, place: BodyState, needs_pose: bool) -> ResolvedGoal:
+def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
     arrays = place.arrays
     if len(target.points) < MIN_MARKERS:
         raise RefusalError(
@@ -241,15 +250,45 @@ def _points(target: PointTarget, place: BodyState, needs_pose: bool) -> Resolved
             f"the goal gives {len(target.points)} points; at least {MIN_MARKERS} that are not on one line are needed",
             value=float(len(target.points)), threshold=float(MIN_MARKERS), unit="markers",
         )  # fmt: skip
-    targets = np.zeros_like(place.points)
-    known = np.zeros(len(arrays.marker_ids), dtype=bool)
-    for marker, coordinates in target.points.items():
-        i = marker_index(marker, arrays)
-        targets[i] = normalize_scale(
-            np.array(coordinates), arrays, f"the point of marker {marker}", str(marker)
-        )
-        known[i] = True
-    return _aim(place, targets, known, only_known=True)
+    targets, known = given_points(target, arrays)
+    _projected(aim, place, targets, known)
+
+
+def given_points(target: PointTarget, arrays: ModelArrays) -> tuple[FloatArray, BoolArray]:
+    """Points (m, 4) of height 1 that ``target`` gives, zeros elsewhere; and which these are (m,).
+
+    Raises RefusalError.
+    """
+    points = np.zeros((len(arrays.marker_ids), 4))
+    given = np.zeros(len(points), dtype=bool)
+    rows = marker_indices(target.points, arrays)
+    scaled, at_infinity = _unit_heights(_numbers(target.points.values(), 4), arrays.plane_at_infinity)
+    if at_infinity >= 0:
+        marker, coordinates = list(target.points.items())[at_infinity]
+        normalize_scale(np.array(coordinates), arrays, f"the point of marker {marker}", str(marker))
+    points[rows], given[rows] = scaled, True
+    return points, given
+
+
+@kernel
+def _unit_heights(points: FloatArray, plane: FloatArray) -> tuple[FloatArray, int]:
+    """`normalize_scale` of ``points`` (k, 4), and the first of them that it refuses, or -1."""
+    scaled = np.empty(points.shape)
+    size = 0.0
+    for i in range(4):
+        size += plane[i] * plane[i]
+    refused = -1
+    for k in range(points.shape[0]):
+        height, square = 0.0, 0.0
+        for i in range(4):
+            height += points[k, i] * plane[i]
+            square += points[k, i] * points[k, i]
+        extent = math.sqrt(square * size)
+        if refused < 0 and not (math.isfinite(extent) and abs(height) > FINITE_HEIGHT * extent):
+            refused = k
+        for i in range(4):
+            scaled[k, i] = points[k, i] / height
+    return scaled, refused
 
 
 def normalize_scale(point: FloatArray, arrays: ModelArrays, what: str, subject: str = "") -> FloatArray:
@@ -267,7 +306,7 @@ def normalize_scale(point: FloatArray, arrays: ModelArrays, what: str, subject: 
     return scaled
 
 
-def _displacement(target: DisplacementTarget, place: BodyState, needs_pose: bool) -> ResolvedGoal:
+def _displacement(aim: GoalResolution, target: DisplacementTarget, place: BodyState) -> None:
     arrays = place.arrays
     matrix = np.array(target.matrix, dtype=np.float64).reshape(4, 4)
     if target.basis is None and target.model_epoch is None:
@@ -290,7 +329,7 @@ def _displacement(target: DisplacementTarget, place: BodyState, needs_pose: bool
             f"markers go from {float(heights.min()):.3g} to {float(heights.max()):.3g}, of a displacement they agree",
             value=lowest / highest if highest > 0.0 else 0.0, threshold=1.0,
         )  # fmt: skip
-    return _aim(place, moved / heights[:, None], np.ones(heights.size, dtype=bool), only_known=False)
+    _projected(aim, place, moved / heights[:, None], np.ones(heights.size, dtype=bool))
 
 
 def _proper(matrix: FloatArray) -> FloatArray:
@@ -344,33 +383,95 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
     return E
 
 
-def _aim(place: BodyState, targets: FloatArray, known: BoolArray, *, only_known: bool) -> ResolvedGoal:
-    """A body at ``targets`` (m, 4) of height 1 where ``known`` (m,): set-points by projection.
-
-    ``only_known``: these are the markers that the error is taken over; else all that are in view.
-    """
-    arrays = place.arrays
+def _projected(aim: GoalResolution, place: BodyState, targets: FloatArray, known: BoolArray) -> None:
+    """A body at ``targets`` (m, 4) of height 1 where ``known`` (m,): set-points by projection."""
     if mirrored(place.points, targets, known):
         raise RefusalError(
             "MIRRORED_GOAL",
             "the points are those of the marker body's mirror image: are left and right, or ids, swapped?",
         )
     in_front(place, targets, known)
-    pixels, _ = view_of(place, targets)
-    wanted = np.repeat(known[None, :].astype(np.float64), len(arrays.matrices), axis=0)
-    set_points = np.where(wanted[..., None] > 0.0, pixels, 0.0)
-    face = _face(set_points, wanted, known, arrays)
-    pose = body_at(place, targets, known, face, set_points, wanted)
-    keeps_its_shape(pose.points, targets, known)
-    pixels, shown = view_of(place, pose.points)
-    shown = shown * (wanted if only_known else 1.0)
-    enough_in_view(place, pixels, shown, known)
+    pixels, _ = view_of(place.settings, place.arrays, targets)
+    aim.wanted = np.repeat(known[None, :].astype(np.float64), len(place.arrays.matrices), axis=0)
+    aim.set_points = np.where(aim.wanted[..., None] > 0.0, pixels, 0.0)
+    aim.targets, aim.known, aim.pose_known = targets, known, True
+
+
+def _shown_set_points(aim: GoalResolution, pose: GoalPose, target: Resolvable, place: BodyState) -> None:
+    """Of a body at the goal: the error is taken over the markers of points, else over all that are in view."""
+    keeps_its_shape(pose.points, aim.targets, aim.known)
+    pixels, shown = view_of(place.settings, place.arrays, pose.points)
+    shown = shown * (aim.wanted if isinstance(target, PointTarget) else 1.0)
+    enough_in_view(place, pixels, shown, aim.known)
     shown = shown * turned_to(place, pose.displacement)
     enough_shown(place, shown)
-    return ResolvedGoal(
-        np.where(shown[..., None] > 0.0, pixels, 0.0), shown, pose.points, pose.displacement,
-        known.astype(np.float64), True, face,
+    aim.set_points, aim.wanted = np.where(shown[..., None] > 0.0, pixels, 0.0), shown
+
+
+# -- its parts ------------------------------------------------------------------------------------------------
+
+
+def _read(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+    """What the target says, in ideal pixels or points of height 1."""
+    _READ[type(target)](aim, target, place)
+    return True
+
+
+def _find_face(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+    """Where its markers are, as far as two cameras tell, and three of them that span a face."""
+    if isinstance(target, FeatureTarget):
+        _triangulated(aim, place)
+    if aim.pose_known:
+        aim.face = _face(aim.set_points, aim.wanted, aim.known, place.arrays)
+    return True
+
+
+def _start_fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+    """A displacement near by, from which least squares goes on."""
+    if not aim.pose_known:
+        return True
+    if aim.rounds == 0:
+        aim.displacement = np.eye(4)
+    steps = LAW_STEPS if place.arrays.sights <= AT_ONCE else STEPS
+    aim.displacement, near = displacement_by_law(
+        place.arrays, place.operators, place.points, aim.targets, aim.known, aim.face, aim.set_points, aim.wanted,
+        aim.displacement, steps,
     )  # fmt: skip
+    aim.rounds += steps
+    if not near and aim.rounds < LAW_STEPS:
+        return False
+    aim.rounds = 0
+    return True
+
+
+def _fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+    """Rounds of least squares; after the last one, whether there is such a body at all."""
+    if not aim.pose_known:
+        return True
+    rounds = min(max(1, ROUNDS_OF_PIXELS // place.arrays.sights), REFINEMENTS - aim.rounds)
+    basis = displacement_basis(place.arrays, place.operators)
+    pose, converged = refined_pose(
+        place.arrays, basis, place.points, aim.displacement, aim.set_points, aim.wanted, rounds
+    )
+    aim.rounds += rounds
+    aim.displacement, aim.points = pose.displacement, pose.points
+    if not converged and aim.rounds < REFINEMENTS:
+        return False
+    one_body(pose, place.points, aim.targets, aim.known)
+    if not isinstance(target, FeatureTarget):
+        _shown_set_points(aim, pose, target, place)
+    return True
+
+
+_PARTS = (_read, _find_face, _start_fit, _fit)
+"""What is done of a target, one after the other; of a large body one a step."""
+
+_READ: dict[type[Any], Callable[[GoalResolution, Any, BodyState], None]] = {
+    FeatureTarget: _features,
+    PointTarget: _points,
+    DisplacementTarget: _displacement,
+}
+"""How a target is read, by its kind."""
 
 
 # -- the face -------------------------------------------------------------------------------------------------
@@ -429,141 +530,3 @@ def _product(A: FloatArray, B: FloatArray) -> FloatArray:
     product = np.empty((4, 4))
     multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
     return product
-
-
-_RESOLVE: dict[type[Any], Callable[[Any, BodyState, bool], ResolvedGoal]] = {
-    FeatureTarget: _features,
-    PointTarget: _points,
-    DisplacementTarget: _displacement,
-}
-"""How a target is resolved, by its kind."""
-
-
-# -- the law's first state ------------------------------------------------------------------------------------
-
-
-def start_servoing(
-    goal: Goal,
-    target: FeatureTarget | PointTarget | DisplacementTarget,
-    context: StepContext,
-    place: BodyState,
-) -> ServoGoal:
-    """The state of a law before its first step, for a body that sets out from ``place``.
-
-    Raises RefusalError naming what makes the goal unusable.
-    """
-    settings, model = context.settings, context.state.model
-    assert model is not None
-    name = goal.law or settings.law
-    law = context.derived.laws.get(name)
-    if law is None:
-        raise RefusalError("NO_SUCH_LAW", str(LAWS.unknown(name)), subject=name)
-    aim = aim_at(target, place, law.needs_goal_pose, model.epoch)
-    weights, body, centre_target = _centre(goal.centre, aim, place, context, model.epoch)
-    return ServoGoal(
-        **run_fields(goal, context, used_cameras(goal, aim.wanted, context)),
-        law=name,
-        jacobian=int(JACOBIANS[goal.jacobian or "mean"]),
-        set_points=aim.set_points,
-        wanted=aim.wanted,
-        rates=np.zeros_like(aim.set_points),
-        target_points=aim.points,
-        target_known=aim.known,
-        pose_known=aim.pose_known,
-        centre_weights=weights,
-        centre_body=body,
-        centre_target=centre_target,
-        faces=place.faces,
-        choice=NOT_CHOSEN._replace(triple=aim.face),
-    )
-
-
-def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, Any]:
-    """Fields of a `LawRun` before its first step: what the goal says, or else the cell."""
-    settings = context.settings
-    gain = goal.gain or settings.gain
-    near, far, slope = (
-        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
-    )
-    return {
-        "goal": goal,
-        "points": goal.points or settings.points,
-        "gain_near": near,
-        "gain_far": far,
-        "gain_slope": slope,
-        "tolerance_px": goal.tolerance_px or settings.tolerance_px,
-        "hold_frames": goal.hold_frames or settings.hold_frames,
-        "time_limit_s": goal.time_limit_s or settings.time_limit_s,
-        "started_ns": context.now_ns,
-        "lease_s": goal.lease_s,
-        "lease_until_ns": context.now_ns + int((goal.lease_s or 0.0) * 1e9),
-        "used": used,
-        "last_frames": sum(e.frames for e in context.state.cameras),
-    }
-
-
-def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatArray:
-    """(c,) 1 for cameras that the law may use. Raises RefusalError where they show too few ``wanted`` (c, m)."""
-    c = len(context.settings.cameras)
-    if goal.cameras is None:
-        return np.ones(c)
-    used = np.zeros(c)
-    for name in goal.cameras:
-        used[camera_index(name, context.settings)] = 1.0
-    shown = int((wanted * used[:, None]).max(axis=0).sum())
-    if shown < MIN_MARKERS:
-        raise RefusalError(
-            "TOO_FEW_MARKERS",
-            f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {MIN_MARKERS} "
-            "are needed",
-            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
-        )  # fmt: skip
-    return used
-
-
-def _centre(
-    centre: Centre | None, aim: ResolvedGoal, place: BodyState, context: StepContext, epoch: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; at the goal.
-
-    The point is stated in the chain's zero. Default: the affine middle of the goal's markers.
-    """
-    arrays = place.arrays
-    weights = np.zeros(len(arrays.marker_ids))
-    body = np.zeros(4)
-    if centre is None:
-        weights = aim.known / max(float(aim.known.sum()), 1.0)
-    elif bool(centre.markers) == (centre.point is not None):
-        raise RefusalError(
-            "CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none"
-        )
-    elif centre.point is not None:
-        if centre.model_epoch is None:
-            raise RefusalError(
-                "FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is"
-            )
-        of_this_model(centre.model_epoch, epoch)
-        now = normalize_scale(np.array(centre.point), arrays, "the centre")[None]
-        H = chain_at(arrays, context.q + context.state.correction)[0]
-        body = transform_points(invert4(H), now)[0]
-        return weights, body, transform_points(aim.displacement, now)[0]
-    else:
-        for marker in centre.markers:
-            weights[marker_index(marker, arrays)] = 1.0
-        weights = weights / float(weights.sum())
-    return weights, body, (weights[:, None] * aim.points).sum(axis=0)
-
-
-def unplanned_report(source: ServoGoal, context: StepContext) -> PlanReport:
-    """The report of a goal whose pose, and so its path, is not known beforehand."""
-    return no_plan(
-        source.law, "the pose at the goal is not known: fewer than three of its markers are shown by two cameras",
-        source.time_limit_s,
-    )  # fmt: skip
-
-
-def no_plan(law: str, why: str, seconds: float) -> PlanReport:
-    """A report without a plan: ``why`` there is none; it takes ``seconds`` at most."""
-    return PlanReport(
-        law=law, way=f"not planned: {why}", seconds=seconds, approaches=(), shares=(), joints={}, pixels={}
-    )

@@ -30,7 +30,7 @@ def start_model_monitor(
 ) -> None:
     """Watch over a new model. ``masked``: ids of markers that stay unused."""
     m = len(arrays.marker_ids)
-    watching = nothing_sighted(len(settings.cameras), len(arrays.rows), len(settings.joint_names), m)
+    watching = nothing_sighted(len(settings.cameras), len(arrays.row_ids), len(settings.joint_names), m)
     for marker in masked:
         if marker in arrays.index:
             watching.masked[arrays.index[marker]] = 1.0

@@ -341,8 +341,8 @@ def _likely_errors(found: FloatArray) -> bool:
 
 def bench_now(watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
     """The newest frames of the cameras ``known``."""
-    weights = np.zeros((len(known), len(arrays.rows)))
-    innovation = np.zeros((len(known), len(arrays.rows), 2))
+    weights = np.zeros((len(known), len(arrays.row_ids)))
+    innovation = np.zeros((len(known), len(arrays.row_ids), 2))
     for row, c in enumerate(known):
         sighting = watching.sightings[c]
         variance = 0.5 * (sighting.spread[:, 0, 0] + sighting.spread[:, 1, 1]) + MODEL_SIGMA_PX**2

@@ -155,7 +155,7 @@ def _known(
     """
     H = chain_at(arrays, q + state.correction)[0]
     points = np.concatenate((transform_points(H, arrays.marker_points), arrays.scene_points))
-    observed = np.concatenate((prediction.pixels[camera], arrays.scene_pixels[camera])) + sights.innovation
+    observed = np.concatenate((prediction.pixels[0], arrays.scene_pixels[camera])) + sights.innovation
     variance = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
     weights = np.where(sights.seen, 1.0 / np.sqrt(variance), 0.0)
     weights[: len(state.watching.masked)] *= 1.0 - state.watching.masked

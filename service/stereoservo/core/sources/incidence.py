@@ -29,13 +29,11 @@ from stereoservo.core.goals.resolve import (
     ideal_pixels,
     joint_index,
     marker_index,
-    no_plan,
     of_this_model,
     raw_set_points,
     require_imaged,
-    run_fields,
-    used_cameras,
 )
+from stereoservo.core.goals.servoing import no_plan, run_fields, used_cameras
 from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.core.prediction import points_now, scene_of
 from stereoservo.core.sources.law import options, run_ended

@@ -6,6 +6,7 @@ Pixels here are raw: no model is needed, and what is kept stays true when the le
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +14,8 @@ import numpy as np
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import Sample
 from stereoservo.core.monitor_state import ObservationStatistics
-from stereoservo.core.prediction import joints_at
-from stereoservo.core.settings import CoreSettings, TrialSettings
+from stereoservo.core.prediction import joints_at, rows_of
+from stereoservo.core.settings import CameraSettings, CoreSettings, TrialSettings
 from stereoservo.core.sources.joint_move import approach_velocity, arrived, farthest
 from stereoservo.core.state import PoseMeasurement
 from stereoservo.messages.reasons import Reason
@@ -36,6 +37,13 @@ def measurement_buffers(settings: CoreSettings) -> dict[str, Any]:
     }
 
 
+@lru_cache(maxsize=4)
+def _sorted_ids(cameras: tuple[CameraSettings, ...]) -> IntArray:
+    """Every marker id that some of the ``cameras`` can report, ascending; not to be written to."""
+    ids: IntArray = np.unique([i for camera in cameras for i in camera.marker_ids]).astype(np.int64)
+    return ids
+
+
 def add_observation(
     sums: ObservationStatistics,
     settings: CoreSettings,
@@ -48,11 +56,12 @@ def add_observation(
     if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_wanted:
         return False
     sums.frames[camera] += 1
-    index = {marker: i for i, marker in enumerate(settings.marker_ids)}
-    rows = [k for k in range(observation.ids.size) if int(observation.ids[k]) in index]
-    if not rows:
+    ids = _sorted_ids(settings.cameras)
+    found = rows_of(observation.ids.astype(np.int64), ids, np.arange(ids.size))
+    rows = np.flatnonzero(found >= 0)
+    if not rows.size:
         return True
-    seen = np.array([index[int(observation.ids[k])] for k in rows])
+    seen = found[rows]
     pixels = observation.pixels[rows]
     known = sums.counts[camera, seen] > 0
     # The arm is never quite at rest: what all markers do together is motion, the remainder is the detector's noise.
@@ -73,7 +82,7 @@ def averages(sums: ObservationStatistics, settings: CoreSettings) -> tuple[Sampl
     Of the detector's covariance the systematic part does not shrink with the number of frames.
     """
     samples = []
-    ids = np.array(settings.marker_ids, dtype=np.int64)
+    ids = _sorted_ids(settings.cameras)
     for camera, description in enumerate(settings.cameras):
         frames = int(sums.frames[camera])
         seen = (sums.counts[camera] * 2 >= max(frames, 1)) & (sums.counts[camera] > 0)

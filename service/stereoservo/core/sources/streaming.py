@@ -11,6 +11,7 @@ from math import isfinite
 
 import numpy as np
 
+from stereoservo.control.face_choice import spread_in_images
 from stereoservo.control.filters import (
     ClientClock,
     arrived,
@@ -23,11 +24,13 @@ from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import (
     MAX_GOAL_RESIDUAL_PX,
     MIN_MARKERS,
+    REFINEMENTS,
     BodyState,
+    displacement_basis,
     refined_pose,
     view_of,
 )
-from stereoservo.core.goals.resolve import marker_index, normalize_scale, of_this_model, raw_set_points
+from stereoservo.core.goals.resolve import given_points, of_this_model, raw_set_points
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.state import ServoGoal, Stream
 from stereoservo.kinematics.kernels import transform_points
@@ -40,6 +43,9 @@ JUMP_SHARE = 0.1
 QUIET_S = 0.5
 """After such a silence of the client the goal stands, and may be reached."""
 FOLLOWING_REFINEMENTS = 3
+PIXELS_AT_ONCE = 512
+"""Pixels of markers above which a step makes one refinement with all markers, and those before with a `FEW`."""
+FEW = 8
 FEED_FORWARD_DAMPING = 1e-6
 
 
@@ -87,15 +93,9 @@ def _set_points(target: FeatureTarget | PointTarget, place: BodyState) -> tuple[
     """(c, m, 2) ideal pixels and (c, m) 1 where the target says something."""
     if isinstance(target, FeatureTarget):
         return raw_set_points(target, place)
-    points = np.ones_like(place.points)
-    given = np.zeros(len(points))
-    for marker, coordinates in target.points.items():
-        i = marker_index(marker, place.arrays)
-        points[i] = normalize_scale(
-            np.array(coordinates), place.arrays, f"the point of marker {marker}", str(marker)
-        )
-        given[i] = 1.0
-    pixels, shown = view_of(place, points)
+    points, given = given_points(target, place.arrays)
+    points[~given] = 1.0
+    pixels, shown = view_of(place.settings, place.arrays, points)
     shown = shown * given[None, :]
     return np.where(shown[..., None] > 0.0, pixels, 0.0), shown
 
@@ -130,14 +130,14 @@ def _no_jump(source: ServoGoal, set_points: FloatArray, wanted: FloatArray, cont
 
 
 def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, wanted: FloatArray) -> None:
-    pose = refined_pose(
-        place.arrays,
-        _basis(place.arrays, place.operators),
-        source.target_points,
-        _identity(),
-        set_points,
-        wanted,
-    )
+    arrays, points, displacement = place.arrays, source.target_points, _identity()
+    basis, rounds = displacement_basis(arrays, place.operators), REFINEMENTS
+    if arrays.sights > PIXELS_AT_ONCE:
+        few = spread_in_images(np.flatnonzero(wanted.max(axis=0) > 0.0), set_points, wanted, FEW)
+        some = np.ascontiguousarray(set_points[:, few]), np.ascontiguousarray(wanted[:, few])
+        displacement = refined_pose(arrays, basis, points[few], displacement, *some)[0].displacement
+        rounds = 1
+    pose, _ = refined_pose(arrays, basis, points, displacement, set_points, wanted, rounds)
     if not pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
         raise RefusalError(
             "NOT_RIGID",
@@ -165,9 +165,9 @@ def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool
     )
     source.rates = rates if moving else np.zeros_like(rates)
     if source.pose_known:
-        pose = refined_pose(
-            arrays, _basis(arrays, prediction.operators), source.target_points, _identity(), source.set_points, given,
-            FOLLOWING_REFINEMENTS,
+        pose, _ = refined_pose(
+            arrays, displacement_basis(arrays, prediction.operators), source.target_points, _identity(),
+            source.set_points, given, 1 if arrays.sights > PIXELS_AT_ONCE else FOLLOWING_REFINEMENTS,
         )  # fmt: skip
         source.target_points = pose.points
         source.centre_target = transform_points(pose.displacement, source.centre_target[None])[0]
@@ -186,10 +186,6 @@ def feed_forward(source: ServoGoal, context: StepContext, active: FloatArray) ->
         np.repeat(active.reshape(-1), 2), FEED_FORWARD_DAMPING,
     )  # fmt: skip
     return velocity
-
-
-def _basis(arrays: ModelArrays, operators: FloatArray) -> FloatArray:
-    return operators if arrays.metric_basis is None else arrays.metric_basis
 
 
 def _identity() -> FloatArray:

@@ -1,0 +1,153 @@
+"""The first state of a control law for a goal whose target is resolved: its options, cameras and centre."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stereoservo.control.face_choice import NOT_CHOSEN
+from stereoservo.control.law import JacobianChoice, Law
+from stereoservo.control.law_registry import LAWS
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.marker_body import MIN_MARKERS
+from stereoservo.core.goals.resolve import camera_index, marker_indices, normalize_scale, of_this_model
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at
+from stereoservo.core.state import GoalResolution, ServoGoal
+from stereoservo.kinematics.kernels import invert4, transform_points
+from stereoservo.messages.goals import AdaptiveGain, Centre, Goal, JacobianName, LawName, PlanReport
+from stereoservo.numerics.arrays import FloatArray
+
+JACOBIANS: dict[JacobianName, JacobianChoice] = {
+    "current": JacobianChoice.CURRENT,
+    "desired": JacobianChoice.DESIRED,
+    "mean": JacobianChoice.MEAN,
+    "fixed-depth": JacobianChoice.FIXED_DEPTH,
+}
+
+
+def law_of(goal: Goal, context: StepContext) -> tuple[LawName, Law]:
+    """The law that ``goal`` asks for, or the cell's. Raises RefusalError."""
+    name = goal.law or context.settings.law
+    law = context.derived.laws.get(name)
+    if law is None:
+        raise RefusalError("NO_SUCH_LAW", str(LAWS.unknown(name)), subject=name)
+    return name, law
+
+
+def start_servoing(goal: Goal, aim: GoalResolution, context: StepContext) -> ServoGoal:
+    """The state of a law before its first step, for a goal that is resolved.
+
+    Raises RefusalError naming what makes the goal unusable.
+    """
+    name, _ = law_of(goal, context)
+    arrays, model = context.arrays, context.state.model
+    assert arrays is not None
+    assert model is not None
+    weights, body, centre_target = _centre(goal.centre, aim, arrays, model.epoch)
+    return ServoGoal(
+        **run_fields(goal, context, used_cameras(goal, aim.wanted, context)),
+        law=name,
+        jacobian=int(JACOBIANS[goal.jacobian or "mean"]),
+        set_points=aim.set_points,
+        wanted=aim.wanted,
+        rates=np.zeros_like(aim.set_points),
+        target_points=aim.points,
+        target_known=aim.known.astype(np.float64),
+        pose_known=aim.pose_known,
+        centre_weights=weights,
+        centre_body=body,
+        centre_target=centre_target,
+        faces=aim.faces,
+        choice=NOT_CHOSEN._replace(triple=aim.face),
+    )
+
+
+def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, Any]:
+    """Fields of a `LawRun` before its first step: what the goal says, or else the cell."""
+    settings = context.settings
+    gain = goal.gain or settings.gain
+    near, far, slope = (
+        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
+    )
+    return {
+        "goal": goal,
+        "points": goal.points or settings.points,
+        "gain_near": near,
+        "gain_far": far,
+        "gain_slope": slope,
+        "tolerance_px": goal.tolerance_px or settings.tolerance_px,
+        "hold_frames": goal.hold_frames or settings.hold_frames,
+        "time_limit_s": goal.time_limit_s or settings.time_limit_s,
+        "started_ns": context.now_ns,
+        "lease_s": goal.lease_s,
+        "lease_until_ns": context.now_ns + int((goal.lease_s or 0.0) * 1e9),
+        "used": used,
+        "last_frames": sum(e.frames for e in context.state.cameras),
+    }
+
+
+def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatArray:
+    """(c,) 1 for cameras that the law may use. Raises RefusalError where they show too few ``wanted`` (c, m)."""
+    c = len(context.settings.cameras)
+    if goal.cameras is None:
+        return np.ones(c)
+    used = np.zeros(c)
+    for name in goal.cameras:
+        used[camera_index(name, context.settings)] = 1.0
+    shown = int((wanted * used[:, None]).max(axis=0).sum())
+    if shown < MIN_MARKERS:
+        raise RefusalError(
+            "TOO_FEW_MARKERS",
+            f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {MIN_MARKERS} "
+            "are needed",
+            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
+        )  # fmt: skip
+    return used
+
+
+def _centre(
+    centre: Centre | None, aim: GoalResolution, arrays: ModelArrays, epoch: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; at the goal.
+
+    The point is stated in the chain's zero. Default: the affine middle of the goal's markers.
+    """
+    weights = np.zeros(len(arrays.marker_ids))
+    body = np.zeros(4)
+    if centre is None:
+        weights = aim.known.astype(np.float64) / max(float(aim.known.sum()), 1.0)
+    elif bool(centre.markers) == (centre.point is not None):
+        raise RefusalError(
+            "CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none"
+        )
+    elif centre.point is not None:
+        if centre.model_epoch is None:
+            raise RefusalError(
+                "FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is"
+            )
+        of_this_model(centre.model_epoch, epoch)
+        now = normalize_scale(np.array(centre.point), arrays, "the centre")[None]
+        H = chain_at(arrays, aim.joints)[0]
+        body = transform_points(invert4(H), now)[0]
+        return weights, body, transform_points(aim.displacement, now)[0]
+    else:
+        weights[marker_indices(centre.markers, arrays)] = 1.0
+        weights = weights / float(weights.sum())
+    return weights, body, (weights[:, None] * aim.points).sum(axis=0)
+
+
+def unplanned_report(source: ServoGoal, context: StepContext) -> PlanReport:
+    """The report of a goal whose pose, and so its path, is not known beforehand."""
+    return no_plan(
+        source.law, "the pose at the goal is not known: fewer than three of its markers are shown by two cameras",
+        source.time_limit_s,
+    )  # fmt: skip
+
+
+def no_plan(law: str, why: str, seconds: float) -> PlanReport:
+    """A report without a plan: ``why`` there is none; it takes ``seconds`` at most."""
+    return PlanReport(
+        law=law, way=f"not planned: {why}", seconds=seconds, approaches=(), shares=(), joints={}, pixels={}
+    )
