@@ -61,10 +61,10 @@ from stereoservo.calibration.rig_model import (
 )
 from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.single_joint_fit import (
-    MIN_MARKERS,
     fit_single_joint,
     link_joints,
     measurements,
+    without_rare_markers,
 )
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
@@ -86,8 +86,6 @@ WILD = 100.0
 """Squared residual over the median from which a pixel of the linked joints is a wrong one."""
 SCALE_ROUNDS = 3
 """Times that scales are removed from the readings and estimated again."""
-MIN_SIGHTINGS = 2
-"""Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 
 
 def fit_model(
@@ -421,7 +419,7 @@ def _start(
     report_progress("cameras", 0.0)
     lenses, lens_model = starting_lenses(trials, options.lens, priors, bend)
     cameras, points, usable = initial_reconstruction(undistorted(trials, lenses))
-    trials, points, usable, left_out = _without_rare_markers(trials, points, usable)
+    trials, points, usable, left_out = without_rare_markers(trials, points, usable)
     ideal = undistorted(trials, lenses)
     separate = []
     for j, name in enumerate(trials.joint_names):
@@ -584,28 +582,3 @@ def _from_other_lenses(
 
 def _silent(stage: str, fraction: float) -> None:
     return
-
-
-def _without_rare_markers(
-    trials: TrialData, points: FloatArray, usable: BoolArray
-) -> tuple[TrialData, FloatArray, BoolArray, tuple[int, ...]]:
-    """Leave out markers that two cameras see at fewer than two stops of joint trials. Raises
-    CalibrationError.
-    """
-    often = np.isfinite(points[trials.trials >= 0]).all(axis=2).sum(axis=0) >= MIN_SIGHTINGS
-    if int(often.sum()) < MIN_MARKERS:
-        raise CalibrationError(
-            "too_few_markers",
-            f"two cameras see {int(often.sum())} markers at {MIN_SIGHTINGS} stops or more; at least "
-            f"{MIN_MARKERS} are needed",
-            markers=int(often.sum()),
-            minimum=MIN_MARKERS,
-        )
-    left_out = tuple(i for i, keep in zip(trials.marker_ids, often, strict=True) if not keep)
-    kept = msgspec.structs.replace(
-        trials,
-        marker_ids=tuple(i for i, keep in zip(trials.marker_ids, often, strict=True) if keep),
-        pixels=trials.pixels[:, :, often],
-        sigmas=trials.sigmas[:, :, often],
-    )
-    return kept, points[:, often], usable[:, :, often], left_out

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import solve
@@ -30,6 +31,8 @@ MIN_STOPS = 4
 """Different positions, at which markers are shown, that a joint's trial needs."""
 MIN_SHOWN = 2
 """Markers that two cameras must see for a stop to count."""
+MIN_SIGHTINGS = 2
+"""Stops of joint trials at which two cameras must see a marker for it to enter the model."""
 MIN_MARKERS = 3
 """Markers that a trial must show."""
 MIN_IMAGE_MOTION = 6.0
@@ -466,3 +469,28 @@ def _chain(kinds: tuple[str, ...], generators: FloatArray, offsets: FloatArray) 
     for kind, generator, offset in zip(kinds, generators, offsets, strict=True):
         product = product @ exp_generator(kind, generator, offset)
     return product
+
+
+def without_rare_markers(
+    trials: TrialData, points: FloatArray, usable: BoolArray
+) -> tuple[TrialData, FloatArray, BoolArray, tuple[int, ...]]:
+    """Leave out markers that two cameras see at fewer than two stops of joint trials. Raises
+    CalibrationError.
+    """
+    often = np.isfinite(points[trials.trials >= 0]).all(axis=2).sum(axis=0) >= MIN_SIGHTINGS
+    if int(often.sum()) < MIN_MARKERS:
+        raise CalibrationError(
+            "too_few_markers",
+            f"two cameras see {int(often.sum())} markers at {MIN_SIGHTINGS} stops or more; at least "
+            f"{MIN_MARKERS} are needed",
+            markers=int(often.sum()),
+            minimum=MIN_MARKERS,
+        )
+    left_out = tuple(i for i, keep in zip(trials.marker_ids, often, strict=True) if not keep)
+    kept = msgspec.structs.replace(
+        trials,
+        marker_ids=tuple(i for i, keep in zip(trials.marker_ids, often, strict=True) if keep),
+        pixels=trials.pixels[:, :, often],
+        sigmas=trials.sigmas[:, :, often],
+    )
+    return kept, points[:, often], usable[:, :, often], left_out
