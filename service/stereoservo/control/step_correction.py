@@ -181,19 +181,17 @@ def corrected_step(
 # -- near singularities -----------------------------------------------------------------------------------------
 
 FREEDOMS = 6
-SINGULAR = 3e-4
-"""Singular value of the stacked operators, over the largest, below which the arm is near a singularity: a spherical
-wrist within some tenths of a degree of stretched, or less.
-"""
-LEAST_DAMPING = 3e-5
-"""Of a motion that the arm has lost, relative to the largest singular value: between the noise of learnt operators and
-`SINGULAR`.
+SINGULAR = 2e-3
+"""Singular value of the stacked operators, over the largest, below which the arm is near a singularity."""
+LEAST_DAMPING = 1e-3
+"""Of a motion that the arm has lost, relative to the largest singular value. Half of `SINGULAR`: the arm goes through
+the singularity, off its line by what it cannot make there; exact steps would turn a wrist by half a turn beside it.
 """
 SPANNED = 1e-3
 """Share of a bracket beyond the motions that are known, below which it tells no new one."""
 LOST = 0.5
 """Share of a motion that the damped step does not make, above which the joints set out to leave the singularity."""
-LEAVING = 300.0
+LEAVING = 100.0
 """Joint motion out of the singularity, over what is lost in units of the largest singular value."""
 LEAVING_RATE = 0.5
 """[rad/s or m/s] at most."""
