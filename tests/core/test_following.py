@@ -11,7 +11,7 @@ import pytest
 
 from stereoservo.core.monitor import PLAY, SILENCE_S, detect_following_error
 from stereoservo.core.state import initial_state
-from stereoservo.messages.goals import Enable, Jog
+from stereoservo.messages.goals import Enable, Jog, Reset
 from stereoservo.messages.reasons import Reason
 
 RATE_HZ = 250.0
@@ -169,3 +169,27 @@ def test_a_slow_jog_with_an_encoder_that_stands_still_ends_in_a_fault(bench: Any
     assert "stood still for" in event.reasons[0].hint
     bench.run(0.5)
     assert np.abs(bench.q - start).max() < 0.09
+
+
+def test_a_reset_begins_anew(bench: Any) -> None:
+    """Commands were lost for less than a silence lasts: what they sent is not counted on top of the next goal's."""
+    bench.run(0.1)
+    bench.step(Enable())
+    bench.run(0.3)
+    name = bench.settings.joint_names[2]
+    assert bench.reply(Jog({name: 1.0}, 2.0)).accepted
+    bench.run(0.6)
+    bench.dead_speed = 10.0  # nothing moves, whatever is sent
+    event = bench.until(lambda e: e.kind == "fault", 0.5)
+    assert "lacks" in event.reasons[0].hint
+    bench.dead_speed = 0.0
+    bench.run(0.3)
+    bench.step(Reset())
+    bench.run(0.1)
+    bench.step(Enable())
+    bench.run(0.3)
+    start = bench.q.copy()
+    assert bench.reply(Jog({name: 0.015}, 2.0)).accepted
+    outputs = bench.run(1.0)
+    assert outputs.status.lifecycle == "active"
+    assert bench.q[2] - start[2] > 0.012

@@ -14,7 +14,14 @@ import pytest
 from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.state import STATE_VERSION, StateVersionError, decode_state, encode_state, is_recorded
+from stereoservo.core.state import (
+    OLDEST_VERSION,
+    STATE_VERSION,
+    StateVersionError,
+    decode_state,
+    encode_state,
+    is_recorded,
+)
 from stereoservo.messages.goals import DEFAULT_LAW, Enable, FeatureTarget, Goal, RunGoal
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.replay import RecordingError, replay
@@ -212,11 +219,15 @@ def test_a_state_of_before_goals_were_resolved_in_parts_is_read(bench: Any) -> N
     bench.step(RunGoal(Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(bench.q + 0.1)))))
     state = msgspec.msgpack.decode(encode_state(bench.core.state))
     del state["planning"]["goal"], state["planning"]["resolution"]
+    state["version"] = 7
     of_then = msgspec.msgpack.encode(state)
     assert is_recorded(bench.core.state, of_then)
     planned = decode_state(of_then).planning
     assert planned is not None
     assert planned.goal.id == str(uuid.UUID(int=1))
+    state["source"]["type"] = "trials"  # whose course was another one then
+    with pytest.raises(StateVersionError):
+        decode_state(msgspec.msgpack.encode(state))
 
 
 def of_version(version: int) -> bytes:
@@ -228,11 +239,11 @@ def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_p
     path = tmp_path / "old.mcap"
     older = msgspec.structs.replace(fingerprint(), stereoservo="0.0.1")
     with FlightRecorder(path, bench.settings, older) as recorder:
-        recorder.checkpoint(3, of_version(STATE_VERSION - 2), 1)
+        recorder.checkpoint(3, of_version(OLDEST_VERSION - 1), 1)
     with pytest.raises(RecordingError) as caught:
         replay(path)
     said = str(caught.value)
-    assert f"state is of version {STATE_VERSION - 2}, this program works with version {STATE_VERSION}" in said
+    assert f"state is of version {OLDEST_VERSION - 1}, this program works with version {STATE_VERSION}" in said
     assert "written by stereoservo 0.0.1" in said
     assert "Replay it with the version that wrote it, or record anew" in said
     assert "not damaged" in said

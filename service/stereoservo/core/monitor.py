@@ -349,8 +349,11 @@ def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     if not context.settings.watch_following or state.history.count == 0:
         return ()
     reason = detect_following_error(state, context.settings, context.q, context.ingested.elapsed_s)
-    if reason is None or state.lifecycle != Lifecycle.ACTIVE:
+    if state.lifecycle != Lifecycle.ACTIVE:
+        state.silent_from = None  # what was sent before is no matter of what is sent next
         return ()  # an arm that is off may be moved by hand
+    if reason is None:
+        return ()
     return (Finding("fault", reason, reason.hint, reason.hint),)
 
 

@@ -30,6 +30,7 @@ from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
 STATE_VERSION = 8
+OLDEST_VERSION = 6  # of states that are read
 HISTORY = 128  # joint samples kept for interpolation: a third of a second at 1 kHz, half of one at 250 Hz
 LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
 
@@ -541,10 +542,9 @@ class StateVersionError(ValueError):
 
 
 class _Versioned(msgspec.Struct):
-    """What every state says of itself, whatever else it holds; and the goal that was being planned."""
+    """What every state says of itself, whatever else it holds."""
 
     version: int
-    planning: dict[str, Any] | None = None
 
 
 _decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
@@ -558,18 +558,11 @@ def encode_state(state: CoreState) -> bytes:
 def decode_state(data: bytes) -> CoreState:
     """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
     # Asked first: a state of another version may hold other fields, too.
-    told = msgspec.msgpack.decode(data, type=_Versioned)
-    version = told.version
-    if (
-        told.planning is not None and "goal" not in told.planning
-    ):  # of before large bodies were planned in parts
-        state_of_then = msgspec.msgpack.decode(data)
-        state_of_then["planning"]["goal"] = told.planning["source"]["goal"]
-        data = msgspec.msgpack.encode(state_of_then)
-    if version == 6:
-        data = msgspec.msgpack.encode(_from_version_6(data))
-    elif version != STATE_VERSION:
+    version = msgspec.msgpack.decode(data, type=_Versioned).version
+    if not OLDEST_VERSION <= version <= STATE_VERSION:
         raise StateVersionError(version)
+    if version < STATE_VERSION:
+        data = msgspec.msgpack.encode(_of_this_version(msgspec.msgpack.decode(data), version))
     state: CoreState = _decoder.decode(data)
     return state
 
@@ -589,15 +582,22 @@ def is_recorded(state: CoreState, data: bytes) -> bool:
     )
 
 
-def _from_version_6(data: bytes) -> dict[str, Any]:
-    """A state of before stamps and gaps of the loop were checked, with nothing refused yet; arrays still encoded."""
-    state: dict[str, Any] = msgspec.msgpack.decode(data)
-    nothing = msgspec.to_builtins(Refused())
-    state |= {
-        "version": STATE_VERSION,
-        "last_step_ns": 0,
-        "refused_joints": nothing,
-        "refused_frames": [nothing for _ in state["cameras"]],
-        "stop_reason": state["contact"].pop("reason"),
-    }
+def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
+    """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
+    midst of trial motions, whose course is another one now.
+    """
+    if state["source"]["type"] == "trials":
+        raise StateVersionError(version)
+    state["version"] = STATE_VERSION
+    if version == 6:  # before stamps and gaps of the loop were checked
+        nothing = msgspec.to_builtins(Refused())
+        state |= {
+            "last_step_ns": 0,
+            "refused_joints": nothing,
+            "refused_frames": [nothing for _ in state["cameras"]],
+            "stop_reason": state["contact"].pop("reason"),
+        }
+    planning = state.get("planning")
+    if planning is not None:  # before large bodies were planned in parts
+        planning["goal"] = planning["source"]["goal"]
     return state

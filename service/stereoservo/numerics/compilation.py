@@ -87,8 +87,9 @@ def _compile(function: _F, **more: Any) -> _F:
     except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
         warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=3)
         compiled = numba.njit(**options)(function)
-    _forget_literals(compiled)
-    KERNELS[function.__module__, function.__qualname__] = compiled
+    if compiled is not function:  # with NUMBA_DISABLE_JIT it is
+        _forget_literals(compiled)
+        KERNELS[function.__module__, function.__qualname__] = compiled
     return cast(_F, compiled)
 
 

@@ -218,8 +218,8 @@ class _Soak:
             causes = "; ".join(f"{reason.code} {reason.hint}" for reason in self.cell.core.state.fault)
             raise ExperimentError(
                 "refused",
-                f"{passed_s:.1f} s: a goal of law {law} was refused after {self.last_fault!r}: {reply.message} "
-                f"{causes}",
+                f"a goal of law {law} was refused after {passed_s:.1f} s (the last fault was {self.last_fault!r}): "
+                f"{reply.message}; {causes}",
             )
         if self.rng.random() > QUIET:
             self.cell.run_for(float(self.rng.uniform(0.0, 1.0)))
