@@ -54,7 +54,7 @@ def of_bytes(model: Path, markers: int) -> dict[str, int]:
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("count", [of_bytes, of_lines])
+@pytest.mark.parametrize("count", [of_bytes, pytest.param(of_lines, marks=pytest.mark.slow)])
 def test_no_step_grows_faster_than_its_markers(
     count: Callable[[Path, int], dict[str, int]], tmp_path: Path
 ) -> None:

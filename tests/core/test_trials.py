@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.sources.calibration import enough_inside, extrapolated, plan_sides
 from stereoservo.core.sources.check import check_targets
-from stereoservo.core.sources.trial_stops import combined_offsets, stop_offset
+from stereoservo.core.sources.trial_stops import (
+    combined_offsets,
+    enough_inside,
+    extrapolated,
+    plan_sides,
+    stop_offset,
+)
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.messages.goals import Calibrate, Enable, Home, JointTarget, RenewGoal
 

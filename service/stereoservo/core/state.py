@@ -591,12 +591,8 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     state["version"] = STATE_VERSION
     if version == 6:  # before stamps and gaps of the loop were checked
         nothing = msgspec.to_builtins(Refused())
-        state |= {
-            "last_step_ns": 0,
-            "refused_joints": nothing,
-            "refused_frames": [nothing for _ in state["cameras"]],
-            "stop_reason": state["contact"].pop("reason"),
-        }
+        state |= {"last_step_ns": 0, "refused_joints": nothing, "stop_reason": state["contact"].pop("reason")}
+        state["refused_frames"] = [nothing for _ in state["cameras"]]
     planning = state.get("planning")
     if planning is not None:  # before large bodies were planned in parts
         planning["goal"] = planning["source"]["goal"]
