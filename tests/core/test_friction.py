@@ -10,6 +10,7 @@ import pytest
 
 from stereoservo.core.move import MOST
 from stereoservo.core.servo_core import ServoCore
+from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.messages.goals import FeatureTarget, JointTarget
 
 STEP = 2.0 * np.pi / 4096.0
@@ -79,6 +80,26 @@ def test_nothing_hunts_while_a_goal_is_held_against_friction(bench: Any, resolut
     assert np.ptp(stood, axis=0).max() < 3e-4
     one_step = max(true_error(bench, bench.q + resolution * joint) for joint in np.eye(6))
     assert true_error(bench, target) < 2.0 * bench.settings.tolerance_px + one_step
+
+
+@pytest.mark.parametrize(
+    ("resolution", "stated", "added"), [(STEP, True, False), (STEP, False, True), (1e-5, True, True)]
+)
+def test_play_before_a_coarse_encoder_is_not_taken_for_friction(
+    bench: Any, resolution: float, stated: bool, added: bool
+) -> None:
+    """A joint that stands, whatever it is sent; the demo with `--mechanics serial_servo` hunted to its time limit."""
+    accuracy = JointAccuracy(np.full(6, 0.01), *(np.zeros(6),) * 3)
+    bench.truth.model = msgspec.structs.replace(
+        bench.truth.model, joint_accuracy=accuracy if stated else None
+    )
+    with_settings(bench, watch_following=False, resolution=(resolution,) * 6)
+    bench.resolution, bench.frozen_joint, bench.dead_speed = resolution, 2, 1.0
+    assert bench.reply(
+        bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)
+    ).accepted
+    bench.run(3.0)
+    assert bool(bench.core.state.friction.velocity.any()) is added
 
 
 def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> None:

@@ -6,7 +6,8 @@ by the type of the state in `MOTION_SOURCES`. To add one: a state of its own, a 
 
 What friction takes of the velocity of a source that works on a goal is added to it. For each joint it is estimated from
 small commands and the travel that they have brought: an integral action for a joint that stands, and none for one that
-follows. Play and sag wind nothing up, since the encoder of a motor that turns through its play does move.
+follows. Play and sag wind nothing up, since the encoder of a motor that turns through its play does move; for encoders
+behind the play see `_bounds`.
 """
 
 from __future__ import annotations
@@ -196,11 +197,19 @@ LEAST_STEPS = 5.0
 
 
 @lru_cache(maxsize=8)
-def _bounds(kinds: tuple[str, ...], resolution: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared."""
+def _bounds(
+    kinds: tuple[str, ...], resolution: tuple[float, ...], inexact: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared.
+
+    Nothing is added to joints with coarse encoders where the model states errors of joint readings (``inexact``): play
+    before the encoder looks like friction, and steps show too late that it is taken up; the joint would hunt.
+    """
     most, travel = (np.array([value[kind] for kind in kinds]) for value in (MOST, LEAST_TRAVEL))
     if resolution:
-        travel = np.maximum(travel, LEAST_STEPS * np.array(resolution))
+        least = LEAST_STEPS * np.array(resolution)
+        most = np.where((least > travel) & inexact, 0.0, most)
+        travel = np.maximum(travel, least)
     most.setflags(write=False)
     travel.setflags(write=False)
     return most, travel
@@ -226,7 +235,9 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
     known.sent_s = known.sent_s + context.dt_s
     wanted = output.velocity
     if context.ingested.joints is not None and _fresh(output, context):
-        _estimate(known, wanted, context.q, _bounds(settings.joint_kinds, settings.resolution), context.dt_s)
+        inexact = state.model is not None and state.model.joint_accuracy is not None
+        bounds = _bounds(settings.joint_kinds, settings.resolution, inexact)
+        _estimate(known, wanted, context.q, bounds, context.dt_s)
     if not known.velocity.any():
         return output
     return replace(output, velocity=np.where(wanted == 0.0, 0.0, wanted + known.velocity))
